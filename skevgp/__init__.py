@@ -1,0 +1,30 @@
+"""Sparse Gaussian process regression that scales, and that knows physics."""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from . import datasets, features, metrics, plotting
+    from .regressor import EVGPRegressor
+
+__version__ = "0.1.0"
+
+__all__ = ["EVGPRegressor", "__version__", "datasets", "features", "metrics", "plotting"]
+
+_SUBMODULES = ("datasets", "features", "metrics", "plotting")
+_HOME = {"EVGPRegressor": "regressor"}
+
+
+def __getattr__(name: str) -> Any:
+    """Import public names when they are first used, so that ``import skevgp`` is quick and needs no optional package."""
+    if name in _SUBMODULES:
+        return import_module(f".{name}", __name__)
+    if name in _HOME:
+        return getattr(import_module(f".{_HOME[name]}", __name__), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

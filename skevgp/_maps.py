@@ -1,0 +1,74 @@
+"""Applying a user's transformer to rows, and checking what comes back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.sparse import issparse
+from sklearn.base import clone
+from sklearn.utils import _safe_indexing
+
+# Rows that a map sees at once.
+MAP_ROWS = 16_384
+
+
+def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
+    """A fitted clone of a transformer, or None.
+
+    Parameters
+    ----------
+    feature_map : transformer or None
+    X : array-like of shape (n, d)
+        As the user gave it.
+    y : ndarray of shape (n,) or (n, o)
+    name : str
+        The argument's name, for errors.
+
+    Raises
+    ------
+    TypeError
+        If it is not a transformer.
+    """
+    if feature_map is None:
+        return None
+    if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
+        raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
+    return clone(feature_map).fit(X, y)
+
+
+def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
+    """What a fitted map makes of rows, block by block.
+
+    Parameters
+    ----------
+    fitted_map : transformer
+    X : array-like of shape (n, d)
+        As the user gave it.
+    name : str
+        The argument's name, for errors.
+
+    Returns
+    -------
+    values : ndarray of shape (n, width)
+
+    Raises
+    ------
+    ValueError
+        If it returns the wrong number of rows, not two dimensions or values that are not finite.
+    """
+    n_rows = X.shape[0]
+    blocks = []
+    for first in range(0, n_rows, MAP_ROWS):
+        rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
+        values = fitted_map.transform(rows)
+        values = np.asarray(values.toarray() if issparse(values) else values, dtype=np.float64)
+        if values.ndim != 2 or len(values) != rows.shape[0]:
+            raise ValueError(
+                f"{name}={fitted_map!r} must return one row per row of X; for {rows.shape[0]} rows it returned the shape "
+                f"{values.shape}."
+            )
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name}={fitted_map!r} returned NaN or infinity for finite rows.")
+        blocks.append(values)
+    return np.concatenate(blocks)

@@ -1,0 +1,41 @@
+"""Packages that only some users need: imported where they are used, or an error that says how to get them."""
+
+from __future__ import annotations
+
+import importlib
+from types import ModuleType
+
+# Importable name -> (what to pip install, the extra of this package that brings it).
+_PACKAGES = {
+    "pinocchio": ("pin", "physics"),
+    "matplotlib": ("matplotlib", "plot"),
+}
+
+
+def require(name: str, purpose: str) -> ModuleType:
+    """Import an optional package.
+
+    Parameters
+    ----------
+    name : str
+        The importable name, for example ``"pinocchio"`` or ``"matplotlib.pyplot"``.
+    purpose : str
+        What it is needed for; the subject of the error's sentence.
+
+    Returns
+    -------
+    module : module
+
+    Raises
+    ------
+    ImportError
+        With the pip command, if the package is not installed.
+    """
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package, extra = _PACKAGES[name.partition(".")[0]]
+        raise ImportError(
+            f"{purpose} needs the optional package {package!r}, which cannot be imported ({error}). "
+            f"Install it with: pip install {package} (or, from a clone of the project: pip install '.[{extra}]')"
+        ) from error

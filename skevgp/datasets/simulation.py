@@ -1,0 +1,113 @@
+"""Trajectories of a system under inputs that are held over each time step."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike
+from scipy.integrate import solve_ivp
+
+from .._optional import require
+from ..robots import System, get_system, pinocchio_model
+
+# Measured against the stored reference: one-step errors below 1e-10 on the pendulum, cartpole and acrobot.
+_RTOL, _ATOL = 1e-11, 1e-13
+
+
+class _ForwardDynamics:
+    """Joint accelerations of many states at once, by the articulated-body algorithm."""
+
+    def __init__(self, system: System):
+        self._pin = require("pinocchio", "Simulating a robot")
+        self._model = pinocchio_model(system)
+        self._data = self._model.createData()
+        self._damping = np.array([link.damping for link in system.links])
+        self._driven = np.array(system.driven)
+
+    def __call__(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        force = -self._damping * v
+        force[:, self._driven] += u
+        aba, model, data = self._pin.aba, self._model, self._data
+        return np.array([aba(model, data, *row) for row in zip(q, v, force, strict=True)])
+
+
+def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03) -> np.ndarray:
+    """Integrate a system's equations of motion with the input held over each step.
+
+    Accelerations come from Pinocchio's articulated-body algorithm, with viscous damping subtracted from the joint
+    forces; the integrator is SciPy's DOP853, started anew at each step, for all trajectories together.
+
+    Parameters
+    ----------
+    system : str or System
+        A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``).
+    z0 : array-like of shape (2 * n_joints,) or (n_trajectories, 2 * n_joints)
+        Initial states: joint positions (rad or m), then velocities (rad/s or m/s).
+    U : array-like of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs)
+        Inputs: torques (N m) or forces (N) on the driven joints, each held for ``dt``.
+    dt : float, default=0.03
+        Length of a step, s.
+
+    Returns
+    -------
+    Z : ndarray of shape (n_steps + 1, 2 * n_joints) or (n_trajectories, n_steps + 1, 2 * n_joints)
+        The states at the times 0, dt, 2 dt, ...; the first is ``z0``.
+
+    Raises
+    ------
+    ImportError
+        If Pinocchio is not installed; the message gives the pip command.
+    ValueError
+        If a shape does not fit the system, a value is not finite, ``dt`` is not positive, the system is unknown, or
+        the integrator gives up.
+
+    Examples
+    --------
+    A pendulum let go at 0.1 rad, without torque, for three steps:
+
+    >>> import numpy as np
+    >>> from skevgp.datasets import simulate
+    >>> simulate("pendulum", [0.1, 0.0], np.zeros((3, 1))).round(4)
+    array([[ 0.1   ,  0.    ],
+           [ 0.0991, -0.0584],
+           [ 0.0965, -0.115 ],
+           [ 0.0922, -0.1689]])
+    """
+    system = get_system(system)
+    n, n_inputs = system.n_joints, system.n_inputs
+    z0, U = np.asarray(z0, dtype=float), np.asarray(U, dtype=float)
+    single = z0.ndim == 1
+    z, inputs = np.atleast_2d(z0), U[np.newaxis] if single else U
+    if z.ndim != 2 or z.shape[1] != 2 * n:
+        raise ValueError(f"z0 must have {2 * n} columns for the system {system.name!r}; got the shape {z0.shape}.")
+    if inputs.ndim != 3 or inputs.shape[0] != len(z) or inputs.shape[2] != n_inputs:
+        wanted = f"(n_steps, {n_inputs})" if single else f"({len(z)}, n_steps, {n_inputs})"
+        raise ValueError(f"U must have the shape {wanted} for the system {system.name!r}; got {U.shape}.")
+    if not (np.isfinite(z).all() and np.isfinite(inputs).all()):
+        raise ValueError("z0 and U must be finite.")
+    if not (np.isfinite(dt) and dt > 0):
+        raise ValueError(f"dt must be a positive number of seconds; got {dt!r}.")
+
+    accelerations = _ForwardDynamics(system)
+
+    def derivative(_t: float, flat: np.ndarray, u: np.ndarray) -> np.ndarray:
+        state = flat.reshape(-1, 2 * n)
+        q, v = state[:, :n], state[:, n:]
+        return np.hstack([v, accelerations(q, v, u)]).ravel()
+
+    Z = np.empty((len(z), inputs.shape[1] + 1, 2 * n))
+    Z[:, 0] = z
+    for step in range(inputs.shape[1]):
+        solution = solve_ivp(
+            derivative,
+            (0.0, dt),
+            Z[:, step].ravel(),
+            method="DOP853",
+            t_eval=(dt,),
+            args=(inputs[:, step],),
+            rtol=_RTOL,
+            atol=_ATOL,
+        )
+        if not solution.success:
+            raise ValueError(f"The integration of {system.name!r} failed in step {step}: {solution.message}")
+        Z[:, step + 1] = solution.y[:, -1].reshape(-1, 2 * n)
+    return Z[0] if single else Z

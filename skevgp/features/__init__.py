@@ -1,0 +1,5 @@
+"""Explicit features h(x): scikit-learn transformers that say what physics knows."""
+
+from .newton import InertiaForce, InertiaForceGravity
+
+__all__ = ["InertiaForce", "InertiaForceGravity"]

@@ -1,0 +1,355 @@
+"""Newton's second law as explicit features: inertia + force (+ gravity), section III of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
+
+from .._validation import check_real
+from ..robots import System, get_system
+
+
+def _has_robot(transformer: _NewtonFeatures) -> bool:
+    if transformer.robot is None:
+        raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
+    return True
+
+
+class _NewtonFeatures(TransformerMixin, BaseEstimator):
+    """What `InertiaForce` and `InertiaForceGravity` share: h starts with x = [q, q̇, u]."""
+
+    robot: str | System | None
+    dt: float
+    inverse_inertia: ArrayLike
+    outputs: Sequence[int | str] | None
+    known_scale: float
+    unknown_scale: float
+    free_scale: float
+
+    def fit(self, X: ArrayLike, y: object = None) -> Self:
+        """Check the columns.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Rows [q, q̇, u]; any width without a robot.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ValueError
+            If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
+        """
+        validate_data(self, X, dtype=np.float64)
+        if self.robot is not None:
+            system = get_system(self.robot)
+            width = 2 * system.n_joints + system.n_inputs
+            if self.n_features_in_ != width:
+                raise ValueError(
+                    f"X has {self.n_features_in_} columns, but {type(self).__name__}({system.name!r}) needs {width}: "
+                    f"{system.state_names + system.input_names}."
+                )
+        return self
+
+    def transform(self, X: ArrayLike) -> np.ndarray:
+        """Evaluate the features.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        H : ndarray of shape (n_samples, n_features_out)
+            h(x) of each row.
+        """
+        check_is_fitted(self)
+        X = validate_data(self, X, dtype=np.float64, reset=False)
+        return np.hstack([X, self._gravity_columns(X)])
+
+    def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
+        """Names of the features.
+
+        Parameters
+        ----------
+        input_features : array-like of str, default=None
+            Names of the columns of X; by default those seen in `fit`, or the robot's own.
+
+        Returns
+        -------
+        names : ndarray of str of shape (n_features_out,)
+        """
+        check_is_fitted(self)
+        if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
+            system = get_system(self.robot)
+            input_features = np.array(system.state_names + system.input_names, dtype=object)
+        names = _check_feature_names_in(self, input_features)
+        return np.concatenate([names, self._gravity_names(names)]).astype(object)
+
+    @available_if(_has_robot)
+    def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """Prior mean and standard deviation of the weights β.
+
+        Known entries (1 and Δt) have the mean that Euler's rule gives and a narrow scale; unknown ones (Δt/J and
+        gravity's factors) the user's guess and a wide scale; the rest mean 0 and ``free_scale``.
+
+        Parameters
+        ----------
+        n_outputs : int
+            How many states are predicted: all 2 * n_joints, or as many as ``outputs`` says.
+
+        Returns
+        -------
+        mean, scale : ndarray of shape (n_outputs, n_features_out)
+
+        Raises
+        ------
+        ValueError
+            If ``n_outputs`` does not fit the robot, or a parameter is out of its range.
+        """
+        assert self.robot is not None
+        system = get_system(self.robot)
+        dt = check_real(self.dt, "dt", minimum=0.0, strict=True)
+        known = check_real(self.known_scale, "known_scale", minimum=0.0)
+        unknown = check_real(self.unknown_scale, "unknown_scale", minimum=0.0)
+        n, n_inputs = system.n_joints, system.n_inputs
+        joints = np.arange(n)
+        width = 2 * n + n_inputs + self._n_gravity(system)
+        mean = np.zeros((2 * n, width))
+        scale = np.full((2 * n, width), check_real(self.free_scale, "free_scale", minimum=0.0))
+        for row, column, value in (
+            (joints, joints, 1.0),  # q' = q + ...
+            (joints, n + joints, dt),  # ... + Δt q̇
+            (n + joints, n + joints, 1.0),  # q̇' = q̇ + ...
+        ):
+            mean[row, column], scale[row, column] = value, known
+        driven, inputs = n + np.array(system.driven), 2 * n + np.arange(n_inputs)
+        mean[driven, inputs] = dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
+        scale[driven, inputs] = unknown
+        self._gravity_prior(system, dt, mean, scale)
+        rows = self._predicted_states(system)
+        if n_outputs != len(rows):
+            names = [system.state_names[row] for row in rows]
+            raise ValueError(
+                f"y has {n_outputs} columns, but {type(self).__name__}({system.name!r}) predicts {len(rows)} states: "
+                f"{names}. Say which ones y holds with outputs=[...]; the names are {system.state_names}."
+            )
+        return mean[rows], scale[rows]
+
+    def _predicted_states(self, system: System) -> list[int]:
+        names = system.state_names
+        if self.outputs is None:
+            return list(range(len(names)))
+        rows = [names.index(output) if output in names else output for output in self.outputs]
+        for row in rows:
+            if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
+                raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
+        return [int(row) for row in rows]
+
+    def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
+        return np.empty((len(X), 0))
+
+    def _gravity_names(self, names: np.ndarray) -> list[str]:
+        return []
+
+    def _n_gravity(self, system: System) -> int:
+        return 0
+
+    def _gravity_prior(self, system: System, dt: float, mean: np.ndarray, scale: np.ndarray) -> None:
+        """Fill in the gravity columns; none here."""
+
+
+def _per_term(value: ArrayLike, n_terms: int, name: str) -> np.ndarray:
+    array = np.asarray(value, dtype=float)
+    if array.shape not in ((), (n_terms,)) or not np.isfinite(array).all():
+        raise ValueError(f"{name} must be a finite number or {n_terms} of them; got {value!r}.")
+    return array
+
+
+class InertiaForce(_NewtonFeatures):
+    r"""Inertia + force features (IF): :math:`h(x) = [q, \dot q, u]` with a Newtonian prior on the weights.
+
+    The prior mean is Euler's rule for :math:`J \ddot q = u` (the paper's eq. inertia_prior),
+
+    .. math:: q' = q + \Delta t\,\dot q, \qquad \dot q' = \dot q + \gamma u, \qquad \gamma = \Delta t / J,
+
+    with :math:`\gamma` on the driven joints.
+
+    Parameters
+    ----------
+    robot : str or None, default=None
+        A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, any number of columns is taken as
+        it is and the weights get the regressor's wide default prior.
+    dt : float, default=0.03
+        Length of a time step, s.
+    inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
+        Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
+    outputs : sequence of int or str, default=None
+        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+    known_scale : float, default=0.1
+        Prior standard deviation of the entries that physics knows (1 and Δt).
+    unknown_scale : float, default=1.0
+        Prior standard deviation of the entries that physics names but does not know (γ).
+    free_scale : float, default=1.0
+        Prior standard deviation of the entries that are 0 in the prior mean; 0 pins them there.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    InertiaForceGravity : Adds gravity.
+
+    Notes
+    -----
+    Do not scale the columns of x before this map: the prior is in SI units. Scaling belongs in the regressor's
+    ``kernel_map``, which only the kernel sees.
+
+    Examples
+    --------
+    >>> from skevgp.features import InertiaForce
+    >>> features = InertiaForce("pendulum").fit([[0.1, 0.0, 1.0]])
+    >>> features.get_feature_names_out().tolist()
+    ['q', 'dq/dt', 'u_q']
+    >>> mean, scale = features.coef_prior(n_outputs=2)
+    >>> mean
+    array([[1.  , 0.03, 0.  ],
+           [0.  , 1.  , 0.  ]])
+    """
+
+    def __init__(
+        self,
+        robot: str | System | None = None,
+        *,
+        dt: float = 0.03,
+        inverse_inertia: ArrayLike = 0.0,
+        outputs: Sequence[int | str] | None = None,
+        known_scale: float = 0.1,
+        unknown_scale: float = 1.0,
+        free_scale: float = 1.0,
+    ):
+        self.robot = robot
+        self.dt = dt
+        self.inverse_inertia = inverse_inertia
+        self.outputs = outputs
+        self.known_scale = known_scale
+        self.unknown_scale = unknown_scale
+        self.free_scale = free_scale
+
+
+class InertiaForceGravity(_NewtonFeatures):
+    r"""Inertia + force + gravity features (IFG): IF and the sine of each link's angle against the vertical.
+
+    :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (the paper's eq. gravity_prior and section III-B) with the sines
+    :math:`\sin q` (pendulum), :math:`\sin\theta` (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot).
+    Gravity slows a link down by :math:`\Delta t` times its gain times the sine.
+
+    Parameters
+    ----------
+    robot : str or None, default=None
+        A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, the sine of every column is added
+        and the weights get the regressor's wide default prior.
+    dt : float, default=0.03
+        Length of a time step, s.
+    inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
+        Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
+    gravity_gain : float or array-like of shape (n_sines,), default=0.0
+        Guess of gravity's acceleration at sine 1, rad/s² (g/l for a point mass).
+    outputs : sequence of int or str, default=None
+        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+    known_scale : float, default=0.1
+        Prior standard deviation of the entries that physics knows (1 and Δt).
+    unknown_scale : float, default=1.0
+        Prior standard deviation of the entries that physics names but does not know (γ).
+    free_scale : float, default=1.0
+        Prior standard deviation of the entries that are 0 in the prior mean; 0 pins them there.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    InertiaForce : Without gravity.
+
+    Notes
+    -----
+    Do not scale the columns of x before this map: the sine of a z-score is not gravity. Scaling belongs in the
+    regressor's ``kernel_map``, which only the kernel sees.
+
+    Examples
+    --------
+    >>> from skevgp.features import InertiaForceGravity
+    >>> features = InertiaForceGravity("pendulum", inverse_inertia=4.0, gravity_gain=20.0)
+    >>> features.fit_transform([[0.1, 0.0, 1.0]]).round(4)
+    array([[0.1   , 0.    , 1.    , 0.0998]])
+    >>> features.get_feature_names_out().tolist()
+    ['q', 'dq/dt', 'u_q', 'sin(q)']
+    >>> features.coef_prior(n_outputs=2)[0]
+    array([[ 1.  ,  0.03,  0.  ,  0.  ],
+           [ 0.  ,  1.  ,  0.12, -0.6 ]])
+    """
+
+    def __init__(
+        self,
+        robot: str | System | None = None,
+        *,
+        dt: float = 0.03,
+        inverse_inertia: ArrayLike = 0.0,
+        gravity_gain: ArrayLike = 0.0,
+        outputs: Sequence[int | str] | None = None,
+        known_scale: float = 0.1,
+        unknown_scale: float = 1.0,
+        free_scale: float = 1.0,
+    ):
+        self.robot = robot
+        self.dt = dt
+        self.inverse_inertia = inverse_inertia
+        self.gravity_gain = gravity_gain
+        self.outputs = outputs
+        self.known_scale = known_scale
+        self.unknown_scale = unknown_scale
+        self.free_scale = free_scale
+
+    def _angles(self) -> list[tuple[int, ...]] | None:
+        """Columns that add up to each angle; None without a robot: every column is one."""
+        return None if self.robot is None else [term.angle for term in get_system(self.robot).gravity]
+
+    def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
+        angles = self._angles()
+        if angles is None:
+            return np.sin(X)
+        return np.sin(np.column_stack([X[:, list(columns)].sum(axis=1) for columns in angles]))
+
+    def _gravity_names(self, names: np.ndarray) -> list[str]:
+        angles = self._angles()
+        if angles is None:
+            angles = [(column,) for column in range(len(names))]
+        return [f"sin({' + '.join(names[list(columns)])})" for columns in angles]
+
+    def _n_gravity(self, system: System) -> int:
+        return len(system.gravity)
+
+    def _gravity_prior(self, system: System, dt: float, mean: np.ndarray, scale: np.ndarray) -> None:
+        gain = np.broadcast_to(_per_term(self.gravity_gain, len(system.gravity), "gravity_gain"), len(system.gravity))
+        first = 2 * system.n_joints + system.n_inputs
+        for index, term in enumerate(system.gravity):
+            rows = [system.n_joints + joint for joint in term.acts_on]
+            mean[rows, first + index] = -dt * gain[index]
+            scale[rows, first + index] = self.unknown_scale

@@ -1,0 +1,168 @@
+"""Fit one sparse model: optimise, look at what came out, try again if it got stuck."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from .model import SparseModel, Values
+from .objectives import BoundObjective, ElboObjective
+from .optimize import Minimum, Report, adam, lbfgs
+from .parameters import ParameterTable
+from .posterior import Posterior
+from .rows import Rows, block_rows
+from .statistics import SufficientStatistics
+
+# An output counts as not learned when this share of what the features alone leave over ends as noise.
+_COLLAPSED = 0.9
+# Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
+_OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
+
+
+@dataclass(frozen=True)
+class Options:
+    """How to optimise.
+
+    Attributes
+    ----------
+    solver : {"lbfgs", "adam"}
+    max_iter : int
+    tol : float
+    batch_size : int
+    learning_rate : float
+    map_blocks : callable
+    """
+
+    solver: Literal["lbfgs", "adam"]
+    max_iter: int
+    tol: float
+    batch_size: int
+    learning_rate: float
+    map_blocks: Callable[..., Iterator[Any]] = map
+
+
+@dataclass(frozen=True)
+class Learned:
+    """A fitted sparse model.
+
+    Attributes
+    ----------
+    model : SparseModel
+    values : dict
+        Of ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``, in internal units.
+    bound : float
+        In nats, of the residuals in internal units.
+    posterior : Posterior
+        In internal units.
+    statistics : list of SufficientStatistics
+        At ``values``, one for each set of inducing points.
+    loss_curve : list of float
+        Minus the bound per iteration.
+    message : str
+        What the user should know of how the fit ended; empty if it converged.
+    """
+
+    model: SparseModel
+    values: Values
+    bound: float
+    posterior: Posterior
+    statistics: list[SufficientStatistics]
+    loss_curve: list[float]
+    message: str
+
+    def updated(self, rows: Rows) -> Learned:
+        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far."""
+        new = self.model.statistics(self.values, rows.blocks(self.model.kernel, block_rows(self._n_inducing)))
+        statistics = [old + more for old, more in zip(self.statistics, new, strict=True)]
+        bound, posterior = self.model.at_optimum(self.values, statistics)
+        return replace(self, bound=bound, posterior=posterior, statistics=statistics)
+
+    @property
+    def _n_inducing(self) -> int:
+        return self.values["inducing_points"].shape[1]
+
+
+def learn(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    rng: np.random.RandomState,
+    report: Report | None = None,
+) -> Learned:
+    """Maximise the bound from the table's starts.
+
+    Parameters
+    ----------
+    model : SparseModel
+    table : ParameterTable
+        Of `start.starting_table`.
+    rows : Rows
+        In internal units.
+    options : Options
+    rng : RandomState
+        Draws the mini-batches.
+    report : callable, default=None
+        report(iteration, minus the bound), once per iteration.
+
+    Returns
+    -------
+    learned : Learned
+    """
+    n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
+    per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
+    if options.solver == "adam":
+        elbo = ElboObjective(model, table, rows, size)
+        batches = rows.batches(model.kernel, options.batch_size, rng)
+        minimum = adam(
+            elbo.minibatch(batches),
+            elbo.table.start(),
+            elbo.table.bounds(),
+            options.max_iter,
+            options.learning_rate,
+            per_row,
+        )
+        bound, posterior, statistics = elbo.solution(minimum.x, rows.blocks(model.kernel, size))
+        values = {parameter.name: elbo.table.values(minimum.x)[parameter.name] for parameter in table.parameters}
+    else:
+        objective = BoundObjective(model, table, rows, size, options.map_blocks)
+        minimum = _lbfgs_unless_collapsed(objective, table, options, per_row)
+        values = table.values(minimum.x)
+        statistics = model.statistics(values, objective.blocks)
+        bound, posterior = model.at_optimum(values, statistics)
+        bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
+    curve = [n_rows * loss for loss in minimum.loss_curve]
+    return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options))
+
+
+def _lbfgs_unless_collapsed(
+    objective: BoundObjective, table: ParameterTable, options: Options, report: Report | None
+) -> Minimum:
+    """L-BFGS from the table's start; from other starts too where the noise came to explain everything."""
+    best: Minimum | None = None
+    for length_factor, noise_factor in ((1.0, 1.0), *_OTHER_STARTS):
+        start = table.coordinates(table.start())
+        start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
+        start["noise"] = start["noise"] + np.log(noise_factor)
+        first = np.clip(table.flat(start), *table.bounds())
+        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, options.tol, report)
+        if best is None or minimum.loss < best.loss:
+            best = minimum
+        if best.interrupted or table["noise"].fixed or not (table.values(best.x)["noise"] > _COLLAPSED).any():
+            break
+    assert best is not None
+    return best
+
+
+def _message(minimum: Minimum, options: Options) -> str:
+    if minimum.interrupted:
+        return f"The fit was interrupted after {minimum.n_iter} iterations; the best parameters so far are kept."
+    if minimum.converged:
+        return ""
+    return (
+        f"The bound was still rising after max_iter={options.max_iter} iterations. Raise max_iter, or stop earlier on "
+        f"purpose with a larger tol (now {options.tol})."
+    )

@@ -1,0 +1,180 @@
+"""Minimise f(θ) -> (value, gradient): L-BFGS for a function of all rows, Adam for mini-batches."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import minimize
+
+from .linalg import NotPositiveDefiniteError
+
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
+# report(iteration, loss): called once per iteration.
+Report = Callable[[int, float], None]
+
+_MAX_RESTARTS = 10
+
+
+@dataclass
+class Minimum:
+    """What an optimiser found.
+
+    Attributes
+    ----------
+    x : ndarray
+        The best point seen.
+    loss : float
+        Its value.
+    loss_curve : list of float
+        The loss per iteration.
+    converged : bool
+    interrupted : bool
+        Whether Ctrl-C ended it.
+    """
+
+    x: np.ndarray
+    loss: float
+    loss_curve: list[float] = field(default_factory=list)
+    converged: bool = False
+    interrupted: bool = False
+
+    @property
+    def n_iter(self) -> int:
+        return len(self.loss_curve)
+
+
+class _Guarded:
+    """An objective that never raises and never returns NaN, and remembers the best point it has seen."""
+
+    def __init__(self, objective: Objective, start: np.ndarray):
+        self._objective = objective
+        self.x, self.loss = start.copy(), np.inf
+
+    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        try:
+            loss, gradient = self._objective(x)
+        except NotPositiveDefiniteError:
+            loss, gradient = np.nan, np.full_like(x, np.nan)
+        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+            # A line search that stepped too far: far above the best loss, but finite, so that it interpolates back.
+            worst = self.loss + 10.0 * (1.0 + abs(self.loss)) if np.isfinite(self.loss) else 1e100
+            return worst, np.zeros_like(x)
+        if loss < self.loss:
+            self.x, self.loss = x.copy(), loss
+        return loss, gradient
+
+
+def lbfgs(
+    objective: Objective,
+    start: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    max_iter: int,
+    tol: float,
+    report: Report | None = None,
+) -> Minimum:
+    """L-BFGS-B (SciPy), started anew from the best point when a line search fails.
+
+    Parameters
+    ----------
+    objective : callable
+        x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
+    start : ndarray of shape (size,)
+    bounds : (lower, upper), each of shape (size,)
+    max_iter : int
+        Iterations in all.
+    tol : float
+        Stop when an iteration lowers the loss by less than this fraction of it.
+    report : callable, default=None
+
+    Returns
+    -------
+    minimum : Minimum
+    """
+    guarded = _Guarded(objective, start)
+    minimum = Minimum(start, np.inf)
+
+    def callback(intermediate_result: object) -> None:
+        minimum.loss_curve.append(guarded.loss)
+        if report is not None:
+            report(minimum.n_iter, guarded.loss)
+
+    try:
+        loss, _ = guarded(start)
+        for _ in range(1 + _MAX_RESTARTS):
+            remaining = max_iter - minimum.n_iter
+            if len(start) == 0 or remaining <= 0:
+                # Asked for no iterations, the start is the answer.
+                minimum.converged = len(start) == 0 or max_iter == 0
+                break
+            before = guarded.loss
+            result = minimize(
+                guarded,
+                guarded.x,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=np.column_stack(bounds),
+                callback=callback,
+                options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": tol, "gtol": 1e-8},
+            )
+            if result.status == 0:
+                minimum.converged = True
+                break
+            # A failed line search: rounding has the last word once a fresh start gains nothing more.
+            if result.status == 2 and before - guarded.loss <= tol * max(abs(guarded.loss), 1.0):
+                minimum.converged = True
+                break
+    except KeyboardInterrupt:
+        minimum.interrupted = True
+    minimum.x, minimum.loss = guarded.x, guarded.loss
+    return minimum
+
+
+def adam(
+    objective: Objective,
+    start: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    max_iter: int,
+    learning_rate: float,
+    report: Report | None = None,
+) -> Minimum:
+    """Adam (Kingma & Ba 2015) with a step size that falls to zero along half a cosine.
+
+    Parameters
+    ----------
+    objective : callable
+        x -> (loss, gradient), of the next mini-batch at each call.
+    start, bounds
+        As in `lbfgs`; steps are clipped to the bounds.
+    max_iter : int
+    learning_rate : float
+        The first step size.
+    report : callable, default=None
+
+    Returns
+    -------
+    minimum : Minimum
+        Its ``x`` is the last point (a mini-batch's loss does not tell which point was best).
+    """
+    x = np.clip(start, *bounds)
+    minimum = Minimum(x, np.inf)
+    first, second = np.zeros_like(x), np.zeros_like(x)
+    decay_first, decay_second = 0.9, 0.999
+    try:
+        for iteration in range(max_iter):
+            loss, gradient = objective(x)
+            minimum.loss_curve.append(loss)
+            first = decay_first * first + (1.0 - decay_first) * gradient
+            second = decay_second * second + (1.0 - decay_second) * gradient**2
+            corrected = np.sqrt(second / (1.0 - decay_second ** (iteration + 1)))
+            step = learning_rate * 0.5 * (1.0 + np.cos(np.pi * iteration / max_iter))
+            x = x - step * first / (1.0 - decay_first ** (iteration + 1)) / (corrected + 1e-8)
+            x = np.clip(x, *bounds)
+            minimum.x = x
+            if report is not None:
+                report(minimum.n_iter, loss)
+        minimum.converged = True
+    except KeyboardInterrupt:
+        minimum.interrupted = True
+    return minimum

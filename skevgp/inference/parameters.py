@@ -1,0 +1,151 @@
+"""Named parameters <-> one flat vector of coordinates, with transforms and bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A row of the table.
+
+    Attributes
+    ----------
+    name : str
+    start : ndarray
+        First value, in the parameter's own units; its shape is the parameter's.
+    transform : {"identity", "log"}
+        The optimiser moves ``value / unit`` or ``log(value)``.
+    lower, upper : ndarray or float
+        Bounds of the value, broadcast to its shape.
+    unit : ndarray or float
+        Size of a typical change, for ``"identity"``.
+    fixed : bool
+        Whether it stays where it starts.
+    """
+
+    name: str
+    start: np.ndarray
+    transform: Literal["identity", "log"] = "identity"
+    lower: np.ndarray | float = -np.inf
+    upper: np.ndarray | float = np.inf
+    unit: np.ndarray | float = 1.0
+    fixed: bool = False
+
+    def coordinate(self, value: np.ndarray | float) -> np.ndarray:
+        """The optimiser's coordinates of a value, flat."""
+        value = np.broadcast_to(value, self.start.shape)
+        with np.errstate(divide="ignore"):
+            moved = np.log(value) if self.transform == "log" else value / self.unit
+        return np.asarray(moved, dtype=float).ravel()
+
+    def value_bounds(self) -> np.ndarray:
+        """Bounds of each entry, (size, 2), in the parameter's own units."""
+        bounds = np.broadcast_to(self.lower, self.start.shape), np.broadcast_to(self.upper, self.start.shape)
+        return np.column_stack([np.ravel(bound) for bound in bounds])
+
+    def value(self, coordinate: np.ndarray) -> np.ndarray:
+        """The value at a coordinate of the parameter's shape."""
+        return np.exp(coordinate) if self.transform == "log" else coordinate * self.unit
+
+
+class ParameterTable:
+    """Parameters in a fixed order; the free ones make up the flat vector that an optimiser moves.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter
+        With distinct names.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter]):
+        self.parameters = tuple(parameters)
+        self._slices: dict[str, slice] = {}
+        end = 0
+        for parameter in self.parameters:
+            if not parameter.fixed:
+                self._slices[parameter.name] = slice(end, end + parameter.start.size)
+                end += parameter.start.size
+        self.size = end
+
+    def __getitem__(self, name: str) -> Parameter:
+        return next(parameter for parameter in self.parameters if parameter.name == name)
+
+    def started_at(self, values: dict[str, np.ndarray]) -> ParameterTable:
+        """The same table with other starts, for the free parameters whose shapes agree."""
+        return ParameterTable(
+            [
+                replace(parameter, start=values[parameter.name])
+                if not parameter.fixed and np.shape(values.get(parameter.name)) == parameter.start.shape
+                else parameter
+                for parameter in self.parameters
+            ]
+        )
+
+    def start(self) -> np.ndarray:
+        """The flat vector (size,) of the starts, put inside their bounds."""
+        flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})
+        return np.clip(flat, *self.bounds())
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds (size,) of the flat vector."""
+        lower = self.flat({parameter.name: parameter.coordinate(parameter.lower) for parameter in self.parameters})
+        upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
+        return lower, upper
+
+    def coordinates(self, flat: Any) -> dict[str, Any]:
+        """The coordinates by name, each in its parameter's shape; can be traced by autograd."""
+        found = {}
+        for parameter in self.parameters:
+            part = parameter.coordinate(parameter.start) if parameter.fixed else flat[self._slices[parameter.name]]
+            found[parameter.name] = part.reshape(parameter.start.shape)
+        return found
+
+    def values(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        """The values by name, in the parameters' own units."""
+        coordinates = self.coordinates(flat)
+        return {parameter.name: parameter.value(coordinates[parameter.name]) for parameter in self.parameters}
+
+    def flat(self, parts: dict[str, np.ndarray]) -> np.ndarray:
+        """Join the free parameters' parts (coordinates or gradients) into a vector (size,)."""
+        if not self._slices:
+            return np.empty(0)
+        return np.concatenate([np.ravel(parts[name]) for name in self._slices])
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a user says of a positive parameter; what is None is chosen from the data.
+
+    Attributes
+    ----------
+    value : ndarray of shape (n,), or None
+    bounds : ndarray of shape (n, 2), or None
+    fixed : bool
+    """
+
+    value: np.ndarray | None = None
+    bounds: np.ndarray | None = None
+    fixed: bool = False
+
+    def parameter(self, name: str, default: np.ndarray, lower: np.ndarray, upper: np.ndarray, unit: Any) -> Parameter:
+        """A row of the table, in internal units.
+
+        Parameters
+        ----------
+        name : str
+        default, lower, upper : ndarray of the parameter's shape
+            Start and bounds, in internal units, where the user says nothing.
+        unit : ndarray or float
+            The user's values are divided by it.
+        """
+        start = default if self.value is None else np.broadcast_to(self.value / unit, default.shape)
+        if self.bounds is not None:
+            lower, upper = self.bounds[:, 0] / unit, self.bounds[:, 1] / unit
+        elif self.value is not None:
+            lower, upper = np.minimum(lower, start), np.maximum(upper, start)
+        return Parameter(name, start, "log", lower, upper, fixed=self.fixed)

@@ -1,0 +1,133 @@
+"""Where a fit starts: what the features alone explain, and the first value and bounds of each parameter."""
+
+from __future__ import annotations
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from .linalg import jittered_cholesky
+from .parameters import Parameter, ParameterTable, Start
+
+# Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
+# all strangers, whatever the number of columns.
+_LENGTHSCALE = 0.6
+_LENGTHSCALE_BOUNDS = 1e-2, 1e4
+
+# In units of the variance that the features alone leave over. A low first noise keeps L-BFGS out of the optimum where
+# the noise explains everything; Adam, whose steps do not grow with the gradient, starts nearer to the data's scatter.
+FIRST_NOISE = {"lbfgs": 1e-4, "adam": 1e-2}
+_NOISE_BOUNDS = 1e-12, 1e2
+_SIGNAL_BOUNDS = 1e-8, 1e8
+
+
+def features_alone(features: np.ndarray, residuals: np.ndarray, scale: np.ndarray) -> np.ndarray:
+    """The most probable w of r = H diag(scale) w + ε, w ~ N(0, I), for each output.
+
+    The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
+    the rounding of the normal equations.
+
+    Parameters
+    ----------
+    features : ndarray of shape (n, p)
+    residuals : ndarray of shape (n, o)
+        y - H mean.
+    scale : ndarray of shape (o, p)
+        Prior standard deviations; 0 keeps a coefficient at its mean.
+
+    Returns
+    -------
+    w : ndarray of shape (o, p)
+    """
+    w = np.zeros(scale.shape)
+    HH = features.T @ features
+    for o, c in enumerate(scale):
+        target = residuals[:, o]
+        noise = 1e-12 * np.mean(target**2)
+        for _ in range(2):
+            if noise == 0.0 or not c.any():
+                break
+            precision = c[:, np.newaxis] * HH * c
+            np.einsum("ii->i", precision)[...] += noise
+            root = jittered_cholesky(precision)
+            for _ in range(3):
+                left_over = target - features @ (c * w[o])
+                w[o] += cho_solve((root, True), c * (features.T @ left_over) - noise * w[o])
+            noise = np.mean((target - features @ (c * w[o])) ** 2)
+    return w
+
+
+def unit_of(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
+    """The root mean square of each column, never below the rounding error of ``reference`` and never 0.
+
+    Parameters
+    ----------
+    values, reference : ndarray of shape (n, o)
+
+    Returns
+    -------
+    unit : ndarray of shape (o,)
+    """
+    largest = np.abs(reference).max(axis=0)
+    unit = np.maximum(rms(values), 1e-14 * largest)
+    return np.where(unit > 0.0, unit, 1.0)
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    """Root mean square of each column, without overflow."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    safe = np.where(largest > 0.0, largest, 1.0)
+    return safe * np.sqrt(np.mean((values / safe) ** 2, axis=0))
+
+
+def spread_of(inputs: np.ndarray) -> np.ndarray:
+    """The standard deviation (d,) of each centred column; 1 where the column is constant."""
+    spread = rms(inputs)
+    return np.where(spread > 0.0, spread, 1.0)
+
+
+def starting_table(
+    inputs: np.ndarray,
+    inducing_points: np.ndarray,
+    target_unit: np.ndarray,
+    hyperparameters: Start,
+    signal: Start,
+    noise: Start,
+    first_noise: float,
+    n_hyperparameters: int,
+) -> ParameterTable:
+    """The parameters of a sparse model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
+
+    Parameters
+    ----------
+    inputs : ndarray of shape (n, d)
+        The kernel's, centred.
+    inducing_points : ndarray of shape (g, m, d)
+        One set per group of outputs.
+    target_unit : ndarray of shape (o,)
+        The size of what the features alone leave over.
+    hyperparameters, signal, noise : Start
+        What the user says of them.
+    first_noise : float
+        Where the noise variance starts, in squared target units, if the user does not say.
+    n_hyperparameters : int
+        1 or d.
+
+    Returns
+    -------
+    table : ParameterTable
+        With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
+    """
+    spread, o = spread_of(inputs), np.ones(len(target_unit))
+    typical = spread if n_hyperparameters > 1 else np.sqrt(np.mean(spread**2, keepdims=True))
+    root_d = np.sqrt(inputs.shape[1])
+    lower, upper = _LENGTHSCALE_BOUNDS
+    return ParameterTable(
+        [
+            hyperparameters.parameter(
+                "hyperparameters", _LENGTHSCALE * root_d * typical, lower * typical, upper * root_d * typical, 1.0
+            ),
+            signal.parameter("signal", o, _SIGNAL_BOUNDS[0] * o, _SIGNAL_BOUNDS[1] * o, target_unit**2),
+            noise.parameter("noise", first_noise * o, _NOISE_BOUNDS[0] * o, _NOISE_BOUNDS[1] * o, target_unit**2),
+            Parameter("inducing_points", inducing_points, unit=spread),
+        ]
+    )

@@ -1,0 +1,210 @@
+"""scikit-learn kernels -> covariances that the inference can differentiate, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+import autograd.numpy as anp
+import numpy as np
+from scipy.spatial.distance import cdist
+from sklearn.gaussian_process import kernels as sk
+
+from .inference.parameters import Start
+
+WORKING = (
+    "RBF (with one length scale or one per column), optionally times a ConstantKernel, optionally plus a WhiteKernel"
+)
+
+
+class SquaredExponential:
+    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9, 5.1).
+
+    Parameters
+    ----------
+    n_columns : int
+        d.
+    isotropic : bool
+        Whether one lengthscale serves all columns.
+    """
+
+    def __init__(self, n_columns: int, isotropic: bool = False):
+        self.n_columns = n_columns
+        self.n_hyperparameters = 1 if isotropic else n_columns
+
+    def prepare(self, inputs: np.ndarray) -> np.ndarray:
+        """[x, 1, x²] of each row as columns, (2 d + 1, n): the exponent is linear in it."""
+        return np.ascontiguousarray(np.hstack([inputs, np.ones((len(inputs), 1)), inputs**2]).T)
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
+        return SquaredExponentialAt(np.exp(hyperparameters), inducing_points)
+
+    def traceable_matrix(self, hyperparameters: Any, inducing_points: Any) -> Any:
+        scaled = inducing_points / anp.exp(hyperparameters)
+        differences = scaled[:, None, :] - scaled[None, :, :]
+        return anp.exp(-0.5 * anp.sum(differences**2, axis=2))
+
+
+class SquaredExponentialAt:
+    """A `SquaredExponential` with lengthscales (1,) or (d,) and inducing points (m, d) put in."""
+
+    def __init__(self, lengthscales: np.ndarray, inducing_points: np.ndarray):
+        self.lengthscales = np.broadcast_to(lengthscales, inducing_points.shape[1:])
+        self.isotropic = len(lengthscales) < inducing_points.shape[1]
+        self.inducing_points = inducing_points
+        precision = self.lengthscales**-2.0
+        self._exponent = np.hstack(
+            [
+                inducing_points * precision,
+                -0.5 * (inducing_points**2 @ precision)[:, np.newaxis],
+                np.broadcast_to(-0.5 * precision, inducing_points.shape),
+            ]
+        )
+
+    def matrix(self) -> np.ndarray:
+        scaled = self.inducing_points / self.lengthscales
+        return np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        U = self._exponent @ prepared
+        np.minimum(U, 0.0, out=U)
+        return np.exp(U, out=U)
+
+    def diagonal(self, prepared: np.ndarray) -> float:
+        return 1.0
+
+    def start_pullback(self) -> np.ndarray:
+        return np.zeros_like(self._exponent)
+
+    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> np.ndarray:
+        """Σ_rows Ū U [x, 1, x²], (m, 2 d + 1); the diagonal is constant and adds nothing."""
+        np.multiply(U_bar, U, out=U_bar)
+        return U_bar @ prepared.T
+
+    def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        Z, d = self.inducing_points, self.inducing_points.shape[1]
+        WX, W, WXX = total[:, :d], total[:, d, np.newaxis], total[:, d + 1 :]
+        within = K_bar * self.matrix()
+        row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
+        # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
+        Z_bar = WX - W * Z + 2.0 * (within_Z - row_sum * Z)
+        length_bar = (WXX - 2.0 * Z * WX + W * Z**2 + 2.0 * Z * (row_sum * Z - within_Z)).sum(axis=0)
+        precision = self.lengthscales**-2.0
+        length_bar = length_bar * precision
+        return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision
+
+
+def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
+    value = np.atleast_1d(np.asarray(value, dtype=float))
+    if hyperparameter.fixed:
+        return Start(value, None, True)
+    return Start(value, np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float))
+
+
+def _sklearn_bounds(start: Start, bounds: np.ndarray) -> Any:
+    """What a scikit-learn kernel takes as ``..._bounds``."""
+    if start.fixed:
+        return "fixed"
+    return tuple(map(float, bounds[0])) if len(bounds) == 1 else bounds
+
+
+@dataclass(frozen=True)
+class KernelSpec:
+    """What a user's kernel says: k = s² k̃ (+ noise), with starts for all of it.
+
+    Attributes
+    ----------
+    covariance : SquaredExponential
+        k̃.
+    hyperparameters : Start
+        Of k̃: the lengthscales.
+    signal : Start
+        s², shared by the outputs as a start.
+    noise : Start
+        σ², from a top-level WhiteKernel.
+    """
+
+    covariance: SquaredExponential
+    hyperparameters: Start = Start()
+    signal: Start = Start()
+    noise: Start = Start()
+
+    def with_noise(self, noise: Start) -> KernelSpec:
+        """The same kernel with another start of the noise."""
+        return replace(self, noise=noise)
+
+    def to_sklearn(
+        self, lengthscales: np.ndarray, length_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
+    ) -> sk.Kernel:
+        """The fitted s² k̃ as a scikit-learn kernel."""
+        scale = lengthscales.copy() if len(lengthscales) > 1 else float(lengthscales[0])
+        return sk.ConstantKernel(signal, _sklearn_bounds(self.signal, signal_bounds)) * sk.RBF(
+            scale, _sklearn_bounds(self.hyperparameters, length_bounds)
+        )
+
+
+def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
+    """Read a scikit-learn kernel.
+
+    Parameters
+    ----------
+    kernel : sklearn.gaussian_process.kernels.Kernel or None
+        None is a squared exponential with one lengthscale per column, all starts taken from the data.
+    n_columns : int
+        Width of the kernel's inputs.
+
+    Returns
+    -------
+    spec : KernelSpec
+
+    Raises
+    ------
+    TypeError
+        If it is not a scikit-learn kernel.
+    ValueError
+        If it is one that does not work yet (the message lists what does) or its length scales do not fit the columns.
+    """
+    if kernel is None:
+        return KernelSpec(SquaredExponential(n_columns))
+    if not isinstance(kernel, sk.Kernel):
+        raise TypeError(
+            f"kernel must be a kernel of sklearn.gaussian_process.kernels or None; got {kernel!r}. These work: {WORKING}."
+        )
+    white = [part for part in _parts(kernel, sk.Sum) if isinstance(part, sk.WhiteKernel)]
+    signal = [part for part in _parts(kernel, sk.Sum) if not isinstance(part, sk.WhiteKernel)]
+    factors = list(_parts(signal[0], sk.Product)) if len(signal) == 1 else []
+    constants = [factor for factor in factors if isinstance(factor, sk.ConstantKernel)]
+    # `type is`: Matérn derives from RBF.
+    shapes = [factor for factor in factors if type(factor) is sk.RBF]
+    if len(white) > 1 or len(constants) > 1 or len(shapes) != 1 or len(factors) != len(constants) + 1:
+        raise ValueError(f"kernel={kernel!r} does not work yet. These work: {WORKING}.")
+
+    rbf = shapes[0]
+    lengthscales = _start(rbf.hyperparameter_length_scale, rbf.length_scale)
+    assert lengthscales.value is not None
+    if rbf.anisotropic and len(lengthscales.value) != n_columns:
+        raise ValueError(
+            f"kernel={kernel!r} has {len(lengthscales.value)} length scales, but its inputs have {n_columns} columns: "
+            "give one length scale, or one per column."
+        )
+    for start in (lengthscales,):
+        if not (np.isfinite(start.value).all() and (start.value > 0).all()):
+            raise ValueError(f"kernel={kernel!r}: length scales must be finite and above 0.")
+    spec = KernelSpec(SquaredExponential(n_columns, isotropic=not rbf.anisotropic), lengthscales)
+    if constants:
+        constant = constants[0]
+        spec = replace(spec, signal=_start(constant.hyperparameter_constant_value, constant.constant_value))
+    if white:
+        noise = white[0]
+        spec = replace(spec, noise=_start(noise.hyperparameter_noise_level, noise.noise_level))
+    return spec
+
+
+def _parts(kernel: sk.Kernel, operator: type) -> Iterator[sk.Kernel]:
+    """The operands of nested sums (or products)."""
+    if isinstance(kernel, operator):
+        yield from _parts(kernel.k1, operator)
+        yield from _parts(kernel.k2, operator)
+    else:
+        yield kernel

@@ -1,0 +1,522 @@
+"""EVGPRegressor: explicit physics features plus a sparse variational Gaussian process."""
+
+from __future__ import annotations
+
+import warnings
+from numbers import Integral, Real
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from joblib import Parallel, delayed, effective_n_jobs
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin, _fit_context
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process.kernels import Kernel
+from sklearn.utils import _safe_indexing, check_random_state
+from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils.validation import check_is_fitted, validate_data
+from threadpoolctl import threadpool_limits
+
+from ._maps import apply_map, fit_map
+from ._progress import Progress
+from .features.prior import resolve_coef_prior
+from .inference.frame import Frame
+from .inference.inducing import initial_inducing_points
+from .inference.learning import Learned, Options, learn
+from .inference.model import SparseModel
+from .inference.parameters import ParameterTable, Start
+from .inference.posterior import Posterior
+from .inference.rows import Rows
+from .inference.start import FIRST_NOISE, starting_table
+from .inference.statistics import BlockMap
+from .kernels import KernelSpec, parse_kernel
+
+_MAX_ITER = {"lbfgs": 1000, "adam": 5000}
+_PREDICT_ROWS = 4096
+
+
+class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    r"""Sparse variational Gaussian process with explicit features (EVGP).
+
+    The model of each output is
+
+    .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
+              f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
+
+    where the features h say what is known (rough physics, a trend) and f, a Gaussian process with ``n_inducing``
+    inducing points, learns the rest. Time is linear in the number of rows. Without a feature map it is the sparse
+    Gaussian process of Titsias (2009) and Hensman et al. (2013).
+
+    Parameters
+    ----------
+    feature_map : transformer, default=None
+        x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
+        it. None has no explicit features.
+    kernel : sklearn.gaussian_process.kernels.Kernel, default=None
+        Covariance of f: an RBF with one length scale or one per column, optionally times a ConstantKernel, optionally
+        plus a WhiteKernel that sets the noise (start, bounds, fixed). The constant is the signal variance, which each
+        output has of its own. Starts, bounds and ``"fixed"`` are respected. None is an RBF with a length scale per
+        column, all starts and bounds taken from the data.
+    kernel_map : transformer, default=None
+        x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
+    n_inducing : int, default=100
+        Inducing points; fewer if there are fewer distinct rows.
+    sharing : {"all", "kernel", "none"}, default="all"
+        What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
+        paper's), or nothing. Signal variance, noise and weights are always per output.
+    posterior : {"full", "diagonal"}, default="full"
+        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
+    coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
+        Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
+        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean.
+    noise_variance : float, default=None
+        Where the noise variance starts; None takes it from the data.
+    normalize_y : bool, default=False
+        Whether the prior mean is the training mean of y, in place of 0.
+    solver : {"lbfgs", "adam"}, default="lbfgs"
+        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters.
+    max_iter : int, default=None
+        Iterations of L-BFGS or steps of Adam; None means 1000 or 5000. With 0 nothing is optimised: kernel and inducing
+        points stay where they start, and q is at its optimum.
+    tol : float, default=1e-7
+        L-BFGS stops when an iteration improves the bound per row by less than this fraction of it (of 1 nat, if that is
+        more).
+    batch_size : int, default=512
+        Rows per step of Adam.
+    learning_rate : float, default=0.02
+        Adam's first step size; it falls to zero along half a cosine.
+    warm_start : bool, default=False
+        Whether to start from the last fit's kernel, noise and inducing points, where shapes agree.
+    n_jobs : int, default=None
+        Threads; None means 1, -1 all cores. The result does not depend on it.
+    random_state : int, RandomState instance or None, default=None
+        Places inducing points and draws mini-batches.
+    verbose : int, default=0
+        1 prints iteration, bound and time about once a second, 2 at each iteration.
+
+    Attributes
+    ----------
+    coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Posterior mean of the weights.
+    coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Their posterior standard deviations.
+    coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
+        Their posterior covariances.
+    coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
+        The prior that was used.
+    feature_map_, kernel_map_ : transformer or None
+        Fitted clones of the maps.
+    inducing_points_ : ndarray of shape (m, d) or, unless ``sharing="all"``, (n_outputs, m, d)
+        In the space of ``kernel_map``.
+    kernel_ : Kernel, or list of Kernel for a y with columns
+        Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
+        optimizer=None)`` is the exact counterpart.
+    noise_variance_ : float or ndarray of shape (n_outputs,)
+        σ², in squared units of y.
+    lower_bound_ : float
+        On the log marginal likelihood; nats, summed over outputs.
+    loss_curve_ : ndarray of shape (n_iter_,)
+        Minus the bound per iteration (of Adam: a mini-batch's estimate).
+    n_iter_ : int
+        Iterations done.
+    n_parameters_ : int
+        Free parameters of kernel, noise, inducing points and q.
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    sklearn.gaussian_process.GaussianProcessRegressor : The exact GP, for a few thousand rows.
+
+    References
+    ----------
+    - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes.
+    - M. K. Titsias (2009): Variational Learning of Inducing Variables in Sparse Gaussian Processes.
+    - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
+    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
+
+    Examples
+    --------
+    A wave on a linear trend; the explicit features are x and 1:
+
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
+    >>> mean, std = model.predict(X, return_std=True)
+    >>> round(model.score(X, y), 2)
+    0.95
+    """
+
+    _parameter_constraints: ClassVar[dict[str, list[Any]]] = {
+        "feature_map": "no_validation",  # type: ignore[dict-item]
+        "kernel": "no_validation",  # type: ignore[dict-item]
+        "kernel_map": "no_validation",  # type: ignore[dict-item]
+        "n_inducing": [Interval(Integral, 1, None, closed="left")],
+        "sharing": [StrOptions({"all", "kernel", "none"})],
+        "posterior": [StrOptions({"full", "diagonal"})],
+        "coef_mean": ["array-like", Real, StrOptions({"auto"})],
+        "coef_scale": ["array-like", Real, StrOptions({"auto"})],
+        "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
+        "normalize_y": ["boolean"],
+        "solver": [StrOptions({"lbfgs", "adam"})],
+        "max_iter": [Interval(Integral, 0, None, closed="left"), None],
+        "tol": [Interval(Real, 0, None, closed="left")],
+        "batch_size": [Interval(Integral, 1, None, closed="left")],
+        "learning_rate": [Interval(Real, 0, None, closed="neither")],
+        "warm_start": ["boolean"],
+        "n_jobs": [Integral, None],
+        "random_state": ["random_state"],
+        "verbose": ["verbose"],
+    }
+
+    def __init__(
+        self,
+        feature_map: TransformerMixin | None = None,
+        kernel: Kernel | None = None,
+        *,
+        kernel_map: TransformerMixin | None = None,
+        n_inducing: int = 100,
+        sharing: Literal["all", "kernel", "none"] = "all",
+        posterior: Literal["full", "diagonal"] = "full",
+        coef_mean: ArrayLike | Literal["auto"] = "auto",
+        coef_scale: ArrayLike | Literal["auto"] = "auto",
+        noise_variance: float | None = None,
+        normalize_y: bool = False,
+        solver: Literal["lbfgs", "adam"] = "lbfgs",
+        max_iter: int | None = None,
+        tol: float = 1e-7,
+        batch_size: int = 512,
+        learning_rate: float = 0.02,
+        warm_start: bool = False,
+        n_jobs: int | None = None,
+        random_state: int | np.random.RandomState | None = None,
+        verbose: int = 0,
+    ):
+        self.feature_map = feature_map
+        self.kernel = kernel
+        self.kernel_map = kernel_map
+        self.n_inducing = n_inducing
+        self.sharing = sharing
+        self.posterior = posterior
+        self.coef_mean = coef_mean
+        self.coef_scale = coef_scale
+        self.noise_variance = noise_variance
+        self.normalize_y = normalize_y
+        self.solver = solver
+        self.max_iter = max_iter
+        self.tol = tol
+        self.batch_size = batch_size
+        self.learning_rate = learning_rate
+        self.warm_start = warm_start
+        self.n_jobs = n_jobs
+        self.random_state = random_state
+        self.verbose = verbose
+
+    @_fit_context(prefer_skip_nested_validation=False)
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fit kernel, noise, inducing points and posterior.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument is out of its range, the data are not finite, or shapes do not fit; the message names the
+            argument, the value and what is allowed.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If the iterations were used up, or the fit was interrupted by Ctrl-C (the best parameters so far are kept).
+        """
+        given = X
+        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        y = np.asarray(y, dtype=np.float64)
+        given = given if hasattr(given, "iloc") else X
+        previous = self.__dict__.get("_learned") if self.warm_start else None
+        frame_before = self.__dict__.get("_frame")
+
+        self.feature_map_ = fit_map(self.feature_map, given, y, "feature_map")
+        self.kernel_map_ = fit_map(self.kernel_map, given, y, "kernel_map")
+        inputs, features = self._mapped(given, X)
+        self._single_output, targets = y.ndim == 1, y.reshape(len(y), -1)
+        spec = parse_kernel(self.kernel, inputs.shape[1])
+        if self.noise_variance is not None:
+            if spec.noise.value is not None:
+                raise ValueError(
+                    f"The noise starts either from noise_variance={self.noise_variance!r} or from the WhiteKernel of "
+                    f"kernel={self.kernel!r}; give one of them."
+                )
+            spec = spec.with_noise(Start(np.array([float(self.noise_variance)])))
+        prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, features, targets)
+        target_mean = targets.mean(axis=0) if self.normalize_y else np.zeros(targets.shape[1])
+
+        self._spec = spec
+        self._frame = Frame.of(inputs, features, targets, target_mean, *prior)
+        rows = self._frame.rows(inputs, features, targets)
+        rng = check_random_state(self.random_state)
+        points = initial_inducing_points(rows.inputs, self.n_inducing, rng)
+        models = self._models(targets.shape[1])
+        self._tables = []
+        for index, (outputs, model) in enumerate(models):
+            table = starting_table(
+                rows.inputs,
+                np.repeat(points[np.newaxis], len(model.groups), axis=0),
+                self._frame.target_unit[outputs],
+                spec.hyperparameters,
+                spec.signal,
+                spec.noise,
+                FIRST_NOISE[self.solver],
+                spec.covariance.n_hyperparameters,
+            )
+            if previous is not None and len(previous) == len(models):
+                table = table.started_at(self._translated(previous[index].values, frame_before, outputs))
+            self._tables.append(table)
+        self._learned = self._learn(models, rows, rng)
+        self._set_attributes()
+        for message in sorted({learned.message for learned in self._learned if learned.message}):
+            warnings.warn(message, ConvergenceWarning, stacklevel=2)
+        return self
+
+    @_fit_context(prefer_skip_nested_validation=False)
+    def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
+
+        The first call is a `fit`. After ``solver="adam"``, q moves to its optimum.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `fit`, and if y does not have the outputs of the first call.
+        """
+        if not hasattr(self, "_learned"):
+            return self.fit(X, y)
+        given = X
+        X, y = validate_data(self, X, y, reset=False, multi_output=True, y_numeric=True, dtype=np.float64)
+        targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
+        if targets.shape[1] != len(self._frame.target_unit):
+            raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(self._frame.target_unit)}.")
+        inputs, features = self._mapped(given if hasattr(given, "iloc") else X, X)
+        rows = self._frame.rows(inputs, features, targets)
+        slices = [outputs for outputs, _ in self._models(targets.shape[1])]
+        self._learned = [
+            learned.updated(rows.outputs(outputs)) for outputs, learned in zip(slices, self._learned, strict=True)
+        ]
+        self._set_attributes()
+        return self
+
+    def predict(
+        self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
+    ) -> Any:
+        """Predict y.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+        return_std : bool, default=False
+            Whether to return the standard deviation too.
+        return_cov : bool, default=False
+            Whether to return the covariance between rows too.
+        include_noise : bool, default=True
+            Whether they are of y, with the learned noise, or of the noise-free g(x).
+
+        Returns
+        -------
+        mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+        std : ndarray of the same shape
+            If ``return_std``.
+        cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
+            If ``return_cov``.
+
+        Raises
+        ------
+        ValueError
+            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+        """
+        if return_std and return_cov:
+            raise ValueError("At most one of return_std and return_cov can be asked for.")
+        check_is_fitted(self)
+        given = X
+        X = validate_data(self, X, reset=False, dtype=np.float64)
+        given = given if hasattr(given, "iloc") else X
+        noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
+        if return_cov:
+            inputs, features = self._mapped(given, X)
+            inputs = inputs - self._frame.centre
+            mean, _ = self._posterior.predict(inputs, features)
+            cov = self._posterior.covariance(inputs, features) + np.eye(len(X))[:, :, np.newaxis] * noise
+            return self._like_y(mean + self._frame.target_mean), self._like_y(cov)
+        mean, variance = np.empty((len(X), len(noise))), np.empty((len(X), len(noise)))
+        for first in range(0, len(X), _PREDICT_ROWS):
+            block = slice(first, first + _PREDICT_ROWS)
+            inputs, features = self._mapped(_safe_indexing(given, block), X[block])
+            mean[block], block_variance = self._posterior.predict(inputs - self._frame.centre, features, return_std)
+            if block_variance is not None:
+                variance[block] = block_variance + noise
+        mean = self._like_y(mean + self._frame.target_mean)
+        return (mean, self._like_y(np.sqrt(variance))) if return_std else mean
+
+    def sample_y(
+        self,
+        X: ArrayLike,
+        n_samples: int = 1,
+        random_state: int | np.random.RandomState | None = 0,
+        include_noise: bool = True,
+    ) -> np.ndarray:
+        """Draw functions from the posterior at some rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_rows, n_features)
+        n_samples : int, default=1
+            How many functions.
+        random_state : int, RandomState instance or None, default=0
+        include_noise : bool, default=True
+            Whether samples are of y, with the learned noise, or of the noise-free g(x).
+
+        Returns
+        -------
+        samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+        """
+        rng = check_random_state(random_state)
+        mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
+        single = mean.ndim == 1
+        mean, cov = mean.reshape(len(mean), -1), cov.reshape(len(mean), len(mean), -1)
+        samples = np.stack(
+            [
+                rng.multivariate_normal(mean[:, o], cov[:, :, o], n_samples, check_valid="ignore").T
+                for o in range(mean.shape[1])
+            ],
+            axis=1,
+        )
+        return samples[:, 0] if single else samples
+
+    def _mapped(self, given: Any, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's inputs and the features of rows."""
+        inputs = X if self.kernel_map_ is None else apply_map(self.kernel_map_, given, "kernel_map")
+        if self.feature_map_ is None:
+            return inputs, np.empty((len(X), 0))
+        return inputs, apply_map(self.feature_map_, given, "feature_map")
+
+    def _models(self, n_outputs: int) -> list[tuple[slice, SparseModel]]:
+        """The independent models and the outputs of each."""
+        prior, one = self._frame.internal_prior(), (slice(0, 1),)
+        if self.sharing == "none":
+            each = [slice(o, o + 1) for o in range(n_outputs)]
+            return [(o, SparseModel(self._spec.covariance, prior.outputs(o), self.posterior, one)) for o in each]
+        groups = (slice(0, n_outputs),) if self.sharing == "all" else tuple(slice(o, o + 1) for o in range(n_outputs))
+        return [(slice(0, n_outputs), SparseModel(self._spec.covariance, prior, self.posterior, groups))]
+
+    def _learn(
+        self, models: list[tuple[slice, SparseModel]], rows: Rows, rng: np.random.RandomState
+    ) -> list[Learned]:
+        n_threads = effective_n_jobs(self.n_jobs)
+        blocks = BlockMap(n_threads if len(models) == 1 else 1)
+        options = Options(
+            self.solver,
+            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
+            self.tol,
+            self.batch_size,
+            self.learning_rate,
+            blocks,
+        )
+        seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
+
+        def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
+            shift = len(rows) * self._frame.log_unit(outputs)
+            report = Progress(self.verbose, shift) if self.verbose else None
+            return learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+
+        jobs = [
+            (outputs, model, table, seed)
+            for (outputs, model), table, seed in zip(models, self._tables, seeds, strict=True)
+        ]
+        try:
+            # One BLAS thread: blocks (or outputs) are what runs in parallel, and bits do not depend on n_jobs.
+            with threadpool_limits(1, user_api="blas"):
+                return Parallel(n_jobs=min(n_threads, len(jobs)), prefer="threads")(delayed(one)(*job) for job in jobs)
+        finally:
+            blocks.close()
+
+    def _translated(self, values: dict[str, np.ndarray], before: Frame, outputs: slice) -> dict[str, np.ndarray]:
+        """An earlier fit's values in this fit's internal units."""
+        same_outputs = len(before.target_unit) == len(self._frame.target_unit)
+        same_columns = len(before.centre) == len(self._frame.centre)
+        if not (same_outputs and same_columns):
+            return {}
+        ratio = (before.target_unit[outputs] / self._frame.target_unit[outputs]) ** 2
+        return {
+            "hyperparameters": values["hyperparameters"],
+            "signal": values["signal"] * ratio,
+            "noise": values["noise"] * ratio,
+            "inducing_points": values["inducing_points"] + before.centre - self._frame.centre,
+        }
+
+    def _set_attributes(self) -> None:
+        frame, learned = self._frame, self._learned
+        self._posterior: Posterior = frame.posterior([one.posterior for one in learned])
+        mean, covariance = self._posterior.coefficients()
+        first = 0 if self._single_output else slice(None)
+        self.coef_, self.coef_cov_ = mean[first], covariance[first]
+        self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+        self.coef_prior_mean_, self.coef_prior_scale_ = frame.prior.mean[first], frame.prior.scale[first]
+        self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
+        points = np.array([group.points for group in self._posterior.inducing]) + frame.centre
+        self.inducing_points_ = points[0] if self.sharing == "all" else points
+        kernels = self._kernels()
+        self.kernel_ = kernels[0] if self._single_output else kernels
+        n_rows = learned[0].statistics[0].n_rows
+        shift = n_rows * frame.log_unit(slice(None))
+        self.lower_bound_ = sum(one.bound for one in learned) - shift
+        self.n_iter_ = max(len(one.loss_curve) for one in learned)
+        curves = [np.pad(one.loss_curve, (0, self.n_iter_ - len(one.loss_curve)), "edge") for one in learned if one.loss_curve]
+        self.loss_curve_ = np.sum(curves, axis=0) + shift if len(curves) == len(learned) else np.empty(0)
+        self.n_parameters_ = sum(
+            table.size + self._n_posterior(points.shape[1], mean.shape[1]) * len(table["signal"].start)
+            for table in self._tables
+        )
+
+    def _n_posterior(self, n_inducing: int, n_features: int) -> int:
+        """Free parameters of q of one output."""
+        size = n_inducing + n_features
+        return 2 * size if self.posterior == "diagonal" else size + size * (size + 1) // 2
+
+    def _kernels(self) -> list[Kernel]:
+        spec: KernelSpec = self._spec
+        kernels = []
+        for group in self._posterior.inducing:
+            for o in range(len(self._frame.target_unit))[group.outputs]:
+                table = self._tables[o if self.sharing == "none" else 0]
+                index = 0 if self.sharing == "none" else o
+                kernels.append(
+                    spec.to_sklearn(
+                        np.exp(group.hyperparameters),
+                        table["hyperparameters"].value_bounds(),
+                        float(self._posterior.signal[o]),
+                        table["signal"].value_bounds()[[index]] * self._frame.target_unit[o] ** 2,
+                    )
+                )
+        return kernels
+
+    def _like_y(self, values: np.ndarray) -> np.ndarray:
+        """Drop the axis of outputs if there is one output, as GaussianProcessRegressor does."""
+        return values[..., 0] if values.shape[-1] == 1 else values
