@@ -78,9 +78,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     max_iter : int, default=None
         Iterations of L-BFGS or steps of Adam; None means 1000 or 5000. With 0 nothing is optimised: kernel and inducing
         points stay where they start, and q is at its optimum.
-    tol : float, default=1e-7
-        L-BFGS stops when an iteration improves the bound per row by less than this fraction of it (of 1 nat, if that is
-        more).
+    tol : float, default=0.01
+        L-BFGS stops when each of three iterations in a row raises the bound by less than this, in nats.
     batch_size : int, default=512
         Rows per step of Adam.
     learning_rate : float, default=0.02
@@ -187,7 +186,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] = "lbfgs",
         max_iter: int | None = None,
-        tol: float = 1e-7,
+        tol: float = 0.01,
         batch_size: int = 512,
         learning_rate: float = 0.02,
         warm_start: bool = False,
@@ -426,9 +425,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         groups = (slice(0, n_outputs),) if self.sharing == "all" else tuple(slice(o, o + 1) for o in range(n_outputs))
         return [(slice(0, n_outputs), SparseModel(self._spec.covariance, prior, self.posterior, groups))]
 
-    def _learn(
-        self, models: list[tuple[slice, SparseModel]], rows: Rows, rng: np.random.RandomState
-    ) -> list[Learned]:
+    def _learn(self, models: list[tuple[slice, SparseModel]], rows: Rows, rng: np.random.RandomState) -> list[Learned]:
         n_threads = effective_n_jobs(self.n_jobs)
         blocks = BlockMap(n_threads if len(models) == 1 else 1)
         options = Options(
@@ -488,7 +485,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         shift = n_rows * frame.log_unit(slice(None))
         self.lower_bound_ = sum(one.bound for one in learned) - shift
         self.n_iter_ = max(len(one.loss_curve) for one in learned)
-        curves = [np.pad(one.loss_curve, (0, self.n_iter_ - len(one.loss_curve)), "edge") for one in learned if one.loss_curve]
+        curves = [
+            np.pad(one.loss_curve, (0, self.n_iter_ - len(one.loss_curve)), "edge") for one in learned if one.loss_curve
+        ]
         self.loss_curve_ = np.sum(curves, axis=0) + shift if len(curves) == len(learned) else np.empty(0)
         self.n_parameters_ = sum(
             table.size + self._n_posterior(points.shape[1], mean.shape[1]) * len(table["signal"].start)

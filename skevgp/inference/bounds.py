@@ -197,7 +197,11 @@ class BoundAtOptimum:
         self.posteriors: list[WhitenedPosterior] = []
         self.fitted = np.empty((m + p, len(signal)))
         self.gradient = StatisticsGradient(
-            np.zeros((m, m)), np.zeros((m, p)), np.empty((m, len(signal))), -0.5 * (signal / noise).sum(), np.zeros((m, m))
+            np.zeros((m, m)),
+            np.zeros((m, p)),
+            np.empty((m, len(signal))),
+            -0.5 * (signal / noise).sum(),
+            np.zeros((m, m)),
         )
         # Terms of each output that do not depend on e, and their derivatives in log s² and log σ².
         self._value, self._log_signal, self._log_noise = np.empty((3, len(signal)))
@@ -225,9 +229,7 @@ class BoundAtOptimum:
             self._log_signal[o] = (
                 np.vdot(VV_bar, statistics.VV) + 0.5 * np.vdot(VH_bar, statistics.VH) - 0.5 * unexplained
             )
-            self._log_noise[o] = (
-                -0.5 * statistics.n_rows - np.vdot(B_bar, q.B) + np.trace(B_bar) + 0.5 * unexplained
-            )
+            self._log_noise[o] = -0.5 * statistics.n_rows - np.vdot(B_bar, q.B) + np.trace(B_bar) + 0.5 * unexplained
 
     def residuals(self) -> Residuals:
         """eᵀe and V e from the statistics: good while the signal is not above about 1e4 times the noise."""
@@ -271,7 +273,13 @@ def _diagonal_gap(
 
 
 def negative_elbo(
-    statistics: SufficientStatistics, signal: Any, noise: Any, prior: CoefficientPrior, mean: Any, root: Any, log_det: Any
+    statistics: SufficientStatistics,
+    signal: Any,
+    noise: Any,
+    prior: CoefficientPrior,
+    mean: Any,
+    root: Any,
+    log_det: Any,
 ) -> Any:
     """The paper's loss (its eq. elbo, with C free where q is a joint Gaussian), summed over outputs.
 

@@ -31,6 +31,7 @@ class Options:
     solver : {"lbfgs", "adam"}
     max_iter : int
     tol : float
+        In nats.
     batch_size : int
     learning_rate : float
     map_blocks : callable
@@ -143,12 +144,13 @@ def _lbfgs_unless_collapsed(
 ) -> Minimum:
     """L-BFGS from the table's start; from other starts too where the noise came to explain everything."""
     best: Minimum | None = None
+    tol = options.tol / objective.linear.n_rows
     for length_factor, noise_factor in ((1.0, 1.0), *_OTHER_STARTS):
         start = table.coordinates(table.start())
         start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
         start["noise"] = start["noise"] + np.log(noise_factor)
         first = np.clip(table.flat(start), *table.bounds())
-        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, options.tol, report)
+        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, tol, report)
         if best is None or minimum.loss < best.loss:
             best = minimum
         if best.interrupted or table["noise"].fixed or not (table.values(best.x)["noise"] > _COLLAPSED).any():

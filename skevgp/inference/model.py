@@ -97,7 +97,13 @@ class SparseModel:
     ) -> BoundAtOptimum:
         """The bound of one group, given the statistics of all outputs."""
         return BoundAtOptimum(
-            statistics.outputs(outputs), signal[outputs], noise[outputs], self.prior.outputs(outputs), self.family, L, L_inv
+            statistics.outputs(outputs),
+            signal[outputs],
+            noise[outputs],
+            self.prior.outputs(outputs),
+            self.family,
+            L,
+            L_inv,
         )
 
 

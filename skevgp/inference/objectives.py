@@ -121,7 +121,7 @@ class ElboObjective:
         )
 
     def minibatch(self, batches: Iterator[tuple[Block, LinearStatistics]]) -> Callable[..., tuple[float, np.ndarray]]:
-        """x -> (loss, gradient) of the next batch, per row of the whole data."""
+        """X -> (loss, gradient) of the next batch, per row of the whole data."""
         gradient = value_and_grad(self._loss)
 
         def objective(x: np.ndarray) -> tuple[float, np.ndarray]:

@@ -15,6 +15,7 @@ Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
 Report = Callable[[int, float], None]
 
 _MAX_RESTARTS = 10
+_PATIENCE = 3
 
 
 @dataclass
@@ -85,7 +86,7 @@ def lbfgs(
     max_iter : int
         Iterations in all.
     tol : float
-        Stop when an iteration lowers the loss by less than this fraction of it.
+        Stop when each of three iterations in a row lowers the loss by less than this.
     report : callable, default=None
 
     Returns
@@ -94,19 +95,25 @@ def lbfgs(
     """
     guarded = _Guarded(objective, start)
     minimum = Minimum(start, np.inf)
+    stalled = 0
 
-    def callback(intermediate_result: object) -> None:
+    def callback(intermediate_result: object) -> None:  # noqa: ARG001 - SciPy looks at the name
+        nonlocal stalled
+        before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
         minimum.loss_curve.append(guarded.loss)
         if report is not None:
             report(minimum.n_iter, guarded.loss)
+        stalled = stalled + 1 if before - guarded.loss < tol else 0
+        if stalled >= _PATIENCE:
+            raise StopIteration
 
     try:
-        loss, _ = guarded(start)
+        guarded(start)
+        # Nothing to move, or asked not to: the start is the answer.
+        minimum.converged = len(start) == 0 or max_iter == 0
         for _ in range(1 + _MAX_RESTARTS):
             remaining = max_iter - minimum.n_iter
-            if len(start) == 0 or remaining <= 0:
-                # Asked for no iterations, the start is the answer.
-                minimum.converged = len(start) == 0 or max_iter == 0
+            if minimum.converged or remaining <= 0:
                 break
             before = guarded.loss
             result = minimize(
@@ -116,15 +123,11 @@ def lbfgs(
                 method="L-BFGS-B",
                 bounds=np.column_stack(bounds),
                 callback=callback,
-                options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": tol, "gtol": 1e-8},
+                options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": 0.0, "gtol": 1e-9},
             )
-            if result.status == 0:
-                minimum.converged = True
-                break
-            # A failed line search: rounding has the last word once a fresh start gains nothing more.
-            if result.status == 2 and before - guarded.loss <= tol * max(abs(guarded.loss), 1.0):
-                minimum.converged = True
-                break
+            # After a failed line search (2) rounding has the last word once a fresh start gains nothing more.
+            failed = result.status == 2 and before - guarded.loss > tol
+            minimum.converged = stalled >= _PATIENCE or (result.status != 1 and not failed)
     except KeyboardInterrupt:
         minimum.interrupted = True
     minimum.x, minimum.loss = guarded.x, guarded.loss

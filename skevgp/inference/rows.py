@@ -104,7 +104,9 @@ class Rows:
         """Blocks of at most ``size`` rows, in order."""
         return [self._block(kernel, slice(first, first + size)) for first in range(0, len(self), size)]
 
-    def batches(self, kernel: Preparer, size: int, rng: np.random.RandomState) -> Iterator[tuple[Block, LinearStatistics]]:
+    def batches(
+        self, kernel: Preparer, size: int, rng: np.random.RandomState
+    ) -> Iterator[tuple[Block, LinearStatistics]]:
         """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""
         size = min(size, len(self))
         while True:

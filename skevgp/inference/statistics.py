@@ -272,9 +272,9 @@ def _unpack(flat: Any, m: int, p: int, o: int) -> tuple[Any, Any, Any, Any]:
     """The inverse of `_pack` for each set of inducing points; can be traced by autograd."""
     ends = np.cumsum([m * m, m * p, m * o])
     return (
-        flat[:, : ends[0]].reshape((-1, m, m)),
-        flat[:, ends[0] : ends[1]].reshape((-1, m, p)),
-        flat[:, ends[1] : ends[2]].reshape((-1, m, o)),
+        flat[:, : ends[0]].reshape((len(flat), m, m)),
+        flat[:, ends[0] : ends[1]].reshape((len(flat), m, p)),
+        flat[:, ends[1] : ends[2]].reshape((len(flat), m, o)),
         flat[:, ends[2]],
     )
 

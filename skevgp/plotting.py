@@ -1,0 +1,291 @@
+"""Pictures in scikit-learn's Display convention: ``from_estimator`` computes, ``plot`` draws. Needs matplotlib."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.utils.validation import check_is_fitted
+
+from ._optional import require
+
+if TYPE_CHECKING:
+    from .regressor import EVGPRegressor
+
+__all__ = ["CoefficientDisplay", "PosteriorDisplay"]
+
+# Blue and orange of Okabe & Ito's palette, safe for colour-blind readers.
+_MODEL, _TRUTH, _INDUCING = "#0072B2", "#D55E00", "#009E73"
+
+
+def _axes(ax: Any) -> Any:
+    pyplot = require("matplotlib.pyplot", "Plotting")
+    return ax if ax is not None else pyplot.subplots()[1]
+
+
+class PosteriorDisplay:
+    """Predicted mean with a band of standard deviations, along one axis.
+
+    Parameters
+    ----------
+    x : ndarray of shape (n_samples,)
+        Where the predictions are.
+    mean, std : ndarray of shape (n_samples,)
+    y : ndarray of shape (n_samples,), default=None
+        Observations at the same places.
+    inducing_points : ndarray of shape (m,), default=None
+        Drawn as crosses along the lower edge.
+
+    Attributes
+    ----------
+    ax_ : matplotlib Axes
+    figure_ : matplotlib Figure
+
+    See Also
+    --------
+    PosteriorDisplay.from_estimator : Make one from a fitted regressor.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.plotting import PosteriorDisplay
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, y)
+    >>> display = PosteriorDisplay.from_estimator(model, np.linspace(-1, 7, 50)[:, np.newaxis])
+    """
+
+    def __init__(
+        self,
+        x: np.ndarray,
+        mean: np.ndarray,
+        std: np.ndarray,
+        y: np.ndarray | None = None,
+        inducing_points: np.ndarray | None = None,
+    ):
+        self.x = x
+        self.mean = mean
+        self.std = std
+        self.y = y
+        self.inducing_points = inducing_points
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        X: ArrayLike,
+        y: ArrayLike | None = None,
+        *,
+        output: int = 0,
+        x: ArrayLike | None = None,
+        ax: Any = None,
+        n_std: float = 2.0,
+        label: str = "mean",
+    ) -> Self:
+        """Predict and draw.
+
+        Parameters
+        ----------
+        estimator : regressor
+            Fitted; its ``predict`` takes ``return_std``.
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
+            Observations at these rows.
+        output : int, default=0
+            Which output to draw.
+        x : array-like of shape (n_samples,), default=None
+            Values along the horizontal axis, for example times; by default the only column of X, or the row numbers.
+        ax : matplotlib Axes, default=None
+            Where to draw; by default on new axes.
+        n_std : float, default=2.0
+            Half width of the band, in standard deviations.
+        label : str, default="mean"
+            Name of the mean's line in the legend.
+
+        Returns
+        -------
+        display : PosteriorDisplay
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        check_is_fitted(estimator)
+        mean, std = (part.reshape(len(part), -1)[:, output] for part in estimator.predict(X, return_std=True))
+        values = np.asarray(X)
+        one_column = values.ndim == 2 and values.shape[1] == 1
+        if x is None:
+            x = values[:, 0] if one_column else np.arange(len(mean))
+        points = getattr(estimator, "inducing_points_", None)
+        if points is not None and one_column and getattr(estimator, "kernel_map_", None) is None:
+            points = points[..., 0] if points.ndim == 2 else points[output, :, 0]
+        else:
+            points = None
+        observed = None if y is None else np.asarray(y, dtype=float).reshape(len(mean), -1)[:, output]
+        return cls(np.asarray(x, dtype=float), mean, std, observed, points).plot(ax=ax, n_std=n_std, label=label)
+
+    def plot(self, ax: Any = None, *, n_std: float = 2.0, label: str = "mean") -> Self:
+        """Draw.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        n_std : float, default=2.0
+            Half width of the band, in standard deviations.
+        label : str, default="mean"
+            Name of the mean's line in the legend.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        ax = _axes(ax)
+        low, high = self.mean - n_std * self.std, self.mean + n_std * self.std
+        ax.fill_between(self.x, low, high, color=_MODEL, alpha=0.2, linewidth=0, label=f"±{n_std:g} std")
+        ax.plot(self.x, self.mean, color=_MODEL, label=label)
+        if self.y is not None:
+            ax.plot(self.x, self.y, color=_TRUTH, linestyle="--", label="observed")
+        if self.inducing_points is not None:
+            # On the lower edge, whatever the limits: x in data, y in axes units.
+            ax.plot(
+                self.inducing_points,
+                np.full(len(self.inducing_points), 0.03),
+                "x",
+                color=_INDUCING,
+                transform=ax.get_xaxis_transform(),
+                label="inducing points",
+            )
+        self.ax_, self.figure_ = ax, ax.figure
+        return self
+
+
+class CoefficientDisplay:
+    """Posterior weights of the explicit features beside their prior, with bars of standard deviations.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the weights.
+    mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
+
+    Attributes
+    ----------
+    ax_ : matplotlib Axes
+    figure_ : matplotlib Figure
+
+    See Also
+    --------
+    CoefficientDisplay.from_estimator : Make one from a fitted regressor.
+
+    Examples
+    --------
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.plotting import CoefficientDisplay
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
+    >>> CoefficientDisplay.from_estimator(model).names
+    ['1', 'x0']
+    """
+
+    def __init__(
+        self,
+        names: list[str],
+        mean: np.ndarray,
+        std: np.ndarray,
+        prior_mean: np.ndarray,
+        prior_std: np.ndarray,
+    ):
+        self.names = names
+        self.mean = mean
+        self.std = std
+        self.prior_mean = prior_mean
+        self.prior_std = prior_std
+
+    @classmethod
+    def from_estimator(cls, estimator: EVGPRegressor, *, output: int = 0, ax: Any = None, n_std: float = 2.0) -> Self:
+        """Read the weights off a fitted regressor and draw.
+
+        Parameters
+        ----------
+        estimator : EVGPRegressor
+            Fitted, with a feature map.
+        output : int, default=0
+            Which output's weights to draw.
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        n_std : float, default=2.0
+            Half length of the bars, in standard deviations.
+
+        Returns
+        -------
+        display : CoefficientDisplay
+
+        Raises
+        ------
+        ValueError
+            If the regressor has no explicit features.
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        check_is_fitted(estimator)
+        width = estimator.coef_.shape[-1]
+        if width == 0:
+            raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
+        names = [f"h{index}" for index in range(width)]
+        if hasattr(estimator.feature_map_, "get_feature_names_out"):
+            names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
+        parts = (
+            np.atleast_2d(part)[output]
+            for part in (
+                estimator.coef_,
+                estimator.coef_std_,
+                estimator.coef_prior_mean_,
+                estimator.coef_prior_scale_,
+            )
+        )
+        return cls(names, *parts).plot(ax=ax, n_std=n_std)
+
+    def plot(self, ax: Any = None, *, n_std: float = 2.0) -> Self:
+        """Draw.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        n_std : float, default=2.0
+            Half length of the bars, in standard deviations.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        ax = _axes(ax)
+        places = np.arange(len(self.names))[::-1]
+        for mean, std, shift, colour, marker, label in (
+            (self.prior_mean, self.prior_std, 0.12, "0.55", "s", "prior"),
+            (self.mean, self.std, -0.12, _MODEL, "o", "posterior"),
+        ):
+            ax.errorbar(
+                mean, places + shift, xerr=n_std * std, fmt=marker, color=colour, capsize=3, label=f"{label} ±{n_std:g} std"
+            )
+        ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
+        ax.set_yticks(places, self.names)
+        ax.set_ylim(-0.6, len(self.names) - 0.4)
+        self.ax_, self.figure_ = ax, ax.figure
+        return self
