@@ -40,10 +40,10 @@ class SquaredExponential:
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
         return SquaredExponentialAt(np.exp(hyperparameters), inducing_points)
 
-    def traceable_matrix(self, hyperparameters: Any, inducing_points: Any) -> Any:
+    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
         scaled = inducing_points / anp.exp(hyperparameters)
-        differences = scaled[:, None, :] - scaled[None, :, :]
-        return anp.exp(-0.5 * anp.sum(differences**2, axis=2))
+        differences = scaled[..., :, None, :] - scaled[..., None, :, :]
+        return anp.exp(-0.5 * anp.sum(differences**2, axis=-1))
 
 
 class SquaredExponentialAt:

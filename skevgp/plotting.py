@@ -286,6 +286,7 @@ class CoefficientDisplay:
             )
         ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
         ax.set_yticks(places, self.names)
+        ax.margins(x=0.1)
         ax.set_ylim(-0.6, len(self.names) - 0.4)
         self.ax_, self.figure_ = ax, ax.figure
         return self

@@ -82,7 +82,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         L-BFGS stops when each of three iterations in a row raises the bound by less than this, in nats.
     batch_size : int, default=512
         Rows per step of Adam.
-    learning_rate : float, default=0.02
+    learning_rate : float, default=0.1
         Adam's first step size; it falls to zero along half a cosine.
     warm_start : bool, default=False
         Whether to start from the last fit's kernel, noise and inducing points, where shapes agree.
@@ -188,7 +188,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         max_iter: int | None = None,
         tol: float = 0.01,
         batch_size: int = 512,
-        learning_rate: float = 0.02,
+        learning_rate: float = 0.1,
         warm_start: bool = False,
         n_jobs: int | None = None,
         random_state: int | np.random.RandomState | None = None,

@@ -40,7 +40,8 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
     diagonal = np.diagonal(matrix)
     while True:
         shifted = matrix.copy()
-        np.einsum("ii->i", shifted)[...] += jitter * diagonal
+        if jitter > 0.0:
+            np.einsum("ii->i", shifted)[...] += jitter * diagonal
         # The transpose of a C-contiguous matrix is what LAPACK reads without a copy: its upper factor is our lower.
         factor, info = lapack.dpotrf(shifted.T, lower=0, clean=1, overwrite_a=1)
         if info == 0 and np.isfinite(factor[-1:, -1:]).all():

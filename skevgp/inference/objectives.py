@@ -143,8 +143,7 @@ class ElboObjective:
     def _loss(self, x: Any, blocks: list[Block], linear: LinearStatistics) -> Any:
         coordinates, model = self.table.coordinates(x), self.model
         points = coordinates["inducing_points"] * self.table["inducing_points"].unit
-        K = anp.array([model.kernel.traceable_matrix(coordinates["hyperparameters"], one) for one in points])
-        L = cholesky(K, JITTER)
+        L = cholesky(model.kernel.traceable_matrices(coordinates["hyperparameters"], points), JITTER)
         statistics = traceable_statistics(coordinates["hyperparameters"], points, L, model.kernel, blocks, linear)
         root, log_det = self._spread(coordinates["spread"], inverse_factor(L))
         return negative_elbo(

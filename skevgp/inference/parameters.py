@@ -39,9 +39,10 @@ class Parameter:
     def coordinate(self, value: np.ndarray | float) -> np.ndarray:
         """The optimiser's coordinates of a value, flat."""
         value = np.broadcast_to(value, self.start.shape)
-        with np.errstate(divide="ignore"):
-            moved = np.log(value) if self.transform == "log" else value / self.unit
-        return np.asarray(moved, dtype=float).ravel()
+        if self.transform == "log":
+            with np.errstate(divide="ignore"):
+                return np.log(np.maximum(value, 0.0)).ravel()
+        return (value / self.unit).ravel()
 
     def value_bounds(self) -> np.ndarray:
         """Bounds of each entry, (size, 2), in the parameter's own units."""

@@ -54,8 +54,8 @@ class Kernel(Protocol):
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> KernelAt:
         """The covariance with hyperparameters (n_hyper,) and inducing points (m, d) put in."""
 
-    def traceable_matrix(self, hyperparameters: Any, inducing_points: Any) -> Any:
-        """k(X_m, X_m) of shape (m, m) in autograd.numpy."""
+    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
+        """k(X_m, X_m) of shape (g, m, m) for sets of inducing points (g, m, d), in autograd.numpy."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,59 @@
+"""The bounds written down from the data in plain autograd.numpy: no statistics, no blocks, no hand-written gradient."""
+
+import autograd.numpy as anp
+import numpy as np
+
+from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.model import JITTER, SparseModel
+from skevgp.inference.rows import Rows
+from skevgp.inference.start import starting_table
+from skevgp.inference.parameters import Start
+from skevgp.kernels import SquaredExponential
+
+
+def squared_exponential(A, B, lengthscales):
+    return anp.exp(-0.5 * anp.sum(((A[:, None, :] - B[None, :, :]) / lengthscales) ** 2, axis=2))
+
+
+def whitened(lengthscales, Z, X):
+    """L and V = L⁻¹ k(Z, X)."""
+    K = squared_exponential(Z, Z, lengthscales)
+    L = anp.linalg.cholesky(K + JITTER * np.eye(len(Z)))
+    return L, anp.linalg.solve(L, squared_exponential(Z, X, lengthscales))
+
+
+def collapsed_bound(lengthscales, signal, noise, Z, rows, prior, family="full"):
+    """Summed over outputs; Z (g, m, d) with g = 1 or one set per output."""
+    total = 0.0
+    for o in range(len(prior.scale)):
+        L, V = whitened(lengthscales, Z[o % len(Z)], rows.inputs)
+        P = anp.concatenate([anp.sqrt(signal[o]) * V.T, rows.features * prior.scale[o]], axis=1)
+        r = rows.residuals[:, o] + rows.features @ (prior.scale[o] * prior.reference[o])
+        B = np.eye(P.shape[1]) + P.T @ P / noise[o]
+        log_det = anp.linalg.slogdet(B)[1]
+        quadratic = (r @ r - (P.T @ r) @ anp.linalg.solve(B, P.T @ r) / noise[o]) / noise[o]
+        trace = signal[o] * anp.sum(1.0 - anp.sum(V**2, axis=0)) / noise[o]
+        total = total - 0.5 * (len(rows) * anp.log(2 * np.pi * noise[o]) + log_det + quadratic + trace)
+        if family == "diagonal":
+            m = len(L)
+            T = anp.linalg.inv(L)
+            precision = T.T @ B[:m, :m] @ T
+            diagonal = anp.concatenate([anp.diag(precision), anp.diag(B)[m:]])
+            log_det_precision = log_det - 2.0 * anp.sum(anp.log(anp.diag(L)))
+            total = total - 0.5 * (anp.sum(anp.log(diagonal)) - log_det_precision)
+    return total
+
+
+def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
+    """A small model, its rows and a table of parameters away from any optimum."""
+    rng = np.random.RandomState(seed)
+    X, H = rng.randn(n, d), rng.randn(n, p)
+    Y = np.sin(X @ rng.randn(d, o)) + H @ rng.randn(p, o) + 0.1 * rng.randn(n, o)
+    prior = CoefficientPrior(np.zeros((o, p)), 0.5 + rng.rand(o, p), 0.3 * rng.randn(o, p))
+    rows = Rows(X, H, Y - H @ prior.offset.T)
+    groups = (slice(0, o),) if shared else tuple(slice(i, i + 1) for i in range(o))
+    model = SparseModel(SquaredExponential(d), prior, family, groups)
+    Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
+    starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
+    table = starting_table(X, Z, np.ones(o), *starts, 1e-2, d)
+    return model, rows, table

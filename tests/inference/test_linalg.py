@@ -1,0 +1,67 @@
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from autograd.test_util import check_grads
+
+from skevgp.inference.linalg import (
+    NotPositiveDefiniteError,
+    cholesky,
+    inverse_factor,
+    jittered_cholesky,
+    lower_triangular,
+    triangular_inverse,
+)
+
+
+def positive_definite(n, seed=0):
+    A = np.random.RandomState(seed).randn(n, n)
+    return A @ A.T + n * np.eye(n)
+
+
+def test_factor_of_a_well_conditioned_matrix_is_numpys():
+    A = positive_definite(7)
+    np.testing.assert_allclose(jittered_cholesky(A), np.linalg.cholesky(A), rtol=1e-13)
+
+
+def test_the_matrix_is_left_alone():
+    A = positive_definite(4)
+    before = A.copy()
+    jittered_cholesky(A, 1e-3)
+    np.testing.assert_array_equal(A, before)
+
+
+def test_jitter_is_relative_to_the_diagonal():
+    A = np.diag([1.0, 1e8, 1e-8])
+    L = jittered_cholesky(A, 1e-2)
+    np.testing.assert_allclose(np.diag(L) ** 2, 1.01 * np.diag(A), rtol=1e-14)
+
+
+def test_a_singular_matrix_gets_just_enough_jitter():
+    A = np.ones((5, 5))
+    L = jittered_cholesky(A)
+    np.testing.assert_allclose(L @ L.T, A, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [np.array([[1.0, 2.0], [2.0, 1.0]]), np.full((2, 2), np.nan), np.array([[np.inf]])])
+def test_hopeless_matrices_raise_a_named_error(bad):
+    with pytest.raises(NotPositiveDefiniteError, match="not positive definite|not finite"):
+        jittered_cholesky(bad)
+
+
+def test_triangular_inverse():
+    L = np.linalg.cholesky(positive_definite(6))
+    inverse = triangular_inverse(L)
+    np.testing.assert_allclose(inverse @ L, np.eye(6), atol=1e-13)
+    np.testing.assert_array_equal(inverse, np.tril(inverse))
+
+
+def symmetrised(function):
+    return lambda A: function(0.5 * (A + anp.swapaxes(A, 1, 2)))
+
+
+def test_pull_backs_agree_with_finite_differences():
+    A = np.array([positive_definite(4, seed) for seed in range(2)])
+    check_grads(symmetrised(cholesky), modes=["rev"], order=1)(A)
+    L = np.linalg.cholesky(A)
+    check_grads(lambda L: inverse_factor(L * np.tril(np.ones((4, 4)))), modes=["rev"], order=1)(L)
+    check_grads(lambda flat: lower_triangular(flat, 3), modes=["rev"], order=1)(np.random.RandomState(0).randn(2, 6))

@@ -1,0 +1,68 @@
+import numpy as np
+
+from skevgp.inference.parameters import Parameter, ParameterTable, Start
+
+
+def table():
+    return ParameterTable(
+        [
+            Parameter("length", np.array([1.0, 2.0]), "log", 0.5, np.array([3.0, 1.5])),
+            Parameter("noise", np.array([0.1]), "log", fixed=True),
+            Parameter("points", np.arange(6.0).reshape(1, 3, 2), unit=np.array([2.0, 4.0])),
+        ]
+    )
+
+
+def test_values_come_back():
+    values = table().values(table().start())
+    np.testing.assert_allclose(values["points"], np.arange(6.0).reshape(1, 3, 2))
+    np.testing.assert_allclose(values["noise"], [0.1])
+    assert table().size == 8
+
+
+def test_starts_are_put_inside_their_bounds():
+    np.testing.assert_allclose(table().values(table().start())["length"], [1.0, 1.5])
+
+
+def test_bounds_are_those_of_the_coordinates():
+    lower, upper = table().bounds()
+    np.testing.assert_allclose(lower[:2], np.log(0.5))
+    np.testing.assert_allclose(upper[:2], np.log([3.0, 1.5]))
+    assert np.isinf(upper[2:]).all()
+    np.testing.assert_allclose(table()["length"].value_bounds(), [[0.5, 3.0], [0.5, 1.5]])
+
+
+def test_a_change_of_one_unit_moves_the_coordinate_by_one():
+    flat = table().start()
+    flat[2:4] += 1.0
+    np.testing.assert_allclose(table().values(flat)["points"][0, 0], [2.0, 5.0])
+
+
+def test_warm_starts_take_over_only_what_fits():
+    again = table().started_at({"length": np.array([0.7, 0.8]), "noise": np.array([9.0]), "points": np.zeros((2, 3, 2))})
+    values = again.values(again.start())
+    np.testing.assert_allclose(values["length"], [0.7, 0.8])
+    np.testing.assert_allclose(values["noise"], [0.1])
+    np.testing.assert_allclose(values["points"], np.arange(6.0).reshape(1, 3, 2))
+
+
+def test_a_start_without_opinion_takes_the_default():
+    parameter = Start().parameter("x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
+    assert (parameter.start, parameter.lower, parameter.upper) == ([2.0], [1.0], [3.0])
+
+
+def test_a_start_in_the_users_units_is_divided_by_the_unit():
+    start = Start(np.array([20.0]), np.array([[5.0, 50.0]]))
+    parameter = start.parameter("x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
+    assert (parameter.start, parameter.lower, parameter.upper) == ([2.0], [0.5], [5.0])
+
+
+def test_default_bounds_make_room_for_a_start_outside():
+    parameter = Start(np.array([100.0])).parameter("x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
+    assert (parameter.start, parameter.upper) == ([10.0], [10.0])
+
+
+def test_a_table_where_all_is_fixed_has_no_coordinates():
+    fixed = ParameterTable([Parameter("noise", np.array([0.1]), "log", fixed=True)])
+    assert fixed.start().shape == (0,)
+    np.testing.assert_allclose(fixed.values(fixed.start())["noise"], [0.1])

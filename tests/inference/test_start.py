@@ -1,0 +1,68 @@
+import numpy as np
+import pytest
+
+from skevgp.inference.inducing import initial_inducing_points
+from skevgp.inference.start import features_alone, rms, unit_of
+
+
+def test_features_alone_are_least_squares_under_a_wide_prior():
+    rng = np.random.RandomState(0)
+    H, b = rng.randn(200, 3), np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]])
+    r = H @ b.T + 1e-3 * rng.randn(200, 2)
+    w = features_alone(H, r, np.full((2, 3), 100.0))
+    np.testing.assert_allclose(100.0 * w.T, np.linalg.lstsq(H, r, rcond=None)[0], atol=1e-8)
+
+
+def test_features_alone_are_ridge_regression_under_a_narrow_prior():
+    rng = np.random.RandomState(0)
+    H, scale = rng.randn(50, 2), np.array([[0.1, 0.2]])
+    r = H @ [[1.0], [1.0]] + rng.randn(50, 1)
+    w = features_alone(H, r, scale)
+    P = H * scale
+    first = np.linalg.lstsq(P, r, rcond=None)[0]
+    noise = np.mean((r - P @ first) ** 2)
+    np.testing.assert_allclose(w[0], np.linalg.solve(P.T @ P + noise * np.eye(2), P.T @ r)[:, 0], rtol=1e-9)
+
+
+def test_a_scale_of_zero_keeps_a_weight():
+    H = np.random.RandomState(0).randn(20, 2)
+    w = features_alone(H, H.sum(axis=1, keepdims=True), np.array([[1.0, 0.0]]))
+    assert w[0, 1] == 0.0
+    assert w[0, 0] != 0.0
+
+
+def test_duplicate_features_share_their_weight():
+    h = np.random.RandomState(0).randn(30, 1)
+    w = features_alone(np.hstack([h, h]), 2.0 * h, np.ones((1, 2)))
+    np.testing.assert_allclose(w, [[1.0, 1.0]], rtol=1e-4)
+
+
+def test_units_survive_extreme_scales():
+    values = np.array([[1e-300, 1e200, 0.0], [1e-300, 1e200, 0.0]])
+    np.testing.assert_allclose(rms(values), [1e-300, 1e200, 0.0])
+    assert unit_of(values, values)[2] == 1.0
+
+
+def test_the_unit_is_not_below_the_rounding_of_the_target():
+    assert unit_of(np.full((3, 1), 1e-20), np.full((3, 1), 1e5))[0] == pytest.approx(1e-9)
+
+
+def test_all_distinct_rows_serve_if_there_are_few():
+    X = np.array([[1.0], [0.0], [1.0], [2.0]])
+    points = initial_inducing_points(X, 10, np.random.RandomState(0))
+    np.testing.assert_array_equal(points, [[1.0], [0.0], [2.0]])
+
+
+def test_points_spread_over_the_data_whatever_the_scales():
+    rng = np.random.RandomState(0)
+    X = rng.rand(2000, 2) * [1e-6, 1e6]
+    points = initial_inducing_points(X, 25, rng) / [1e-6, 1e6]
+    assert points.shape == (25, 2)
+    nearest = np.linalg.norm(X[:, np.newaxis] / [1e-6, 1e6] - points, axis=2).min(axis=1)
+    assert nearest.max() < 0.35
+
+
+def test_a_sample_serves_for_many_rows(monkeypatch):
+    monkeypatch.setattr("skevgp.inference.inducing.MAX_SAMPLE", 100)
+    X = np.random.RandomState(0).rand(5000, 1)
+    assert initial_inducing_points(X, 100, np.random.RandomState(0)).shape == (100, 1)
