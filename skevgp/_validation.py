@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+LARGEST = 1e100
+
 
 def check_integer(value: Any, name: str, *, minimum: int) -> int:
     """An integer not below ``minimum``, or an error that names it."""
@@ -24,3 +26,10 @@ def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -
     if not np.isfinite(value) or value < minimum or (strict and value == minimum):
         raise ValueError(f"{name} must be finite and {'above' if strict else 'at least'} {minimum}; got {value!r}.")
     return float(value)
+
+
+def check_magnitude(values: np.ndarray, name: str) -> None:
+    """Refuse finite numbers whose squares would overflow."""
+    largest = np.abs(values).max(initial=0.0)
+    if largest > LARGEST:
+        raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")

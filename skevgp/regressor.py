@@ -19,6 +19,7 @@ from threadpoolctl import threadpool_limits
 
 from ._maps import apply_map, fit_map
 from ._progress import Progress
+from ._validation import check_magnitude
 from .features.prior import resolve_coef_prior
 from .inference.frame import Frame
 from .inference.inducing import initial_inducing_points
@@ -238,10 +239,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ConvergenceWarning
             If the iterations were used up, or the fit was interrupted by Ctrl-C (the best parameters so far are kept).
         """
-        given = X
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
-        y = np.asarray(y, dtype=np.float64)
-        given = given if hasattr(given, "iloc") else X
+        given, X, y = self._validated(X, y, reset=True)
         previous = self.__dict__.get("_learned") if self.warm_start else None
         frame_before = self.__dict__.get("_frame")
 
@@ -309,12 +307,11 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not hasattr(self, "_learned"):
             return self.fit(X, y)
-        given = X
-        X, y = validate_data(self, X, y, reset=False, multi_output=True, y_numeric=True, dtype=np.float64)
-        targets = np.asarray(y, dtype=np.float64).reshape(len(y), -1)
+        given, X, y = self._validated(X, y)
+        targets = y.reshape(len(y), -1)
         if targets.shape[1] != len(self._frame.target_unit):
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(self._frame.target_unit)}.")
-        inputs, features = self._mapped(given if hasattr(given, "iloc") else X, X)
+        inputs, features = self._mapped(given, X)
         rows = self._frame.rows(inputs, features, targets)
         slices = [outputs for outputs, _ in self._models(targets.shape[1])]
         self._learned = [
@@ -354,9 +351,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
         check_is_fitted(self)
-        given = X
-        X = validate_data(self, X, reset=False, dtype=np.float64)
-        given = given if hasattr(given, "iloc") else X
+        given, X, _ = self._validated(X)
         noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
         if return_cov:
             inputs, features = self._mapped(given, X)
@@ -408,6 +403,18 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             axis=1,
         )
         return samples[:, 0] if single else samples
+
+    def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
+        """X as the maps shall see it (a data frame stays one), X and y as arrays."""
+        given = X
+        if y is None and not reset:
+            X, y = validate_data(self, X, reset=False, dtype=np.float64), np.empty(0)
+        else:
+            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64)
+            y = np.asarray(y, dtype=np.float64)
+        check_magnitude(X, "X")
+        check_magnitude(y, "y")
+        return (given if hasattr(given, "iloc") else X), X, y
 
     def _mapped(self, given: Any, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""

@@ -17,6 +17,8 @@ _LENGTHSCALE_BOUNDS = 1e-2, 1e4
 # the noise explains everything; Adam, whose steps do not grow with the gradient, starts nearer to the data's scatter.
 FIRST_NOISE = {"lbfgs": 1e-4, "adam": 1e-2}
 _NOISE_BOUNDS = 1e-12, 1e2
+# So that the lowest noise variance in the user's units is not rounded to 0.
+_SMALLEST_UNIT = 1e-140
 _SIGNAL_BOUNDS = 1e-8, 1e8
 
 
@@ -69,7 +71,7 @@ def unit_of(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
     """
     largest = np.abs(reference).max(axis=0)
     unit = np.maximum(rms(values), 1e-14 * largest)
-    return np.where(unit > 0.0, unit, 1.0)
+    return np.where(unit > 0.0, np.maximum(unit, _SMALLEST_UNIT), 1.0)
 
 
 def rms(values: np.ndarray) -> np.ndarray:

@@ -1,0 +1,201 @@
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import solve_ivp
+
+from skevgp.datasets import simulate
+from skevgp.datasets.simulation import _ForwardDynamics
+from skevgp.robots import SYSTEMS, get_system
+
+G = 9.81
+DT = 0.03
+REFERENCE = Path(__file__).parents[3] / "shared" / "reference"
+STORED = [name for name in sorted(SYSTEMS) if (REFERENCE / f"{name}.npz").is_file()]
+
+
+def pendulum(q, v, u):
+    """m l² q̈ + b q̇ + m g l sin q = u."""
+    mass, length, damping = 1.0, 0.5, 0.1
+    torque = u[:, 0] - damping * v[:, 0] - mass * G * length * np.sin(q[:, 0])
+    return (torque / (mass * length**2))[:, np.newaxis]
+
+
+def cartpole(q, v, u):
+    """M(θ) [ẍ, θ̈] = [u + m l s θ̇², -m g l s], a force on the cart and no friction."""
+    cart, mass, length = 10.0, 1.0, 0.5
+    sine, cosine = np.sin(q[:, 1]), np.cos(q[:, 1])
+    M = np.empty((len(q), 2, 2))
+    M[:, 0, 0] = cart + mass
+    M[:, 0, 1] = M[:, 1, 0] = mass * length * cosine
+    M[:, 1, 1] = mass * length**2
+    force = np.column_stack([u[:, 0] + mass * length * sine * v[:, 1] ** 2, -mass * G * length * sine])
+    return np.linalg.solve(M, force[:, :, np.newaxis])[:, :, 0]
+
+
+def acrobot(q, v, u):
+    """Spong's acrobot: relative elbow angle, a torque on the elbow, viscous damping on both joints."""
+    m1, m2, l1, com1, com2, damping = 1.0, 1.0, 1.0, 0.5, 1.0, 0.1
+    J1, J2 = 0.083 + m1 * com1**2, 0.33 + m2 * com2**2
+    coupling, s2 = m2 * l1 * com2, np.sin(q[:, 1])
+    c2 = np.cos(q[:, 1])
+    M = np.empty((len(q), 2, 2))
+    M[:, 0, 0] = J1 + J2 + m2 * l1**2 + 2.0 * coupling * c2
+    M[:, 0, 1] = M[:, 1, 0] = J2 + coupling * c2
+    M[:, 1, 1] = J2
+    tip = m2 * G * com2 * np.sin(q[:, 0] + q[:, 1])
+    shoulder = G * (m1 * com1 + m2 * l1) * np.sin(q[:, 0]) + tip
+    force = np.column_stack(
+        [
+            coupling * s2 * (2.0 * v[:, 0] * v[:, 1] + v[:, 1] ** 2) - shoulder - damping * v[:, 0],
+            u[:, 0] - coupling * s2 * v[:, 0] ** 2 - tip - damping * v[:, 1],
+        ]
+    )
+    return np.linalg.solve(M, force[:, :, np.newaxis])[:, :, 0]
+
+
+CLOSED_FORM = {"pendulum": pendulum, "cartpole": cartpole, "acrobot": acrobot}
+INPUT_SCALE = {"pendulum": 1.0, "cartpole": 100.0, "acrobot": 0.5}
+
+
+def random_states(name, n_states, seed):
+    rng = np.random.default_rng(seed)
+    n = get_system(name).n_joints
+    q, v = rng.uniform(-np.pi, np.pi, (n_states, n)), rng.uniform(-3.0, 3.0, (n_states, n))
+    return q, v, INPUT_SCALE[name] * rng.standard_normal((n_states, 1))
+
+
+def one_step(accelerations, z, u):
+    n = len(z) // 2
+
+    def derivative(_t, state):
+        return np.r_[state[n:], accelerations(state[np.newaxis, :n], state[np.newaxis, n:], u[np.newaxis])[0]]
+
+    return solve_ivp(derivative, (0.0, DT), z, method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+
+
+def assert_accelerations(actual, expected):
+    assert_allclose(actual, expected, rtol=0, atol=1e-10 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("name", CLOSED_FORM)
+def test_accelerations_equal_the_closed_form(name):
+    q, v, u = random_states(name, 100, seed=0)
+    assert_accelerations(_ForwardDynamics(get_system(name))(q, v, u), CLOSED_FORM[name](q, v, u))
+
+
+@pytest.mark.parametrize("name", CLOSED_FORM)
+def test_one_step_equals_the_integrated_closed_form(name):
+    q, v, u = random_states(name, 20, seed=1)
+    z = np.hstack([q, v])
+    expected = [one_step(CLOSED_FORM[name], *row) for row in zip(z, u, strict=True)]
+    assert_allclose(simulate(name, z, u[:, np.newaxis], DT)[:, 1], expected, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_one_step_equals_the_stored_reference(name):
+    stored = np.load(REFERENCE / f"{name}.npz")
+    before = stored["Z"][:, :-1].reshape(-1, stored["Z"].shape[2])
+    after = stored["Z"][:, 1:].reshape(before.shape)
+    U = stored["U"].reshape(len(before), 1, -1)
+    assert_allclose(simulate(name, before, U, float(stored["dt"]))[:, 1], after, rtol=0, atol=1e-8)
+
+
+@pytest.mark.parametrize("name", STORED)
+def test_accelerations_equal_the_stored_reference(name):
+    stored = np.load(REFERENCE / f"{name}.npz")
+    accelerations = _ForwardDynamics(get_system(name))(stored["acc_q"], stored["acc_v"], stored["acc_u"])
+    assert_accelerations(accelerations, stored["acc_qddot"])
+
+
+@pytest.mark.parametrize("name", CLOSED_FORM)
+def test_many_trajectories_equal_one_at_a_time(name):
+    q, v, _ = random_states(name, 4, seed=2)
+    z0, U = np.hstack([q, 0.2 * v]), INPUT_SCALE[name] * np.random.default_rng(3).standard_normal((4, 10, 1))
+    alone = [simulate(name, z, u) for z, u in zip(z0, U, strict=True)]
+    assert_allclose(simulate(name, z0, U), alone, rtol=0, atol=1e-9)
+
+
+def test_a_long_trajectory_is_many_steps():
+    z0, U = [2.0, 0.5], np.random.default_rng(0).standard_normal((5, 1))
+    Z = simulate("pendulum", z0, U)
+    again = [simulate("pendulum", z, u[np.newaxis])[1] for z, u in zip(Z[:-1], U, strict=True)]
+    assert_array_equal(Z[1:], again)
+
+
+def test_one_trajectory_has_two_dimensions():
+    Z = simulate("cartpole", [0.0, 0.1, 0.0, 0.0], np.zeros((3, 1)))
+    assert Z.shape == (4, 4)
+    assert_array_equal(Z[0], [0.0, 0.1, 0.0, 0.0])
+
+
+def test_many_trajectories_have_three_dimensions():
+    z0 = np.arange(8.0).reshape(2, 4) / 10.0
+    Z = simulate("acrobot", z0, np.zeros((2, 3, 1)))
+    assert Z.shape == (2, 4, 4)
+    assert_array_equal(Z[:, 0], z0)
+
+
+def test_no_steps_leave_the_initial_state():
+    assert_array_equal(simulate("pendulum", [1.0, 0.0], np.empty((0, 1))), [[1.0, 0.0]])
+
+
+def test_a_system_works_in_place_of_its_name():
+    U = np.ones((2, 1))
+    by_name, by_system = (simulate(system, [1.0, 0.0], U) for system in ("pendulum", get_system("pendulum")))
+    assert_array_equal(by_name, by_system)
+
+
+def test_the_input_is_held_for_dt():
+    U = np.array([[1.0], [-1.0]])
+    coarse = simulate("pendulum", [0.5, 0.0], U, dt=0.04)
+    fine = simulate("pendulum", [0.5, 0.0], np.repeat(U, 2, axis=0), dt=0.02)
+    assert_allclose(coarse, fine[::2], rtol=0, atol=1e-10)
+
+
+def test_the_undriven_cartpole_keeps_its_energy():
+    Z = simulate("cartpole", [0.2, 2.5, 0.3, -0.4], np.zeros((100, 1)))
+    _, theta, dx, dtheta = Z.T
+    kinetic = 0.5 * 11.0 * dx**2 + 0.5 * np.cos(theta) * dx * dtheta + 0.5 * 0.25 * dtheta**2
+    energy = kinetic - G * 0.5 * np.cos(theta)
+    assert np.ptp(kinetic) > 1.0
+    assert_allclose(energy, energy[0], rtol=0, atol=1e-8)
+
+
+def test_damping_slows_the_pendulum_down():
+    q, v = simulate("pendulum", [1.0, 0.0], np.zeros((100, 1))).T
+    energy = 0.5 * 0.25 * v**2 - G * 0.5 * np.cos(q)
+    assert (np.diff(energy) < 0).all()
+
+
+ZEROS = np.zeros((3, 1))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("pendulum", [0.0], ZEROS), r"z0 must have 2 columns .*'pendulum'.* \(1,\)"),
+        (("cartpole", [[0.0, 0.0]], ZEROS[np.newaxis]), r"z0 must have 4 columns .*'cartpole'.* \(1, 2\)"),
+        (("pendulum", np.zeros((1, 1, 2)), ZEROS), r"z0 must have 2 columns .* \(1, 1, 2\)"),
+        (("pendulum", [0.0, 0.0], np.zeros((3, 2))), r"U must have the shape \(n_steps, 1\).* \(3, 2\)"),
+        (("pendulum", [0.0, 0.0], np.zeros(3)), r"U must have the shape \(n_steps, 1\).* \(3,\)"),
+        (("pendulum", np.zeros((2, 2)), ZEROS), r"U must have the shape \(2, n_steps, 1\).* \(3, 1\)"),
+        (("pendulum", np.zeros((2, 2)), np.zeros((3, 3, 1))), r"U must have the shape \(2, n_steps, 1\)"),
+        (("pendulum", [np.nan, 0.0], ZEROS), "z0 and U must be finite"),
+        (("pendulum", [0.0, 0.0], ZEROS + np.inf), "z0 and U must be finite"),
+        (("pendulum", [0.0, 0.0], ZEROS, 0.0), "dt must be .*0.0"),
+        (("pendulum", [0.0, 0.0], ZEROS, -0.03), "dt must be .*-0.03"),
+        (("pendulum", [0.0, 0.0], ZEROS, np.nan), "dt must be .*nan"),
+        (("robot", [0.0, 0.0], ZEROS), r"Unknown system 'robot'.*\['acrobot', 'cartpole', 'pendulum'\]"),
+        (("pendulm", [0.0, 0.0], ZEROS), "Did you mean 'pendulum'"),
+    ],
+)
+def test_bad_arguments_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        simulate(*arguments)
+
+
+def test_an_integration_that_gives_up_is_an_error():
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="integration of 'pendulum' failed in step 0"):
+        simulate("pendulum", [1.0, 1e200], ZEROS)

@@ -1,0 +1,268 @@
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+
+from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.robots import get_system
+
+MAPS = [InertiaForce, InertiaForceGravity]
+COLUMNS = {
+    "pendulum": ["q", "dq/dt", "u_q"],
+    "cartpole": ["x", "theta", "dx/dt", "dtheta/dt", "u_x"],
+    "acrobot": ["q1", "q2", "dq1/dt", "dq2/dt", "u_q2"],
+}
+SINES = {"pendulum": ["sin(q)"], "cartpole": ["sin(theta)"], "acrobot": ["sin(q1)", "sin(q1 + q2)"]}
+DT, GAMMA, G1, G2 = 0.1, 0.2, 0.3, 0.4  # DT * 2, DT * 3 and DT * 4: the guesses below
+
+# The paper's eq. inertia_prior and gravity_prior, and section III-B.
+IF_MEANS = {
+    "pendulum": [[1, DT, 0], [0, 1, GAMMA]],
+    "cartpole": [[1, 0, DT, 0, 0], [0, 1, 0, DT, 0], [0, 0, 1, 0, GAMMA], [0, 0, 0, 1, 0]],
+    "acrobot": [[1, 0, DT, 0, 0], [0, 1, 0, DT, 0], [0, 0, 1, 0, 0], [0, 0, 0, 1, GAMMA]],
+}
+IFG_MEANS = {
+    "pendulum": [[1, DT, 0, 0], [0, 1, GAMMA, -G1]],
+    "cartpole": [[1, 0, DT, 0, 0, 0], [0, 1, 0, DT, 0, 0], [0, 0, 1, 0, GAMMA, 0], [0, 0, 0, 1, 0, -G1]],
+    "acrobot": [
+        [1, 0, DT, 0, 0, 0, 0],
+        [0, 1, 0, DT, 0, 0, 0],
+        [0, 0, 1, 0, 0, -G1, -G2],
+        [0, 0, 0, 1, GAMMA, 0, -G2],
+    ],
+}
+GAIN = {"pendulum": 3.0, "cartpole": [3.0], "acrobot": [3.0, 4.0]}
+# Entries that physics knows (k), names without a value (u), and leaves at zero (.).
+IFG_ROLES = {
+    "pendulum": ["kk..", ".kuu"],
+    "cartpole": ["k.k...", ".k.k..", "..k.u.", "...k.u"],
+    "acrobot": ["k.k....", ".k.k...", "..k..uu", "...ku.u"],
+}
+
+
+def rows(name, n_rows=5):
+    return np.random.default_rng(0).normal(size=(n_rows, len(COLUMNS[name])))
+
+
+def scales(roles, known, unknown, free):
+    return [[{"k": known, "u": unknown, ".": free}[role] for role in row] for row in roles]
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_inertia_force_is_the_row_itself(name):
+    X = rows(name)
+    assert_array_equal(InertiaForce(name).fit_transform(X), X)
+
+
+@pytest.mark.parametrize(
+    ("name", "angles"),
+    [
+        ("pendulum", lambda q: q[:, [0]]),
+        ("cartpole", lambda q: q[:, [1]]),
+        ("acrobot", lambda q: np.column_stack([q[:, 0], q[:, 0] + q[:, 1]])),
+    ],
+)
+def test_gravity_adds_the_sine_of_each_angle_against_the_vertical(name, angles):
+    X = rows(name)
+    assert_allclose(InertiaForceGravity(name).fit_transform(X), np.hstack([X, np.sin(angles(X))]), rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_the_prior_mean_of_inertia_force_is_that_of_the_paper(name):
+    features = InertiaForce(name, dt=DT, inverse_inertia=2.0)
+    mean, _ = features.coef_prior(len(IF_MEANS[name]))
+    assert_allclose(mean, IF_MEANS[name], rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_the_prior_mean_with_gravity_is_that_of_the_paper(name):
+    features = InertiaForceGravity(name, dt=DT, inverse_inertia=[2.0], gravity_gain=GAIN[name])
+    mean, _ = features.coef_prior(len(IFG_MEANS[name]))
+    assert_allclose(mean, IFG_MEANS[name], rtol=1e-15)
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_without_guesses_only_eulers_rule_is_known(name):
+    mean, _ = InertiaForceGravity(name).coef_prior(len(IFG_ROLES[name]))
+    euler = scales(IFG_ROLES[name], known=1.0, unknown=0.0, free=0.0)
+    assert_array_equal(mean != 0, np.array(euler) != 0)
+    assert set(mean[mean != 0]) == {1.0, 0.03}
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_known_unknown_and_free_entries_have_their_own_scales(name):
+    features = InertiaForceGravity(name, known_scale=0.01, unknown_scale=5.0, free_scale=0.5)
+    _, scale = features.coef_prior(len(IFG_ROLES[name]))
+    assert_array_equal(scale, scales(IFG_ROLES[name], 0.01, 5.0, 0.5))
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_inertia_force_has_the_scales_of_its_columns(name):
+    n_outputs = len(IFG_ROLES[name])
+    _, without = InertiaForce(name).coef_prior(n_outputs)
+    _, with_gravity = InertiaForceGravity(name).coef_prior(n_outputs)
+    assert_array_equal(without, with_gravity[:, : len(COLUMNS[name])])
+
+
+def test_known_entries_are_narrower_than_unknown_ones():
+    _, scale = InertiaForce("pendulum").coef_prior(2)
+    assert scale[0, 0] < scale[1, 2]
+
+
+def test_a_free_scale_of_zero_pins_the_zeros():
+    mean, scale = InertiaForceGravity("acrobot", free_scale=0.0, gravity_gain=1.0, inverse_inertia=1.0).coef_prior(4)
+    assert_array_equal(scale == 0, mean == 0)
+
+
+def test_one_guess_serves_all_sines():
+    one, each = (InertiaForceGravity("acrobot", gravity_gain=gain).coef_prior(4)[0] for gain in (9.0, [9.0, 9.0]))
+    assert_array_equal(one, each)
+
+
+@pytest.mark.parametrize("outputs", [["dq2/dt", "q1"], [3, 0], ("dq2/dt", 0), np.array([3, 0])])
+def test_outputs_choose_states_by_name_or_index(outputs):
+    guesses = {"inverse_inertia": 2.0, "gravity_gain": 3.0}
+    mean, scale = InertiaForceGravity("acrobot", outputs=outputs, **guesses).coef_prior(2)
+    all_means, all_scales = InertiaForceGravity("acrobot", **guesses).coef_prior(4)
+    assert_array_equal(mean, all_means[[3, 0]])
+    assert_array_equal(scale, all_scales[[3, 0]])
+
+
+@pytest.mark.parametrize("outputs", [["q3"], [4], [-1], [True], [0.0], [None], ["q1", 7]])
+def test_outputs_that_are_no_states_list_the_states(outputs):
+    with pytest.raises(ValueError, match=r"must be indices or names of the states \['q1', 'q2', 'dq1/dt', 'dq2/dt'\]"):
+        InertiaForce("acrobot", outputs=outputs).coef_prior(len(outputs))
+
+
+@pytest.mark.parametrize(
+    ("outputs", "n_outputs", "message"),
+    [
+        (None, 1, r"y has 1 columns.* predicts 2 states: \['q', 'dq/dt'\].*outputs="),
+        (None, 3, "y has 3 columns.* predicts 2 states"),
+        (["q"], 2, r"y has 2 columns.* predicts 1 states: \['q'\]"),
+    ],
+)
+def test_a_target_of_another_width_is_an_error(outputs, n_outputs, message):
+    with pytest.raises(ValueError, match=message):
+        InertiaForce("pendulum", outputs=outputs).coef_prior(n_outputs)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        ({"dt": 0.0}, "dt must be finite and above 0.0; got 0.0"),
+        ({"dt": np.nan}, "dt must be finite and above 0.0; got nan"),
+        ({"known_scale": -1.0}, "known_scale must be .* at least 0.0; got -1.0"),
+        ({"unknown_scale": np.inf}, "unknown_scale must be finite"),
+        ({"free_scale": -0.1}, "free_scale must be .* at least 0.0; got -0.1"),
+        ({"inverse_inertia": [1.0, 2.0]}, "inverse_inertia must be a finite number or 1 of them"),
+        ({"inverse_inertia": np.nan}, "inverse_inertia must be a finite number"),
+        ({"gravity_gain": [1.0, 2.0, 3.0]}, "gravity_gain must be a finite number or 2 of them"),
+    ],
+)
+def test_a_bad_parameter_is_named(parameters, message):
+    with pytest.raises(ValueError, match=message):
+        InertiaForceGravity("acrobot", **parameters).coef_prior(4)
+
+
+@pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
+def test_a_parameter_that_is_no_number_is_named(parameter):
+    with pytest.raises(TypeError, match=f"{parameter} must be a number; got 'much'"):
+        InertiaForce("pendulum", **{parameter: "much"}).coef_prior(2)
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_a_wrong_number_of_columns_is_an_error(feature_map):
+    message = rf"X has 4 columns, but {feature_map.__name__}\('pendulum'\) needs 3: \['q', 'dq/dt', 'u_q'\]"
+    with pytest.raises(ValueError, match=message):
+        feature_map("pendulum").fit(np.zeros((2, 4)))
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_an_unknown_robot_lists_the_known_ones(feature_map):
+    with pytest.raises(ValueError, match=r"Unknown system 'carpole'.*\['acrobot', 'cartpole', 'pendulum'\].*'cartpole'\?"):
+        feature_map("carpole").fit(np.zeros((2, 5)))
+
+
+def test_a_system_works_in_place_of_its_name():
+    X = rows("acrobot")
+    by_system = InertiaForceGravity(get_system("acrobot")).fit(X)
+    assert_array_equal(by_system.transform(X), InertiaForceGravity("acrobot").fit_transform(X))
+    assert_array_equal(by_system.coef_prior(4)[0], InertiaForceGravity("acrobot").coef_prior(4)[0])
+
+
+def test_without_a_robot_inertia_force_is_the_identity():
+    X = np.random.default_rng(0).normal(size=(4, 7))
+    assert_array_equal(InertiaForce().fit_transform(X), X)
+
+
+def test_without_a_robot_gravity_adds_the_sine_of_each_column():
+    X = np.random.default_rng(0).normal(size=(4, 2))
+    assert_array_equal(InertiaForceGravity().fit_transform(X), np.hstack([X, np.sin(X)]))
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_only_a_robot_gives_a_prior(feature_map):
+    assert not hasattr(feature_map(), "coef_prior")
+    assert hasattr(feature_map("pendulum"), "coef_prior")
+
+
+@pytest.mark.parametrize("name", COLUMNS)
+def test_features_are_named_after_the_robot(name):
+    features = InertiaForceGravity(name).fit(rows(name))
+    assert features.get_feature_names_out().tolist() == COLUMNS[name] + SINES[name]
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_features_of_a_data_frame_are_named_after_its_columns(feature_map):
+    frame = pd.DataFrame(rows("acrobot"), columns=list("abcde"))
+    sines = ["sin(a)", "sin(a + b)"] if feature_map is InertiaForceGravity else []
+    assert feature_map("acrobot").fit(frame).get_feature_names_out().tolist() == [*"abcde", *sines]
+
+
+def test_features_can_be_named_by_the_caller():
+    features = InertiaForceGravity("pendulum").fit(rows("pendulum"))
+    assert features.get_feature_names_out(["a", "b", "c"]).tolist() == ["a", "b", "c", "sin(a)"]
+
+
+def test_without_a_robot_features_are_numbered():
+    features = InertiaForceGravity().fit(np.zeros((2, 2)))
+    assert features.get_feature_names_out().tolist() == ["x0", "x1", "sin(x0)", "sin(x1)"]
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_there_is_a_name_per_feature(feature_map):
+    features = feature_map("acrobot").fit(rows("acrobot"))
+    assert features.transform(rows("acrobot")).shape[1] == len(features.get_feature_names_out())
+
+
+def test_pandas_output_keeps_the_index_and_names_the_columns():
+    frame = pd.DataFrame(rows("pendulum"), columns=["q", "dq/dt", "u_q"], index=range(10, 15))
+    transformed = InertiaForceGravity("pendulum").set_output(transform="pandas").fit_transform(frame)
+    assert list(transformed.columns) == ["q", "dq/dt", "u_q", "sin(q)"]
+    assert list(transformed.index) == list(frame.index)
+    assert_array_equal(transformed, InertiaForceGravity("pendulum").fit_transform(frame))
+
+
+def test_transform_before_fit_is_an_error():
+    with pytest.raises(NotFittedError):
+        InertiaForce("pendulum").transform(rows("pendulum"))
+
+
+@pytest.mark.parametrize("feature_map", MAPS)
+def test_a_clone_has_the_same_parameters(feature_map):
+    features = feature_map("acrobot", dt=0.1, inverse_inertia=[2.0], outputs=["q1"], free_scale=0.0)
+    copy = clone(features.fit(rows("acrobot")))
+    assert copy.get_params() == features.get_params()
+    assert not hasattr(copy, "n_features_in_")
+
+
+@pytest.mark.parametrize("robot", ["acrobot", get_system("acrobot"), None])
+def test_a_pickled_map_works_the_same(robot):
+    X = rows("acrobot")
+    features = InertiaForceGravity(robot).fit(X)
+    assert_array_equal(pickle.loads(pickle.dumps(features)).transform(X), features.transform(X))

@@ -1,0 +1,161 @@
+from math import log, pi, sqrt
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from scipy.stats import norm
+
+from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error, std_norm
+
+RNG = np.random.default_rng(0)
+Y, MEAN = RNG.normal(size=(2, 30, 3))
+STD = RNG.uniform(0.1, 2.0, size=(30, 3))
+OF_PREDICTIONS = [prediction_error, containing_ratios, negative_log_predictive_density]
+
+
+def arguments(metric, y=Y, mean=MEAN, std=STD):
+    return (y, mean) if metric is prediction_error else (y, mean, std)
+
+
+def test_error_by_hand():
+    assert prediction_error([[0.0, 0.0], [1.0, 2.0]], [[3.0, 4.0], [1.0, 3.0]]) == 3.0
+
+
+def test_error_of_one_output_is_the_mean_absolute_error():
+    assert prediction_error([1.0, 2.0, 3.0], [0.0, 4.0, 3.0]) == 1.0
+
+
+def test_error_row_by_row():
+    expected = sum(sqrt(sum((a - b) ** 2 for a, b in zip(*pair, strict=True))) for pair in zip(Y, MEAN, strict=True)) / 30
+    assert prediction_error(Y, MEAN) == pytest.approx(expected, rel=1e-14)
+
+
+def test_std_norm_by_hand():
+    assert std_norm([[3.0, 4.0], [5.0, 12.0]]) == 9.0
+
+
+def test_std_norm_of_one_output_is_the_mean():
+    assert std_norm([1.0, 2.0, 6.0]) == 3.0
+
+
+def test_std_norm_row_by_row():
+    assert std_norm(STD) == pytest.approx(sum(sqrt(sum(s**2 for s in row)) for row in STD) / 30, rel=1e-14)
+
+
+def test_ratios_by_hand():
+    ratios = containing_ratios([[1.0, -3.0], [0.0, 9.0]], np.zeros((2, 2)), [[1.0, 2.0], [1.0, 1.0]])
+    assert_array_equal(ratios, [0.5, 0.75, 0.75])
+
+
+def test_the_edge_of_the_interval_is_inside():
+    assert_array_equal(containing_ratios([2.0], [0.0], [1.0], k=[1.9, 2.0]), [0.0, 1.0])
+
+
+def test_ratios_pair_by_pair():
+    pairs = list(zip(Y.ravel(), MEAN.ravel(), STD.ravel(), strict=True))
+    expected = [sum(abs(y - mean) <= k * std for y, mean, std in pairs) / 90 for k in (0.5, 1, 2)]
+    assert_allclose(containing_ratios(Y, MEAN, STD, k=(0.5, 1, 2)), expected, rtol=1e-15)
+
+
+def test_ratios_of_exact_predictions_without_uncertainty():
+    assert_array_equal(containing_ratios([1.0, 2.0], [1.0, 2.5], [0.0, 0.0]), [0.5, 0.5, 0.5])
+
+
+def test_density_by_hand():
+    expected = 0.5 * log(2 * pi) + log(2.0) + 0.5 * 1.5**2
+    assert negative_log_predictive_density([3.0], [0.0], [2.0]) == pytest.approx(expected, rel=1e-15)
+
+
+def test_density_sums_outputs_and_averages_rows():
+    expected = -norm.logpdf(Y, MEAN, STD).sum() / 30
+    assert negative_log_predictive_density(Y, MEAN, STD) == pytest.approx(expected, rel=1e-13)
+
+
+def test_the_true_standard_deviation_has_the_best_density():
+    y = 2.0 * RNG.standard_normal(10_000)
+    scores = [negative_log_predictive_density(y, np.zeros_like(y), np.full_like(y, std)) for std in (1.0, 2.0, 4.0)]
+    assert np.argmin(scores) == 1
+
+
+def test_gaussian_errors_fall_into_the_intervals_of_the_normal_distribution():
+    std = RNG.uniform(0.5, 5.0, size=(20_000, 2))
+    mean = RNG.normal(size=std.shape)
+    ratios = containing_ratios(mean + std * RNG.standard_normal(std.shape), mean, std)
+    assert_allclose(ratios, [0.6827, 0.9545, 0.9973], rtol=0, atol=0.01)
+
+
+def test_the_density_of_gaussian_errors_is_their_entropy():
+    y = 3.0 * RNG.standard_normal(50_000)
+    score = negative_log_predictive_density(y, np.zeros_like(y), np.full_like(y, 3.0))
+    assert score == pytest.approx(0.5 * log(2 * pi) + log(3.0) + 0.5, abs=0.02)
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_one_column_equals_one_dimension(metric):
+    row, column = (arguments(metric, *(part[index] for part in (Y, MEAN, STD))) for index in (np.s_[:, 0], np.s_[:, :1]))
+    assert_array_equal(metric(*row), metric(*column))
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_lists_work(metric):
+    assert_array_equal(metric(*(part.tolist() for part in arguments(metric))), metric(*arguments(metric)))
+
+
+@pytest.mark.parametrize("metric", [prediction_error, negative_log_predictive_density])
+def test_scores_are_plain_floats(metric):
+    assert type(metric(*arguments(metric))) is float
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_another_number_of_rows_is_an_error(metric):
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        metric(*arguments(metric, mean=MEAN[:-1]))
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+@pytest.mark.parametrize("mean", [MEAN[:, :1], MEAN[:, 0]])
+def test_another_number_of_outputs_is_an_error(metric, mean):
+    with pytest.raises(ValueError, match="same number of outputs; got .*'y_true': 3, 'y_pred': 1"):
+        metric(*arguments(metric, mean=mean))
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+@pytest.mark.parametrize(("name", "argument"), [("y_true", "y"), ("y_pred", "mean")])
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_value_that_is_not_finite_is_named(metric, name, argument, value):
+    with pytest.raises(ValueError, match=rf"Input {name} contains"):
+        metric(*arguments(metric, **{argument: np.where(Y == Y[3, 1], value, Y)}))
+
+
+@pytest.mark.parametrize("metric", [containing_ratios, negative_log_predictive_density])
+def test_a_standard_deviation_that_is_not_finite_is_named(metric):
+    with pytest.raises(ValueError, match="Input std contains NaN"):
+        metric(Y, MEAN, np.full_like(STD, np.nan))
+
+
+@pytest.mark.parametrize("metric", [containing_ratios, negative_log_predictive_density])
+def test_a_negative_standard_deviation_is_an_error(metric):
+    with pytest.raises(ValueError, match=r"std must .*smallest value is -0\.5"):
+        metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])
+
+
+def test_std_norm_of_negative_values_is_an_error():
+    with pytest.raises(ValueError, match=r"std must not be negative; its smallest value is -0\.5"):
+        std_norm([1.0, -0.5])
+
+
+def test_the_density_needs_a_positive_standard_deviation():
+    with pytest.raises(ValueError, match=r"std must be above 0; its smallest value is 0\.0"):
+        negative_log_predictive_density([0.0], [0.0], [0.0])
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_no_rows_are_an_error(metric):
+    with pytest.raises(ValueError, match="minimum of 1 is required"):
+        metric(*arguments(metric, y=[], mean=[], std=[]))
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_three_dimensions_are_an_error(metric):
+    with pytest.raises(ValueError, match="dim"):
+        metric(*arguments(metric, y=Y[np.newaxis]))

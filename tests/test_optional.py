@@ -1,0 +1,122 @@
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import skevgp
+from skevgp._optional import require
+from skevgp.datasets import make_dynamics, simulate
+from skevgp.features import InertiaForceGravity
+
+ROOT = Path(skevgp.__file__).parents[1]
+OPTIONAL = {"pinocchio", "example_robot_data", "matplotlib", "dask", "distributed", "casadi", "skops"}
+
+
+def packages_loaded_by(code):
+    """Names of the packages that a fresh interpreter has loaded after some code."""
+    code += "\nimport json, sys\nprint(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
+    done = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True, cwd=ROOT)
+    return set(json.loads(done.stdout))
+
+
+def test_require_imports_what_is_there():
+    assert require("matplotlib.colors", "Plotting") is sys.modules["matplotlib.colors"]
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("pinocchio", r"Simulating needs the optional package 'pin'.*pip install pin .*pip install '\.\[physics\]'"),
+        ("matplotlib", r"Simulating needs .* 'matplotlib'.*pip install matplotlib .*pip install '\.\[plot\]'"),
+    ],
+)
+def test_a_missing_package_gets_the_pip_command(monkeypatch, name, message):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(ImportError, match=message):
+        require(name, "Simulating")
+
+
+def test_a_missing_module_of_a_package_gets_the_pip_command(monkeypatch):
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ImportError, match="pip install matplotlib"):
+        require("matplotlib.pyplot", "Plotting")
+
+
+def test_the_reason_is_kept(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(ImportError, match="import of pinocchio halted") as caught:
+        require("pinocchio", "Simulating")
+    assert isinstance(caught.value.__cause__, ImportError)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        lambda: make_dynamics("pendulum", 1, 1),
+        lambda: simulate("pendulum", [0.0, 0.0], [[0.0]]),
+    ],
+)
+def test_simulating_without_pinocchio_gives_the_pip_command(monkeypatch, use):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(ImportError, match=r"needs the optional package 'pin'.*pip install pin "):
+        use()
+
+
+def test_an_unknown_system_is_told_before_the_missing_package(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    with pytest.raises(ValueError, match="Unknown system"):
+        make_dynamics("robot")
+
+
+@pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot"])
+def test_features_of_the_named_systems_need_no_pinocchio(monkeypatch, robot):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    features = InertiaForceGravity(robot).fit(np.zeros((1, 3 if robot == "pendulum" else 5)))
+    assert features.coef_prior(2 if robot == "pendulum" else 4)[0].any()
+
+
+def test_importing_the_package_loads_no_other():
+    bare = packages_loaded_by("")
+    loaded = packages_loaded_by("import skevgp") - bare
+    assert "skevgp" in loaded
+    assert not loaded & (OPTIONAL | {"sklearn", "scipy", "numpy", "autograd"})
+
+
+@pytest.mark.parametrize(
+    "code",
+    [
+        "from skevgp import EVGPRegressor",
+        "from skevgp import datasets, features, metrics, plotting",
+        "from skevgp.features import InertiaForceGravity\n"
+        "InertiaForceGravity('acrobot').fit_transform([[0.0] * 5])\n"
+        "InertiaForceGravity('acrobot').coef_prior(4)",
+        "from skevgp.datasets import make_toy\nmake_toy()",
+    ],
+)
+def test_optional_packages_are_loaded_only_where_they_are_used(code):
+    loaded = packages_loaded_by(code)
+    assert "sklearn" in loaded
+    assert not loaded & OPTIONAL
+
+
+def test_public_names_are_listed():
+    assert dir(skevgp) == sorted(skevgp.__all__)
+    assert {"EVGPRegressor", "datasets", "features", "metrics", "plotting", "__version__"} <= set(dir(skevgp))
+
+
+@pytest.mark.parametrize("name", skevgp.__all__)
+def test_public_names_can_be_imported(name):
+    assert getattr(skevgp, name) is not None
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'skevgp' has no attribute 'EVGPClassifier'"):
+        skevgp.EVGPClassifier  # noqa: B018
+
+
+def test_an_unknown_name_cannot_be_imported():
+    with pytest.raises(ImportError, match="cannot import name 'EVGPClassifier'"):
+        from skevgp import EVGPClassifier  # noqa: F401

@@ -1,0 +1,420 @@
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_toy
+
+
+def smooth(n=150, outputs=2, noise=0.05, seed=0):
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-2, 2, (n, 2))
+    Y = np.column_stack([np.sin(2 * X[:, 0]) + X[:, 1], 3 * np.cos(X[:, 1]) * X[:, 0]])[:, :outputs]
+    return X, Y + noise * rng.randn(*Y.shape)
+
+
+X, Y = smooth()
+X_NEW, Y_NEW = smooth(80, seed=1)
+
+
+def model(**arguments):
+    return EVGPRegressor(**{"n_inducing": 20, "random_state": 0} | arguments)
+
+
+# --- shapes ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("y", "shape"), [(Y[:, 0], (80,)), (Y[:, :1], (80,)), (Y, (80, 2))], ids=["one output", "one column", "two outputs"]
+)
+def test_shapes_follow_scikit_learns_gaussian_process(y, shape):
+    m = model(tol=1e9).fit(X, y)
+    mean, std = m.predict(X_NEW, return_std=True)
+    mean_again, cov = m.predict(X_NEW, return_cov=True)
+    assert mean.shape == std.shape == mean_again.shape == shape
+    assert cov.shape == (80, *shape)
+    assert m.sample_y(X_NEW, 3).shape == (*shape, 3)
+    np.testing.assert_array_equal(m.predict(X_NEW), mean)
+    np.testing.assert_allclose(mean_again, mean, atol=1e-10)
+    np.testing.assert_allclose(np.einsum("ii...->i...", cov), std**2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("y", "outputs"), [(Y[:, 0], ()), (Y[:, :1], (1,)), (Y, (2,))])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_shapes_of_attributes(y, outputs, sharing):
+    m = model(feature_map=PolynomialFeatures(1), sharing=sharing, tol=1e9).fit(X, y)
+    assert m.coef_.shape == m.coef_std_.shape == (*outputs, 3)
+    assert m.coef_prior_mean_.shape == m.coef_prior_scale_.shape == (*outputs, 3)
+    assert m.coef_cov_.shape == (*outputs, 3, 3)
+    assert np.shape(m.noise_variance_) == outputs
+    assert isinstance(m.noise_variance_, float) == (outputs == ())
+    n_sets = () if sharing == "all" else (max(1, *outputs, 1),)
+    assert m.inducing_points_.shape == (*n_sets, 20, 2)
+    assert isinstance(m.kernel_, list) == (outputs != ())
+    assert m.loss_curve_.shape == (m.n_iter_,)
+
+
+def test_without_features_coef_has_no_width():
+    m = model(max_iter=0).fit(X, Y)
+    assert m.coef_.shape == (2, 0)
+    assert m.feature_map_ is None
+    assert m.loss_curve_.shape == (0,)
+
+
+def test_std_and_covariance_together_are_refused():
+    with pytest.raises(ValueError, match="At most one"):
+        model(max_iter=0).fit(X, Y).predict(X, return_std=True, return_cov=True)
+
+
+def test_noise_is_included_unless_told_otherwise():
+    m = model(tol=1e9).fit(X, Y)
+    _, with_noise = m.predict(X_NEW, return_std=True)
+    _, without = m.predict(X_NEW, return_std=True, include_noise=False)
+    np.testing.assert_allclose(with_noise**2 - without**2, np.broadcast_to(m.noise_variance_, (80, 2)), rtol=1e-6)
+
+
+def test_samples_have_the_predicted_moments():
+    m = model(tol=1.0).fit(X, Y)
+    samples = m.sample_y(X_NEW[:4], 20_000, random_state=0)
+    mean, cov = m.predict(X_NEW[:4], return_cov=True)
+    std = m.predict(X_NEW[:4], return_std=True)[1]
+    assert (np.abs(samples.mean(axis=2) - mean) < 5 * std / np.sqrt(20_000)).all()
+    np.testing.assert_allclose(np.cov(samples[:, 0]), cov[:, :, 0], atol=0.1 * cov[:, :, 0].max())
+    np.testing.assert_array_equal(samples, m.sample_y(X_NEW[:4], 20_000, random_state=0))
+
+
+def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):
+    m = model(feature_map=PolynomialFeatures(1), tol=1e9).fit(X, Y)
+    whole = m.predict(X_NEW, return_std=True)
+    monkeypatch.setattr("skevgp.regressor._PREDICT_ROWS", 7)
+    for part, expected in zip(m.predict(X_NEW, return_std=True), whole, strict=True):
+        np.testing.assert_allclose(part, expected, rtol=1e-9)
+
+
+# --- learning ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_it_learns(sharing, posterior):
+    m = model(sharing=sharing, posterior=posterior).fit(X, Y)
+    assert m.score(X_NEW, Y_NEW) > 0.99
+    np.testing.assert_allclose(np.sqrt(m.noise_variance_), 0.05, rtol=0.5)
+
+
+def test_the_bound_rises_and_ends_at_minus_the_loss():
+    m = model().fit(X, Y)
+    assert (np.diff(m.loss_curve_) <= 0).all()
+    assert m.lower_bound_ == pytest.approx(-m.loss_curve_[-1], rel=1e-9)
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
+    """Same kernel: Adam has to find q, whose optimum L-BFGS has in closed form; then all of it."""
+    fixed = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], "fixed") + WhiteKernel(0.01, "fixed")
+    x, y = X[:60], Y[:60, 0]
+    arguments = {"n_inducing": 6, "posterior": posterior, "feature_map": PolynomialFeatures(1)}
+    lbfgs = model(kernel=fixed, tol=1e-8, **arguments).fit(x, y)
+    adam = model(kernel=fixed, solver="adam", batch_size=60, max_iter=2000, **arguments).fit(x, y)
+    assert adam.lower_bound_ == pytest.approx(lbfgs.lower_bound_, rel=1e-4)
+    np.testing.assert_allclose(adam.predict(X_NEW), lbfgs.predict(X_NEW), atol=0.01)
+    np.testing.assert_allclose(
+        adam.predict(X_NEW, return_std=True)[1], lbfgs.predict(X_NEW, return_std=True)[1], rtol=0.02
+    )
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_adam_learns_in_mini_batches(sharing, posterior):
+    m = model(solver="adam", sharing=sharing, posterior=posterior, batch_size=50, max_iter=600).fit(X, Y)
+    assert m.score(X_NEW, Y_NEW) > 0.98
+    assert m.n_iter_ == len(m.loss_curve_) == 600
+
+
+def test_outputs_that_share_nothing_are_independent_models():
+    together = model(sharing="none", tol=1.0).fit(X, Y)
+    for o in range(2):
+        alone = model(sharing="none", tol=1.0).fit(X, Y[:, o])
+        np.testing.assert_allclose(together.predict(X_NEW)[:, o], alone.predict(X_NEW), atol=1e-8)
+
+
+def test_no_lower_bound_is_above_a_wider_familys():
+    bounds = {family: model(posterior=family, tol=1e-3).fit(X, Y).lower_bound_ for family in ("full", "diagonal")}
+    assert bounds["diagonal"] < bounds["full"]
+
+
+@pytest.mark.parametrize(
+    ("n_columns", "n_features", "m", "outputs", "expected"),
+    [
+        (3, 0, 40, 2, 407),
+        (3, 3, 10, 2, 119),
+        (3, 4, 10, 2, 123),
+        (5, 0, 100, 4, 2813),
+        (5, 5, 60, 4, 1733),
+        (5, 6, 60, 4, 1741),
+        (5, 0, 250, 4, 7013),
+        (5, 5, 150, 4, 4253),
+        (5, 7, 150, 4, 4269),
+    ],
+)
+def test_parameter_counts_are_the_papers(n_columns, n_features, m, outputs, expected):
+    rng = np.random.RandomState(0)
+    x = rng.randn(300, n_columns)
+    features = FunctionTransformer(lambda x: np.hstack([x, x, x])[:, :n_features]) if n_features else None
+    fitted = model(feature_map=features, n_inducing=m, posterior="diagonal", sharing="kernel", max_iter=0)
+    assert fitted.fit(x, rng.randn(300, outputs)).n_parameters_ == expected
+
+
+def test_parameter_counts_of_the_other_settings():
+    count = {s: model(sharing=s, max_iter=0).fit(X, Y).n_parameters_ for s in ("all", "kernel", "none")}
+    q = 20 + 20 * 21 // 2
+    assert count == {
+        "all": 40 + 2 + 2 * (q + 2),
+        "kernel": 80 + 2 + 2 * (q + 2),
+        "none": 80 + 4 + 2 * (q + 2),
+    }
+
+
+def test_normalize_y_is_centring_by_hand():
+    centred = model(tol=1.0).fit(X, Y - Y.mean(axis=0))
+    normalised = model(tol=1.0, normalize_y=True).fit(X, Y)
+    np.testing.assert_allclose(normalised.predict(X_NEW), centred.predict(X_NEW) + Y.mean(axis=0), atol=1e-8)
+
+
+def test_without_features_the_prior_mean_is_zero():
+    far = np.full((1, 2), 1e3)
+    assert model(tol=1.0).fit(X, Y + 10).predict(far) == pytest.approx(np.zeros((1, 2)))
+    assert model(tol=1.0, normalize_y=True).fit(X, Y + 10).predict(far) == pytest.approx(10 + Y.mean(axis=0)[np.newaxis])
+
+
+def test_units_do_not_matter():
+    """A column or a target in other units gives the same model in those units."""
+    unit_x, unit_y = np.array([1e6, 1e-6]), np.array([1e-9, 1e9])
+    plain = model(max_iter=30, tol=1e-9)
+    scaled = clone(plain)
+    with pytest.warns(ConvergenceWarning):
+        plain.fit(X, Y)
+    with pytest.warns(ConvergenceWarning):
+        scaled.fit(X * unit_x, Y * unit_y)
+    np.testing.assert_allclose(scaled.predict(X_NEW * unit_x) / unit_y, plain.predict(X_NEW), rtol=1e-3, atol=1e-3)
+    np.testing.assert_allclose(scaled.noise_variance_ / unit_y**2, plain.noise_variance_, rtol=1e-2)
+    assert scaled.lower_bound_ == pytest.approx(plain.lower_bound_ - 150 * np.log(unit_y).sum(), rel=1e-3)
+
+
+def test_the_noise_starts_where_the_user_says():
+    m = model(noise_variance=0.3, max_iter=0).fit(X, Y)
+    np.testing.assert_allclose(m.noise_variance_, 0.3)
+
+
+# --- explicit features -------------------------------------------------------------------------------------------
+
+
+def test_a_linear_trend_is_found_and_extrapolated():
+    x = np.linspace(0, 20, 300)[:, np.newaxis]
+    y = 5.0 + 3.0 * x[:, 0] + np.sin(3 * x[:, 0]) + 0.1 * np.random.RandomState(0).randn(300)
+    m = model(feature_map=PolynomialFeatures(1), n_inducing=50).fit(x, y)
+    np.testing.assert_allclose(m.coef_, [5.0, 3.0], atol=1.0)
+    mean, std = m.predict([[40.0]], return_std=True)
+    assert mean == pytest.approx(125.0, abs=5.0)
+    assert abs(mean - 125.0) < 3 * std
+
+
+def test_a_scale_of_zero_keeps_a_weight_at_its_mean():
+    m = model(feature_map=PolynomialFeatures(1), coef_mean=[1.0, 2.0, 3.0], coef_scale=[1.0, 0.0, 1.0], tol=1.0)
+    m.fit(X, Y[:, 0])
+    assert m.coef_[1] == 2.0
+    assert m.coef_std_[1] == 0.0
+    assert m.coef_[0] != 1.0
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_a_fixed_weight_works_with_all_solvers(solver, posterior):
+    m = model(feature_map=PolynomialFeatures(1), coef_scale=0.0, coef_mean=1.0, solver=solver, posterior=posterior)
+    m.set_params(max_iter=20, tol=1e9).fit(X, Y[:, 0])
+    np.testing.assert_array_equal(m.coef_, 1.0)
+    assert np.isfinite(m.lower_bound_)
+
+
+def test_the_default_prior_of_a_map_without_one_is_wide():
+    m = model(feature_map=PolynomialFeatures(1), max_iter=0).fit(X, Y)
+    np.testing.assert_array_equal(m.coef_prior_mean_, 0.0)
+    rms = np.sqrt(np.mean(PolynomialFeatures(1).fit_transform(X) ** 2, axis=0))
+    np.testing.assert_allclose(m.coef_prior_scale_, 10 * Y.std(axis=0)[:, np.newaxis] / rms)
+
+
+def test_maps_see_the_data_as_given():
+    """A data frame stays one, in fit and in predict; the kernel's inputs and the features each have their own map."""
+
+    class Recorder(TransformerMixin, BaseEstimator):
+        seen = []  # noqa: RUF012
+
+        def fit(self, X, y=None):
+            self.n_fits_ = getattr(self, "n_fits_", 0) + 1
+            return self
+
+        def transform(self, X):
+            Recorder.seen.append(type(X))
+            return X[["b"]]
+
+    frame = pd.DataFrame(X, columns=["a", "b"])
+    m = model(feature_map=Recorder(), kernel_map=StandardScaler(), max_iter=0).fit(frame, Y)
+    m.predict(frame, return_std=True)
+    assert set(Recorder.seen) == {pd.DataFrame}
+    assert m.feature_map_.n_fits_ == 1
+    assert m.coef_.shape == (2, 1)
+
+
+def test_scaling_in_kernel_map_leaves_the_features_alone():
+    units = np.array([1.0, 1e4])
+    m = model(feature_map=FunctionTransformer(np.sin), kernel_map=StandardScaler(), tol=1.0).fit(X * units, Y)
+    np.testing.assert_allclose(m.inducing_points_.std(axis=0), 1.0, atol=0.5)
+    assert m.feature_map_.transform(np.array([[1.0, 2.0]]))[0, 0] == np.sin(1.0)
+
+
+# --- going on ----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_partial_fit_is_fit_with_the_same_kernel_and_points(sharing, posterior):
+    m = model(feature_map=PolynomialFeatures(1), sharing=sharing, posterior=posterior, tol=1.0).fit(X, Y)
+    bound, points = m.lower_bound_, m.inducing_points_.copy()
+    m.partial_fit(X_NEW, Y_NEW)
+    np.testing.assert_array_equal(m.inducing_points_, points)
+    # Two halves in another order, from a model of few rows that is then given the same parameters.
+    other = model(feature_map=PolynomialFeatures(1), sharing=sharing, posterior=posterior, tol=1.0).fit(X, Y)
+    for part in (slice(40, 80), slice(0, 40)):
+        other.partial_fit(X_NEW[part], Y_NEW[part])
+    np.testing.assert_allclose(other.predict(X_NEW), m.predict(X_NEW), atol=1e-8)
+    np.testing.assert_allclose(other.predict(X_NEW, return_std=True)[1], m.predict(X_NEW, return_std=True)[1], rtol=1e-7)
+    assert other.lower_bound_ == pytest.approx(m.lower_bound_, rel=1e-9)
+    assert m.lower_bound_ > bound
+
+
+def test_partial_fit_equals_a_fit_of_all_rows():
+    kernel = ConstantKernel(2.0, "fixed") * RBF([0.8, 1.2], "fixed") + WhiteKernel(0.01, "fixed")
+    first = X[:20]
+    arguments = {"kernel": kernel, "n_inducing": 20, "max_iter": 0, "coef_mean": 0.5, "coef_scale": 2.0}
+    parts = model(feature_map=PolynomialFeatures(1), **arguments).partial_fit(first, Y[:20])
+    parts.partial_fit(X[20:], Y[20:])
+    # A warm start keeps the first fit's inducing points, the first twenty rows.
+    whole = model(feature_map=PolynomialFeatures(1), **arguments, warm_start=True).fit(first, Y[:20])
+    whole.fit(X, Y)
+    np.testing.assert_allclose(whole.inducing_points_, parts.inducing_points_, atol=1e-12)
+    np.testing.assert_allclose(parts.predict(X_NEW), whole.predict(X_NEW), atol=1e-8)
+    np.testing.assert_allclose(parts.coef_cov_, whole.coef_cov_, atol=1e-8)
+    assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
+
+
+def test_the_first_partial_fit_is_a_fit():
+    np.testing.assert_array_equal(
+        model(tol=1.0).partial_fit(X, Y).predict(X_NEW), model(tol=1.0).fit(X, Y).predict(X_NEW)
+    )
+
+
+def test_partial_fit_after_adam_puts_q_at_its_optimum():
+    m = model(solver="adam", max_iter=50, batch_size=50).fit(X, Y)
+    error = np.abs(m.predict(X_NEW) - Y_NEW).mean()
+    m.partial_fit(X_NEW, Y_NEW)
+    assert np.abs(m.predict(X_NEW) - Y_NEW).mean() < error
+
+
+def test_partial_fit_refuses_other_shapes():
+    m = model(max_iter=0).fit(X, Y)
+    with pytest.raises(ValueError, match="y has 1 outputs, but the model has 2"):
+        m.partial_fit(X, Y[:, 0])
+    with pytest.raises(ValueError, match="3 features"):
+        m.partial_fit(np.hstack([X, X[:, :1]]), Y)
+
+
+@pytest.mark.parametrize("sharing", ["all", "none"])
+def test_warm_start_goes_on_where_the_last_fit_ended(sharing):
+    m = model(warm_start=True, sharing=sharing).fit(X, Y)
+    first, n_first = m.lower_bound_, m.n_iter_
+    m.fit(X, Y)
+    assert m.lower_bound_ >= first - 0.1
+    assert m.n_iter_ < n_first / 2
+
+
+def test_warm_start_with_other_shapes_starts_anew():
+    m = model(warm_start=True, max_iter=0).fit(X, Y)
+    m.set_params(n_inducing=10).fit(X, Y[:, 0])
+    assert m.predict(X_NEW).shape == (80,)
+    m.fit(X[:, :1], Y[:, 0])
+    assert m.inducing_points_.shape == (10, 1)
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+@pytest.mark.parametrize("sharing", ["all", "none"])
+def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch):
+    monkeypatch.setattr("skevgp.inference.rows._MIN_BLOCK_ROWS", 16)
+    monkeypatch.setattr("skevgp.inference.rows._BLOCK_NUMBERS", 16)
+    fits = [
+        model(sharing=sharing, solver=solver, n_jobs=n_jobs, max_iter=20, tol=1e9).fit(X, Y) for n_jobs in (None, 1, 2)
+    ]
+    for m in fits[1:]:
+        np.testing.assert_array_equal(m.predict(X_NEW), fits[0].predict(X_NEW))
+        np.testing.assert_array_equal(m.loss_curve_, fits[0].loss_curve_)
+
+
+def test_verbose_prints_iteration_bound_and_time(capsys):
+    m = model(verbose=2).fit(X, Y)
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) == m.n_iter_
+    assert lines[-1].startswith(f"iteration {m.n_iter_:6d}   bound")
+    assert float(lines[-1].split()[3]) == pytest.approx(m.lower_bound_, abs=1e-2)
+    model(verbose=1, tol=1e9).fit(X, Y)
+    assert len(capsys.readouterr().out.splitlines()) == 1
+
+
+def test_too_few_iterations_warn_and_say_what_to_change():
+    with pytest.warns(ConvergenceWarning, match=r"max_iter=3 iterations. Raise max_iter"):
+        model(max_iter=3).fit(X, Y)
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+@pytest.mark.parametrize("sharing", ["all", "none"])
+def test_ctrl_c_keeps_the_best_parameters_and_warns(monkeypatch, sharing, solver):
+    class Interrupt:
+        def __init__(self, verbose, shift):
+            pass
+
+        def __call__(self, iteration, loss):
+            if iteration == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
+    with pytest.warns(ConvergenceWarning, match="interrupted after 3 iterations"):
+        m = model(verbose=1, solver=solver, sharing=sharing).fit(X, Y)
+    assert np.isfinite(m.predict(X_NEW)).all()
+    assert m.n_iter_ == 3
+
+
+def test_fitted_models_pickle_and_clone():
+    m = model(feature_map=PolynomialFeatures(1), tol=1.0).fit(X, Y)
+    again = pickle.loads(pickle.dumps(m))
+    np.testing.assert_array_equal(again.predict(X_NEW), m.predict(X_NEW))
+    with pytest.raises(NotFittedError):
+        clone(m).predict(X_NEW)
+
+
+def test_predict_sets_nothing():
+    m = model(max_iter=0).fit(X, Y)
+    before = dict(vars(m))
+    m.predict(X_NEW, return_std=True)
+    m.sample_y(X_NEW)
+    assert vars(m).keys() == before.keys()
+    assert all(vars(m)[name] is before[name] for name in before)
+
+
+def test_the_readme_toy():
+    x, y = make_toy(random_state=0, return_X_y=True)
+    m = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(x, y)
+    assert np.sqrt(m.noise_variance_) == pytest.approx(1.7, rel=0.15)
