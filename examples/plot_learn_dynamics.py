@@ -24,6 +24,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.metrics import containing_ratios, prediction_error, std_norm
+from skevgp.plotting import CoefficientDisplay
 
 # Inducing points (the paper's Table 2) of VGP and RES-VGP, and of EVGP.
 INDUCING = {"pendulum": (40, 10), "cartpole": (100, 60), "acrobot": (250, 150)}
@@ -70,7 +71,10 @@ parser.add_argument(
 )
 options = parser.parse_args()
 if os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1":
-    options.trajectories, options.steps, options.inducing = options.trajectories or 10, options.steps or 30, (20, 10)
+    quick = {"trajectories": 10, "steps": 30, "inducing": (20, 10)}
+    options = argparse.Namespace(
+        **{name: quick.get(name) if value is None else value for name, value in vars(options).items()}
+    )
 m_vgp, m_evgp = options.inducing or INDUCING[options.system]
 
 # %%
@@ -80,12 +84,12 @@ m_vgp, m_evgp = options.inducing or INDUCING[options.system]
 try:
     import matplotlib.pyplot as plt
 
-    from skevgp.plotting import CoefficientDisplay
-
     sizes = {"n_trajectories": options.trajectories, "n_steps": options.steps}
     train = make_dynamics(options.system, **sizes, noise=options.noise, random_state=options.seed)
     test = make_dynamics(options.system, **sizes, random_state=options.seed + 1000)
-except (ImportError, ValueError) as error:
+except ImportError as error:
+    sys.exit(f"error: {error}\nThis example needs Pinocchio and matplotlib: pip install pin matplotlib")
+except ValueError as error:
     sys.exit(f"error: {error}")
 
 # %%
@@ -106,8 +110,9 @@ n_states = train.target.shape[1]
 predictions = {}
 
 print(f"{options.system}: {len(train.data)} rows for training, {len(test.data)} for testing, seed {options.seed}")
-header = f"{'Error':>9} {'median':>9} {'99 %':>9} {'‖STD‖':>9} {'CR-1':>6} {'CR-2':>6} {'CR-3':>6} {'param.':>7}"
-print(f"{'':9s} {header} {'seconds':>8}   paper: {'Error':>6} {'‖STD‖':>6} {'CR-1':>6} {'CR-2':>6} {'CR-3':>6} {'param.':>7}")
+columns = ("Error", "median", "99 %", "‖STD‖", "CR-1", "CR-2", "CR-3", "param.", "seconds")
+paper_columns = ("Error", "‖STD‖", "CR-1", "CR-2", "CR-3", "param.")
+print(" " * 9, *(f"{name:>8}" for name in columns), "  paper:", *(f"{name:>7}" for name in paper_columns))
 for name, model in models.items():
     base = (train.data[:, :n_states], test.data[:, :n_states]) if name == "RES-VGP" else (0.0, 0.0)
     start = time.perf_counter()
@@ -117,12 +122,13 @@ for name, model in models.items():
     mean = mean + base[1]
     predictions[name] = mean, std
     errors = np.linalg.norm(test.target - mean, axis=1)
-    cr = containing_ratios(test.target, mean, std)
-    error, paper = prediction_error(test.target, mean), PAPER[options.system][name]
+    accuracy = prediction_error(test.target, mean), np.median(errors), np.quantile(errors, 0.99), std_norm(std)
     print(
-        f"{name:9s} {error:9.5f} {np.median(errors):9.5f} {np.quantile(errors, 0.99):9.5f} {std_norm(std):9.5f} "
-        f"{cr[0]:6.3f} {cr[1]:6.3f} {cr[2]:6.3f} {model.n_parameters_:7d} {seconds:8.2f}   "
-        f"       {paper[0]:6.3f} {paper[1]:6.3f} {paper[2]:6.3f} {paper[3]:6.3f} {paper[4]:6.3f} {paper[5]:7d}",
+        f"{name:9s}",
+        *(f"{value:8.5f}" for value in accuracy),
+        *(f"{ratio:8.3f}" for ratio in containing_ratios(test.target, mean, std)),
+        f"{model.n_parameters_:8d} {seconds:8.2f}         ",
+        *(f"{value:7.3f}" if isinstance(value, float) else f"{value:7d}" for value in PAPER[options.system][name]),
         flush=True,
     )
 

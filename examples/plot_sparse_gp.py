@@ -55,7 +55,9 @@ print(f"{'':26s} {'points':>6s} {'seconds':>8s} {'noise std':>9s}")
 print(f"{'GaussianProcessRegressor':26s} {len(X):6d} {exact_seconds:8.2f} {'':>9s}")
 noise = np.sqrt(sparse.noise_variance_)
 print(f"{'EVGPRegressor':26s} {len(sparse.inducing_points_):6d} {sparse_seconds:8.2f} {noise:9.3f}   (true: 1.7)")
-print(f"largest difference of the means inside the data: {difference:.3f}; slope {slope:.2f} ± {slope_std:.2f} (true: 3)")
+print(
+    f"largest difference of the means inside the data: {difference:.3f}; slope {slope:.2f} ± {slope_std:.2f} (true: 3)"
+)
 
 # %%
 # The same picture inside the data; outside, one falls back to a constant, the other to the trend
@@ -64,7 +66,12 @@ print(f"largest difference of the means inside the data: {difference:.3f}; slope
 figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), sharey=True, layout="constrained")
 for ax, title, mean, std in (
     (axes[0], f"GaussianProcessRegressor: {len(X)} points, {exact_seconds:.1f} s", exact_mean, exact_std),
-    (axes[1], f"EVGPRegressor + trend: {len(sparse.inducing_points_)} inducing points, {sparse_seconds:.2f} s", sparse_mean, sparse_std),
+    (
+        axes[1],
+        f"EVGPRegressor + trend: {len(sparse.inducing_points_)} inducing points, {sparse_seconds:.2f} s",
+        sparse_mean,
+        sparse_std,
+    ),
 ):
     ax.plot(X[:, 0], y, ".", color="0.75", markersize=2, zorder=0, label="data")
     ax.plot(x_grid[:, 0], mean, color="#0072B2", label="mean")

@@ -18,7 +18,7 @@ _HOME = {"EVGPRegressor": "regressor"}
 
 
 def __getattr__(name: str) -> Any:
-    """Import public names when they are first used, so that ``import skevgp`` is quick and needs no optional package."""
+    """Import public names when they are first used: ``import skevgp`` is quick and needs no optional package."""
     if name in _SUBMODULES:
         return import_module(f".{name}", __name__)
     if name in _HOME:

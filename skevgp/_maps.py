@@ -65,8 +65,8 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
         values = np.asarray(values.toarray() if issparse(values) else values, dtype=np.float64)
         if values.ndim != 2 or len(values) != rows.shape[0]:
             raise ValueError(
-                f"{name}={fitted_map!r} must return one row per row of X; for {rows.shape[0]} rows it returned the shape "
-                f"{values.shape}."
+                f"{name}={fitted_map!r} must return one row per row of X; for {rows.shape[0]} rows it returned the "
+                f"shape {values.shape}."
             )
         if not np.isfinite(values).all():
             raise ValueError(f"{name}={fitted_map!r} returned NaN or infinity for finite rows.")

@@ -23,9 +23,10 @@ def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -
     """A finite number not below (``strict``: above) ``minimum``, or an error that names it."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number; got {value!r}.")
-    if not np.isfinite(value) or value < minimum or (strict and value == minimum):
+    number = float(value)
+    if not np.isfinite(number) or number < minimum or (strict and number == minimum):
         raise ValueError(f"{name} must be finite and {'above' if strict else 'at least'} {minimum}; got {value!r}.")
-    return float(value)
+    return number
 
 
 def check_magnitude(values: np.ndarray, name: str) -> None:

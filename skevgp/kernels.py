@@ -12,6 +12,7 @@ from scipy.spatial.distance import cdist
 from sklearn.gaussian_process import kernels as sk
 
 from .inference.parameters import Start
+from .inference.start import Starts
 
 WORKING = (
     "RBF (with one length scale or one per column), optionally times a ConstantKernel, optionally plus a WhiteKernel"
@@ -111,36 +112,30 @@ def _sklearn_bounds(start: Start, bounds: np.ndarray) -> Any:
 
 @dataclass(frozen=True)
 class KernelSpec:
-    """What a user's kernel says: k = s² k̃ (+ noise), with starts for all of it.
+    """What a user's kernel says: k = s² k̃ (+ noise).
 
     Attributes
     ----------
     covariance : SquaredExponential
         k̃.
-    hyperparameters : Start
-        Of k̃: the lengthscales.
-    signal : Start
-        s², shared by the outputs as a start.
-    noise : Start
-        σ², from a top-level WhiteKernel.
+    starts : Starts
+        Of the lengthscales, s² and, from a top-level WhiteKernel, σ².
     """
 
     covariance: SquaredExponential
-    hyperparameters: Start = Start()
-    signal: Start = Start()
-    noise: Start = Start()
+    starts: Starts
 
-    def with_noise(self, noise: Start) -> KernelSpec:
-        """The same kernel with another start of the noise."""
-        return replace(self, noise=noise)
+    def with_noise(self, noise_variance: float) -> KernelSpec:
+        """The same kernel with a start of the noise."""
+        return replace(self, starts=replace(self.starts, noise=Start(np.array([float(noise_variance)]))))
 
     def to_sklearn(
         self, lengthscales: np.ndarray, length_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
     ) -> sk.Kernel:
         """The fitted s² k̃ as a scikit-learn kernel."""
         scale = lengthscales.copy() if len(lengthscales) > 1 else float(lengthscales[0])
-        return sk.ConstantKernel(signal, _sklearn_bounds(self.signal, signal_bounds)) * sk.RBF(
-            scale, _sklearn_bounds(self.hyperparameters, length_bounds)
+        return sk.ConstantKernel(signal, _sklearn_bounds(self.starts.signal, signal_bounds)) * sk.RBF(
+            scale, _sklearn_bounds(self.starts.hyperparameters, length_bounds)
         )
 
 
@@ -166,10 +161,11 @@ def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
         If it is one that does not work yet (the message lists what does) or its length scales do not fit the columns.
     """
     if kernel is None:
-        return KernelSpec(SquaredExponential(n_columns))
+        return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()))
     if not isinstance(kernel, sk.Kernel):
         raise TypeError(
-            f"kernel must be a kernel of sklearn.gaussian_process.kernels or None; got {kernel!r}. These work: {WORKING}."
+            f"kernel must be a kernel of sklearn.gaussian_process.kernels or None; got {kernel!r}. "
+            f"These work: {WORKING}."
         )
     white = [part for part in _parts(kernel, sk.Sum) if isinstance(part, sk.WhiteKernel)]
     signal = [part for part in _parts(kernel, sk.Sum) if not isinstance(part, sk.WhiteKernel)]
@@ -181,27 +177,25 @@ def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
         raise ValueError(f"kernel={kernel!r} does not work yet. These work: {WORKING}.")
 
     rbf = shapes[0]
-    lengthscales = _start(rbf.hyperparameter_length_scale, rbf.length_scale)
-    assert lengthscales.value is not None
-    if rbf.anisotropic and len(lengthscales.value) != n_columns:
+    lengths = np.atleast_1d(np.asarray(rbf.length_scale, dtype=float))
+    if rbf.anisotropic and len(lengths) != n_columns:
         raise ValueError(
-            f"kernel={kernel!r} has {len(lengthscales.value)} length scales, but its inputs have {n_columns} columns: "
+            f"kernel={kernel!r} has {len(lengths)} length scales, but its inputs have {n_columns} columns: "
             "give one length scale, or one per column."
         )
-    for start in (lengthscales,):
-        if not (np.isfinite(start.value).all() and (start.value > 0).all()):
-            raise ValueError(f"kernel={kernel!r}: length scales must be finite and above 0.")
-    spec = KernelSpec(SquaredExponential(n_columns, isotropic=not rbf.anisotropic), lengthscales)
-    if constants:
-        constant = constants[0]
-        spec = replace(spec, signal=_start(constant.hyperparameter_constant_value, constant.constant_value))
-    if white:
-        noise = white[0]
-        spec = replace(spec, noise=_start(noise.hyperparameter_noise_level, noise.noise_level))
-    return spec
+    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
+        raise ValueError(f"kernel={kernel!r}: length scales must be finite and above 0.")
+    return KernelSpec(
+        SquaredExponential(n_columns, isotropic=not rbf.anisotropic),
+        Starts(
+            _start(rbf.hyperparameter_length_scale, lengths),
+            _start(constants[0].hyperparameter_constant_value, constants[0].constant_value) if constants else Start(),
+            _start(white[0].hyperparameter_noise_level, white[0].noise_level) if white else Start(),
+        ),
+    )
 
 
-def _parts(kernel: sk.Kernel, operator: type) -> Iterator[sk.Kernel]:
+def _parts(kernel: Any, operator: Any) -> Iterator[Any]:
     """The operands of nested sums (or products)."""
     if isinstance(kernel, operator):
         yield from _parts(kernel.k1, operator)

@@ -282,7 +282,13 @@ class CoefficientDisplay:
             (self.mean, self.std, -0.12, _MODEL, "o", "posterior"),
         ):
             ax.errorbar(
-                mean, places + shift, xerr=n_std * std, fmt=marker, color=colour, capsize=3, label=f"{label} ±{n_std:g} std"
+                mean,
+                places + shift,
+                xerr=n_std * std,
+                fmt=marker,
+                color=colour,
+                capsize=3,
+                label=f"{label} ±{n_std:g} std",
             )
         ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
         ax.set_yticks(places, self.names)

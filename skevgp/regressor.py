@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from joblib import Parallel, delayed, effective_n_jobs
+from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin, _fit_context
 from sklearn.exceptions import ConvergenceWarning
@@ -15,22 +16,16 @@ from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import _safe_indexing, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
-from threadpoolctl import threadpool_limits
 
 from ._maps import apply_map, fit_map
 from ._progress import Progress
 from ._validation import check_magnitude
 from .features.prior import resolve_coef_prior
 from .inference.frame import Frame
-from .inference.inducing import initial_inducing_points
-from .inference.learning import Learned, Options, learn
-from .inference.model import SparseModel
-from .inference.parameters import ParameterTable, Start
+from .inference.learning import Options
+from .inference.outputs import FittedOutputs
 from .inference.posterior import Posterior
-from .inference.rows import Rows
-from .inference.start import FIRST_NOISE, starting_table
-from .inference.statistics import BlockMap
-from .kernels import KernelSpec, parse_kernel
+from .kernels import parse_kernel
 
 _MAX_ITER = {"lbfgs": 1000, "adam": 5000}
 _PREDICT_ROWS = 4096
@@ -240,48 +235,46 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the iterations were used up, or the fit was interrupted by Ctrl-C (the best parameters so far are kept).
         """
         given, X, y = self._validated(X, y, reset=True)
-        previous = self.__dict__.get("_learned") if self.warm_start else None
-        frame_before = self.__dict__.get("_frame")
-
         self.feature_map_ = fit_map(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_map(self.kernel_map, given, y, "kernel_map")
         inputs, features = self._mapped(given, X)
-        self._single_output, targets = y.ndim == 1, y.reshape(len(y), -1)
+        targets = y.reshape(len(y), -1)
         spec = parse_kernel(self.kernel, inputs.shape[1])
         if self.noise_variance is not None:
-            if spec.noise.value is not None:
+            if spec.starts.noise.value is not None:
                 raise ValueError(
                     f"The noise starts either from noise_variance={self.noise_variance!r} or from the WhiteKernel of "
                     f"kernel={self.kernel!r}; give one of them."
                 )
-            spec = spec.with_noise(Start(np.array([float(self.noise_variance)])))
+            spec = spec.with_noise(self.noise_variance)
         prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, features, targets)
         target_mean = targets.mean(axis=0) if self.normalize_y else np.zeros(targets.shape[1])
 
-        self._spec = spec
-        self._frame = Frame.of(inputs, features, targets, target_mean, *prior)
-        rows = self._frame.rows(inputs, features, targets)
-        rng = check_random_state(self.random_state)
-        points = initial_inducing_points(rows.inputs, self.n_inducing, rng)
-        models = self._models(targets.shape[1])
-        self._tables = []
-        for index, (outputs, model) in enumerate(models):
-            table = starting_table(
-                rows.inputs,
-                np.repeat(points[np.newaxis], len(model.groups), axis=0),
-                self._frame.target_unit[outputs],
-                spec.hyperparameters,
-                spec.signal,
-                spec.noise,
-                FIRST_NOISE[self.solver],
-                spec.covariance.n_hyperparameters,
-            )
-            if previous is not None and len(previous) == len(models):
-                table = table.started_at(self._translated(previous[index].values, frame_before, outputs))
-            self._tables.append(table)
-        self._learned = self._learn(models, rows, rng)
+        frame = Frame.of(inputs, features, targets, target_mean, *prior)
+        options = Options(
+            self.solver,
+            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
+            self.tol,
+            self.batch_size,
+            self.learning_rate,
+        )
+        self._fitted = FittedOutputs.fit(
+            frame,
+            frame.rows(inputs, features, targets),
+            spec.covariance,
+            spec.starts,
+            self.sharing,
+            self.posterior,
+            self.n_inducing,
+            options,
+            check_random_state(self.random_state),
+            effective_n_jobs(self.n_jobs),
+            getattr(self, "_fitted", None) if self.warm_start else None,
+            partial(Progress, self.verbose) if self.verbose else None,
+        )
+        self._spec, self._single_output = spec, y.ndim == 1
         self._set_attributes()
-        for message in sorted({learned.message for learned in self._learned if learned.message}):
+        for message in self._fitted.messages:
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
         return self
 
@@ -305,18 +298,15 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ValueError, TypeError
             As `fit`, and if y does not have the outputs of the first call.
         """
-        if not hasattr(self, "_learned"):
+        if not hasattr(self, "_fitted"):
             return self.fit(X, y)
         given, X, y = self._validated(X, y)
         targets = y.reshape(len(y), -1)
-        if targets.shape[1] != len(self._frame.target_unit):
-            raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(self._frame.target_unit)}.")
+        frame = self._fitted.frame
+        if targets.shape[1] != len(frame.target_unit):
+            raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(frame.target_unit)}.")
         inputs, features = self._mapped(given, X)
-        rows = self._frame.rows(inputs, features, targets)
-        slices = [outputs for outputs, _ in self._models(targets.shape[1])]
-        self._learned = [
-            learned.updated(rows.outputs(outputs)) for outputs, learned in zip(slices, self._learned, strict=True)
-        ]
+        self._fitted = self._fitted.updated(frame.rows(inputs, features, targets))
         self._set_attributes()
         return self
 
@@ -355,18 +345,20 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
         if return_cov:
             inputs, features = self._mapped(given, X)
-            inputs = inputs - self._frame.centre
+            inputs = inputs - self._fitted.frame.centre
             mean, _ = self._posterior.predict(inputs, features)
             cov = self._posterior.covariance(inputs, features) + np.eye(len(X))[:, :, np.newaxis] * noise
-            return self._like_y(mean + self._frame.target_mean), self._like_y(cov)
+            return self._like_y(mean + self._fitted.frame.target_mean), self._like_y(cov)
         mean, variance = np.empty((len(X), len(noise))), np.empty((len(X), len(noise)))
         for first in range(0, len(X), _PREDICT_ROWS):
             block = slice(first, first + _PREDICT_ROWS)
             inputs, features = self._mapped(_safe_indexing(given, block), X[block])
-            mean[block], block_variance = self._posterior.predict(inputs - self._frame.centre, features, return_std)
+            mean[block], block_variance = self._posterior.predict(
+                inputs - self._fitted.frame.centre, features, return_std
+            )
             if block_variance is not None:
                 variance[block] = block_variance + noise
-        mean = self._like_y(mean + self._frame.target_mean)
+        mean = self._like_y(mean + self._fitted.frame.target_mean)
         return (mean, self._like_y(np.sqrt(variance))) if return_std else mean
 
     def sample_y(
@@ -423,105 +415,32 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             return inputs, np.empty((len(X), 0))
         return inputs, apply_map(self.feature_map_, given, "feature_map")
 
-    def _models(self, n_outputs: int) -> list[tuple[slice, SparseModel]]:
-        """The independent models and the outputs of each."""
-        prior, one = self._frame.internal_prior(), (slice(0, 1),)
-        if self.sharing == "none":
-            each = [slice(o, o + 1) for o in range(n_outputs)]
-            return [(o, SparseModel(self._spec.covariance, prior.outputs(o), self.posterior, one)) for o in each]
-        groups = (slice(0, n_outputs),) if self.sharing == "all" else tuple(slice(o, o + 1) for o in range(n_outputs))
-        return [(slice(0, n_outputs), SparseModel(self._spec.covariance, prior, self.posterior, groups))]
-
-    def _learn(self, models: list[tuple[slice, SparseModel]], rows: Rows, rng: np.random.RandomState) -> list[Learned]:
-        n_threads = effective_n_jobs(self.n_jobs)
-        blocks = BlockMap(n_threads if len(models) == 1 else 1)
-        options = Options(
-            self.solver,
-            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
-            self.tol,
-            self.batch_size,
-            self.learning_rate,
-            blocks,
-        )
-        seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
-
-        def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
-            shift = len(rows) * self._frame.log_unit(outputs)
-            report = Progress(self.verbose, shift) if self.verbose else None
-            return learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
-
-        jobs = [
-            (outputs, model, table, seed)
-            for (outputs, model), table, seed in zip(models, self._tables, seeds, strict=True)
-        ]
-        try:
-            # One BLAS thread: blocks (or outputs) are what runs in parallel, and bits do not depend on n_jobs.
-            with threadpool_limits(1, user_api="blas"):
-                return Parallel(n_jobs=min(n_threads, len(jobs)), prefer="threads")(delayed(one)(*job) for job in jobs)
-        finally:
-            blocks.close()
-
-    def _translated(self, values: dict[str, np.ndarray], before: Frame, outputs: slice) -> dict[str, np.ndarray]:
-        """An earlier fit's values in this fit's internal units."""
-        same_outputs = len(before.target_unit) == len(self._frame.target_unit)
-        same_columns = len(before.centre) == len(self._frame.centre)
-        if not (same_outputs and same_columns):
-            return {}
-        ratio = (before.target_unit[outputs] / self._frame.target_unit[outputs]) ** 2
-        return {
-            "hyperparameters": values["hyperparameters"],
-            "signal": values["signal"] * ratio,
-            "noise": values["noise"] * ratio,
-            "inducing_points": values["inducing_points"] + before.centre - self._frame.centre,
-        }
-
     def _set_attributes(self) -> None:
-        frame, learned = self._frame, self._learned
-        self._posterior: Posterior = frame.posterior([one.posterior for one in learned])
-        mean, covariance = self._posterior.coefficients()
+        fitted, prior = self._fitted, self._fitted.frame.prior
+        self._posterior: Posterior = fitted.posterior()
         first = 0 if self._single_output else slice(None)
+        mean, covariance = self._posterior.coefficients()
         self.coef_, self.coef_cov_ = mean[first], covariance[first]
         self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.coef_prior_mean_, self.coef_prior_scale_ = frame.prior.mean[first], frame.prior.scale[first]
+        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first], prior.scale[first]
         self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
-        points = np.array([group.points for group in self._posterior.inducing]) + frame.centre
+        points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
         self.inducing_points_ = points[0] if self.sharing == "all" else points
-        kernels = self._kernels()
-        self.kernel_ = kernels[0] if self._single_output else kernels
-        n_rows = learned[0].statistics[0].n_rows
-        shift = n_rows * frame.log_unit(slice(None))
-        self.lower_bound_ = sum(one.bound for one in learned) - shift
-        self.n_iter_ = max(len(one.loss_curve) for one in learned)
-        curves = [
-            np.pad(one.loss_curve, (0, self.n_iter_ - len(one.loss_curve)), "edge") for one in learned if one.loss_curve
+        kernels = [
+            self._spec.to_sklearn(
+                np.exp(group.hyperparameters),
+                fitted.bounds("hyperparameters", o),
+                float(self._posterior.signal[o]),
+                fitted.bounds("signal", o),
+            )
+            for group in self._posterior.inducing
+            for o in range(len(prior.mean))[group.outputs]
         ]
-        self.loss_curve_ = np.sum(curves, axis=0) + shift if len(curves) == len(learned) else np.empty(0)
-        self.n_parameters_ = sum(
-            table.size + self._n_posterior(points.shape[1], mean.shape[1]) * len(table["signal"].start)
-            for table in self._tables
-        )
-
-    def _n_posterior(self, n_inducing: int, n_features: int) -> int:
-        """Free parameters of q of one output."""
-        size = n_inducing + n_features
-        return 2 * size if self.posterior == "diagonal" else size + size * (size + 1) // 2
-
-    def _kernels(self) -> list[Kernel]:
-        spec: KernelSpec = self._spec
-        kernels = []
-        for group in self._posterior.inducing:
-            for o in range(len(self._frame.target_unit))[group.outputs]:
-                table = self._tables[o if self.sharing == "none" else 0]
-                index = 0 if self.sharing == "none" else o
-                kernels.append(
-                    spec.to_sklearn(
-                        np.exp(group.hyperparameters),
-                        table["hyperparameters"].value_bounds(),
-                        float(self._posterior.signal[o]),
-                        table["signal"].value_bounds()[[index]] * self._frame.target_unit[o] ** 2,
-                    )
-                )
-        return kernels
+        self.kernel_ = kernels[0] if self._single_output else kernels
+        self.lower_bound_ = fitted.lower_bound
+        self.loss_curve_ = fitted.loss_curve
+        self.n_iter_ = fitted.n_iter
+        self.n_parameters_ = fitted.n_parameters
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         """Drop the axis of outputs if there is one output, as GaussianProcessRegressor does."""

@@ -30,7 +30,8 @@ def parameters_of(function):
 
 def section(docstring, title):
     """The text of a numpydoc section, or None."""
-    found = re.search(rf"^{title}\n-{{{len(title)}}}\n(.*?)(?=^\S[^\n]*\n-{{3,}}$|\Z)", docstring, re.DOTALL | re.MULTILINE)
+    pattern = rf"^{title}\n-+\n(.*?)(?=^\S[^\n]*\n---+$|\Z)"
+    found = re.search(pattern, docstring, re.DOTALL | re.MULTILINE)
     return found and found[1]
 
 

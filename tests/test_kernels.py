@@ -38,7 +38,7 @@ def test_coincident_points_have_covariance_one_at_most():
     ],
 )
 def test_kernels_that_work(kernel):
-    assert parse_kernel(kernel, 2).hyperparameters.value is not None
+    assert parse_kernel(kernel, 2).starts.hyperparameters.value is not None
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,9 @@ def test_fixed_parameters_stay():
 
 
 def test_bounds_are_respected_and_come_back():
-    kernel = ConstantKernel(2.0, (1.9, 2.1)) * RBF([0.5, 0.5], [(0.4, 0.6), (0.45, 0.55)]) + WhiteKernel(0.5, (0.4, 0.6))
+    kernel = ConstantKernel(2.0, (1.9, 2.1)) * RBF([0.5, 0.5], [(0.4, 0.6), (0.45, 0.55)]) + WhiteKernel(
+        0.5, (0.4, 0.6)
+    )
     model = fitted(kernel)
     assert 1.9 <= model.kernel_.k1.constant_value <= 2.1
     assert (model.kernel_.k2.length_scale >= [0.4, 0.45]).all()

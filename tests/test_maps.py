@@ -2,7 +2,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_array_equal
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, issparse
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LinearRegression
@@ -101,7 +101,8 @@ def test_a_map_sees_blocks_of_rows():
 def test_blocks_equal_one_pass(feature_map):
     feature_map.fit(X)
     in_one = feature_map.transform(X)
-    assert_array_equal(apply_map(feature_map, X, "feature_map"), in_one.toarray() if hasattr(in_one, "toarray") else in_one)
+    in_one = in_one.toarray() if issparse(in_one) else in_one
+    assert_array_equal(apply_map(feature_map, X, "feature_map"), in_one)
 
 
 def test_few_rows_are_one_block_and_not_copied():
@@ -118,7 +119,7 @@ def test_a_data_frame_stays_one():
     pd.testing.assert_frame_equal(pd.concat(recorder.seen_), frame)
 
 
-@pytest.mark.parametrize("function", [lambda X: X[:-1], lambda X: np.vstack([X, X]), lambda X: X.sum(axis=0, keepdims=True)])
+@pytest.mark.parametrize("function", [lambda X: X[:-1], lambda X: np.vstack([X, X]), lambda X: X[:1]])
 def test_another_number_of_rows_is_an_error(function):
     with pytest.raises(ValueError, match=r"feature_map=.* must return one row per row of X; for 10 rows it returned"):
         apply_map(returning(function), X, "feature_map")
@@ -132,11 +133,11 @@ def test_rows_are_counted_in_each_block():
 
 @pytest.mark.parametrize("function", [lambda X: X[:, 0], lambda X: X[:, :, np.newaxis], lambda X: 1.0])
 def test_a_result_without_two_dimensions_is_an_error(function):
-    with pytest.raises(ValueError, match="kernel_map=.* must return one row per row of X"):
+    with pytest.raises(ValueError, match=r"kernel_map=.* must return one row per row of X"):
         apply_map(returning(function), X, "kernel_map")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_result_that_is_not_finite_is_an_error(value):
-    with pytest.raises(ValueError, match="kernel_map=.* returned NaN or infinity for finite rows"):
-        apply_map(returning(lambda X: np.where(X == X[-1, -1], value, X)), X, "kernel_map")
+    with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity for finite rows"):
+        apply_map(returning(lambda X: X + [0.0, 0.0, value]), X, "kernel_map")

@@ -111,16 +111,20 @@ def test_bounds_are_ordered(data):
     )
     bounds = {}
     for family in ("full", "diagonal"):
-        bounds[family] = EVGPRegressor(
-            PolynomialFeatures(1),
-            fixed_kernel() + WhiteKernel(NOISE, "fixed"),
-            n_inducing=15,
-            posterior=family,
-            coef_mean=MEAN,
-            coef_scale=SCALE,
-            max_iter=0,
-            random_state=0,
-        ).fit(X, Y).lower_bound_
+        bounds[family] = (
+            EVGPRegressor(
+                PolynomialFeatures(1),
+                fixed_kernel() + WhiteKernel(NOISE, "fixed"),
+                n_inducing=15,
+                posterior=family,
+                coef_mean=MEAN,
+                coef_scale=SCALE,
+                max_iter=0,
+                random_state=0,
+            )
+            .fit(X, Y)
+            .lower_bound_
+        )
     assert exact_bound > bounds["full"] > bounds["diagonal"]
 
 

@@ -220,5 +220,5 @@ def test_without_axes_there_is_a_new_figure(trend, draw):
 )
 def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
-    with pytest.raises(ImportError, match="Plotting needs the optional package 'matplotlib'.*pip install matplotlib"):
+    with pytest.raises(ImportError, match=r"Plotting needs the optional package 'matplotlib'.*pip install matplotlib"):
         display.plot()

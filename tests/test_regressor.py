@@ -190,7 +190,9 @@ def test_normalize_y_is_centring_by_hand():
 def test_without_features_the_prior_mean_is_zero():
     far = np.full((1, 2), 1e3)
     assert model(tol=1.0).fit(X, Y + 10).predict(far) == pytest.approx(np.zeros((1, 2)))
-    assert model(tol=1.0, normalize_y=True).fit(X, Y + 10).predict(far) == pytest.approx(10 + Y.mean(axis=0)[np.newaxis])
+    assert model(tol=1.0, normalize_y=True).fit(X, Y + 10).predict(far) == pytest.approx(
+        10 + Y.mean(axis=0)[np.newaxis]
+    )
 
 
 def test_units_do_not_matter():
@@ -293,7 +295,9 @@ def test_partial_fit_is_fit_with_the_same_kernel_and_points(sharing, posterior):
     for part in (slice(40, 80), slice(0, 40)):
         other.partial_fit(X_NEW[part], Y_NEW[part])
     np.testing.assert_allclose(other.predict(X_NEW), m.predict(X_NEW), atol=1e-8)
-    np.testing.assert_allclose(other.predict(X_NEW, return_std=True)[1], m.predict(X_NEW, return_std=True)[1], rtol=1e-7)
+    np.testing.assert_allclose(
+        other.predict(X_NEW, return_std=True)[1], m.predict(X_NEW, return_std=True)[1], rtol=1e-7
+    )
     assert other.lower_bound_ == pytest.approx(m.lower_bound_, rel=1e-9)
     assert m.lower_bound_ > bound
 

@@ -159,7 +159,7 @@ def make_dynamics(
         target_names=system.state_names,
         robot=robot,
         DESCR=(
-            f"{n_trajectories} trajectories of {n_steps} steps of {dt} s of the system {system.name!r}; noise {noise} on "
-            f"the targets and {input_noise} on the states, as fractions of their standard deviations."
+            f"{n_trajectories} trajectories of {n_steps} steps of {dt} s of the system {system.name!r}; noise {noise} "
+            f"on the targets and {input_noise} on the states, as fractions of their standard deviations."
         ),
     )

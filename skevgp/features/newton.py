@@ -75,8 +75,8 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
             h(x) of each row.
         """
         check_is_fitted(self)
-        X = validate_data(self, X, dtype=np.float64, reset=False)
-        return np.hstack([X, self._gravity_columns(X)])
+        rows: np.ndarray = validate_data(self, X, dtype=np.float64, reset=False)
+        return np.hstack([rows, self._gravity_columns(rows)])
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
         """Names of the features.

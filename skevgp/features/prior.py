@@ -52,8 +52,8 @@ def resolve_coef_prior(
         mean, scale = _map_prior(feature_map, first, shape[0], shape[1])
         if mean.shape != shape or scale.shape != shape:
             raise ValueError(
-                f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = {shape}; "
-                f"got {mean.shape} and {scale.shape}."
+                f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = "
+                f"{shape}; got {mean.shape} and {scale.shape}."
             )
         auto_mean, auto_scale = mean, np.where(np.isnan(scale), auto_scale, scale)
     mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)

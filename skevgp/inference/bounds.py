@@ -216,7 +216,8 @@ class BoundAtOptimum:
             value = -0.5 * (statistics.n_rows * (LOG_2PI + np.log(sigma2)) + log_det + penalty + unexplained)
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
-                assert L is not None and L_inv is not None
+                assert L is not None
+                assert L_inv is not None
                 gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det, B_bar, L, L_inv)
                 value -= gap
                 B_bar -= gap_B_bar

@@ -66,7 +66,7 @@ class Frame:
         return float(np.log(self.target_unit[outputs]).sum())
 
     def posterior(self, parts: Sequence[Posterior]) -> Posterior:
-        """Posteriors of consecutive outputs, in internal units -> one in the user's (but for centre and target_mean)."""
+        """Posteriors of consecutive outputs in internal units -> one in the user's, but for centre and target_mean."""
         inducing, first = [], 0
         for part in parts:
             for group in part.inducing:

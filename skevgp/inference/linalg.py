@@ -105,7 +105,7 @@ def inverse_factor(L: np.ndarray) -> np.ndarray:
 
 @primitive
 def lower_triangular(flat: np.ndarray, size: int) -> np.ndarray:
-    """Lower triangular matrices (g, n, n) from their diagonals and then their strictly lower entries (g, n (n + 1) / 2)."""
+    """Lower triangular matrices (g, n, n) from rows (g, n (n + 1) / 2): the diagonal, then the entries below it."""
     matrices = np.zeros((len(flat), size, size))
     np.einsum("gii->gi", matrices)[...] = flat[:, :size]
     rows, columns = np.tril_indices(size, -1)

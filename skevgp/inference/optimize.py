@@ -97,7 +97,7 @@ def lbfgs(
     minimum = Minimum(start, np.inf)
     stalled = 0
 
-    def callback(intermediate_result: object) -> None:  # noqa: ARG001 - SciPy looks at the name
+    def callback(intermediate_result: object) -> None:  # SciPy looks at the name
         nonlocal stalled
         before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
         minimum.loss_curve.append(guarded.loss)

@@ -54,6 +54,10 @@ class Parameter:
         return np.exp(coordinate) if self.transform == "log" else coordinate * self.unit
 
 
+def _shape(values: dict[str, np.ndarray], name: str) -> tuple[int, ...] | None:
+    return values[name].shape if name in values else None
+
+
 class ParameterTable:
     """Parameters in a fixed order; the free ones make up the flat vector that an optimiser moves.
 
@@ -81,7 +85,7 @@ class ParameterTable:
         return ParameterTable(
             [
                 replace(parameter, start=values[parameter.name])
-                if not parameter.fixed and np.shape(values.get(parameter.name)) == parameter.start.shape
+                if not parameter.fixed and _shape(values, parameter.name) == parameter.start.shape
                 else parameter
                 for parameter in self.parameters
             ]

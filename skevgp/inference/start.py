@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.linalg import cho_solve
 
@@ -20,6 +22,25 @@ _NOISE_BOUNDS = 1e-12, 1e2
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
 _SIGNAL_BOUNDS = 1e-8, 1e8
+
+
+@dataclass(frozen=True)
+class Starts:
+    """What the user says of the kernel and the noise.
+
+    Attributes
+    ----------
+    hyperparameters : Start
+        Of k̃.
+    signal : Start
+        s², the same for all outputs.
+    noise : Start
+        σ², the same for all outputs.
+    """
+
+    hyperparameters: Start
+    signal: Start
+    noise: Start
 
 
 def features_alone(features: np.ndarray, residuals: np.ndarray, scale: np.ndarray) -> np.ndarray:
@@ -91,9 +112,7 @@ def starting_table(
     inputs: np.ndarray,
     inducing_points: np.ndarray,
     target_unit: np.ndarray,
-    hyperparameters: Start,
-    signal: Start,
-    noise: Start,
+    starts: Starts,
     first_noise: float,
     n_hyperparameters: int,
 ) -> ParameterTable:
@@ -107,7 +126,7 @@ def starting_table(
         One set per group of outputs.
     target_unit : ndarray of shape (o,)
         The size of what the features alone leave over.
-    hyperparameters, signal, noise : Start
+    starts : Starts
         What the user says of them.
     first_noise : float
         Where the noise variance starts, in squared target units, if the user does not say.
@@ -125,11 +144,13 @@ def starting_table(
     lower, upper = _LENGTHSCALE_BOUNDS
     return ParameterTable(
         [
-            hyperparameters.parameter(
+            starts.hyperparameters.parameter(
                 "hyperparameters", _LENGTHSCALE * root_d * typical, lower * typical, upper * root_d * typical, 1.0
             ),
-            signal.parameter("signal", o, _SIGNAL_BOUNDS[0] * o, _SIGNAL_BOUNDS[1] * o, target_unit**2),
-            noise.parameter("noise", first_noise * o, _NOISE_BOUNDS[0] * o, _NOISE_BOUNDS[1] * o, target_unit**2),
+            starts.signal.parameter("signal", o, _SIGNAL_BOUNDS[0] * o, _SIGNAL_BOUNDS[1] * o, target_unit**2),
+            starts.noise.parameter(
+                "noise", first_noise * o, _NOISE_BOUNDS[0] * o, _NOISE_BOUNDS[1] * o, target_unit**2
+            ),
             Parameter("inducing_points", inducing_points, unit=spread),
         ]
     )

@@ -48,6 +48,8 @@ class KernelAt(Protocol):
 class Kernel(Protocol):
     """A covariance function of unit signal variance, k̃."""
 
+    n_hyperparameters: int
+
     def prepare(self, inputs: np.ndarray) -> Any:
         """What `KernelAt` needs of rows (n, d), computed once."""
 

@@ -184,7 +184,7 @@ def test_a_wrong_number_of_columns_is_an_error(feature_map):
 
 @pytest.mark.parametrize("feature_map", MAPS)
 def test_an_unknown_robot_lists_the_known_ones(feature_map):
-    with pytest.raises(ValueError, match=r"Unknown system 'carpole'.*\['acrobot', 'cartpole', 'pendulum'\].*'cartpole'\?"):
+    with pytest.raises(ValueError, match=r"Unknown system 'carpole'.*\['acrobot', 'cartpole', 'pendulum'\]"):
         feature_map("carpole").fit(np.zeros((2, 5)))
 
 

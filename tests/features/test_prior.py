@@ -196,7 +196,7 @@ def test_a_scale_of_zero_is_allowed():
     ],
 )
 def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
-    with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.*\(n_outputs, n_features_out\) = \(2, 3\); got "):
+    with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.* = \(2, 3\); got "):
         resolve(Opinionated(mean, scale))
 
 

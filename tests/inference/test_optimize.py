@@ -9,9 +9,7 @@ FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
 def rosenbrock(x):
     value = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
-    return value, np.array(
-        [-400.0 * x[0] * (x[1] - x[0] ** 2) - 2.0 * (1 - x[0]), 200.0 * (x[1] - x[0] ** 2)]
-    )
+    return value, np.array([-400.0 * x[0] * (x[1] - x[0] ** 2) - 2.0 * (1 - x[0]), 200.0 * (x[1] - x[0] ** 2)])
 
 
 def test_lbfgs_finds_the_minimum_and_reports_each_iteration():

@@ -39,7 +39,9 @@ def test_a_change_of_one_unit_moves_the_coordinate_by_one():
 
 
 def test_warm_starts_take_over_only_what_fits():
-    again = table().started_at({"length": np.array([0.7, 0.8]), "noise": np.array([9.0]), "points": np.zeros((2, 3, 2))})
+    again = table().started_at(
+        {"length": np.array([0.7, 0.8]), "noise": np.array([9.0]), "points": np.zeros((2, 3, 2))}
+    )
     values = again.values(again.start())
     np.testing.assert_allclose(values["length"], [0.7, 0.8])
     np.testing.assert_allclose(values["noise"], [0.1])

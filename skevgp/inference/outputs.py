@@ -1,0 +1,197 @@
+"""Several outputs: which of them share what, fitted together, in the user's units."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from joblib import Parallel, delayed
+from threadpoolctl import threadpool_limits
+
+from .bounds import PosteriorFamily
+from .frame import Frame
+from .inducing import initial_inducing_points
+from .learning import Learned, Options, learn
+from .model import SparseModel
+from .optimize import Report
+from .parameters import ParameterTable
+from .posterior import Posterior
+from .rows import Rows
+from .start import FIRST_NOISE, Starts, starting_table
+from .statistics import BlockMap, Kernel
+
+Sharing = Literal["all", "kernel", "none"]
+
+
+def _models(sharing: Sharing, kernel: Kernel, frame: Frame, family: PosteriorFamily) -> list[tuple[slice, SparseModel]]:
+    """The independent models and the outputs of each."""
+    prior, n_outputs = frame.internal_prior(), len(frame.target_unit)
+    each = tuple(slice(o, o + 1) for o in range(n_outputs))
+    if sharing == "none":
+        return [(o, SparseModel(kernel, prior.outputs(o), family, (slice(0, 1),))) for o in each]
+    groups = (slice(0, n_outputs),) if sharing == "all" else each
+    return [(slice(0, n_outputs), SparseModel(kernel, prior, family, groups))]
+
+
+@dataclass(frozen=True)
+class FittedOutputs:
+    """Fitted sparse models of consecutive outputs.
+
+    Attributes
+    ----------
+    frame : Frame
+    outputs : tuple of slice
+        Of each model.
+    tables : tuple of ParameterTable
+        Where each model started, and its bounds.
+    learned : tuple of Learned
+        Each model, in internal units.
+    """
+
+    frame: Frame
+    outputs: tuple[slice, ...]
+    tables: tuple[ParameterTable, ...]
+    learned: tuple[Learned, ...]
+
+    @classmethod
+    def fit(
+        cls,
+        frame: Frame,
+        rows: Rows,
+        kernel: Kernel,
+        starts: Starts,
+        sharing: Sharing,
+        family: PosteriorFamily,
+        n_inducing: int,
+        options: Options,
+        rng: np.random.RandomState,
+        n_threads: int = 1,
+        previous: FittedOutputs | None = None,
+        reporter: Callable[[float], Report] | None = None,
+    ) -> FittedOutputs:
+        """Place inducing points and maximise the bound of each model.
+
+        Parameters
+        ----------
+        frame : Frame
+        rows : Rows
+            In internal units.
+        kernel : Kernel
+        starts : Starts
+            What the user says of kernel and noise.
+        sharing : {"all", "kernel", "none"}
+        family : {"full", "diagonal"}
+        n_inducing : int
+        options : Options
+        rng : RandomState
+        n_threads : int, default=1
+            For independent models, or else for blocks of rows.
+        previous : FittedOutputs, default=None
+            Start where this one ended, as far as shapes agree.
+        reporter : callable, default=None
+            reporter(what to add to a loss in internal units) returns the model's report.
+
+        Returns
+        -------
+        fitted : FittedOutputs
+        """
+        points = initial_inducing_points(rows.inputs, n_inducing, rng)
+        models = _models(sharing, kernel, frame, family)
+        tables = []
+        for index, (outputs, model) in enumerate(models):
+            table = starting_table(
+                rows.inputs,
+                np.repeat(points[np.newaxis], len(model.groups), axis=0),
+                frame.target_unit[outputs],
+                starts,
+                FIRST_NOISE[options.solver],
+                kernel.n_hyperparameters,
+            )
+            if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
+                table = table.started_at(previous._values_in(frame, index))
+            tables.append(table)
+        seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
+        blocks = BlockMap(n_threads if len(models) == 1 else 1)
+        options = replace(options, map_blocks=blocks)
+
+        def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
+            report = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
+            return learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+
+        jobs = [(*model, table, seed) for model, table, seed in zip(models, tables, seeds, strict=True)]
+        try:
+            # One BLAS thread: blocks (or outputs) are what runs in parallel, and bits do not depend on n_threads.
+            with threadpool_limits(1, user_api="blas"):
+                learned = Parallel(min(n_threads, len(jobs)), prefer="threads")(delayed(one)(*job) for job in jobs)
+        finally:
+            blocks.close()
+        return cls(frame, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
+
+    def updated(self, rows: Rows) -> FittedOutputs:
+        """Fold new rows, in internal units, into the posteriors."""
+        learned = (one.updated(rows.outputs(own)) for own, one in zip(self.outputs, self.learned, strict=True))
+        return replace(self, learned=tuple(learned))
+
+    def posterior(self) -> Posterior:
+        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+        return self.frame.posterior([one.posterior for one in self.learned])
+
+    @property
+    def lower_bound(self) -> float:
+        """In nats, summed over outputs."""
+        return sum(one.bound for one in self.learned) - self._shift
+
+    @property
+    def n_iter(self) -> int:
+        return max(len(one.loss_curve) for one in self.learned)
+
+    @property
+    def loss_curve(self) -> np.ndarray:
+        """Minus the bound per iteration, (n_iter,); a model that is done keeps its last value."""
+        curves = [one.loss_curve for one in self.learned]
+        if not all(curves):
+            return np.empty(0)
+        return np.sum([np.pad(curve, (0, self.n_iter - len(curve)), "edge") for curve in curves], axis=0) + self._shift
+
+    @property
+    def n_parameters(self) -> int:
+        """Free parameters of kernels, noise, inducing points and q."""
+        total = 0
+        for table, one in zip(self.tables, self.learned, strict=True):
+            size = len(one.posterior.mean[0])
+            q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
+            total += table.size + q * len(one.posterior.mean)
+        return total
+
+    @property
+    def messages(self) -> list[str]:
+        """What the user should know of how the fits ended."""
+        return sorted({one.message for one in self.learned if one.message})
+
+    def bounds(self, name: str, output: int) -> np.ndarray:
+        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+        index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
+        bounds = self.tables[index][name].value_bounds()
+        if name == "signal":
+            return bounds[[output - self.outputs[index].start]] * self.frame.target_unit[output] ** 2
+        return bounds
+
+    @property
+    def _shift(self) -> float:
+        """From internal units to the user's, for a loss of all rows."""
+        return self.learned[0].statistics[0].n_rows * self.frame.log_unit(slice(None))
+
+    def _values_in(self, frame: Frame, index: int) -> dict[str, np.ndarray]:
+        """A model's values in another frame's internal units."""
+        if len(frame.centre) != len(self.frame.centre):
+            return {}
+        outputs, values = self.outputs[index], self.learned[index].values
+        ratio = (self.frame.target_unit[outputs] / frame.target_unit[outputs]) ** 2
+        return {
+            "hyperparameters": values["hyperparameters"],
+            "signal": values["signal"] * ratio,
+            "noise": values["noise"] * ratio,
+            "inducing_points": values["inducing_points"] + self.frame.centre - frame.centre,
+        }

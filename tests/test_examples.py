@@ -1,0 +1,87 @@
+"""The examples as a user runs them, in short mode."""
+
+import os
+import runpy
+import subprocess
+import sys
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+LEARN = EXAMPLES / "plot_learn_dynamics.py"
+
+
+@pytest.fixture(autouse=True)
+def short_mode(monkeypatch):
+    monkeypatch.setenv("SKEVGP_EXAMPLES_QUICK", "1")
+    monkeypatch.setattr(plt, "show", lambda: None)
+    yield
+    plt.close("all")
+
+
+def run(script, *arguments, monkeypatch):
+    monkeypatch.setattr(sys, "argv", [str(script), *map(str, arguments)])
+    return runpy.run_path(str(script), run_name="__main__")
+
+
+def test_sparse_gp(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_sparse_gp.py", tmp_path / "picture.png", monkeypatch=monkeypatch)
+    assert "EVGPRegressor" in capsys.readouterr().out
+    assert names["difference"] < 1.0
+    assert (tmp_path / "picture.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
+def test_learn_dynamics(monkeypatch, capsys, tmp_path, system):
+    run(LEARN, "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
+    lines = capsys.readouterr().out.splitlines()
+    errors = {
+        line.split()[0]: float(line.split()[1]) for line in lines if line.split()[0].endswith(("GP", "IF", "IFG"))
+    }
+    assert errors.keys() == {"VGP", "RES-VGP", "EVGP-IF", "EVGP-IFG"}
+    assert max(errors.values()) < 1.0
+    assert errors["EVGP-IFG"] < 0.1
+    assert (tmp_path / f"learn_dynamics_{system}.png").stat().st_size > 10_000
+
+
+def command_line(*arguments, code=""):
+    program = [
+        "-c",
+        f"import runpy, sys; {code or 'pass'}; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0])",
+        str(LEARN),
+    ]
+    environment = os.environ | {"MPLBACKEND": "Agg"}
+    return subprocess.run(
+        [sys.executable, *program, *arguments], capture_output=True, text=True, env=environment, check=False
+    )
+
+
+def test_help():
+    result = command_line("--help")
+    assert result.returncode == 0
+    assert "--system {acrobot,cartpole,pendulum}" in result.stdout
+
+
+def test_a_wrong_system_lists_the_right_ones():
+    result = command_line("--system", "pendulums")
+    assert result.returncode == 2
+    assert "invalid choice: 'pendulums'" in result.stderr
+    assert "cartpole" in result.stderr
+
+
+def test_a_wrong_size_is_a_line_not_a_traceback():
+    result = command_line("--trajectories", "0")
+    assert result.returncode == 1
+    assert result.stderr == "error: n_trajectories must be at least 1; got 0.\n"
+
+
+@pytest.mark.parametrize(
+    ("package", "pip"), [("pinocchio", "pip install pin"), ("matplotlib", "pip install matplotlib")]
+)
+def test_without_an_optional_package(package, pip):
+    result = command_line(code=f"sys.modules[{package!r}] = None")
+    assert result.returncode == 1
+    assert pip in result.stderr
+    assert "Traceback" not in result.stderr
