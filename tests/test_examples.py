@@ -78,7 +78,7 @@ def test_a_wrong_size_is_a_line_not_a_traceback():
 
 
 @pytest.mark.parametrize(
-    ("package", "pip"), [("pinocchio", "pip install pin"), ("matplotlib", "pip install matplotlib")]
+    ("package", "pip"), [("pinocchio", "pip install pin"), ("matplotlib", "pip install pin matplotlib")]
 )
 def test_without_an_optional_package(package, pip):
     result = command_line(code=f"sys.modules[{package!r}] = None")

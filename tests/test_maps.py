@@ -140,4 +140,4 @@ def test_a_result_without_two_dimensions_is_an_error(function):
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_result_that_is_not_finite_is_an_error(value):
     with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity for finite rows"):
-        apply_map(returning(lambda X: X + [0.0, 0.0, value]), X, "kernel_map")
+        apply_map(returning(lambda X: np.add(X, [0.0, 0.0, value])), X, "kernel_map")

@@ -125,7 +125,7 @@ def test_another_number_of_outputs_is_an_error(metric, mean):
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_a_value_that_is_not_finite_is_named(metric, name, argument, value):
     with pytest.raises(ValueError, match=rf"Input {name} contains"):
-        metric(*arguments(metric, **{argument: Y + [0.0, 0.0, value]}))
+        metric(*arguments(metric, **{argument: np.add(Y, [0.0, 0.0, value])}))
 
 
 @pytest.mark.parametrize("metric", [containing_ratios, negative_log_predictive_density])

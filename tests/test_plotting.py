@@ -74,15 +74,23 @@ def test_mean_and_observations_have_colours_of_their_own():
     assert len({to_rgb(line.get_color()) for line in drawn.values()}) == 3
 
 
-@pytest.mark.parametrize("sharing", ["all", "kernel"])
-def test_inducing_points_are_crosses_on_the_lower_edge(sharing):
-    model = fitted(Y, sharing=sharing)
-    display = PosteriorDisplay.from_estimator(model, X, output=1)
+def test_inducing_points_are_crosses_on_the_lower_edge():
+    model = fitted()
+    display = PosteriorDisplay.from_estimator(model, X)
     crosses = lines(display)["inducing points"]
-    assert_array_equal(crosses.get_xdata(), model.inducing_points_.reshape(-1, 5)[-1])
+    assert_array_equal(crosses.get_xdata(), model.inducing_points_[:, 0])
     assert crosses.get_marker() == "x"
+    display.figure_.draw_without_rendering()
     on_screen = crosses.get_transform().transform(np.column_stack(crosses.get_data()))
     assert display.ax_.transAxes.inverted().transform(on_screen)[:, 1] == pytest.approx(0.03)
+
+
+@pytest.mark.parametrize("output", [0, 1])
+def test_each_output_shows_its_own_inducing_points(output):
+    model = EVGPRegressor(n_inducing=5, sharing="kernel", random_state=0).fit(X, Y)
+    crosses = lines(PosteriorDisplay.from_estimator(model, X, output=output))["inducing points"]
+    assert_array_equal(crosses.get_xdata(), model.inducing_points_[output, :, 0])
+    assert (model.inducing_points_[0] != model.inducing_points_[1]).any()
 
 
 def test_inducing_points_of_another_space_are_not_drawn():

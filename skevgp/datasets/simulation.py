@@ -68,9 +68,9 @@ def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03
     >>> from skevgp.datasets import simulate
     >>> simulate("pendulum", [0.1, 0.0], np.zeros((3, 1))).round(4)
     array([[ 0.1   ,  0.    ],
-           [ 0.0991, -0.0584],
-           [ 0.0965, -0.115 ],
-           [ 0.0922, -0.1689]])
+           [ 0.0991, -0.0582],
+           [ 0.0965, -0.1148],
+           [ 0.0923, -0.1686]])
     """
     system = get_system(system)
     n, n_inputs = system.n_joints, system.n_inputs

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Self
+from numbers import Real
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import BaseEstimator, TransformerMixin, _fit_context
+from sklearn.utils._param_validation import Interval
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
 
-from .._validation import check_real
 from ..robots import System, get_system
 
 
@@ -32,6 +33,17 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
     unknown_scale: float
     free_scale: float
 
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "robot": "no_validation",
+        "dt": [Interval(Real, 0, None, closed="neither")],
+        "inverse_inertia": [Real, "array-like"],
+        "outputs": ["array-like", None],
+        "known_scale": [Interval(Real, 0, None, closed="left")],
+        "unknown_scale": [Interval(Real, 0, None, closed="left")],
+        "free_scale": [Interval(Real, 0, None, closed="left")],
+    }
+
+    @_fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: object = None) -> Self:
         """Check the columns.
 
@@ -119,25 +131,23 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
             If ``n_outputs`` does not fit the robot, or a parameter is out of its range.
         """
         assert self.robot is not None
+        self._validate_params()
         system = get_system(self.robot)
-        dt = check_real(self.dt, "dt", minimum=0.0, strict=True)
-        known = check_real(self.known_scale, "known_scale", minimum=0.0)
-        unknown = check_real(self.unknown_scale, "unknown_scale", minimum=0.0)
         n, n_inputs = system.n_joints, system.n_inputs
         joints = np.arange(n)
         width = 2 * n + n_inputs + self._n_gravity(system)
         mean = np.zeros((2 * n, width))
-        scale = np.full((2 * n, width), check_real(self.free_scale, "free_scale", minimum=0.0))
+        scale = np.full((2 * n, width), self.free_scale, dtype=float)
         for row, column, value in (
             (joints, joints, 1.0),  # q' = q + ...
-            (joints, n + joints, dt),  # ... + Δt q̇
+            (joints, n + joints, self.dt),  # ... + Δt q̇
             (n + joints, n + joints, 1.0),  # q̇' = q̇ + ...
         ):
-            mean[row, column], scale[row, column] = value, known
+            mean[row, column], scale[row, column] = value, self.known_scale
         driven, inputs = n + np.array(system.driven), 2 * n + np.arange(n_inputs)
-        mean[driven, inputs] = dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
-        scale[driven, inputs] = unknown
-        self._gravity_prior(system, dt, mean, scale)
+        mean[driven, inputs] = self.dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
+        scale[driven, inputs] = self.unknown_scale
+        self._gravity_prior(system, mean, scale)
         rows = self._predicted_states(system)
         if n_outputs != len(rows):
             names = [system.state_names[row] for row in rows]
@@ -166,7 +176,7 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
     def _n_gravity(self, system: System) -> int:
         return 0
 
-    def _gravity_prior(self, system: System, dt: float, mean: np.ndarray, scale: np.ndarray) -> None:
+    def _gravity_prior(self, system: System, mean: np.ndarray, scale: np.ndarray) -> None:
         """Fill in the gravity columns; none here."""
 
 
@@ -327,6 +337,11 @@ class InertiaForceGravity(_NewtonFeatures):
         self.unknown_scale = unknown_scale
         self.free_scale = free_scale
 
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **_NewtonFeatures._parameter_constraints,
+        "gravity_gain": [Real, "array-like"],
+    }
+
     def _angles(self) -> list[tuple[int, ...]] | None:
         """Columns that add up to each angle; None without a robot: every column is one."""
         return None if self.robot is None else [term.angle for term in get_system(self.robot).gravity]
@@ -346,10 +361,10 @@ class InertiaForceGravity(_NewtonFeatures):
     def _n_gravity(self, system: System) -> int:
         return len(system.gravity)
 
-    def _gravity_prior(self, system: System, dt: float, mean: np.ndarray, scale: np.ndarray) -> None:
+    def _gravity_prior(self, system: System, mean: np.ndarray, scale: np.ndarray) -> None:
         gain = np.broadcast_to(_per_term(self.gravity_gain, len(system.gravity), "gravity_gain"), len(system.gravity))
         first = 2 * system.n_joints + system.n_inputs
         for index, term in enumerate(system.gravity):
             rows = [system.n_joints + joint for joint in term.acts_on]
-            mean[rows, first + index] = -dt * gain[index]
+            mean[rows, first + index] = -self.dt * gain[index]
             scale[rows, first + index] = self.unknown_scale

@@ -187,6 +187,7 @@ ZEROS = np.zeros((3, 1))
         (("pendulum", [0.0, 0.0], ZEROS, 0.0), "dt must be .*0.0"),
         (("pendulum", [0.0, 0.0], ZEROS, -0.03), "dt must be .*-0.03"),
         (("pendulum", [0.0, 0.0], ZEROS, np.nan), "dt must be .*nan"),
+        (("pendulum", [0.0, 0.0], ZEROS, np.inf), "dt must be .*inf"),
         (("robot", [0.0, 0.0], ZEROS), r"Unknown system 'robot'.*\['acrobot', 'cartpole', 'pendulum'\]"),
         (("pendulm", [0.0, 0.0], ZEROS), "Did you mean 'pendulum'"),
     ],
