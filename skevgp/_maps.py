@@ -9,6 +9,8 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.utils import _safe_indexing
 
+from ._validation import as_floats
+
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
 
@@ -34,7 +36,11 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
         return None
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
-    return clone(feature_map).fit(X, y)
+    try:
+        fresh = clone(feature_map)
+    except TypeError as error:
+        raise TypeError(f"{name}={feature_map!r} cannot be cloned: {error}") from error
+    return fresh.fit(X, y)
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
@@ -58,11 +64,11 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
         If it returns the wrong number of rows, not two dimensions or values that are not finite.
     """
     n_rows = X.shape[0]
-    blocks = []
+    blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
         rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
         values = fitted_map.transform(rows)
-        values = np.asarray(values.toarray() if issparse(values) else values, dtype=np.float64)
+        values = as_floats(values.toarray() if issparse(values) else values, f"What {name}={fitted_map!r} returns")
         if values.ndim != 2 or len(values) != rows.shape[0]:
             raise ValueError(
                 f"{name}={fitted_map!r} must return one row per row of X; for {rows.shape[0]} rows it returned the "
@@ -70,5 +76,10 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
             )
         if not np.isfinite(values).all():
             raise ValueError(f"{name}={fitted_map!r} returned NaN or infinity for finite rows.")
+        if blocks and values.shape[1] != blocks[0].shape[1]:
+            raise ValueError(
+                f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
+                f"{blocks[0].shape[1]} and {values.shape[1]}."
+            )
         blocks.append(values)
     return np.concatenate(blocks)

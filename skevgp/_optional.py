@@ -34,7 +34,8 @@ def require(name: str, purpose: str) -> ModuleType:
     try:
         return importlib.import_module(name)
     except ImportError as error:
-        package, extra = _PACKAGES[name.partition(".")[0]]
+        top = name.partition(".")[0]
+        package, extra = _PACKAGES.get(top, (top, "all"))
         raise ImportError(
             f"{purpose} needs the optional package {package!r}, which cannot be imported ({error}). "
             f"Install it with: pip install {package} (or, from a clone of the project: pip install '.[{extra}]')"

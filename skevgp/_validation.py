@@ -34,3 +34,14 @@ def check_magnitude(values: np.ndarray, name: str) -> None:
     largest = np.abs(values).max(initial=0.0)
     if largest > LARGEST:
         raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")
+
+
+def as_floats(values: Any, name: str) -> np.ndarray:
+    """Real numbers as an array of floats, or an error that names them."""
+    array = np.asarray(values)
+    if array.dtype.kind in "cSUMm":
+        raise ValueError(f"{name} must be real numbers; got the type {array.dtype}.")
+    try:
+        return np.asarray(array, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{name} must be real numbers: {error}.") from error

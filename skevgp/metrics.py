@@ -16,8 +16,6 @@ def _matrix(values: ArrayLike, name: str) -> np.ndarray:
     matrix = check_array(values, ensure_2d=False, dtype=np.float64, input_name=name)
     if matrix.ndim == 1:
         matrix = matrix[:, np.newaxis]
-    if matrix.ndim != 2:
-        raise ValueError(f"{name} must have 1 or 2 dimensions; got the shape {matrix.shape}.")
     return matrix
 
 
@@ -92,7 +90,7 @@ def std_norm(std: ArrayLike) -> float:
 
 
 def containing_ratios(
-    y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike, k: Sequence[float] = (1, 2, 3)
+    y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike, k: Sequence[float] | float = (1, 2, 3)
 ) -> np.ndarray:
     """Share of the values within k predicted standard deviations (CR-k in the paper).
 
@@ -102,8 +100,8 @@ def containing_ratios(
     ----------
     y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
         Observations, predicted means and predicted standard deviations (with noise).
-    k : sequence of float, default=(1, 2, 3)
-        Half widths of the interval, in standard deviations.
+    k : float or sequence of float, default=(1, 2, 3)
+        Half widths of the interval, in standard deviations, not negative.
 
     Returns
     -------
@@ -123,7 +121,10 @@ def containing_ratios(
     """
     y_true, y_pred, std = _matrices(y_true=y_true, y_pred=y_pred, std=std)
     error, std = np.abs(y_true - y_pred), _positive(std, "std")
-    return np.array([np.mean(error <= width * std) for width in k])
+    widths = np.atleast_1d(np.asarray(k, dtype=float))
+    if not (widths >= 0).all():
+        raise ValueError(f"k must be numbers that are not negative; got {k!r}.")
+    return np.array([np.mean(error <= width * std) for width in widths])
 
 
 def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:

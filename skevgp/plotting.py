@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.utils.validation import check_is_fitted
+from sklearn.utils.validation import check_consistent_length, check_is_fitted
 
 from ._optional import require
 
@@ -22,6 +22,11 @@ _MODEL, _TRUTH, _INDUCING = "#0072B2", "#D55E00", "#009E73"
 def _axes(ax: Any) -> Any:
     pyplot = require("matplotlib.pyplot", "Plotting")
     return ax if ax is not None else pyplot.subplots()[1]
+
+
+def _check_output(output: int, n_outputs: int) -> None:
+    if not -n_outputs <= output < n_outputs:
+        raise ValueError(f"output={output!r} must be the index of one of {n_outputs} outputs.")
 
 
 class PosteriorDisplay:
@@ -102,7 +107,7 @@ class PosteriorDisplay:
         n_std : float, default=2.0
             Half width of the band, in standard deviations.
         label : str, default="mean"
-            Name of the mean's line in the legend.
+            Name of the mean's line, for ``display.ax_.legend()``.
 
         Returns
         -------
@@ -110,11 +115,15 @@ class PosteriorDisplay:
 
         Raises
         ------
+        ValueError
+            If y or x does not have a value per row of X, or there is no such output.
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
         check_is_fitted(estimator)
-        mean, std = (part.reshape(len(part), -1)[:, output] for part in estimator.predict(X, return_std=True))
+        mean, std = (part.reshape(len(part), -1) for part in estimator.predict(X, return_std=True))
+        _check_output(output, mean.shape[1])
+        mean, std = mean[:, output], std[:, output]
         values = np.asarray(X)
         one_column = values.ndim == 2 and values.shape[1] == 1
         if x is None:
@@ -124,8 +133,10 @@ class PosteriorDisplay:
             points = points[..., 0] if points.ndim == 2 else points[output, :, 0]
         else:
             points = None
+        places = np.asarray(x, dtype=float)
+        check_consistent_length(mean, places, y)
         observed = None if y is None else np.asarray(y, dtype=float).reshape(len(mean), -1)[:, output]
-        return cls(np.asarray(x, dtype=float), mean, std, observed, points).plot(ax=ax, n_std=n_std, label=label)
+        return cls(places, mean, std, observed, points).plot(ax=ax, n_std=n_std, label=label)
 
     def plot(self, ax: Any = None, *, n_std: float = 2.0, label: str = "mean") -> Self:
         """Draw.
@@ -137,7 +148,7 @@ class PosteriorDisplay:
         n_std : float, default=2.0
             Half width of the band, in standard deviations.
         label : str, default="mean"
-            Name of the mean's line in the legend.
+            Name of the mean's line, for ``display.ax_.legend()``.
 
         Returns
         -------
@@ -149,11 +160,13 @@ class PosteriorDisplay:
             If matplotlib is not installed; the message gives the pip command.
         """
         ax = _axes(ax)
-        low, high = self.mean - n_std * self.std, self.mean + n_std * self.std
-        ax.fill_between(self.x, low, high, color=_MODEL, alpha=0.2, linewidth=0, label=f"±{n_std:g} std")
-        ax.plot(self.x, self.mean, color=_MODEL, label=label)
+        order = np.argsort(self.x, kind="stable")
+        x, mean, std = self.x[order], self.mean[order], self.std[order]
+        low, high = mean - n_std * std, mean + n_std * std
+        ax.fill_between(x, low, high, color=_MODEL, alpha=0.2, linewidth=0, label=f"±{n_std:g} std")
+        ax.plot(x, mean, color=_MODEL, label=label)
         if self.y is not None:
-            ax.plot(self.x, self.y, color=_TRUTH, linestyle="--", label="observed")
+            ax.plot(x, self.y[order], color=_TRUTH, linestyle="--", label="observed")
         if self.inducing_points is not None:
             # On the lower edge, whatever the limits: x in data, y in axes units.
             ax.plot(
@@ -234,17 +247,19 @@ class CoefficientDisplay:
         Raises
         ------
         ValueError
-            If the regressor has no explicit features.
+            If the regressor has no explicit features, or there is no such output.
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
         check_is_fitted(estimator)
-        width = estimator.coef_.shape[-1]
+        n_outputs, width = np.atleast_2d(estimator.coef_).shape
         if width == 0:
             raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
-        names = [f"h{index}" for index in range(width)]
-        if hasattr(estimator.feature_map_, "get_feature_names_out"):
+        _check_output(output, n_outputs)
+        try:
             names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
+        except AttributeError:  # A map, or a step of it, that does not name its features.
+            names = [f"h{index}" for index in range(width)]
         parts = (
             np.atleast_2d(part)[output]
             for part in (

@@ -141,3 +141,27 @@ def test_a_result_without_two_dimensions_is_an_error(function):
 def test_a_result_that_is_not_finite_is_an_error(value):
     with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity for finite rows"):
         apply_map(returning(lambda X: np.add(X, [0.0, 0.0, value])), X, "kernel_map")
+
+
+def test_a_map_that_changes_its_width_is_an_error(monkeypatch):
+    monkeypatch.setattr("skevgp._maps.MAP_ROWS", 3)
+    widths = iter([2, 1])
+    with pytest.raises(ValueError, match="same number of columns for all rows; it returned 2 and 1"):
+        apply_map(returning(lambda X: X[:, : next(widths)]), np.ones((6, 3)), "feature_map")
+
+
+def test_a_map_that_returns_words_is_an_error():
+    with pytest.raises(ValueError, match="What feature_map=.* returns must be real numbers"):
+        apply_map(returning(lambda X: np.full(X.shape, "a")), np.ones((2, 2)), "feature_map")
+
+
+def test_a_map_that_cannot_be_cloned_is_named():
+    class Plain:
+        def fit(self, X, y=None):
+            return self
+
+        def transform(self, X):
+            return X
+
+    with pytest.raises(TypeError, match="kernel_map=.* cannot be cloned"):
+        fit_map(Plain(), np.ones((2, 2)), np.ones(2), "kernel_map")

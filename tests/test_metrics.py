@@ -160,3 +160,13 @@ def test_no_rows_are_an_error(metric):
 def test_three_dimensions_are_an_error(metric):
     with pytest.raises(ValueError, match="dim"):
         metric(*arguments(metric, y=Y[np.newaxis]))
+
+
+def test_one_width_may_stand_alone():
+    np.testing.assert_array_equal(containing_ratios([0.5, 1.5], [0.0, 0.0], [1.0, 1.0], k=1), [0.5])
+
+
+@pytest.mark.parametrize("k", [-1, [1, np.nan]])
+def test_widths_must_not_be_negative(k):
+    with pytest.raises(ValueError, match="k must be numbers that are not negative"):
+        containing_ratios([0.5], [0.0], [1.0], k=k)

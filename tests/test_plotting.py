@@ -8,6 +8,7 @@ from matplotlib.colors import to_rgb
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor
@@ -230,3 +231,28 @@ def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"Plotting needs the optional package 'matplotlib'.*pip install matplotlib"):
         display.plot()
+
+
+@pytest.mark.parametrize("arguments", [{"y": np.zeros(3)}, {"x": np.zeros(3)}])
+def test_another_number_of_observations_or_places_is_an_error(trend, arguments):
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        PosteriorDisplay.from_estimator(trend, X[:5], **arguments)
+
+
+@pytest.mark.parametrize("output", [2, -3])
+def test_an_output_that_is_not_there_is_named(trend, output):
+    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
+        PosteriorDisplay.from_estimator(trend, X[:5], output=output)
+    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
+        CoefficientDisplay.from_estimator(trend, output=output)
+
+
+def test_places_are_drawn_in_order():
+    display = PosteriorDisplay(np.array([2.0, 0.0, 1.0]), np.array([20.0, 0.0, 10.0]), np.ones(3)).plot()
+    np.testing.assert_array_equal(display.ax_.lines[0].get_xydata(), [[0, 0], [1, 10], [2, 20]])
+
+
+def test_a_pipeline_of_maps_without_names_is_numbered():
+    features = make_pipeline(FunctionTransformer())
+    model = EVGPRegressor(features, n_inducing=3, max_iter=0).fit(np.arange(10.0)[:, np.newaxis], np.arange(10.0))
+    assert CoefficientDisplay.from_estimator(model).names == ["h0"]

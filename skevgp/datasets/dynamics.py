@@ -126,7 +126,7 @@ def make_dynamics(
     (['q', 'dq/dt', 'u_q'], [0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
     """
     robot, system = system, get_system(system)
-    if system.name not in _PAPER:
+    if system.name not in _PAPER or len(_PAPER[system.name].state_scale) != 2 * system.n_joints:
         raise ValueError(f"No sampling scales are known for {system.name!r}; the known systems are {sorted(_PAPER)}.")
     sampling = _PAPER[system.name]
     n_trajectories = sampling.n_trajectories if n_trajectories is None else n_trajectories

@@ -7,6 +7,7 @@ from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
 from .._optional import require
+from .._validation import as_floats, check_real
 from ..robots import System, get_system, pinocchio_model
 
 # Measured against the stored reference: one-step errors below 1e-10 on the pendulum, cartpole and acrobot.
@@ -56,9 +57,9 @@ def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03
     ------
     ImportError
         If Pinocchio is not installed; the message gives the pip command.
-    ValueError
-        If a shape does not fit the system, a value is not finite, ``dt`` is not positive, the system is unknown, or
-        the integrator gives up.
+    ValueError, TypeError
+        If a shape does not fit the system, a value is not a finite real number, ``dt`` is not positive, the system is
+        unknown, or the integrator gives up.
 
     Examples
     --------
@@ -74,25 +75,29 @@ def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03
     """
     system = get_system(system)
     n, n_inputs = system.n_joints, system.n_inputs
-    z0, U = np.asarray(z0, dtype=float), np.asarray(U, dtype=float)
+    check_real(dt, "dt", minimum=0.0, strict=True)
+    z0, U = as_floats(z0, "z0"), as_floats(U, "U")
     single = z0.ndim == 1
     z, inputs = np.atleast_2d(z0), U[np.newaxis] if single else U
-    if z.ndim != 2 or z.shape[1] != 2 * n:
-        raise ValueError(f"z0 must have {2 * n} columns for the system {system.name!r}; got the shape {z0.shape}.")
+    if z.ndim != 2 or z.shape[1] != 2 * n or len(z) == 0:
+        raise ValueError(
+            f"z0 must have {2 * n} columns for the system {system.name!r} and some rows; got the shape {z0.shape}."
+        )
     if inputs.ndim != 3 or inputs.shape[0] != len(z) or inputs.shape[2] != n_inputs:
         wanted = f"(n_steps, {n_inputs})" if single else f"({len(z)}, n_steps, {n_inputs})"
         raise ValueError(f"U must have the shape {wanted} for the system {system.name!r}; got {U.shape}.")
     if not (np.isfinite(z).all() and np.isfinite(inputs).all()):
         raise ValueError("z0 and U must be finite.")
-    if not (np.isfinite(dt) and dt > 0):
-        raise ValueError(f"dt must be a positive number of seconds; got {dt!r}.")
 
     accelerations = _ForwardDynamics(system)
 
     def derivative(_t: float, flat: np.ndarray, u: np.ndarray) -> np.ndarray:
         state = flat.reshape(-1, 2 * n)
         q, v = state[:, :n], state[:, n:]
-        return np.hstack([v, accelerations(q, v, u)]).ravel()
+        change = np.hstack([v, accelerations(q, v, u)]).ravel()
+        if not np.isfinite(change).all():
+            raise ValueError(f"The accelerations of {system.name!r} overflow: z0 or U is too large.")
+        return change
 
     Z = np.empty((len(z), inputs.shape[1] + 1, 2 * n))
     Z[:, 0] = z

@@ -13,6 +13,7 @@ from sklearn.utils._param_validation import Interval
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
 
+from .._validation import as_floats
 from ..robots import System, get_system
 
 
@@ -181,7 +182,7 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
 
 
 def _per_term(value: ArrayLike, n_terms: int, name: str) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = as_floats(value, name)
     if array.shape not in ((), (n_terms,)) or not np.isfinite(array).all():
         raise ValueError(f"{name} must be a finite number or {n_terms} of them; got {value!r}.")
     return array
@@ -277,8 +278,9 @@ class InertiaForceGravity(_NewtonFeatures):
         Length of a time step, s.
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
-    gravity_gain : float or array-like of shape (n_sines,), default=0.0
-        Guess of gravity's acceleration at sine 1, rad/s² (g/l for a point mass).
+    gravity_gain : float or array-like of shape (n_sines,) or (n_joints, n_sines), default=0.0
+        Guess of gravity's acceleration at sine 1, rad/s² (g/l for a point mass): one for all, one per sine, or one per
+        joint and sine (of which those that the prior names are used).
     outputs : sequence of int or str, default=None
         Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
     known_scale : float, default=0.1
@@ -362,9 +364,12 @@ class InertiaForceGravity(_NewtonFeatures):
         return len(system.gravity)
 
     def _gravity_prior(self, system: System, mean: np.ndarray, scale: np.ndarray) -> None:
-        gain = np.broadcast_to(_per_term(self.gravity_gain, len(system.gravity), "gravity_gain"), len(system.gravity))
+        n, n_terms = system.n_joints, len(system.gravity)
+        gain = as_floats(self.gravity_gain, "gravity_gain")
+        if gain.shape != (n, n_terms) or not np.isfinite(gain).all():
+            gain = np.broadcast_to(_per_term(gain, n_terms, "gravity_gain"), (n, n_terms))
         first = 2 * system.n_joints + system.n_inputs
         for index, term in enumerate(system.gravity):
-            rows = [system.n_joints + joint for joint in term.acts_on]
-            mean[rows, first + index] = -self.dt * gain[index]
-            scale[rows, first + index] = self.unknown_scale
+            for joint in term.acts_on:
+                mean[n + joint, first + index] = 0.0 - self.dt * gain[joint, index]
+                scale[n + joint, first + index] = self.unknown_scale

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.utils import _safe_indexing
+
+from .._validation import as_floats
 
 # Standard deviation of a weight whose map has no opinion: the feature could explain ten times the target's scatter.
 _WIDE = 10.0
@@ -26,8 +30,8 @@ def resolve_coef_prior(
     Parameters
     ----------
     coef_mean, coef_scale : array-like of shape (o, p), scalar or "auto"
-        ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; unions concatenate those of their parts, and a part
-        without one gets mean 0 and scale 10 * std(y) / rms(h).
+        ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; unions concatenate those of their parts. A part
+        without one, and entries of a scale that are NaN, get mean 0 and scale 10 * std(y) / rms(h).
     feature_map : transformer or None
         Fitted.
     X : array-like of shape (n, d)
@@ -50,16 +54,12 @@ def resolve_coef_prior(
     if feature_map is not None and "auto" in (_word(coef_mean), _word(coef_scale)):
         first = _safe_indexing(X, slice(0, 1))
         mean, scale = _map_prior(feature_map, first, shape[0], shape[1])
-        if mean.shape != shape or scale.shape != shape:
-            raise ValueError(
-                f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = "
-                f"{shape}; got {mean.shape} and {scale.shape}."
-            )
         auto_mean, auto_scale = mean, np.where(np.isnan(scale), auto_scale, scale)
     mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)
     scale = auto_scale if _word(coef_scale) == "auto" else _as_table(coef_scale, "coef_scale", shape)
-    if not (np.isfinite(mean).all() and np.isfinite(scale).all()):
-        raise ValueError("coef_mean and coef_scale must be finite.")
+    for name, values in (("coef_mean", mean), ("coef_scale", scale)):
+        if not np.isfinite(values).all():
+            raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
     if (scale < 0).any():
         raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
     return mean.astype(float), scale.astype(float)
@@ -70,7 +70,7 @@ def _word(value: Any) -> str | None:
 
 
 def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.ndarray:
-    array = np.asarray(value, dtype=float)
+    array = as_floats(value, name)
     # With one output its row may stand alone.
     if array.shape not in ((), shape, (shape[1],) if shape[0] == 1 else ()):
         raise ValueError(
@@ -88,21 +88,57 @@ def _wide_scale(features: np.ndarray, targets: np.ndarray) -> np.ndarray:
 
 
 def _map_prior(feature_map: Any, first: Any, n_outputs: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Prior of a map's features; NaN in the scale where it has no opinion."""
+    """Prior (n_outputs, width) of a map's features; NaN in the scale where it has no opinion."""
     if hasattr(feature_map, "coef_prior"):
-        mean, scale = feature_map.coef_prior(n_outputs)
-        return np.asarray(mean, dtype=float), np.asarray(scale, dtype=float)
+        return _own_prior(feature_map, (n_outputs, width))
+    mean, scale = np.zeros((n_outputs, width)), np.full((n_outputs, width), np.nan)
     if isinstance(feature_map, Pipeline):
-        last = feature_map.steps[-1][1]
-        return _map_prior(last, feature_map[:-1].transform(first) if len(feature_map) > 1 else first, n_outputs, width)
+        steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]
+        for step in steps[:-1]:
+            first = step.transform(first)
+        return _map_prior(steps[-1], first, n_outputs, width) if steps else (mean, scale)
+    for part, part_first, columns, weight in _parts_of(feature_map, first):
+        part_mean, part_scale = _map_prior(part, part_first, n_outputs, len(columns))
+        mean[:, columns] = part_mean / weight
+        scale[:, columns] = part_scale / abs(weight)
+    return mean, scale
+
+
+def _own_prior(feature_map: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """What a map's ``coef_prior`` says, checked."""
+    prior = feature_map.coef_prior(shape[0])
+    shapes = [np.shape(part) for part in prior] if isinstance(prior, (tuple, list)) else type(prior).__name__
+    if shapes != [shape, shape]:
+        raise ValueError(
+            f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = {shape}; "
+            f"got {shapes}."
+        )
+    return np.asarray(prior[0], dtype=float), np.asarray(prior[1], dtype=float)
+
+
+def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarray, float]]:
+    """The parts of a union: map, what it sees of the first row, its columns in the result, their weight.
+
+    Parts of weight 0 are left out: their features are 0 and say nothing of a weight.
+    """
     if isinstance(feature_map, FeatureUnion):
-        parts = []
+        start = 0
         for name, part in feature_map.transformer_list:
             if part == "drop":
                 continue
-            own_width = np.shape(first if part == "passthrough" else part.transform(first))[1]
-            mean, scale = _map_prior(part, first, n_outputs, own_width)
-            weight = (feature_map.transformer_weights or {}).get(name, 1.0)
-            parts.append((mean / weight, scale / weight))
-        return np.hstack([mean for mean, _ in parts]), np.hstack([scale for _, scale in parts])
-    return np.zeros((n_outputs, width)), np.full((n_outputs, width), np.nan)
+            width = np.shape(first if part == "passthrough" else part.transform(first))[1]
+            weight = _weight(feature_map, name)
+            if weight != 0.0:
+                yield part, first, np.arange(start, start + width), weight
+            start += width
+    elif isinstance(feature_map, ColumnTransformer):
+        for name, part, columns in feature_map.transformers_:
+            own = np.arange(feature_map.output_indices_[name].start, feature_map.output_indices_[name].stop)
+            weight = _weight(feature_map, name)
+            if len(own) and weight != 0.0:
+                yield part, _safe_indexing(first, columns, axis=1), own, weight
+
+
+def _weight(union: Any, name: str) -> float:
+    weight = (union.transformer_weights or {}).get(name)
+    return 1.0 if weight is None else float(weight)

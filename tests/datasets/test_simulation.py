@@ -200,3 +200,25 @@ def test_bad_arguments_are_named(arguments, message):
 def test_an_integration_that_gives_up_is_an_error():
     with np.errstate(all="ignore"), pytest.raises(ValueError, match="integration of 'pendulum' failed in step 0"):
         simulate("pendulum", [1.0, 1e200], ZEROS)
+
+
+@pytest.mark.parametrize("system", ["cartpole", "acrobot"])
+def test_states_whose_accelerations_overflow_are_refused(system):
+    with pytest.raises(ValueError, match="accelerations of .* overflow"), np.errstate(all="ignore"):
+        simulate(system, [0.3, 0.3, 1e200, 1e200], np.zeros((1, 1)))
+
+
+@pytest.mark.parametrize("dt", ["a", None, [0.1, 0.2], True])
+def test_a_step_that_is_no_number_is_named(dt):
+    with pytest.raises(TypeError, match="dt must be a number"):
+        simulate("pendulum", [0.0, 0.0], np.zeros((1, 1)), dt=dt)
+
+
+def test_complex_states_are_refused():
+    with pytest.raises(ValueError, match="z0 must be real numbers"):
+        simulate("pendulum", [0.0, 1j], np.zeros((1, 1)))
+
+
+def test_no_trajectory_is_an_error():
+    with pytest.raises(ValueError, match="and some rows"):
+        simulate("pendulum", np.zeros((0, 2)), np.zeros((0, 3, 1)))

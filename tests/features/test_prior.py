@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.compose import make_column_transformer
 from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
@@ -202,7 +203,7 @@ def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
 
 def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
     union = make_union(Opinionated(np.zeros((2, 2)), np.ones((2, 2))), FunctionTransformer())
-    with pytest.raises(ValueError, match=r"\(2, 6\); got \(2, 5\) and \(2, 5\)"):
+    with pytest.raises(ValueError, match=r"\(2, 3\); got \[\(2, 2\), \(2, 2\)\]"):
         resolve(union)
 
 
@@ -219,3 +220,53 @@ def test_a_map_whose_mean_is_not_finite_is_an_error():
 def test_the_width_of_the_target_must_fit_the_robot():
     with pytest.raises(ValueError, match="y has 1 columns, but InertiaForce"):
         resolve(InertiaForce("pendulum"), targets=TARGETS[:, :1])
+
+
+@pytest.mark.parametrize("last", ["passthrough", None])
+def test_a_pipeline_that_ends_with_nothing_keeps_the_prior(last):
+    mean, scale = resolve(make_pipeline(InertiaForce("pendulum"), last))
+    assert_array_equal(mean, IF_MEAN)
+    assert_array_equal(scale, IF_SCALE)
+
+
+def test_a_column_transformer_keeps_the_prior_of_its_parts():
+    columns = make_column_transformer(
+        (PolynomialFeatures(1), [0]), (InertiaForce("pendulum"), [0, 1, 2]), ("drop", [1]), ("passthrough", [2])
+    )
+    mean, scale = resolve(columns)
+    assert_array_equal(mean[:, 2:5], IF_MEAN)
+    assert_array_equal(scale[:, 2:5], IF_SCALE)
+    assert_array_equal(mean[:, [0, 1, 5]], 0.0)
+    assert_allclose(scale[:, [0, 1, 5]], wide(columns.transform(X))[:, [0, 1, 5]])
+
+
+@pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
+def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
+    union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
+    mean, scale = resolve_coef_prior("auto", "auto", union.fit(X), X, X, TARGETS)
+    assert_allclose(mean, factor * IF_MEAN)
+    assert_allclose(scale, abs(factor) * IF_SCALE)
+
+
+def test_a_part_of_weight_zero_says_nothing():
+    union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": 0.0})
+    mean, scale = resolve(union)
+    assert_array_equal(mean, 0.0)
+    assert np.isfinite(scale).all()
+
+
+def test_nan_in_a_scale_leaves_it_to_the_data():
+    mean, scale = resolve(Opinionated(np.ones((2, 3)), np.array([[1.0, np.nan, 2.0]] * 2)))
+    assert_array_equal(mean, 1.0)
+    assert_array_equal(scale[:, [0, 2]], [[1.0, 2.0]] * 2)
+    assert_allclose(scale[:, 1], wide(X)[:, 1])
+
+
+@pytest.mark.parametrize("prior", [None, np.ones((2, 3))])
+def test_a_prior_that_is_not_two_arrays_is_an_error(prior):
+    class Broken(Opinionated):
+        def coef_prior(self, n_outputs):
+            return prior
+
+    with pytest.raises(ValueError, match=r"must return two arrays"):
+        resolve(Broken(None, None))
