@@ -9,7 +9,7 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.utils import _safe_indexing
 
-from ._validation import as_floats
+from ._validation import as_floats, check_magnitude
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
@@ -81,5 +81,8 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
                 f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
                 f"{blocks[0].shape[1]} and {values.shape[1]}."
             )
+        if values.shape[1] == 0:
+            raise ValueError(f"{name}={fitted_map!r} returned no columns.")
+        check_magnitude(values, f"What {name}={fitted_map!r} returns")
         blocks.append(values)
     return np.concatenate(blocks)

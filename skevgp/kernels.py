@@ -14,6 +14,9 @@ from sklearn.gaussian_process import kernels as sk
 from .inference.parameters import Start
 from .inference.start import Starts
 
+# Their squares neither vanish nor overflow.
+SMALLEST, LARGEST = 1e-100, 1e100
+
 WORKING = (
     "RBF (with one length scale or one per column), optionally times a ConstantKernel, optionally plus a WhiteKernel"
 )
@@ -97,10 +100,18 @@ class SquaredExponentialAt:
 
 
 def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
+    """A hyperparameter's value and bounds, checked."""
     value = np.atleast_1d(np.asarray(value, dtype=float))
+    if not ((value >= SMALLEST) & (value <= LARGEST)).all():
+        raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
     if hyperparameter.fixed:
         return Start(value, None, True)
-    return Start(value, np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float))
+    bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
+    if not ((bounds[:, 0] > 0.0) & (bounds[:, 0] <= bounds[:, 1])).all():
+        raise ValueError(
+            f"kernel: {hyperparameter.name}_bounds must be above 0, the lower ones first; got {bounds.tolist()}."
+        )
+    return Start(value, bounds)
 
 
 def _sklearn_bounds(start: Start, bounds: np.ndarray) -> Any:
@@ -158,7 +169,8 @@ def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
     TypeError
         If it is not a scikit-learn kernel.
     ValueError
-        If it is one that does not work yet (the message lists what does) or its length scales do not fit the columns.
+        If it is one that does not work yet (the message lists what does), its length scales do not fit the columns, or
+        a value or bound is out of range.
     """
     if kernel is None:
         return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()))
@@ -183,8 +195,6 @@ def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
             f"kernel={kernel!r} has {len(lengths)} length scales, but its inputs have {n_columns} columns: "
             "give one length scale, or one per column."
         )
-    if not (np.isfinite(lengths).all() and (lengths > 0).all()):
-        raise ValueError(f"kernel={kernel!r}: length scales must be finite and above 0.")
     return KernelSpec(
         SquaredExponential(n_columns, isotropic=not rbf.anisotropic),
         Starts(

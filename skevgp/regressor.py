@@ -64,7 +64,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
     coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
         Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
-        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean.
+        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean. If y is far
+        from 0 compared with its scatter, an intercept among the features needs a wider scale than that, or
+        ``normalize_y=True``.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     normalize_y : bool, default=False
@@ -75,7 +77,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Iterations of L-BFGS or steps of Adam; None means 1000 or 5000. With 0 nothing is optimised: kernel and inducing
         points stay where they start, and q is at its optimum.
     tol : float, default=0.01
-        L-BFGS stops when each of three iterations in a row raises the bound by less than this, in nats.
+        In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
+        when that no longer gains a hundred times as much.
     batch_size : int, default=512
         Rows per step of Adam.
     learning_rate : float, default=0.1
@@ -113,9 +116,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration (of Adam: a mini-batch's estimate).
     n_iter_ : int
-        Iterations done.
+        Iterations of the start that was kept (a fit whose noise comes to explain everything is tried from others).
     n_parameters_ : int
-        Free parameters of kernel, noise, inducing points and q.
+        Parameters of kernel, noise and inducing points that are not fixed, and all of q.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -167,6 +170,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "verbose": ["verbose"],
     }
 
+    _fitted: FittedOutputs
+
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
@@ -217,7 +222,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Numbers up to 1e100. The maps see it as it is given: a data frame stays one.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Numbers up to 1e100.
 
         Returns
         -------
@@ -234,46 +241,13 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ConvergenceWarning
             If the iterations were used up, or the fit was interrupted by Ctrl-C (the best parameters so far are kept).
         """
-        given, X, y = self._validated(X, y, reset=True)
-        self.feature_map_ = fit_map(self.feature_map, given, y, "feature_map")
-        self.kernel_map_ = fit_map(self.kernel_map, given, y, "kernel_map")
-        inputs, features = self._mapped(given, X)
-        targets = y.reshape(len(y), -1)
-        spec = parse_kernel(self.kernel, inputs.shape[1])
-        if self.noise_variance is not None:
-            if spec.starts.noise.value is not None:
-                raise ValueError(
-                    f"The noise starts either from noise_variance={self.noise_variance!r} or from the WhiteKernel of "
-                    f"kernel={self.kernel!r}; give one of them."
-                )
-            spec = spec.with_noise(self.noise_variance)
-        prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, features, targets)
-        target_mean = targets.mean(axis=0) if self.normalize_y else np.zeros(targets.shape[1])
-
-        frame = Frame.of(inputs, features, targets, target_mean, *prior)
-        options = Options(
-            self.solver,
-            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
-            self.tol,
-            self.batch_size,
-            self.learning_rate,
-        )
-        self._fitted = FittedOutputs.fit(
-            frame,
-            frame.rows(inputs, features, targets),
-            spec.covariance,
-            spec.starts,
-            self.sharing,
-            self.posterior,
-            self.n_inducing,
-            options,
-            check_random_state(self.random_state),
-            effective_n_jobs(self.n_jobs),
-            getattr(self, "_fitted", None) if self.warm_start else None,
-            partial(Progress, self.verbose) if self.verbose else None,
-        )
-        self._spec, self._single_output = spec, y.ndim == 1
-        self._set_attributes()
+        before = dict(vars(self))
+        try:
+            self._fit(X, y)
+        except BaseException:
+            # A failed fit leaves the model as it was.
+            self.__dict__ = before
+            raise
         for message in self._fitted.messages:
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
         return self
@@ -282,7 +256,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 
-        The first call is a `fit`. After ``solver="adam"``, q moves to its optimum.
+        The first call is a `fit`. After ``solver="adam"``, q moves to its optimum. The rows seen before are known by
+        their sums only: where the noise is below 1e-8 of the signal, ``lower_bound_`` is good to about a nat.
 
         Parameters
         ----------
@@ -306,7 +281,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if targets.shape[1] != len(frame.target_unit):
             raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(frame.target_unit)}.")
         inputs, features = self._mapped(given, X)
-        self._fitted = self._fitted.updated(frame.rows(inputs, features, targets))
+        rows = frame.rows(inputs, features, targets)
+        check_magnitude(rows.residuals, "y, in units of what the first fit left over,")
+        self._fitted = self._fitted.updated(rows)
         self._set_attributes()
         return self
 
@@ -396,6 +373,51 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         return samples[:, 0] if single else samples
 
+    def _fit(self, X: Any, y: Any) -> None:
+        given, X, y = self._validated(X, y, reset=True)
+        self.feature_map_ = fit_map(self.feature_map, given, y, "feature_map")
+        self.kernel_map_ = fit_map(self.kernel_map, given, y, "kernel_map")
+        inputs, features = self._mapped(given, X)
+        targets = y.reshape(len(y), -1)
+        spec = parse_kernel(self.kernel, inputs.shape[1])
+        if self.noise_variance is not None:
+            if spec.starts.noise.value is not None:
+                raise ValueError(
+                    f"The noise starts either from noise_variance={self.noise_variance!r} or from the WhiteKernel of "
+                    f"kernel={self.kernel!r}; give one of them."
+                )
+            spec = spec.with_noise(self.noise_variance)
+        prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, features, targets)
+        target_mean = targets.mean(axis=0) if self.normalize_y else np.zeros(targets.shape[1])
+
+        frame = Frame.of(inputs, features, targets, target_mean, *prior)
+        options = Options(
+            self.solver,
+            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
+            self.tol,
+            self.batch_size,
+            self.learning_rate,
+        )
+        self._fitted = FittedOutputs.fit(
+            frame,
+            frame.rows(inputs, features, targets),
+            spec.covariance,
+            spec.starts,
+            self.sharing,
+            self.posterior,
+            self.n_inducing,
+            options,
+            check_random_state(self.random_state),
+            effective_n_jobs(self.n_jobs),
+            getattr(self, "_fitted", None) if self.warm_start else None,
+            partial(Progress, self.verbose) if self.verbose else None,
+        )
+        self._spec, self._single_output = spec, y.ndim == 1
+        self._set_attributes()
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "_posterior")
+
     def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
         """X as the maps shall see it (a data frame stays one), X and y as arrays."""
         given = X
@@ -422,10 +444,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         mean, covariance = self._posterior.coefficients()
         self.coef_, self.coef_cov_ = mean[first], covariance[first]
         self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first], prior.scale[first]
+        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
         self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
         points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
-        self.inducing_points_ = points[0] if self.sharing == "all" else points
+        self.inducing_points_ = points[0] if fitted.sharing == "all" else points
         kernels = [
             self._spec.to_sklearn(
                 np.exp(group.hyperparameters),

@@ -72,10 +72,25 @@ def test_length_scales_must_fit_the_columns():
         EVGPRegressor(kernel=RBF([1.0, 2.0, 3.0])).fit(X, X[:, 0])
 
 
-@pytest.mark.parametrize("length", [0.0, -1.0, np.nan])
-def test_length_scales_must_be_positive(length):
-    with pytest.raises(ValueError, match="length scales must be finite and above 0"):
-        parse_kernel(RBF(length), 2)
+@pytest.mark.parametrize(
+    ("kernel", "message"),
+    [
+        (RBF(0.0), "length_scale must be between"),
+        (RBF(-1.0), "length_scale must be between"),
+        (RBF(np.nan), "length_scale must be between"),
+        (RBF(1e-300, "fixed"), "length_scale must be between"),
+        (ConstantKernel(-1.0) * RBF(), "constant_value must be between"),
+        (ConstantKernel(0.0, "fixed") * RBF(), "constant_value must be between"),
+        (RBF() + WhiteKernel(np.nan), "noise_level must be between"),
+        (RBF() + WhiteKernel(0.0, "fixed"), "noise_level must be between"),
+        (RBF(1.0, (10.0, 0.1)), "length_scale_bounds must be above 0, the lower ones first"),
+        (RBF(1.0, (np.nan, 10.0)), "length_scale_bounds must be above 0"),
+        (RBF() + WhiteKernel(1.0, (-1.0, 10.0)), "noise_level_bounds must be above 0"),
+    ],
+)
+def test_values_and_bounds_out_of_range_are_named(kernel, message):
+    with pytest.raises(ValueError, match=message):
+        parse_kernel(kernel, 2)
 
 
 def fitted(kernel, **arguments):

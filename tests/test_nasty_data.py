@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.preprocessing import PolynomialFeatures
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
 from skevgp.features import InertiaForce, InertiaForceGravity
@@ -96,6 +96,31 @@ def test_noise_that_is_all_there_is_is_found():
     assert np.sqrt(model.noise_variance_) == pytest.approx(2.0, rel=0.1)
 
 
+@pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1])
+def test_a_constant_column_may_move_a_little_afterwards(constant):
+    """The mean of equal numbers rounds; the column must not end with a lengthscale of 1e-17."""
+    rng = np.random.RandomState(0)
+    X = np.column_stack([rng.uniform(-2, 2, 1000), np.full(1000, constant)])
+    y = np.sin(2 * X[:, 0]) + 0.05 * rng.randn(1000)
+    model = EVGPRegressor(n_inducing=15, random_state=0, tol=1.0).fit(X, y)
+    assert model.score(X * [1.0, 1.0 + 1e-9], y) > 0.99
+
+
+@pytest.mark.parametrize("offset", [1e2, 1e4])
+def test_a_wave_far_from_zero_is_learned(offset):
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2, 2, (300, 1))
+    y = offset + np.sin(2 * X[:, 0]) + 0.05 * rng.randn(300)
+    assert EVGPRegressor(n_inducing=20, random_state=0).fit(X, y).score(X, y) > 0.98
+
+
+def test_rows_that_differ_by_rounding_share_inducing_points():
+    rng = np.random.RandomState(0)
+    X = np.repeat([[0.0], [1.0], [2.0]], 20, axis=0) + 1e-14 * rng.randn(60, 1)
+    model = EVGPRegressor(n_inducing=20, random_state=0, tol=1.0).fit(X, X[:, 0] + 0.1 * rng.randn(60))
+    assert np.isfinite(model.predict(X)).all()
+
+
 GOOD = np.random.RandomState(0).randn(20, 3)
 
 
@@ -134,6 +159,9 @@ def test_bad_data(X, y, message):
         ({"feature_map": PolynomialFeatures(1), "coef_mean": [1.0, 2.0]}, r"coef_mean must be .* \(1, 4\)"),
         ({"feature_map": PolynomialFeatures(1), "coef_scale": -1.0}, "coef_scale must not be negative"),
         ({"feature_map": PolynomialFeatures(1), "coef_scale": np.inf}, "finite"),
+        ({"feature_map": PolynomialFeatures(1), "coef_mean": 1e300}, "coef_mean must not exceed"),
+        ({"feature_map": FunctionTransformer(lambda X: 1e200 * X)}, "What feature_map=.* must not exceed"),
+        ({"kernel_map": FunctionTransformer(lambda X: X[:, :0])}, "kernel_map=.* returned no columns"),
         ({"feature_map": InertiaForceGravity("pendulums")}, "Unknown system 'pendulums'.*Did you mean 'pendulum'"),
         ({"feature_map": InertiaForce("acrobot")}, "X has 3 columns, but .* needs 5"),
         ({"feature_map": InertiaForce("pendulum")}, "y has 1 columns, but .* predicts 2 states"),

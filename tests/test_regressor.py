@@ -1,4 +1,8 @@
+import os
 import pickle
+import signal
+import threading
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
@@ -7,6 +11,7 @@ from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
@@ -422,3 +427,87 @@ def test_the_readme_toy():
     x, y = make_toy(random_state=0, return_X_y=True)
     m = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(x, y)
     assert np.sqrt(m.noise_variance_) == pytest.approx(1.7, rel=0.15)
+
+
+# --- changed parameters, failed fits, threads --------------------------------------------------------------------
+
+
+def test_a_failed_refit_leaves_the_model_as_it_was():
+    m = model(feature_map=PolynomialFeatures(1), max_iter=0).fit(X, Y)
+    before = m.predict(X_NEW)
+    m.set_params(kernel_map=StandardScaler(), feature_map=None, noise_variance=1.0, kernel=RBF() + WhiteKernel())
+    with pytest.raises(ValueError, match="give one of them"):
+        m.fit(np.hstack([X, X]), Y)
+    np.testing.assert_array_equal(m.predict(X_NEW), before)
+
+
+def test_a_failed_first_fit_is_not_a_fit():
+    m = model(coef_scale=-1.0, feature_map=PolynomialFeatures(1))
+    with pytest.raises(ValueError, match="coef_scale"):
+        m.fit(X, Y)
+    with pytest.raises(NotFittedError):
+        m.predict(X_NEW)
+
+
+def test_attributes_are_copies():
+    m = model(feature_map=PolynomialFeatures(1), max_iter=0).fit(X, Y)
+    before = m.predict(X_NEW)
+    for name in ("coef_", "coef_prior_mean_", "coef_prior_scale_", "inducing_points_", "noise_variance_"):
+        getattr(m, name)[...] = 99.0
+    np.testing.assert_array_equal(m.predict(X_NEW), before)
+
+
+def test_partial_fit_keeps_the_sharing_of_the_fit():
+    m = model(sharing="kernel", max_iter=0).fit(X, Y).set_params(sharing="all")
+    assert m.partial_fit(X_NEW, Y_NEW).inducing_points_.shape == (2, 20, 2)
+
+
+def test_warm_start_forgets_points_of_another_space():
+    m = model(warm_start=True, tol=1.0).fit(X * [1.0, 1e4], Y)
+    m.set_params(kernel_map=StandardScaler()).fit(X * [1.0, 1e4], Y)
+    cold = model(kernel_map=StandardScaler(), tol=1.0).fit(X * [1.0, 1e4], Y)
+    assert m.lower_bound_ == pytest.approx(cold.lower_bound_, abs=1e-6)
+
+
+def test_adam_that_diverges_says_so():
+    m = model(solver="adam", learning_rate=50.0, max_iter=20, posterior="diagonal")
+    with pytest.warns(ConvergenceWarning, match=r"Adam diverged.* Lower learning_rate \(now 50.0\)"):
+        m.fit(X, Y)
+    assert np.isfinite(m.predict(X_NEW)).all()
+
+
+def test_a_fit_that_says_it_converged_has_little_left_to_gain():
+    m = model(warm_start=True).fit(X, Y)
+    first = m.lower_bound_
+    assert m.fit(X, Y).lower_bound_ - first < 5.0
+
+
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver):
+    """With outputs in threads of their own, the signal reaches the main thread only."""
+    many = np.hstack([Y] * 3)
+    m = model(sharing="none", solver=solver, n_jobs=2, tol=0.0, max_iter=1_000_000, batch_size=32)
+    timer = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
+    timer.start()
+    with pytest.warns(ConvergenceWarning, match="interrupted after"):
+        m.fit(X, many)
+    assert m.predict(X_NEW).shape == (80, 6)
+    assert np.isfinite(m.predict(X_NEW)).all()
+
+
+def test_fits_at_once_give_the_libraries_their_threads_back():
+    with threadpool_limits(2):
+        before = [library["num_threads"] for library in threadpool_info()]
+        with ThreadPoolExecutor(3) as pool:
+            fits = list(pool.map(lambda seed: model(random_state=seed, tol=1.0).fit(X, Y), range(3)))
+        assert [library["num_threads"] for library in threadpool_info()] == before
+    assert all(m.score(X_NEW, Y_NEW) > 0.9 for m in fits)
+
+
+def test_the_number_of_library_threads_does_not_matter():
+    predictions = []
+    for n_threads in (1, 2):
+        with threadpool_limits(n_threads):
+            m = model(max_iter=20, tol=1e9).fit(X, Y)
+        predictions.append(m.inducing_points_)
+    np.testing.assert_array_equal(*predictions)

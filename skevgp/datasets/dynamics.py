@@ -105,7 +105,8 @@ def make_dynamics(
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,): the trajectory of each row, for `GroupKFold`;
         - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): the true states;
-        - ``feature_names``, ``target_names``, ``robot`` (as given, for a feature map), ``DESCR``.
+        - ``dt`` : float, and ``robot``, as given: what a feature map must be told (``InertiaForce(robot, dt=dt)``);
+        - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
         If ``return_X_y``.
 
@@ -158,6 +159,7 @@ def make_dynamics(
         feature_names=system.state_names + system.input_names,
         target_names=system.state_names,
         robot=robot,
+        dt=dt,
         DESCR=(
             f"{n_trajectories} trajectories of {n_steps} steps of {dt} s of the system {system.name!r}; noise {noise} "
             f"on the targets and {input_noise} on the states, as fractions of their standard deviations."

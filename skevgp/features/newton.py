@@ -114,8 +114,8 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
         """Prior mean and standard deviation of the weights β.
 
-        Known entries (1 and Δt) have the mean that Euler's rule gives and a narrow scale; unknown ones (Δt/J and
-        gravity's factors) the user's guess and a wide scale; the rest mean 0 and ``free_scale``.
+        Known entries (1 and Δt) have the mean that Euler's rule gives and ``known_scale``; unknown ones (Δt/J and
+        gravity's factors) the user's guess and ``unknown_scale``; the rest mean 0 and ``free_scale``.
 
         Parameters
         ----------
@@ -203,13 +203,14 @@ class InertiaForce(_NewtonFeatures):
         A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, any number of columns is taken as
         it is and the weights get the regressor's wide default prior.
     dt : float, default=0.03
-        Length of a time step, s.
+        Length of a time step, s; that of the data.
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     outputs : sequence of int or str, default=None
         Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
     known_scale : float, default=0.1
-        Prior standard deviation of the entries that physics knows (1 and Δt).
+        Prior standard deviation of the entries that physics knows (1 and Δt): narrower than the others, and wide enough
+        for what Euler's rule neglects.
     unknown_scale : float, default=1.0
         Prior standard deviation of the entries that physics names but does not know (γ).
     free_scale : float, default=1.0
@@ -275,7 +276,7 @@ class InertiaForceGravity(_NewtonFeatures):
         A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, the sine of every column is added
         and the weights get the regressor's wide default prior.
     dt : float, default=0.03
-        Length of a time step, s.
+        Length of a time step, s; that of the data.
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity_gain : float or array-like of shape (n_sines,) or (n_joints, n_sines), default=0.0
@@ -284,7 +285,8 @@ class InertiaForceGravity(_NewtonFeatures):
     outputs : sequence of int or str, default=None
         Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
     known_scale : float, default=0.1
-        Prior standard deviation of the entries that physics knows (1 and Δt).
+        Prior standard deviation of the entries that physics knows (1 and Δt): narrower than the others, and wide enough
+        for what Euler's rule neglects.
     unknown_scale : float, default=1.0
         Prior standard deviation of the entries that physics names but does not know (γ).
     free_scale : float, default=1.0

@@ -11,7 +11,7 @@ from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.utils import _safe_indexing
 
-from .._validation import as_floats
+from .._validation import as_floats, check_magnitude
 
 # Standard deviation of a weight whose map has no opinion: the feature could explain ten times the target's scatter.
 _WIDE = 10.0
@@ -60,6 +60,7 @@ def resolve_coef_prior(
     for name, values in (("coef_mean", mean), ("coef_scale", scale)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
+        check_magnitude(values, name)
     if (scale < 0).any():
         raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
     return mean.astype(float), scale.astype(float)

@@ -49,7 +49,10 @@ class Frame:
         reference = features_alone(features, residuals, coef_scale)
         prior = CoefficientPrior(coef_mean, coef_scale, reference)
         left_over = targets - target_mean - features @ prior.offset.T
-        return cls(inputs.mean(axis=0), target_mean, unit_of(left_over, targets), prior)
+        # The mean of equal numbers may round; what is left must then be 0, not a column of tiny numbers.
+        constant = np.ptp(inputs, axis=0) <= 8.0 * np.finfo(float).eps * np.abs(inputs).max(axis=0)
+        centre = np.where(constant, inputs[0], inputs.mean(axis=0))
+        return cls(centre, target_mean, unit_of(left_over, targets), prior)
 
     def rows(self, inputs: np.ndarray, features: np.ndarray, targets: np.ndarray) -> Rows:
         """Rows in internal units."""

@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
+
+from .start import spread_of
 
 # k-means on a sample of the rows costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
@@ -15,6 +20,7 @@ def initial_inducing_points(inputs: np.ndarray, n_inducing: int, rng: np.random.
     Parameters
     ----------
     inputs : ndarray of shape (n_rows, d)
+        Centred.
     n_inducing : int
         At most so many points.
     rng : RandomState
@@ -25,12 +31,15 @@ def initial_inducing_points(inputs: np.ndarray, n_inducing: int, rng: np.random.
         With m = min(n_inducing, distinct rows): all distinct rows, in the order of their first appearance, if there
         are no more than ``n_inducing``.
     """
-    if len(inputs) > MAX_SAMPLE:
-        inputs = inputs[np.sort(rng.choice(len(inputs), MAX_SAMPLE, replace=False))]
+    n_sample = max(MAX_SAMPLE, 10 * n_inducing)
+    if len(inputs) > n_sample:
+        inputs = inputs[np.sort(rng.choice(len(inputs), n_sample, replace=False))]
     _, first = np.unique(inputs, axis=0, return_index=True)
     if len(first) <= n_inducing:
         return inputs[np.sort(first)]
-    scale = inputs.std(axis=0)
-    scale[scale == 0.0] = 1.0
-    clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit(inputs / scale)
-    return clusters.cluster_centers_ * scale
+    scale = spread_of(inputs)
+    with warnings.catch_warnings():
+        # Of rows that differ by rounding only: fewer points are then the right answer.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit(inputs / scale)
+    return np.unique(clusters.cluster_centers_, axis=0) * scale

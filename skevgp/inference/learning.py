@@ -64,6 +64,8 @@ class Learned:
         Minus the bound per iteration.
     message : str
         What the user should know of how the fit ended; empty if it converged.
+    interrupted : bool
+        Whether Ctrl-C ended it.
     """
 
     model: SparseModel
@@ -73,6 +75,7 @@ class Learned:
     statistics: list[SufficientStatistics]
     loss_curve: list[float]
     message: str
+    interrupted: bool = False
 
     def updated(self, rows: Rows) -> Learned:
         """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far."""
@@ -126,25 +129,35 @@ def learn(
             options.learning_rate,
             per_row,
         )
-        bound, posterior, statistics = elbo.solution(minimum.x, rows.blocks(model.kernel, size))
+        blocks = rows.blocks(model.kernel, size)
+        bound, posterior, statistics = elbo.solution(minimum.x, blocks)
         values = {parameter.name: elbo.table.values(minimum.x)[parameter.name] for parameter in table.parameters}
+        message = _message(minimum, options)
+        if not minimum.interrupted and not (
+            minimum.converged and bound >= elbo.solution(elbo.table.start(), blocks)[0]
+        ):
+            message = (
+                f"Adam diverged: after {minimum.n_iter} steps the bound is below where it started. Lower learning_rate "
+                f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
+            )
     else:
         objective = BoundObjective(model, table, rows, size, options.map_blocks)
-        minimum = _lbfgs_unless_collapsed(objective, table, options, per_row)
+        minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, per_row)
+        message = _message(minimum, options)
         values = table.values(minimum.x)
         statistics = model.statistics(values, objective.blocks)
         bound, posterior = model.at_optimum(values, statistics)
         bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
     curve = [n_rows * loss for loss in minimum.loss_curve]
-    return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options))
+    return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
 
 
 def _lbfgs_unless_collapsed(
-    objective: BoundObjective, table: ParameterTable, options: Options, report: Report | None
+    objective: BoundObjective, table: ParameterTable, scatter: np.ndarray, options: Options, report: Report | None
 ) -> Minimum:
     """L-BFGS from the table's start; from other starts too where the noise came to explain everything."""
     best: Minimum | None = None
-    tol = options.tol / objective.linear.n_rows
+    tol, collapsed = options.tol / objective.linear.n_rows, _COLLAPSED * scatter
     for length_factor, noise_factor in ((1.0, 1.0), *_OTHER_STARTS):
         start = table.coordinates(table.start())
         start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
@@ -153,7 +166,7 @@ def _lbfgs_unless_collapsed(
         minimum = lbfgs(objective, first, table.bounds(), options.max_iter, tol, report)
         if best is None or minimum.loss < best.loss:
             best = minimum
-        if best.interrupted or table["noise"].fixed or not (table.values(best.x)["noise"] > _COLLAPSED).any():
+        if best.interrupted or table["noise"].fixed or not (table.values(best.x)["noise"] > collapsed).any():
             break
     assert best is not None
     return best
@@ -164,6 +177,12 @@ def _message(minimum: Minimum, options: Options) -> str:
         return f"The fit was interrupted after {minimum.n_iter} iterations; the best parameters so far are kept."
     if minimum.converged:
         return ""
+    if minimum.n_iter < options.max_iter:
+        return (
+            f"L-BFGS stopped after {minimum.n_iter} iterations: rounding errors keep hiding the way up, as in data "
+            "without noise. The best parameters are kept; a larger tol, fewer inducing points or a WhiteKernel with a "
+            "lower bound on the noise end sooner."
+        )
     return (
         f"The bound was still rising after max_iter={options.max_iter} iterations. Raise max_iter, or stop earlier on "
         f"purpose with a larger tol (now {options.tol})."

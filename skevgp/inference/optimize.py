@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.optimize import minimize
+from scipy.optimize import OptimizeResult, minimize
 
 from .linalg import NotPositiveDefiniteError
 
@@ -16,6 +16,10 @@ Report = Callable[[int, float], None]
 
 _MAX_RESTARTS = 10
 _PATIENCE = 3
+# Relative size of a step that changes the loss by its rounding error only.
+_HAIR = 1e-10
+# A fresh start is worth another when it lowers the loss by this many times the tolerance.
+_WORTH = 100.0
 
 
 @dataclass
@@ -67,6 +71,14 @@ class _Guarded:
         return loss, gradient
 
 
+def _nudged(guarded: _Guarded, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
+    """A point next to the best with a middling loss, and how much the loss scatters there: its rounding error."""
+    rng, best = np.random.RandomState(0), guarded.x
+    points = [np.clip(best + _HAIR * np.maximum(np.abs(best), 1.0) * rng.randn(len(best)), *bounds) for _ in range(5)]
+    losses = np.array([guarded(point)[0] for point in points])
+    return points[int(np.argsort(losses)[2])], float(losses.std())
+
+
 def lbfgs(
     objective: Objective,
     start: np.ndarray,
@@ -75,7 +87,7 @@ def lbfgs(
     tol: float,
     report: Report | None = None,
 ) -> Minimum:
-    """L-BFGS-B (SciPy), started anew from the best point when a line search fails.
+    """L-BFGS-B (SciPy), started anew from the best point when it stalls or a line search fails.
 
     Parameters
     ----------
@@ -86,7 +98,8 @@ def lbfgs(
     max_iter : int
         Iterations in all.
     tol : float
-        Stop when each of three iterations in a row lowers the loss by less than this.
+        Start anew when each of three iterations in a row lowers the loss by less than this; stop when that no longer
+        lowers it by a hundred times as much.
     report : callable, default=None
 
     Returns
@@ -97,13 +110,15 @@ def lbfgs(
     minimum = Minimum(start, np.inf)
     stalled = 0
 
-    def callback(intermediate_result: object) -> None:  # SciPy looks at the name
+    def callback(intermediate_result: OptimizeResult) -> None:
+        # The iterate's own loss: a probe of a line search may have seen a better one by chance.
         nonlocal stalled
+        loss = float(intermediate_result.fun)
         before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
-        minimum.loss_curve.append(guarded.loss)
+        minimum.loss_curve.append(loss)
         if report is not None:
-            report(minimum.n_iter, guarded.loss)
-        stalled = stalled + 1 if before - guarded.loss < tol else 0
+            report(minimum.n_iter, loss)
+        stalled = stalled + 1 if before - loss < tol else 0
         if stalled >= _PATIENCE:
             raise StopIteration
 
@@ -111,23 +126,28 @@ def lbfgs(
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
+        x, enough = start, -np.inf
         for _ in range(1 + _MAX_RESTARTS):
             remaining = max_iter - minimum.n_iter
             if minimum.converged or remaining <= 0:
                 break
-            before = guarded.loss
+            before, stalled = guarded.loss, 0
             result = minimize(
                 guarded,
-                guarded.x,
+                x,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=np.column_stack(bounds),
                 callback=callback,
                 options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": 0.0, "gtol": 1e-9},
             )
-            # After a failed line search (2) rounding has the last word once a fresh start gains nothing more.
-            failed = result.status == 2 and before - guarded.loss > tol
-            minimum.converged = stalled >= _PATIENCE or (result.status != 1 and not failed)
+            if result.status == 1:
+                break
+            # It stalled, or a line search failed: either it is done, or memory and rounding errors led it astray.
+            # Start anew a hair away, where the loss is not what rounding made of it here, until that gains no more.
+            minimum.converged = before - guarded.loss <= enough
+            x, rounding = _nudged(guarded, bounds)
+            enough = max(_WORTH * tol, 2.0 * rounding)
     except KeyboardInterrupt:
         minimum.interrupted = True
     minimum.x, minimum.loss = guarded.x, guarded.loss
@@ -158,7 +178,8 @@ def adam(
     Returns
     -------
     minimum : Minimum
-        Its ``x`` is the last point (a mini-batch's loss does not tell which point was best).
+        Its ``x`` is the last point (a mini-batch's loss does not tell which point was best), or the last at which the
+        loss was finite.
     """
     x = np.clip(start, *bounds)
     minimum = Minimum(x, np.inf)
@@ -166,7 +187,13 @@ def adam(
     decay_first, decay_second = 0.9, 0.999
     try:
         for iteration in range(max_iter):
-            loss, gradient = objective(x)
+            try:
+                loss, gradient = objective(x)
+            except NotPositiveDefiniteError:
+                return minimum
+            if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+                return minimum
+            minimum.x = x
             minimum.loss_curve.append(loss)
             first = decay_first * first + (1.0 - decay_first) * gradient
             second = decay_second * second + (1.0 - decay_second) * gradient**2
@@ -174,10 +201,9 @@ def adam(
             step = learning_rate * 0.5 * (1.0 + np.cos(np.pi * iteration / max_iter))
             x = x - step * first / (1.0 - decay_first ** (iteration + 1)) / (corrected + 1e-8)
             x = np.clip(x, *bounds)
-            minimum.x = x
             if report is not None:
                 report(minimum.n_iter, loss)
-        minimum.converged = True
+        minimum.x, minimum.converged = x, True
     except KeyboardInterrupt:
         minimum.interrupted = True
     return minimum

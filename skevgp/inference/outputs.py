@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
-from typing import Literal
+from threading import Event
+from typing import Any, Literal
 
 import numpy as np
-from joblib import Parallel, delayed
-from threadpoolctl import threadpool_limits
 
 from .bounds import PosteriorFamily
 from .frame import Frame
@@ -20,7 +20,8 @@ from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
 from .start import FIRST_NOISE, Starts, starting_table
-from .statistics import BlockMap, Kernel
+from .statistics import Kernel
+from .threads import BlockMap, single_threaded_libraries
 
 Sharing = Literal["all", "kernel", "none"]
 
@@ -35,6 +36,19 @@ def _models(sharing: Sharing, kernel: Kernel, frame: Frame, family: PosteriorFam
     return [(slice(0, n_outputs), SparseModel(kernel, prior, family, groups))]
 
 
+def _side_by_side(one: Callable[..., Learned], jobs: list[Any], n_threads: int, stop: Event) -> list[Learned]:
+    """Each job's result; Ctrl-C sets ``stop``, upon which jobs end with what they have."""
+    if n_threads < 2:
+        return [one(*job) for job in jobs]
+    with ThreadPoolExecutor(n_threads) as pool:
+        futures = [pool.submit(one, *job) for job in jobs]
+        try:
+            wait(futures)
+        except KeyboardInterrupt:
+            stop.set()
+        return [future.result() for future in futures]
+
+
 @dataclass(frozen=True)
 class FittedOutputs:
     """Fitted sparse models of consecutive outputs.
@@ -42,6 +56,7 @@ class FittedOutputs:
     Attributes
     ----------
     frame : Frame
+    sharing : {"all", "kernel", "none"}
     outputs : tuple of slice
         Of each model.
     tables : tuple of ParameterTable
@@ -51,6 +66,7 @@ class FittedOutputs:
     """
 
     frame: Frame
+    sharing: Sharing
     outputs: tuple[slice, ...]
     tables: tuple[ParameterTable, ...]
     learned: tuple[Learned, ...]
@@ -97,7 +113,8 @@ class FittedOutputs:
         -------
         fitted : FittedOutputs
         """
-        points = initial_inducing_points(rows.inputs, n_inducing, rng)
+        with single_threaded_libraries():
+            points = initial_inducing_points(rows.inputs, n_inducing, rng)
         models = _models(sharing, kernel, frame, family)
         tables = []
         for index, (outputs, model) in enumerate(models):
@@ -106,28 +123,38 @@ class FittedOutputs:
                 np.repeat(points[np.newaxis], len(model.groups), axis=0),
                 frame.target_unit[outputs],
                 starts,
+                rows.scatter()[outputs],
                 FIRST_NOISE[options.solver],
                 kernel.n_hyperparameters,
             )
             if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
-                table = table.started_at(previous._values_in(frame, index))
+                table = table.started_at(previous._values_in(frame, rows, index))
             tables.append(table)
         seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
-        blocks = BlockMap(n_threads if len(models) == 1 else 1)
+        blocks, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
         options = replace(options, map_blocks=blocks)
 
         def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
-            report = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
-            return learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+            inner = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
+
+            def report(iteration: int, loss: float) -> None:
+                if stop.is_set():
+                    raise KeyboardInterrupt
+                if inner is not None:
+                    inner(iteration, loss)
+
+            learned = learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+            if learned.interrupted:
+                stop.set()
+            return learned
 
         jobs = [(*model, table, seed) for model, table, seed in zip(models, tables, seeds, strict=True)]
         try:
-            # One BLAS thread: blocks (or outputs) are what runs in parallel, and bits do not depend on n_threads.
-            with threadpool_limits(1, user_api="blas"):
-                learned = Parallel(min(n_threads, len(jobs)), prefer="threads")(delayed(one)(*job) for job in jobs)
+            with single_threaded_libraries():
+                learned = _side_by_side(one, jobs, min(n_threads, len(jobs)), stop)
         finally:
             blocks.close()
-        return cls(frame, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
+        return cls(frame, sharing, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
 
     def updated(self, rows: Rows) -> FittedOutputs:
         """Fold new rows, in internal units, into the posteriors."""
@@ -168,6 +195,8 @@ class FittedOutputs:
     @property
     def messages(self) -> list[str]:
         """What the user should know of how the fits ended."""
+        if any(one.interrupted for one in self.learned):
+            return [max(self.learned, key=lambda one: (one.interrupted, len(one.loss_curve))).message]
         return sorted({one.message for one in self.learned if one.message})
 
     def bounds(self, name: str, output: int) -> np.ndarray:
@@ -183,15 +212,19 @@ class FittedOutputs:
         """From internal units to the user's, for a loss of all rows."""
         return self.learned[0].statistics[0].n_rows * self.frame.log_unit(slice(None))
 
-    def _values_in(self, frame: Frame, index: int) -> dict[str, np.ndarray]:
-        """A model's values in another frame's internal units."""
+    def _values_in(self, frame: Frame, rows: Rows, index: int) -> dict[str, np.ndarray]:
+        """A model's values in another frame's internal units; none if the inputs are others."""
         if len(frame.centre) != len(self.frame.centre):
             return {}
         outputs, values = self.outputs[index], self.learned[index].values
+        points = values["inducing_points"] + self.frame.centre - frame.centre
+        lowest, highest = rows.inputs.min(axis=0), rows.inputs.max(axis=0)
+        if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
+            return {}
         ratio = (self.frame.target_unit[outputs] / frame.target_unit[outputs]) ** 2
         return {
             "hyperparameters": values["hyperparameters"],
             "signal": values["signal"] * ratio,
             "noise": values["noise"] * ratio,
-            "inducing_points": values["inducing_points"] + self.frame.centre - frame.centre,
+            "inducing_points": points,
         }

@@ -144,13 +144,11 @@ class Start:
         ----------
         name : str
         default, lower, upper : ndarray of the parameter's shape
-            Start and bounds, in internal units, where the user says nothing.
+            Start and bounds, in internal units, where the user says nothing; a start is put inside the bounds.
         unit : ndarray or float
             The user's values are divided by it.
         """
         start = default if self.value is None else np.broadcast_to(self.value / unit, default.shape)
         if self.bounds is not None:
             lower, upper = self.bounds[:, 0] / unit, self.bounds[:, 1] / unit
-        elif self.value is not None:
-            lower, upper = np.minimum(lower, start), np.maximum(upper, start)
         return Parameter(name, start, "log", lower, upper, fixed=self.fixed)

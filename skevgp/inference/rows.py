@@ -100,6 +100,11 @@ class Rows:
     def __len__(self) -> int:
         return len(self.inputs)
 
+    def scatter(self) -> np.ndarray:
+        """Variance (o,) of the residuals; 1 where they do not vary."""
+        scatter = self.residuals.var(axis=0)
+        return np.where(scatter > 0.0, scatter, 1.0)
+
     def blocks(self, kernel: Preparer, size: int) -> list[Block]:
         """Blocks of at most ``size`` rows, in order."""
         return [self._block(kernel, slice(first, first + size)) for first in range(0, len(self), size)]

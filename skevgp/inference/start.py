@@ -18,7 +18,10 @@ _LENGTHSCALE_BOUNDS = 1e-2, 1e4
 # In units of the variance that the features alone leave over. A low first noise keeps L-BFGS out of the optimum where
 # the noise explains everything; Adam, whose steps do not grow with the gradient, starts nearer to the data's scatter.
 FIRST_NOISE = {"lbfgs": 1e-4, "adam": 1e-2}
-_NOISE_BOUNDS = 1e-12, 1e2
+# Below 1e-10 of it, rounding in k(x, x) - |v|² (about 1e-16 times the condition of L, 1e6) outweighs the noise.
+_NOISE_BOUNDS = 1e-10, 1e2
+# Of squared target units, however little they scatter: about the rounding error of the residuals.
+_LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
 _SIGNAL_BOUNDS = 1e-8, 1e8
@@ -105,7 +108,7 @@ def rms(values: np.ndarray) -> np.ndarray:
 def spread_of(inputs: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of each centred column; 1 where the column is constant."""
     spread = rms(inputs)
-    return np.where(spread > 0.0, spread, 1.0)
+    return np.where(spread > _SMALLEST_UNIT, spread, 1.0)
 
 
 def starting_table(
@@ -113,6 +116,7 @@ def starting_table(
     inducing_points: np.ndarray,
     target_unit: np.ndarray,
     starts: Starts,
+    scatter: np.ndarray,
     first_noise: float,
     n_hyperparameters: int,
 ) -> ParameterTable:
@@ -128,8 +132,10 @@ def starting_table(
         The size of what the features alone leave over.
     starts : Starts
         What the user says of them.
+    scatter : ndarray of shape (o,)
+        Variance of the residuals, in squared target units: 1, but for targets far from 0.
     first_noise : float
-        Where the noise variance starts, in squared target units, if the user does not say.
+        Where the noise variance starts, as a share of the scatter, if the user does not say.
     n_hyperparameters : int
         1 or d.
 
@@ -149,7 +155,11 @@ def starting_table(
             ),
             starts.signal.parameter("signal", o, _SIGNAL_BOUNDS[0] * o, _SIGNAL_BOUNDS[1] * o, target_unit**2),
             starts.noise.parameter(
-                "noise", first_noise * o, _NOISE_BOUNDS[0] * o, _NOISE_BOUNDS[1] * o, target_unit**2
+                "noise",
+                first_noise * scatter,
+                np.maximum(_NOISE_BOUNDS[0] * scatter, _LOWEST_NOISE),
+                _NOISE_BOUNDS[1] * o,
+                target_unit**2,
             ),
             Parameter("inducing_points", inducing_points, unit=spread),
         ]

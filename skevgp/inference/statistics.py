@@ -9,7 +9,6 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -116,25 +115,6 @@ class SufficientStatistics:
     @classmethod
     def _fields(cls) -> Iterable[str]:
         return cls.__dataclass_fields__
-
-
-class BlockMap:
-    """Apply a function to blocks, in threads if there are several, and yield the results in the blocks' order.
-
-    The order of summation never depends on the number of threads, so neither do the bits of a sum.
-    """
-
-    def __init__(self, n_threads: int = 1):
-        self._pool = ThreadPoolExecutor(n_threads) if n_threads > 1 else None
-
-    def __call__(self, function: Callable[..., Any], *sequences: Sequence[Any]) -> Iterator[Any]:
-        if self._pool is None or len(sequences[0]) < 2:
-            return map(function, *sequences)
-        return self._pool.map(function, *sequences)
-
-    def close(self) -> None:
-        if self._pool is not None:
-            self._pool.shutdown()
 
 
 def collect(

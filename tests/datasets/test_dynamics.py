@@ -8,7 +8,7 @@ from sklearn.utils import check_random_state
 from skevgp.datasets import make_dynamics, simulate
 from skevgp.robots import get_system
 
-KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "DESCR"}
+KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "dt", "DESCR"}
 ALPHA = {"pendulum": [np.pi, 0.5], "cartpole": [1.0, np.pi, 0.5, 0.5], "acrobot": [np.pi, 1.0, 0.5, 0.5]}
 ETA = {"pendulum": 1.0, "cartpole": 100.0, "acrobot": 0.5}
 NAMES = {

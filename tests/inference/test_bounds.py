@@ -70,7 +70,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
     table = starting_table(
-        rows.inputs, table["inducing_points"].start, np.ones(2), Starts(Start(), Start(), Start()), 0.1, 1
+        rows.inputs, table["inducing_points"].start, np.ones(2), Starts(Start(), Start(), Start()), np.ones(2), 0.1, 1
     )
     loss = plain_loss(model, rows, table)
     value, gradient = BoundObjective(model, table, rows, 17)(table.start())

@@ -59,9 +59,10 @@ def test_a_start_in_the_users_units_is_divided_by_the_unit():
     assert (parameter.start, parameter.lower, parameter.upper) == ([2.0], [0.5], [5.0])
 
 
-def test_default_bounds_make_room_for_a_start_outside():
+def test_a_start_outside_the_default_bounds_is_put_inside():
     parameter = Start(np.array([100.0])).parameter("x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
-    assert (parameter.start, parameter.upper) == ([10.0], [10.0])
+    table = ParameterTable([parameter])
+    np.testing.assert_allclose(table.values(table.start())["x"], [3.0])
 
 
 def test_a_table_where_all_is_fixed_has_no_coordinates():
