@@ -66,3 +66,10 @@ def test_a_sample_serves_for_many_rows(monkeypatch):
     monkeypatch.setattr("skevgp.inference.inducing.MAX_SAMPLE", 100)
     X = np.random.RandomState(0).rand(5000, 1)
     assert initial_inducing_points(X, 100, np.random.RandomState(0)).shape == (100, 1)
+
+
+def test_the_first_points_are_far_apart():
+    """Adam moves in coordinates whitened in this order; sorted points make each nearly follow from the one before."""
+    X = np.random.RandomState(0).rand(2000, 1)
+    points = initial_inducing_points(X, 20, np.random.RandomState(0))[:, 0]
+    assert np.abs(np.diff(points[:5])).min() > 2.0 * np.diff(np.sort(points)).mean()
