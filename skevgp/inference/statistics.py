@@ -1,6 +1,6 @@
 """One pass over the rows: the sufficient statistics of a sparse GP with explicit features, and their pull-back.
 
-Everything the model learns from the data goes through a few sums over rows (SPEC of the model: Titsias 2009 with
+Everything the model learns from the data goes through a few sums over rows (Titsias 2009 with
 explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened inside each block, V = L⁻¹ k(X_m, X),
 *before* they are summed: summing k(X_m, X) k(X, X_m) and whitening afterwards loses all digits when the signal is
 1e6 times the noise or more.
