@@ -1,7 +1,6 @@
 import os
 import pickle
 import signal
-import threading
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -483,14 +482,22 @@ def test_a_fit_that_says_it_converged_has_little_left_to_gain():
 
 
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
-def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver):
+def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver, monkeypatch):
     """With outputs in threads of their own, the signal reaches the main thread only."""
-    many = np.hstack([Y] * 3)
-    m = model(sharing="none", solver=solver, n_jobs=2, tol=0.0, max_iter=1_000_000, batch_size=32)
-    timer = threading.Timer(1.0, lambda: os.kill(os.getpid(), signal.SIGINT))
-    timer.start()
+    sent = []
+
+    class Signal:
+        def __init__(self, verbose, shift):
+            pass
+
+        def __call__(self, iteration, loss):
+            if iteration == 3 and not sent:
+                sent.append(os.kill(os.getpid(), signal.SIGINT))
+
+    monkeypatch.setattr("skevgp.regressor.Progress", Signal)
+    m = model(sharing="none", solver=solver, n_jobs=2, tol=0.0, max_iter=1_000_000, batch_size=32, verbose=1)
     with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m.fit(X, many)
+        m.fit(X, np.hstack([Y] * 3))
     assert m.predict(X_NEW).shape == (80, 6)
     assert np.isfinite(m.predict(X_NEW)).all()
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor, wait
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass, replace
 from threading import Event
 from typing import Any, Literal
@@ -40,12 +40,15 @@ def _side_by_side(one: Callable[..., Learned], jobs: list[Any], n_threads: int, 
     """Each job's result; Ctrl-C sets ``stop``, upon which jobs end with what they have."""
     if n_threads < 2:
         return [one(*job) for job in jobs]
+    futures: list[Future[Learned]] = []
     with ThreadPoolExecutor(n_threads) as pool:
-        futures = [pool.submit(one, *job) for job in jobs]
         try:
+            for job in jobs:
+                futures.append(pool.submit(one, *job))
             wait(futures)
         except KeyboardInterrupt:
             stop.set()
+            futures += [pool.submit(one, *job) for job in jobs[len(futures) :]]
         return [future.result() for future in futures]
 
 
