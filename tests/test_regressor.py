@@ -485,6 +485,8 @@ def test_a_fit_that_says_it_converged_has_little_left_to_gain():
 def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver, monkeypatch):
     """With outputs in threads of their own, the signal reaches the main thread only."""
     sent = []
+    # A run in the background of a shell ignores SIGINT.
+    handler = signal.signal(signal.SIGINT, signal.default_int_handler)
 
     class Signal:
         def __init__(self, verbose, shift):
@@ -495,9 +497,12 @@ def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver, monkeypatch):
                 sent.append(os.kill(os.getpid(), signal.SIGINT))
 
     monkeypatch.setattr("skevgp.regressor.Progress", Signal)
-    m = model(sharing="none", solver=solver, n_jobs=2, tol=0.0, max_iter=1_000_000, batch_size=32, verbose=1)
-    with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m.fit(X, np.hstack([Y] * 3))
+    m = model(sharing="none", solver=solver, n_jobs=2, tol=0.0, max_iter=3000, batch_size=32, verbose=1)
+    try:
+        with pytest.warns(ConvergenceWarning, match="interrupted after"):
+            m.fit(X, np.hstack([Y] * 3))
+    finally:
+        signal.signal(signal.SIGINT, handler)
     assert m.predict(X_NEW).shape == (80, 6)
     assert np.isfinite(m.predict(X_NEW)).all()
 
