@@ -32,15 +32,17 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
     TypeError
         If it is not a transformer.
     """
-    if feature_map is None:
-        return None
+    return None if feature_map is None else fresh_map(feature_map, name).fit(X, y)
+
+
+def fresh_map(feature_map: Any, name: str) -> Any:
+    """A clone of a transformer, or a TypeError that names it."""
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
     try:
-        fresh = clone(feature_map)
+        return clone(feature_map)
     except TypeError as error:
         raise TypeError(f"{name}={feature_map!r} cannot be cloned: {error}") from error
-    return fresh.fit(X, y)
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:

@@ -9,6 +9,7 @@ from types import ModuleType
 _PACKAGES = {
     "pinocchio": ("pin", "physics"),
     "matplotlib": ("matplotlib", "plot"),
+    "dask": ("'dask[array,distributed]'", "dask"),
 }
 
 

@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 LARGEST = 1e100
+# So many rows can be looked at in one go.
+_FEW_ROWS = 16
 
 
 def check_integer(value: Any, name: str, *, minimum: int) -> int:
@@ -29,9 +31,22 @@ def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -
     return number
 
 
+def is_plain(estimator: Any, X: Any) -> bool:
+    """Whether X is a few finite rows as a fitted estimator saw them: in a control loop they need no other check."""
+    return (
+        type(X) is np.ndarray
+        and X.dtype == np.float64
+        and X.ndim == 2
+        and 0 < len(X) <= _FEW_ROWS
+        and X.shape[1] == estimator.n_features_in_
+        and not hasattr(estimator, "feature_names_in_")
+        and bool(np.abs(X).max() <= LARGEST)  # False if there is a NaN
+    )
+
+
 def check_magnitude(values: np.ndarray, name: str) -> None:
     """Refuse finite numbers whose squares would overflow."""
-    largest = np.abs(values).max(initial=0.0)
+    largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
     if largest > LARGEST:
         raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")
 

@@ -78,9 +78,6 @@ class SquaredExponentialAt:
     def diagonal(self, prepared: np.ndarray) -> float:
         return 1.0
 
-    def start_pullback(self) -> np.ndarray:
-        return np.zeros_like(self._exponent)
-
     def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> np.ndarray:
         """Σ_rows Ū U [x, 1, x²], (m, 2 d + 1); the diagonal is constant and adds nothing."""
         np.multiply(U_bar, U, out=U_bar)

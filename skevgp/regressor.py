@@ -17,18 +17,22 @@ from sklearn.utils import _safe_indexing, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._maps import apply_map, fit_map
+from ._dask import DaskSource, aligned, fit_map_to_chunks, is_dask, predict_chunks
+from ._data import MappedRows, map_rows
+from ._maps import fit_map
 from ._progress import Progress
-from ._validation import check_magnitude
-from .features.prior import resolve_coef_prior
+from ._validation import check_magnitude, is_plain
+from .features.prior import resolve_coef_prior, wide_scale
 from .inference.frame import Frame
 from .inference.learning import Options
 from .inference.outputs import FittedOutputs
 from .inference.posterior import Posterior
+from .inference.source import LocalSource, Source, moments_of_rows
 from .kernels import parse_kernel
 
 _MAX_ITER = {"lbfgs": 1000, "adam": 8000}
-_PREDICT_ROWS = 4096
+# float32 is not copied as a whole: pieces of it become float64.
+_DTYPES = [np.float64, np.float32]
 
 
 class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -276,13 +280,11 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not hasattr(self, "_fitted"):
             return self.fit(X, y)
         given, X, y = self._validated(X, y)
-        targets = y.reshape(len(y), -1)
-        frame = self._fitted.frame
-        if targets.shape[1] != len(frame.target_unit):
-            raise ValueError(f"y has {targets.shape[1]} outputs, but the model has {len(frame.target_unit)}.")
-        inputs, features = self._mapped(given, X)
-        rows = frame.rows(inputs, features, targets)
-        check_magnitude(rows.residuals, "y, in units of what the first fit left over,")
+        frame, n_outputs = self._fitted.frame, 1 if y.ndim == 1 else y.shape[1]
+        if n_outputs != self._n_outputs:
+            raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
+        rows = frame.rows(self._source(given, X, y))
+        check_magnitude(rows.residuals.largest, "y, in units of what the first fit left over,")
         self._fitted = self._fitted.updated(rows)
         self._set_attributes()
         return self
@@ -318,25 +320,35 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
         check_is_fitted(self)
-        given, X, _ = self._validated(X)
+        if is_dask(X):
+            if return_cov:
+                raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+            self._validated(X)
+            shape = () if self._n_outputs == 1 else (self._n_outputs,)
+            return predict_chunks(self, X, return_std, include_noise, shape)
+        given, X, _ = (X, X, None) if is_plain(self, X) else self._validated(X)
         noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
         if return_cov:
-            inputs, features = self._mapped(given, X)
-            inputs = inputs - self._fitted.frame.centre
-            mean, _ = self._posterior.predict(inputs, features)
-            cov = self._posterior.covariance(inputs, features) + np.eye(len(X))[:, :, np.newaxis] * noise
+            inputs, features = map_rows(given, X, self.feature_map_, self.kernel_map_)
+            mean, cov = self._posterior.covariance(inputs - self._fitted.frame.centre, features)
+            cov = cov + np.eye(len(X))[:, :, np.newaxis] * noise
             return self._like_y(mean + self._fitted.frame.target_mean), self._like_y(cov)
-        mean, variance = np.empty((len(X), len(noise))), np.empty((len(X), len(noise)))
-        for first in range(0, len(X), _PREDICT_ROWS):
-            block = slice(first, first + _PREDICT_ROWS)
-            inputs, features = self._mapped(_safe_indexing(given, block), X[block])
-            mean[block], block_variance = self._posterior.predict(
-                inputs - self._fitted.frame.centre, features, return_std
+        means, variances = [], []
+        size = self._posterior.rows_at_once
+        for first in range(0, len(X), size):
+            block = slice(first, first + size)
+            rows = np.asarray(X[block], dtype=np.float64)
+            inputs, features = map_rows(
+                rows if given is X else _safe_indexing(given, block), rows, self.feature_map_, self.kernel_map_
             )
-            if block_variance is not None:
-                variance[block] = block_variance + noise
-        mean = self._like_y(mean + self._fitted.frame.target_mean)
-        return (mean, self._like_y(np.sqrt(variance))) if return_std else mean
+            mean, variance = self._posterior.predict(inputs - self._fitted.frame.centre, features, return_std)
+            means.append(mean + self._fitted.frame.target_mean)
+            if variance is not None:
+                variances.append(np.sqrt(variance + noise))
+        mean = self._like_y(means[0] if len(means) == 1 else np.concatenate(means))
+        if not return_std:
+            return mean
+        return mean, self._like_y(variances[0] if len(variances) == 1 else np.concatenate(variances))
 
     def sample_y(
         self,
@@ -375,11 +387,12 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _fit(self, X: Any, y: Any) -> None:
         given, X, y = self._validated(X, y, reset=True)
-        self.feature_map_ = fit_map(self.feature_map, given, y, "feature_map")
-        self.kernel_map_ = fit_map(self.kernel_map, given, y, "kernel_map")
-        inputs, features = self._mapped(given, X)
-        targets = y.reshape(len(y), -1)
-        spec = parse_kernel(self.kernel, inputs.shape[1])
+        fit_to = fit_map_to_chunks if is_dask(X) else fit_map
+        self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
+        self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
+        source = self._source(given, X, y)
+        inputs, features, targets = source.sum(moments_of_rows)
+        spec = parse_kernel(self.kernel, len(inputs.mean))
         if self.noise_variance is not None:
             if spec.starts.noise.value is not None:
                 raise ValueError(
@@ -387,10 +400,11 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     f"kernel={self.kernel!r}; give one of them."
                 )
             spec = spec.with_noise(self.noise_variance)
-        prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, features, targets)
-        target_mean = targets.mean(axis=0) if self.normalize_y else np.zeros(targets.shape[1])
+        wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest)
+        prior = resolve_coef_prior(self.coef_mean, self.coef_scale, self.feature_map_, given, wide)
+        target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
 
-        frame = Frame.of(inputs, features, targets, target_mean, *prior)
+        frame = Frame.of(source, inputs, targets, target_mean, *prior)
         options = Options(
             self.solver,
             _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
@@ -400,7 +414,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         self._fitted = FittedOutputs.fit(
             frame,
-            frame.rows(inputs, features, targets),
+            frame.rows(source),
             spec.covariance,
             spec.starts,
             self.sharing,
@@ -420,22 +434,25 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
         """X as the maps shall see it (a data frame stays one), X and y as arrays."""
+        if is_dask(X):
+            validate_data(self, X, reset=reset, skip_check_array=True)
+            X, y = (X, np.empty(0)) if y is None and not reset else aligned(X, y)
+            return X, X, y
         given = X
         if y is None and not reset:
-            X, y = validate_data(self, X, reset=False, dtype=np.float64), np.empty(0)
+            X, y = validate_data(self, X, reset=False, dtype=_DTYPES), np.empty(0)
         else:
-            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=np.float64)
-            y = np.asarray(y, dtype=np.float64)
+            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=_DTYPES)
+            y = y if y.dtype.kind == "f" else np.asarray(y, dtype=np.float64)
         check_magnitude(X, "X")
         check_magnitude(y, "y")
         return (given if hasattr(given, "iloc") else X), X, y
 
-    def _mapped(self, given: Any, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's inputs and the features of rows."""
-        inputs = X if self.kernel_map_ is None else apply_map(self.kernel_map_, given, "kernel_map")
-        if self.feature_map_ is None:
-            return inputs, np.empty((len(X), 0))
-        return inputs, apply_map(self.feature_map_, given, "feature_map")
+    def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
+        """The rows through the maps."""
+        if is_dask(X):
+            return DaskSource(X, y, self.feature_map_, self.kernel_map_)
+        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
 
     def _set_attributes(self) -> None:
         fitted, prior = self._fitted, self._fitted.frame.prior
@@ -463,6 +480,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter
         self.n_parameters_ = fitted.n_parameters
+
+    @property
+    def _n_outputs(self) -> int:
+        return len(self._posterior.noise)
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         """Drop the axis of outputs if there is one output, as GaussianProcessRegressor does."""

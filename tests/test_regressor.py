@@ -96,7 +96,7 @@ def test_samples_have_the_predicted_moments():
 def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):
     m = model(feature_map=PolynomialFeatures(1), tol=1e9).fit(X, Y)
     whole = m.predict(X_NEW, return_std=True)
-    monkeypatch.setattr("skevgp.regressor._PREDICT_ROWS", 7)
+    monkeypatch.setattr("skevgp.inference.posterior.Posterior.rows_at_once", 7)
     for part, expected in zip(m.predict(X_NEW, return_std=True), whole, strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-9)
 
@@ -362,8 +362,9 @@ def test_warm_start_with_other_shapes_starts_anew():
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch):
-    monkeypatch.setattr("skevgp.inference.rows._MIN_BLOCK_ROWS", 16)
-    monkeypatch.setattr("skevgp.inference.rows._BLOCK_NUMBERS", 16)
+    monkeypatch.setattr("skevgp.inference.blocks._MIN_BLOCK_ROWS", 16)
+    monkeypatch.setattr("skevgp.inference.blocks._WORTH_THREADS", 0)
+    monkeypatch.setattr("skevgp.inference.blocks._BLOCK_NUMBERS", 16)
     fits = [
         model(sharing=sharing, solver=solver, n_jobs=n_jobs, max_iter=20, tol=1e9).fit(X, Y) for n_jobs in (None, 1, 2)
     ]

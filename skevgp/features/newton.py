@@ -13,7 +13,7 @@ from sklearn.utils._param_validation import Interval
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
 
-from .._validation import as_floats
+from .._validation import as_floats, is_plain
 from ..robots import System, get_system
 
 
@@ -88,7 +88,7 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
             h(x) of each row.
         """
         check_is_fitted(self)
-        rows: np.ndarray = validate_data(self, X, dtype=np.float64, reset=False)
+        rows: np.ndarray = X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[assignment]
         return np.hstack([rows, self._gravity_columns(rows)])
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:

@@ -22,8 +22,7 @@ def resolve_coef_prior(
     coef_scale: ArrayLike | str,
     feature_map: Any,
     X: Any,
-    features: np.ndarray,
-    targets: np.ndarray,
+    wide: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Prior mean and standard deviation of the weights.
 
@@ -31,14 +30,13 @@ def resolve_coef_prior(
     ----------
     coef_mean, coef_scale : array-like of shape (o, p), scalar or "auto"
         ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; unions concatenate those of their parts. A part
-        without one, and entries of a scale that are NaN, get mean 0 and scale 10 * std(y) / rms(h).
+        without one, and entries of a scale that are NaN, get mean 0 and the scale ``wide``.
     feature_map : transformer or None
         Fitted.
     X : array-like of shape (n, d)
         What the map takes; only its first row is used, to learn the widths of the parts of a union.
-    features : ndarray of shape (n, p)
-        h(x).
-    targets : ndarray of shape (n, o)
+    wide : ndarray of shape (o, p)
+        `wide_scale`.
 
     Returns
     -------
@@ -49,8 +47,8 @@ def resolve_coef_prior(
     ValueError
         If a shape does not fit, a value is not finite or a scale is negative.
     """
-    shape = targets.shape[1], features.shape[1]
-    auto_mean, auto_scale = np.zeros(shape), _wide_scale(features, targets)
+    shape = wide.shape
+    auto_mean, auto_scale = np.zeros(shape), wide
     if feature_map is not None and "auto" in (_word(coef_mean), _word(coef_scale)):
         first = _safe_indexing(X, slice(0, 1))
         mean, scale = _map_prior(feature_map, first, shape[0], shape[1])
@@ -81,11 +79,24 @@ def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.n
     return np.broadcast_to(array, shape)
 
 
-def _wide_scale(features: np.ndarray, targets: np.ndarray) -> np.ndarray:
-    scatter = targets.std(axis=0)
-    scatter = np.where(scatter > 0.0, scatter, np.abs(targets).max(axis=0))
-    size = np.sqrt(np.mean(features**2, axis=0))
-    return _WIDE * np.where(scatter > 0.0, scatter, 1.0)[:, np.newaxis] / np.where(size > 0.0, size, 1.0)
+def wide_scale(feature_size: np.ndarray, target_scatter: np.ndarray, target_largest: np.ndarray) -> np.ndarray:
+    """10 * std(y) / rms(h), the scale of weights of which nothing is known.
+
+    Parameters
+    ----------
+    feature_size : ndarray of shape (p,)
+        Root mean square of each feature.
+    target_scatter, target_largest : ndarray of shape (o,)
+        Standard deviation of each target, and its largest absolute value, which serves where it does not vary.
+
+    Returns
+    -------
+    scale : ndarray of shape (o, p)
+    """
+    scatter = np.where(target_scatter > 0.0, target_scatter, target_largest)
+    return (
+        _WIDE * np.where(scatter > 0.0, scatter, 1.0)[:, np.newaxis] / np.where(feature_size > 0.0, feature_size, 1.0)
+    )
 
 
 def _map_prior(feature_map: Any, first: Any, n_outputs: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -10,6 +10,7 @@ import numpy as np
 from .bounds import CoefficientPrior
 from .posterior import Posterior
 from .rows import Rows
+from .source import Moments, RawRows, Source
 from .start import features_alone, unit_of
 
 
@@ -37,27 +38,29 @@ class Frame:
     @classmethod
     def of(
         cls,
-        inputs: np.ndarray,
-        features: np.ndarray,
-        targets: np.ndarray,
+        source: Source,
+        inputs: Moments,
+        targets: Moments,
         target_mean: np.ndarray,
         coef_mean: np.ndarray,
         coef_scale: np.ndarray,
     ) -> Frame:
-        """The frame of a training set: inputs (n, d), features (n, p), targets (n, o), prior (o, p)."""
-        residuals = targets - target_mean - features @ coef_mean.T
-        reference = features_alone(features, residuals, coef_scale)
+        """The frame of a training set, from its rows, moments of its columns, and the prior (o, p) of its weights."""
+        reference, left_over = features_alone(source, target_mean, coef_mean, coef_scale)
         prior = CoefficientPrior(coef_mean, coef_scale, reference)
-        left_over = targets - target_mean - features @ prior.offset.T
         # The mean of equal numbers may round; what is left must then be 0, not a column of tiny numbers.
-        constant = np.ptp(inputs, axis=0) <= 8.0 * np.finfo(float).eps * np.abs(inputs).max(axis=0)
-        centre = np.where(constant, inputs[0], inputs.mean(axis=0))
-        return cls(centre, target_mean, unit_of(left_over, targets), prior)
+        constant = inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
+        centre = np.where(constant, inputs.lowest, inputs.mean)
+        return cls(centre, target_mean, unit_of(left_over, targets.largest), prior)
 
-    def rows(self, inputs: np.ndarray, features: np.ndarray, targets: np.ndarray) -> Rows:
+    def to_internal(self, raw: RawRows) -> RawRows:
+        """Centred inputs, features, and what the reference leaves of the targets, in its own units."""
+        left_over = raw.targets - self.target_mean - raw.features @ self.prior.offset.T
+        return RawRows(raw.inputs - self.centre, raw.features, left_over / self.target_unit)
+
+    def rows(self, source: Source) -> Rows:
         """Rows in internal units."""
-        left_over = targets - self.target_mean - features @ self.prior.offset.T
-        return Rows(inputs - self.centre, features, left_over / self.target_unit)
+        return Rows(source, self.to_internal)
 
     def internal_prior(self) -> CoefficientPrior:
         """The prior for residuals in units of ``target_unit``."""

@@ -8,10 +8,16 @@ import numpy as np
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
+from .source import Moments
 from .start import spread_of
 
 # k-means on a sample of the rows costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
+
+
+def sample_size(n_inducing: int) -> int:
+    """How many rows are enough to place so many points."""
+    return max(MAX_SAMPLE, 10 * n_inducing)
 
 
 def initial_inducing_points(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
@@ -20,7 +26,7 @@ def initial_inducing_points(inputs: np.ndarray, n_inducing: int, rng: np.random.
     Parameters
     ----------
     inputs : ndarray of shape (n_rows, d)
-        Centred.
+        Centred; of all rows, or of `sample_size` of them.
     n_inducing : int
         At most so many points.
     rng : RandomState
@@ -31,13 +37,10 @@ def initial_inducing_points(inputs: np.ndarray, n_inducing: int, rng: np.random.
         With m = min(n_inducing, distinct rows): all distinct rows, in the order of their first appearance, if there
         are no more than ``n_inducing``.
     """
-    n_sample = max(MAX_SAMPLE, 10 * n_inducing)
-    if len(inputs) > n_sample:
-        inputs = inputs[np.sort(rng.choice(len(inputs), n_sample, replace=False))]
     _, first = np.unique(inputs, axis=0, return_index=True)
     if len(first) <= n_inducing:
         return inputs[np.sort(first)]
-    scale = spread_of(inputs)
+    scale = spread_of(Moments.of(inputs))
     with warnings.catch_warnings():
         # Of rows that differ by rounding only: fewer points are then the right answer.
         warnings.simplefilter("ignore", ConvergenceWarning)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
@@ -13,8 +12,9 @@ from .objectives import BoundObjective, ElboObjective
 from .optimize import Minimum, Report, adam, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
-from .rows import Rows, block_rows
+from .rows import Rows
 from .statistics import SufficientStatistics
+from .threads import BlockMap
 
 # An output counts as not learned when this share of what the features alone leave over ends as noise.
 _COLLAPSED = 0.9
@@ -34,7 +34,7 @@ class Options:
         In nats.
     batch_size : int
     learning_rate : float
-    map_blocks : callable
+    threads : BlockMap
     """
 
     solver: Literal["lbfgs", "adam"]
@@ -42,7 +42,7 @@ class Options:
     tol: float
     batch_size: int
     learning_rate: float
-    map_blocks: Callable[..., Iterator[Any]] = map
+    threads: BlockMap = field(default_factory=BlockMap)
 
 
 @dataclass(frozen=True)
@@ -79,14 +79,11 @@ class Learned:
 
     def updated(self, rows: Rows) -> Learned:
         """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far."""
-        new = self.model.statistics(self.values, rows.blocks(self.model.kernel, block_rows(self._n_inducing)))
+        n_inducing = self.values["inducing_points"].shape[1]
+        new = self.model.statistics(self.values, rows.blocks(self.model.kernel, n_inducing))
         statistics = [old + more for old, more in zip(self.statistics, new, strict=True)]
         bound, posterior = self.model.at_optimum(self.values, statistics)
         return replace(self, bound=bound, posterior=posterior, statistics=statistics)
-
-    @property
-    def _n_inducing(self) -> int:
-        return self.values["inducing_points"].shape[1]
 
 
 def learn(
@@ -116,10 +113,11 @@ def learn(
     -------
     learned : Learned
     """
-    n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
+    n_rows = len(rows)
+    blocks = rows.blocks(model.kernel, table["inducing_points"].start.shape[1], options.threads)
     per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
     if options.solver == "adam":
-        elbo = ElboObjective(model, table, rows, size)
+        elbo = ElboObjective(model, table, blocks)
         batches = rows.batches(model.kernel, options.batch_size, rng)
         minimum = adam(
             elbo.minibatch(batches),
@@ -129,23 +127,20 @@ def learn(
             options.learning_rate,
             per_row,
         )
-        blocks = rows.blocks(model.kernel, size)
-        bound, posterior, statistics = elbo.solution(minimum.x, blocks)
+        bound, posterior, statistics = elbo.solution(minimum.x)
         values = {parameter.name: elbo.table.values(minimum.x)[parameter.name] for parameter in table.parameters}
         message = _message(minimum, options)
-        if not minimum.interrupted and not (
-            minimum.converged and bound >= elbo.solution(elbo.table.start(), blocks)[0]
-        ):
+        if not minimum.interrupted and not (minimum.converged and bound >= elbo.solution(elbo.table.start())[0]):
             message = (
                 f"Adam diverged: after {minimum.n_iter} steps the bound is below where it started. Lower learning_rate "
                 f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
             )
     else:
-        objective = BoundObjective(model, table, rows, size, options.map_blocks)
+        objective = BoundObjective(model, table, blocks)
         minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, per_row)
         message = _message(minimum, options)
         values = table.values(minimum.x)
-        statistics = model.statistics(values, objective.blocks)
+        statistics = model.statistics(values, blocks)
         bound, posterior = model.at_optimum(values, statistics)
         bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
     curve = [n_rows * loss for loss in minimum.loss_curve]
@@ -157,7 +152,7 @@ def _lbfgs_unless_collapsed(
 ) -> Minimum:
     """L-BFGS from the table's start; from other starts too where the noise came to explain everything."""
     best: Minimum | None = None
-    tol, collapsed = options.tol / objective.linear.n_rows, _COLLAPSED * scatter
+    tol, collapsed = options.tol / objective.blocks.linear.n_rows, _COLLAPSED * scatter
     for length_factor, noise_factor in ((1.0, 1.0), *_OTHER_STARTS):
         start = table.coordinates(table.start())
         start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)

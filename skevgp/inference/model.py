@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
+from .blocks import Blocks
 from .bounds import BoundAtOptimum, CoefficientPrior, PosteriorFamily
 from .linalg import jittered_cholesky, triangular_inverse
 from .posterior import InducingSet, Posterior
-from .rows import Block, LinearStatistics
 from .statistics import Kernel, SufficientStatistics, collect
 
 # Relative to the signal variance. k(X_m, X_m) from exact differences is accurate to about m times 1e-16.
@@ -40,10 +40,9 @@ class SparseModel:
     family: PosteriorFamily
     groups: tuple[slice, ...]
 
-    def statistics(self, values: Values, blocks: list[Block]) -> list[SufficientStatistics]:
+    def statistics(self, values: Values, rows: Blocks) -> list[SufficientStatistics]:
         """The statistics of all outputs for each set of inducing points."""
-        linear = LinearStatistics.of(blocks)
-        return [collect(blocks, linear, at, L_inv)[0] for at, _, L_inv in self.factors(values)]
+        return [collect(rows, at, L_inv) for at, _, L_inv in self.factors(values)]
 
     def at_optimum(self, values: Values, statistics: list[SufficientStatistics]) -> tuple[float, Posterior]:
         """The bound and the posterior with q at its optimum.

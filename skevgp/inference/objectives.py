@@ -9,12 +9,12 @@ import autograd.numpy as anp
 import numpy as np
 from autograd import value_and_grad
 
+from .blocks import Batch, Blocks
 from .bounds import Residuals, negative_elbo
 from .linalg import cholesky, cholesky_pullback, inverse_factor, lower_triangular
 from .model import JITTER, SparseModel, log_variances
 from .parameters import Parameter, ParameterTable
 from .posterior import Posterior
-from .rows import Block, LinearStatistics, Rows
 from .statistics import SufficientStatistics, collect, pull_back, traceable_statistics
 
 
@@ -24,30 +24,20 @@ class BoundObjective:
     Parameters
     ----------
     model : SparseModel
-    rows : Rows
-    block_rows : int
-    map_blocks : callable
+    table : ParameterTable
+    blocks : Blocks
     """
 
-    def __init__(
-        self,
-        model: SparseModel,
-        table: ParameterTable,
-        rows: Rows,
-        block_rows: int,
-        map_blocks: Callable[..., Iterator[Any]] = map,
-    ):
-        self.model, self.table, self.map_blocks = model, table, map_blocks
-        self.blocks = rows.blocks(model.kernel, block_rows)
-        self.linear = LinearStatistics.of(self.blocks)
+    def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
+        self.model, self.table, self.blocks = model, table, blocks
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
         values, model = self.table.values(flat), self.model
         units = self.table["inducing_points"].unit
-        total = 0.0
+        total, n_rows = 0.0, self.blocks.linear.n_rows
         gradient = {name: np.zeros_like(value) for name, value in values.items()}
         for index, (outputs, (at, L, L_inv)) in enumerate(zip(model.groups, model.factors(values), strict=True)):
-            statistics, kept = collect(self.blocks, self.linear, at, L_inv, True, self.map_blocks)
+            statistics = collect(self.blocks, at, L_inv)
             bound = model.bound(statistics, outputs, values["signal"], values["noise"], L, L_inv)
             bar = bound.gradient
             rows_bar, L_bar, squares, VE = pull_back(
@@ -55,13 +45,11 @@ class BoundObjective:
                 at,
                 L_inv,
                 statistics,
-                kept,
                 bar.VV,
                 bar.VH,
                 self._all_outputs(bar.VE, outputs),
                 bar.unexplained,
                 self._all_outputs(bound.fitted, outputs),
-                self.map_blocks,
             )
             residuals = Residuals(squares[outputs], VE[:, outputs])
             hyper_bar, Z_bar = at.finish_pullback(rows_bar, cholesky_pullback(L, L_inv, L_bar + bar.L))
@@ -69,7 +57,7 @@ class BoundObjective:
             gradient["hyperparameters"] += hyper_bar
             gradient["inducing_points"][index] += Z_bar * units
             gradient["signal"][outputs], gradient["noise"][outputs] = bound.log_gradients(residuals)
-        return -total / self.linear.n_rows, -self.table.flat(gradient) / self.linear.n_rows
+        return -total / n_rows, -self.table.flat(gradient) / n_rows
 
     def _all_outputs(self, part: np.ndarray, outputs: slice) -> np.ndarray:
         """Columns of some outputs (., o_group) -> of all (., o), with zeros for the others."""
@@ -89,14 +77,13 @@ class ElboObjective:
     model : SparseModel
     table : ParameterTable
         Of the parameters without q.
-    rows : Rows
-    block_rows : int
+    blocks : Blocks
+        All rows.
     """
 
-    def __init__(self, model: SparseModel, table: ParameterTable, rows: Rows, block_rows: int):
-        self.model, self.n_rows = model, len(rows)
+    def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
+        self.model, self.blocks, self.n_rows = model, blocks, blocks.linear.n_rows
         start = table.values(table.start())
-        blocks = rows.blocks(model.kernel, block_rows)
         self.m, (o, self.p) = start["inducing_points"].shape[1], model.prior.scale.shape
         mean, spread, self.root_start = [], [], []
         for own, outputs, (_, L, L_inv) in zip(
@@ -110,7 +97,7 @@ class ElboObjective:
         if model.family == "full":
             spread = [np.zeros(size * (size + 1) // 2)] * o
         # A step of w should move the prediction as much as a step of v does.
-        reach = model.prior.scale * np.sqrt(np.mean(rows.features**2, axis=0))
+        reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH) / self.n_rows)
         unit = np.hstack([np.ones((o, self.m)), 1.0 / np.where(reach > 0.0, reach, 1.0)])
         self.table = ParameterTable(
             [
@@ -120,34 +107,33 @@ class ElboObjective:
             ]
         )
 
-    def minibatch(self, batches: Iterator[tuple[Block, LinearStatistics]]) -> Callable[..., tuple[float, np.ndarray]]:
+    def minibatch(self, batches: Iterator[Batch]) -> Callable[..., tuple[float, np.ndarray]]:
         """X -> (loss, gradient) of the next batch, per row of the whole data."""
         gradient = value_and_grad(self._loss)
 
         def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-            block, linear = next(batches)
-            loss, bar = gradient(x, [block], linear)
+            loss, bar = gradient(x, next(batches))
             return loss / self.n_rows, bar / self.n_rows
 
         return objective
 
-    def solution(self, x: np.ndarray, blocks: list[Block]) -> tuple[float, Posterior, list[SufficientStatistics]]:
+    def solution(self, x: np.ndarray) -> tuple[float, Posterior, list[SufficientStatistics]]:
         """The bound on all rows, the posterior and the statistics at a point."""
         values = self.table.values(x)
-        bound = -float(self._loss(x, blocks, LinearStatistics.of(blocks)))
+        bound = -float(self._loss(x, self.blocks))
         L_inv = np.array([factor for _, _, factor in self.model.factors(values)])
         root, _ = self._spread(values["spread"], L_inv)
         posterior = self.model.posterior(values, list(values["mean"]), [matrix.T for matrix in root])
-        return bound, posterior, self.model.statistics(values, blocks)
+        return bound, posterior, self.model.statistics(values, self.blocks)
 
-    def _loss(self, x: Any, blocks: list[Block], linear: LinearStatistics) -> Any:
+    def _loss(self, x: Any, rows: Blocks) -> Any:
         coordinates, model = self.table.coordinates(x), self.model
         points = coordinates["inducing_points"] * self.table["inducing_points"].unit
         L = cholesky(model.kernel.traceable_matrices(coordinates["hyperparameters"], points), JITTER)
-        statistics = traceable_statistics(coordinates["hyperparameters"], points, L, model.kernel, blocks, linear)
+        statistics = traceable_statistics(coordinates["hyperparameters"], points, L, model.kernel, rows)
         root, log_det = self._spread(coordinates["spread"], inverse_factor(L))
         return negative_elbo(
-            statistics.scaled(self.n_rows / linear.n_rows),
+            statistics.scaled(self.n_rows / rows.linear.n_rows),
             anp.exp(coordinates["signal"]),
             anp.exp(coordinates["noise"]),
             model.prior,

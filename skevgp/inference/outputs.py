@@ -12,14 +12,14 @@ import numpy as np
 
 from .bounds import PosteriorFamily
 from .frame import Frame
-from .inducing import initial_inducing_points
+from .inducing import initial_inducing_points, sample_size
 from .learning import Learned, Options, learn
 from .model import SparseModel
 from .optimize import Report
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
-from .start import FIRST_NOISE, Starts, starting_table
+from .start import FIRST_NOISE, Starts, spread_of, starting_table
 from .statistics import Kernel
 from .threads import BlockMap, single_threaded_libraries
 
@@ -117,12 +117,12 @@ class FittedOutputs:
         fitted : FittedOutputs
         """
         with single_threaded_libraries():
-            points = initial_inducing_points(rows.inputs, n_inducing, rng)
+            points = initial_inducing_points(rows.sample(sample_size(n_inducing), rng), n_inducing, rng)
         models = _models(sharing, kernel, frame, family)
         tables = []
         for index, (outputs, model) in enumerate(models):
             table = starting_table(
-                rows.inputs,
+                spread_of(rows.inputs),
                 np.repeat(points[np.newaxis], len(model.groups), axis=0),
                 frame.target_unit[outputs],
                 starts,
@@ -134,8 +134,9 @@ class FittedOutputs:
                 table = table.started_at(previous._values_in(frame, rows, index))
             tables.append(table)
         seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
-        blocks, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
-        options = replace(options, map_blocks=blocks)
+        threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
+        options = replace(options, threads=threads)
+        at_once = min(n_threads, len(models))
 
         def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
             inner = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
@@ -146,7 +147,8 @@ class FittedOutputs:
                 if inner is not None:
                     inner(iteration, loss)
 
-            learned = learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+            own = rows.outputs(outputs, 1.0 / at_once)
+            learned = learn(model, table, own, options, np.random.RandomState(seed), report)
             if learned.interrupted:
                 stop.set()
             return learned
@@ -154,9 +156,9 @@ class FittedOutputs:
         jobs = [(*model, table, seed) for model, table, seed in zip(models, tables, seeds, strict=True)]
         try:
             with single_threaded_libraries():
-                learned = _side_by_side(one, jobs, min(n_threads, len(jobs)), stop)
+                learned = _side_by_side(one, jobs, at_once, stop)
         finally:
-            blocks.close()
+            threads.close()
         return cls(frame, sharing, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
 
     def updated(self, rows: Rows) -> FittedOutputs:
@@ -221,7 +223,7 @@ class FittedOutputs:
             return {}
         outputs, values = self.outputs[index], self.learned[index].values
         points = values["inducing_points"] + self.frame.centre - frame.centre
-        lowest, highest = rows.inputs.min(axis=0), rows.inputs.max(axis=0)
+        lowest, highest = rows.inputs.lowest, rows.inputs.highest
         if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
             return {}
         ratio = (self.frame.target_unit[outputs] / frame.target_unit[outputs]) ** 2

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
 from .bounds import CoefficientPrior
-from .statistics import Kernel
+from .statistics import Kernel, KernelAt
+
+# Of the spread of all outputs at once.
+_PREDICTED_NUMBERS = 2**20
 
 
 @dataclass(frozen=True)
@@ -57,6 +62,12 @@ class Posterior:
     mean: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
 
+    @property
+    def rows_at_once(self) -> int:
+        """How many rows to predict at once, so that memory stays small and products are large."""
+        stacked = sum(len(mean) for mean in self.mean)
+        return int(np.clip(_PREDICTED_NUMBERS // stacked, 256, 4096))
+
     def predict(
         self, inputs: np.ndarray, features: np.ndarray, return_variance: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None]:
@@ -75,33 +86,51 @@ class Posterior:
         mean : ndarray of shape (n, o)
         variance : ndarray of shape (n, o), or None
         """
-        mean = features @ self.prior.offset.T
-        variance = np.empty_like(mean) if return_variance else None
-        prepared = self.kernel.prepare(inputs)
-        for group in self.inducing:
-            kernel = self.kernel.at(group.hyperparameters, group.points)
-            V = group.L_inv @ kernel.cross(prepared)
-            if variance is not None:
-                unexplained = np.maximum(kernel.diagonal(prepared) - np.einsum("mn,mn->n", V, V), 0.0)
-            for o in range(len(self.signal))[group.outputs]:
-                P = self._projection(V, features, o)
-                mean[:, o] += self.mean[o] @ P
-                if variance is not None:
-                    spread = self.root[o] @ P
-                    variance[:, o] = self.signal[o] * unexplained + np.einsum("mn,mn->n", spread, spread)
-        return mean, variance
+        prepared, means, variances = self.kernel.prepare(inputs), [], []
+        for group in self._groups:
+            P, unexplained = group.project(prepared, features)
+            means.append((group.mean @ P).T)
+            if return_variance:
+                spread = group.root @ P
+                np.multiply(spread, spread, out=spread)
+                squares = spread.reshape(len(group.mean), -1, len(inputs)).sum(axis=1)
+                variances.append((np.outer(group.signal, np.maximum(unexplained, 0.0)) + squares).T)
+        mean = _side_by_side(means)
+        mean += features @ self.prior.offset.T
+        return mean, _side_by_side(variances) if return_variance else None
 
-    def covariance(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Covariance of the noise-free g(x) between rows, of shape (n, n, o)."""
-        covariance = np.empty((len(inputs), len(inputs), len(self.signal)))
-        prepared = self.kernel.prepare(inputs)
-        for group in self.inducing:
-            V = group.L_inv @ self.kernel.at(group.hyperparameters, group.points).cross(prepared)
-            unexplained = self.kernel.at(group.hyperparameters, inputs).matrix() - V.T @ V
-            for o in range(len(self.signal))[group.outputs]:
-                spread = self.root[o] @ self._projection(V, features, o)
-                covariance[:, :, o] = self.signal[o] * unexplained + spread.T @ spread
-        return covariance
+    def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o)."""
+        mean, _ = self.predict(inputs, features)
+        covariance, prepared = [], self.kernel.prepare(inputs)
+        for group, own in zip(self._groups, self.inducing, strict=True):
+            P, _ = group.project(prepared, features)
+            V = P[: len(own.points)]
+            unexplained = self.kernel.at(own.hyperparameters, inputs).matrix() - V.T @ V
+            for signal, root in zip(group.signal, np.split(group.root, len(group.mean)), strict=True):
+                spread = root @ P
+                covariance.append(signal * unexplained + spread.T @ spread)
+        return mean, np.stack(covariance, axis=2)
+
+    @cached_property
+    def _groups(self) -> tuple[_Group, ...]:
+        """What does not depend on the rows, computed once: a control loop predicts one row at a time."""
+        groups = []
+        for own in self.inducing:
+            outputs = range(len(self.signal))[own.outputs]
+            m = len(own.points)
+            # [s; c] turns [V; Hᵀ] into Pᵀ of each output.
+            scales = [np.append(np.full(m, np.sqrt(self.signal[o])), self.prior.scale[o]) for o in outputs]
+            groups.append(
+                _Group(
+                    self.kernel.at(own.hyperparameters, own.points),
+                    own.L_inv,
+                    self.signal[own.outputs],
+                    np.array([self.mean[o] * scale for o, scale in zip(outputs, scales, strict=True)]),
+                    np.vstack([self.root[o] * scale for o, scale in zip(outputs, scales, strict=True)]),
+                )
+            )
+        return tuple(groups)
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
@@ -114,6 +143,35 @@ class Posterior:
             covariance[o] = spread.T @ spread
         return mean, covariance
 
-    def _projection(self, V: np.ndarray, features: np.ndarray, output: int) -> np.ndarray:
-        """Pᵀ: [s V; diag(c) Hᵀ] (m + p, n)."""
-        return np.vstack([np.sqrt(self.signal[output]) * V, (features * self.prior.scale[output]).T])
+
+@dataclass(frozen=True)
+class _Group:
+    """Outputs that share inducing points, ready to predict: g(x) has the mean ``mean @ P`` and the spread ``root @ P``.
+
+    Attributes
+    ----------
+    kernel : KernelAt
+    L_inv : ndarray of shape (m, m)
+    signal : ndarray of shape (o,)
+    mean : ndarray of shape (o, m + p)
+    root : ndarray of shape (o (m + p), m + p)
+        Of one output above the other.
+    """
+
+    kernel: KernelAt
+    L_inv: np.ndarray
+    signal: np.ndarray
+    mean: np.ndarray
+    root: np.ndarray
+
+    def project(self, prepared: Any, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""
+        m = len(self.L_inv)
+        P = np.empty((m + features.shape[1], len(features)))
+        V = np.matmul(self.L_inv, self.kernel.cross(prepared), out=P[:m])
+        P[m:] = features.T
+        return P, self.kernel.diagonal(prepared) - np.einsum("mn,mn->n", V, V)
+
+
+def _side_by_side(columns: list[np.ndarray]) -> np.ndarray:
+    return columns[0] if len(columns) == 1 else np.hstack(columns)

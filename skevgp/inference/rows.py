@@ -1,15 +1,21 @@
-"""The data as blocks of rows."""
+"""The rows of a data set in internal units, in which every number is of order one."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from sklearn.utils.random import sample_without_replacement
 
-# A block's k(X_m, X) should stay in a core's cache: about this many numbers, but not fewer rows than this.
-_BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**15, 512, 4096
+from .blocks import Batch, Block, Blocks
+from .source import Moments, RawRows, Source
+from .threads import BlockMap
+
+# Mini-batches are drawn from so many rows at a time: shuffling needs memory.
+_SHUFFLED_ROWS = 2**18
 
 
 class Preparer(Protocol):
@@ -19,64 +25,33 @@ class Preparer(Protocol):
         """What the kernel computes once of rows (n, d)."""
 
 
-def block_rows(n_inducing: int) -> int:
-    """How many rows a block has; depends on nothing but the number of inducing points."""
-    return int(np.clip(_BLOCK_NUMBERS // max(n_inducing, 1), _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS))
+# From the user's units to the internal ones: (inputs, features, residuals) as `RawRows`.
+ToInternal = Callable[[RawRows], RawRows]
 
 
 @dataclass(frozen=True)
-class Block:
-    """Consecutive rows of the data.
+class MakeBlock:
+    """Rows in the user's units -> `Block` of some outputs."""
 
-    Attributes
-    ----------
-    prepared : object
-        The kernel's inputs, as its ``prepare`` returns them.
-    linear : ndarray of shape (n, p + o)
-        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums.
-    n_features : int
-        p.
-    """
+    kernel: Preparer
+    to_internal: ToInternal
+    outputs: slice = field(default_factory=lambda: slice(None))
 
-    prepared: Any
-    linear: np.ndarray
-    n_features: int
-
-    @property
-    def features(self) -> np.ndarray:
-        return self.linear[:, : self.n_features]
-
-    @property
-    def residuals(self) -> np.ndarray:
-        return self.linear[:, self.n_features :]
+    def __call__(self, raw: RawRows) -> Block:
+        rows = self.to_internal(raw)
+        linear = np.hstack([rows.features, rows.targets[:, self.outputs]])
+        return Block(self.kernel.prepare(rows.inputs), linear, rows.features.shape[1])
 
 
 @dataclass(frozen=True)
-class LinearStatistics:
-    """The sums over rows that do not depend on any parameter: computed once per data set.
+class _InternalMoments:
+    """Rows in the user's units -> moments of the inputs and the residuals in internal units."""
 
-    Attributes
-    ----------
-    n_rows : int
-    HH : ndarray of shape (p, p)
-        HᵀH.
-    HR : ndarray of shape (p, o)
-        Hᵀr.
-    RR : ndarray of shape (o,)
-        rᵀr of each output.
-    """
+    to_internal: ToInternal
 
-    n_rows: int
-    HH: np.ndarray
-    HR: np.ndarray
-    RR: np.ndarray
-
-    @classmethod
-    def of(cls, blocks: Iterable[Block]) -> LinearStatistics:
-        """Sum over at least one block."""
-        parts = [(len(b.linear), b.linear.T @ b.linear, b.n_features) for b in blocks]
-        total, p = sum(part[1] for part in parts), parts[0][2]
-        return cls(sum(part[0] for part in parts), total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy())
+    def __call__(self, raw: RawRows) -> tuple[Moments, Moments]:
+        rows = self.to_internal(raw)
+        return Moments.of(rows.inputs), Moments.of(rows.targets)
 
 
 @dataclass(frozen=True)
@@ -85,45 +60,68 @@ class Rows:
 
     Attributes
     ----------
-    inputs : ndarray of shape (n, d)
-        The kernel's, centred.
-    features : ndarray of shape (n, p)
-        h(x).
-    residuals : ndarray of shape (n, o)
-        y minus the reference linear part, in units of its own size.
+    source : Source
+        In the user's units.
+    to_internal : callable
+        From there to centred inputs and to residuals (in place of targets): y minus the reference linear part, in
+        units of its own size.
+    columns : slice
+        The outputs that count.
+    share : float
+        Of the memory for blocks, for one of several fits at once.
     """
 
-    inputs: np.ndarray
-    features: np.ndarray
-    residuals: np.ndarray
+    source: Source
+    to_internal: ToInternal
+    columns: slice = field(default_factory=lambda: slice(None))
+    share: float = 1.0
 
     def __len__(self) -> int:
-        return len(self.inputs)
+        return self.source.n_rows
+
+    @cached_property
+    def _moments(self) -> tuple[Moments, Moments]:
+        return self.source.sum(_InternalMoments(self.to_internal))
+
+    @property
+    def inputs(self) -> Moments:
+        """Of the centred inputs' columns."""
+        return self._moments[0]
+
+    @property
+    def residuals(self) -> Moments:
+        """Of the residuals of all outputs."""
+        return self._moments[1]
 
     def scatter(self) -> np.ndarray:
         """Variance (o,) of the residuals; 1 where they do not vary."""
-        scatter = self.residuals.var(axis=0)
+        scatter = self._moments[1].variance[self.columns]
         return np.where(scatter > 0.0, scatter, 1.0)
 
-    def blocks(self, kernel: Preparer, size: int) -> list[Block]:
-        """Blocks of at most ``size`` rows, in order."""
-        return [self._block(kernel, slice(first, first + size)) for first in range(0, len(self), size)]
+    def sample(self, size: int, rng: np.random.RandomState) -> np.ndarray:
+        """The inputs of all rows, or of ``size`` of them drawn at random, in their order."""
+        chosen = np.arange(len(self))
+        if len(self) > size:
+            chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
+        return self.to_internal(self.source.take(chosen)).inputs
 
-    def batches(
-        self, kernel: Preparer, size: int, rng: np.random.RandomState
-    ) -> Iterator[tuple[Block, LinearStatistics]]:
+    def blocks(self, kernel: Preparer, n_inducing: int, threads: BlockMap | None = None) -> Blocks:
+        """The rows as blocks for a kernel with so many inducing points."""
+        make = MakeBlock(kernel, self.to_internal, self.columns)
+        return self.source.blocks(make, n_inducing, BlockMap() if threads is None else threads, self.share)
+
+    def batches(self, kernel: Preparer, size: int, rng: np.random.RandomState) -> Iterator[Batch]:
         """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""
         size = min(size, len(self))
+        make = MakeBlock(kernel, self.to_internal, self.columns)
+        shard = max(_SHUFFLED_ROWS // size, 1) * size
+        starts = np.arange(0, len(self), shard) if len(self) > shard else np.zeros(1, dtype=int)
         while True:
-            order = rng.permutation(len(self))
-            for first in range(0, len(self) - size + 1, size):
-                block = self._block(kernel, order[first : first + size])
-                yield block, LinearStatistics.of([block])
+            for first in rng.permutation(starts) if len(starts) > 1 else starts:
+                order = first + rng.permutation(min(shard, len(self) - first))
+                for begin in range(0, len(order) - size + 1, size):
+                    yield Batch(make(self.source.take(order[begin : begin + size])))
 
-    def outputs(self, columns: slice) -> Rows:
+    def outputs(self, columns: slice, share: float = 1.0) -> Rows:
         """The same rows with some of the outputs."""
-        return Rows(self.inputs, self.features, self.residuals[:, columns])
-
-    def _block(self, kernel: Preparer, rows: slice | np.ndarray) -> Block:
-        linear = np.hstack([self.features[rows], self.residuals[rows]])
-        return Block(kernel.prepare(self.inputs[rows]), linear, self.features.shape[1])
+        return replace(self, columns=columns, share=share)

@@ -9,6 +9,7 @@ from scipy.linalg import cho_solve
 
 from .linalg import jittered_cholesky
 from .parameters import Parameter, ParameterTable, Start
+from .source import Moments, RawRows, Source
 
 # Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
 # all strangers, whatever the number of columns.
@@ -46,73 +47,88 @@ class Starts:
     noise: Start
 
 
-def features_alone(features: np.ndarray, residuals: np.ndarray, scale: np.ndarray) -> np.ndarray:
-    """The most probable w of r = H diag(scale) w + ε, w ~ N(0, I), for each output.
+@dataclass(frozen=True)
+class _LeftOver:
+    """Rows -> Hᵀl (p, o), lᵀl (o,) and HᵀH of l = y - target_mean - H coefᵀ."""
+
+    target_mean: np.ndarray
+    coef: np.ndarray
+
+    def __call__(self, raw: RawRows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        left_over = raw.targets - self.target_mean - raw.features @ self.coef.T
+        H = raw.features
+        return H.T @ left_over, np.einsum("no,no->o", left_over, left_over), H.T @ H
+
+
+def features_alone(
+    source: Source, target_mean: np.ndarray, mean: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable w of y = target_mean + H (mean + diag(scale) w) + ε, w ~ N(0, I), for each output.
 
     The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
     the rounding of the normal equations.
 
     Parameters
     ----------
-    features : ndarray of shape (n, p)
-    residuals : ndarray of shape (n, o)
-        y - H mean.
+    source : Source
+        n rows with p features and o targets.
+    target_mean : ndarray of shape (o,)
+    mean : ndarray of shape (o, p)
+        Prior means.
     scale : ndarray of shape (o, p)
         Prior standard deviations; 0 keeps a coefficient at its mean.
 
     Returns
     -------
     w : ndarray of shape (o, p)
+    left_over : ndarray of shape (o,)
+        Root mean square of what they leave over.
     """
     w = np.zeros(scale.shape)
-    HH = features.T @ features
-    for o, c in enumerate(scale):
-        target = residuals[:, o]
-        noise = 1e-12 * np.mean(target**2)
-        for _ in range(2):
-            if noise == 0.0 or not c.any():
-                break
-            precision = c[:, np.newaxis] * HH * c
-            np.einsum("ii->i", precision)[...] += noise
-            root = jittered_cholesky(precision)
-            for _ in range(3):
-                left_over = target - features @ (c * w[o])
-                w[o] += cho_solve((root, True), c * (features.T @ left_over) - noise * w[o])
-            noise = np.mean((target - features @ (c * w[o])) ** 2)
-    return w
+    HL, squares, HH = source.sum(_LeftOver(target_mean, mean))
+    moving = [o for o in range(len(scale)) if squares[o] > 0.0 and scale[o].any()]
+    share = 1e-12
+    for _ in range(2 if moving else 0):
+        noise = share * squares / source.n_rows
+        share = 1.0
+        roots = {}
+        for o in moving:
+            precision = scale[o][:, np.newaxis] * HH * scale[o]
+            np.einsum("ii->i", precision)[...] += noise[o]
+            roots[o] = jittered_cholesky(precision) if noise[o] > 0.0 else None
+        for _ in range(3):
+            for o in moving:
+                if roots[o] is not None:
+                    w[o] += cho_solve((roots[o], True), scale[o] * HL[:, o] - noise[o] * w[o])
+            HL, squares, _ = source.sum(_LeftOver(target_mean, mean + scale * w))
+    return w, np.sqrt(squares / source.n_rows)
 
 
-def unit_of(values: np.ndarray, reference: np.ndarray) -> np.ndarray:
-    """The root mean square of each column, never below the rounding error of ``reference`` and never 0.
+def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
 
     Parameters
     ----------
-    values, reference : ndarray of shape (n, o)
+    left_over : ndarray of shape (o,)
+        Root mean square.
+    largest : ndarray of shape (o,)
+        Of the target's absolute values.
 
     Returns
     -------
     unit : ndarray of shape (o,)
     """
-    largest = np.abs(reference).max(axis=0)
-    unit = np.maximum(rms(values), 1e-14 * largest)
+    unit = np.maximum(left_over, 1e-14 * largest)
     return np.where(unit > 0.0, np.maximum(unit, _SMALLEST_UNIT), 1.0)
 
 
-def rms(values: np.ndarray) -> np.ndarray:
-    """Root mean square of each column, without overflow."""
-    largest = np.abs(values).max(axis=0, initial=0.0)
-    safe = np.where(largest > 0.0, largest, 1.0)
-    return safe * np.sqrt(np.mean((values / safe) ** 2, axis=0))
-
-
-def spread_of(inputs: np.ndarray) -> np.ndarray:
-    """The standard deviation (d,) of each centred column; 1 where the column is constant."""
-    spread = rms(inputs)
-    return np.where(spread > _SMALLEST_UNIT, spread, 1.0)
+def spread_of(inputs: Moments) -> np.ndarray:
+    """The root mean square (d,) of each centred column; 1 where the column is constant."""
+    return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
 
 
 def starting_table(
-    inputs: np.ndarray,
+    spread: np.ndarray,
     inducing_points: np.ndarray,
     target_unit: np.ndarray,
     starts: Starts,
@@ -124,8 +140,8 @@ def starting_table(
 
     Parameters
     ----------
-    inputs : ndarray of shape (n, d)
-        The kernel's, centred.
+    spread : ndarray of shape (d,)
+        Of the kernel's inputs: `spread_of`.
     inducing_points : ndarray of shape (g, m, d)
         One set per group of outputs.
     target_unit : ndarray of shape (o,)
@@ -144,9 +160,9 @@ def starting_table(
     table : ParameterTable
         With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
     """
-    spread, o = spread_of(inputs), np.ones(len(target_unit))
+    o = np.ones(len(target_unit))
     typical = spread if n_hyperparameters > 1 else np.sqrt(np.mean(spread**2, keepdims=True))
-    root_d = np.sqrt(inputs.shape[1])
+    root_d = np.sqrt(len(spread))
     lower, upper = _LENGTHSCALE_BOUNDS
     return ParameterTable(
         [

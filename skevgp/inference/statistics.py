@@ -8,18 +8,15 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 from autograd.extend import defvjp_argnums, primitive
 
+from .blocks import Block, Blocks
 from .linalg import triangular_inverse
-from .rows import Block, LinearStatistics
-
-# Blocks keep k(X_m, X) and V for the second pass while they fit in this many bytes; beyond it they are recomputed.
-KEEP_BYTES = 128 * 2**20
 
 
 class KernelAt(Protocol):
@@ -34,11 +31,8 @@ class KernelAt(Protocol):
     def diagonal(self, prepared: Any) -> np.ndarray | float:
         """k(x, x) of each row, of shape (n,), or one number for all."""
 
-    def start_pullback(self) -> Any:
-        """An empty sum for `cross_pullback`."""
-
     def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> Any:
-        """What one block adds to the sum; may overwrite ``U_bar``."""
+        """What one block adds, by ``+``, to the sum for `finish_pullback`; may overwrite ``U_bar``."""
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in the hyperparameters (n_hyper,) and the inducing points (m, d), of the rows and of `matrix`."""
@@ -117,72 +111,86 @@ class SufficientStatistics:
         return cls.__dataclass_fields__
 
 
-def collect(
-    blocks: Sequence[Block],
-    linear: LinearStatistics,
-    kernel: KernelAt,
-    L_inv: np.ndarray,
-    keep: bool = False,
-    map_blocks: Callable[..., Iterator[Any]] = map,
-) -> tuple[SufficientStatistics, list[tuple[np.ndarray, np.ndarray] | None]]:
+@dataclass(frozen=True)
+class _FirstPass:
+    """Block -> V Vᵀ, V [H, r] and Σ max(k(x, x) - |v|², 0)."""
+
+    kernel: KernelAt
+    L_inv: np.ndarray
+
+    def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray, float]:
+        U = self.kernel.cross(block.prepared)
+        V = self.L_inv @ U
+        block.kept = (self.L_inv, U, V) if block.may_keep else None
+        unexplained = self.kernel.diagonal(block.prepared) - np.einsum("ij,ij->j", V, V)
+        return V @ V.T, V @ block.linear, np.maximum(unexplained, 0.0).sum()
+
+
+@dataclass(frozen=True)
+class _SecondPass:
+    """Block -> what it adds to the kernel's pull-back, eᵀe of each output and V e.
+
+    Ū = (L⁻ᵀ symmetric) V + (L⁻ᵀ linear_bar) [H, e]ᵀ: the m-sized products came first.
+    """
+
+    kernel: KernelAt
+    L_inv: np.ndarray
+    from_whitened: np.ndarray
+    from_linear: np.ndarray
+    unexplained_bar: float
+    fitted: np.ndarray | None
+
+    def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
+        if block.kept is not None and block.kept[0] is self.L_inv:
+            _, U, V = block.kept
+        else:
+            U = self.kernel.cross(block.prepared)
+            V = self.L_inv @ U
+        linear, p, m = block.linear, block.n_features, len(V)
+        if self.fitted is not None:
+            linear = linear.copy()
+            linear[:, p:] -= V.T @ self.fitted[:m]
+            linear[:, p:] -= block.features @ self.fitted[m:]
+        e = linear[:, p:]
+        U_bar = self.from_whitened @ V
+        U_bar += self.from_linear @ linear.T
+        rows_bar = self.kernel.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
+        return rows_bar, np.einsum("no,no->o", e, e), V @ e
+
+
+def collect(rows: Blocks, kernel: KernelAt, L_inv: np.ndarray) -> SufficientStatistics:
     """First pass over the rows.
 
     Parameters
     ----------
-    blocks : sequence of Block
-    linear : LinearStatistics
-        Of the same blocks.
+    rows : Blocks
     kernel : KernelAt
         With m inducing points.
     L_inv : ndarray of shape (m, m)
         Inverse of the lower Cholesky factor of k(X_m, X_m).
-    keep : bool, default=False
-        Whether blocks keep (k(X_m, X), V) for `pull_back`, within `KEEP_BYTES`.
-    map_blocks : callable, default=map
 
     Returns
     -------
     statistics : SufficientStatistics
-    kept : list with one entry per block
-        (U, V), or None where it must be recomputed.
     """
-    m, p = len(L_inv), len(linear.HH)
-    budget = KEEP_BYTES if keep else 0
-
-    def one(block: Block, keep_this: bool) -> tuple[Any, ...]:
-        U = kernel.cross(block.prepared)
-        V = L_inv @ U
-        unexplained = kernel.diagonal(block.prepared) - np.einsum("ij,ij->j", V, V)
-        return V @ V.T, V @ block.linear, np.maximum(unexplained, 0.0).sum(), (U, V) if keep_this else None
-
-    bytes_per_row = 16 * m
-    keeps, used = [], 0
-    for block in blocks:
-        used += bytes_per_row * len(block.linear)
-        keeps.append(used <= budget)
-
-    VV, VL, total = np.zeros((m, m)), np.zeros((m, p + linear.HR.shape[1])), 0.0
-    kept = []
-    for block_VV, block_VL, block_unexplained, block_kept in map_blocks(one, blocks, keeps):
-        VV += block_VV
-        VL += block_VL
-        total += block_unexplained
-        kept.append(block_kept)
-    return SufficientStatistics(linear.n_rows, VV, VL[:, :p], VL[:, p:], linear.HH, linear.HR, linear.RR, total), kept
+    linear = rows.linear
+    VV, VL, unexplained = rows.sum(_FirstPass(kernel, L_inv))
+    p = len(linear.HH)
+    return SufficientStatistics(
+        linear.n_rows, VV, VL[:, :p], VL[:, p:], linear.HH, linear.HR, linear.RR, float(unexplained)
+    )
 
 
 def pull_back(
-    blocks: Sequence[Block],
+    rows: Blocks,
     kernel: KernelAt,
     L_inv: np.ndarray,
     statistics: SufficientStatistics,
-    kept: Sequence[tuple[np.ndarray, np.ndarray] | None],
     VV_bar: np.ndarray,
     VH_bar: np.ndarray,
     VR_bar: np.ndarray,
     unexplained_bar: float,
     fitted: np.ndarray | None = None,
-    map_blocks: Callable[..., Iterator[Any]] = map,
 ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
     """Second pass over the rows: gradients of a scalar in the statistics -> in the kernel's rows and in L.
 
@@ -192,9 +200,9 @@ def pull_back(
 
     Parameters
     ----------
-    blocks, kernel, L_inv, map_blocks
+    rows, kernel, L_inv
         As in `collect`.
-    statistics, kept
+    statistics : SufficientStatistics
         What `collect` returned.
     VV_bar, VH_bar, VR_bar, unexplained_bar
         Gradients in the statistics of these names, of the same shapes.
@@ -212,33 +220,10 @@ def pull_back(
     VE : ndarray of shape (m, o)
         V e, or V r.
     """
-    m, p = statistics.VH.shape
     symmetric = VV_bar + VV_bar.T
     np.einsum("ii->i", symmetric)[...] -= 2.0 * unexplained_bar
-    # Ū = (L⁻ᵀ symmetric) V + (L⁻ᵀ linear_bar) [H, e]ᵀ: the m-sized products come first.
-    from_V, from_linear = L_inv.T @ symmetric, L_inv.T @ np.hstack([VH_bar, VR_bar])
-
-    def one(block: Block, block_kept: tuple[np.ndarray, np.ndarray] | None) -> tuple[Any, ...]:
-        if block_kept is None:
-            U = kernel.cross(block.prepared)
-            V = L_inv @ U
-        else:
-            U, V = block_kept
-        linear = block.linear
-        if fitted is not None:
-            linear = linear.copy()
-            linear[:, p:] -= V.T @ fitted[:m]
-            linear[:, p:] -= block.features @ fitted[m:]
-        e = linear[:, p:]
-        U_bar = from_V @ V
-        U_bar += from_linear @ linear.T
-        return kernel.cross_pullback(block.prepared, U, U_bar, unexplained_bar), np.einsum("no,no->o", e, e), V @ e
-
-    rows_bar, squares, VE = kernel.start_pullback(), np.zeros(VR_bar.shape[1]), np.zeros(VR_bar.shape)
-    for block_bar, block_squares, block_VE in map_blocks(one, blocks, kept):
-        rows_bar += block_bar
-        squares += block_squares
-        VE += block_VE
+    from_whitened, from_linear = L_inv.T @ symmetric, L_inv.T @ np.hstack([VH_bar, VR_bar])
+    rows_bar, squares, VE = rows.sum(_SecondPass(kernel, L_inv, from_whitened, from_linear, unexplained_bar, fitted))
     VbarV = symmetric @ statistics.VV + VH_bar @ statistics.VH.T + VR_bar @ VE.T
     return rows_bar, -np.tril(L_inv.T @ VbarV), squares, VE
 
@@ -267,28 +252,27 @@ def _flat_statistics(
     inducing_points: np.ndarray,
     L: np.ndarray,
     kernel: Kernel,
-    blocks: Sequence[Block],
-    linear: LinearStatistics,
+    rows: Blocks,
     memo: list[Any],
 ) -> np.ndarray:
     flat = []
     for points, factor in zip(inducing_points, L, strict=True):
         at, L_inv = kernel.at(hyperparameters, points), triangular_inverse(factor)
-        statistics, kept = collect(blocks, linear, at, L_inv, keep=True)
-        memo.append((at, L_inv, statistics, kept))
+        statistics = collect(rows, at, L_inv)
+        memo.append((at, L_inv, statistics))
         flat.append(_pack(statistics.VV, statistics.VH, statistics.VR, statistics.unexplained))
     return np.array(flat)
 
 
 def _flat_statistics_vjp(argnums: Sequence[int], _value: np.ndarray, args: Any, _kwargs: Any) -> Callable[..., Any]:
-    hyperparameters, inducing_points, L, _, blocks, linear, memo = args
+    hyperparameters, inducing_points, L, _, rows, memo = args
 
     def vjp(flat_bar: np.ndarray) -> tuple[np.ndarray, ...]:
         gradients = np.zeros_like(hyperparameters), np.zeros_like(inducing_points), np.zeros_like(L)
         m = L.shape[1]
-        bars = zip(*_unpack(flat_bar, m, *linear.HR.shape), strict=True)
-        for index, ((at, L_inv, statistics, kept), bar) in enumerate(zip(memo, bars, strict=True)):
-            rows_bar, gradients[2][index], _, _ = pull_back(blocks, at, L_inv, statistics, kept, *bar)
+        bars = zip(*_unpack(flat_bar, m, *rows.linear.HR.shape), strict=True)
+        for index, ((at, L_inv, statistics), bar) in enumerate(zip(memo, bars, strict=True)):
+            rows_bar, gradients[2][index], _, _ = pull_back(rows, at, L_inv, statistics, *bar)
             hyper_bar, gradients[1][index] = at.finish_pullback(rows_bar, np.zeros((m, m)))
             gradients[0][...] += hyper_bar
         return tuple(gradients[argnum] for argnum in argnums)
@@ -304,8 +288,7 @@ def traceable_statistics(
     inducing_points: Any,
     L: Any,
     kernel: Kernel,
-    blocks: Sequence[Block],
-    linear: LinearStatistics,
+    rows: Blocks,
 ) -> SufficientStatistics:
     """The statistics of several sets of inducing points, as a function that autograd differentiates by `pull_back`.
 
@@ -316,15 +299,13 @@ def traceable_statistics(
     L : array of shape (g, m, m)
         Lower Cholesky factors of k(X_m, X_m), themselves traced.
     kernel : Kernel
-    blocks : sequence of Block
-    linear : LinearStatistics
-        Of the same blocks.
+    rows : Blocks
 
     Returns
     -------
     statistics : SufficientStatistics
         Traced, with a leading axis g, where it depends on the first three arguments.
     """
-    flat = _flat_statistics(hyperparameters, inducing_points, L, kernel, blocks, linear, [])
+    flat, linear = _flat_statistics(hyperparameters, inducing_points, L, kernel, rows, []), rows.linear
     VV, VH, VR, unexplained = _unpack(flat, L.shape[1], *linear.HR.shape)
     return SufficientStatistics(linear.n_rows, VV, VH, VR, linear.HH, linear.HR, linear.RR, unexplained)

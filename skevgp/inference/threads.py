@@ -1,14 +1,19 @@
-"""Threads: blocks (or outputs) run side by side, BLAS and OpenMP inside them do not."""
+"""Sums in a fixed order, in threads that hold BLAS and OpenMP to one thread each."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
+from itertools import islice
 from threading import Lock
-from typing import Any
+from typing import Any, TypeVar
 
 from threadpoolctl import threadpool_limits
+
+Part = TypeVar("Part")
+Total = TypeVar("Total")
 
 _lock, _users, _limits = Lock(), 0, None
 
@@ -34,19 +39,50 @@ def single_threaded_libraries() -> Iterator[None]:
                 _limits = None
 
 
-class BlockMap:
-    """Apply a function to blocks, in threads if there are several, and yield the results in the blocks' order.
+def add(first: Any, second: Any) -> Any:
+    """First + second; of tuples, entry by entry."""
+    if isinstance(first, tuple):
+        return tuple(a + b for a, b in zip(first, second, strict=True))
+    return first + second
 
-    The order of summation never depends on the number of threads, so neither do the bits of a sum.
+
+def ordered_sum(parts: Iterable[Any]) -> Any:
+    """The sum of at least one part, from the first to the last."""
+    iterator = iter(parts)
+    total = next(iterator)
+    for part in iterator:
+        total = add(total, part)
+    return total
+
+
+class BlockMap:
+    """Apply a function to parts of the data, in threads if there are several, and yield results in the parts' order.
+
+    Few parts are under way at once, so that memory does not grow with their number, and the order of summation never
+    depends on the number of threads, so neither do the bits of a sum.
     """
 
     def __init__(self, n_threads: int = 1):
+        self._n_threads = n_threads
         self._pool = ThreadPoolExecutor(n_threads) if n_threads > 1 else None
 
-    def __call__(self, function: Callable[..., Any], *sequences: Sequence[Any]) -> Iterator[Any]:
-        if self._pool is None or len(sequences[0]) < 2:
-            return map(function, *sequences)
-        return self._pool.map(function, *sequences)
+    def __call__(self, function: Callable[[Part], Total], parts: Iterable[Part]) -> Iterator[Total]:
+        if self._pool is None:
+            yield from map(function, parts)
+            return
+        waiting = iter(parts)
+        running: deque[Future[Total]] = deque()
+        try:
+            for part in islice(waiting, 2 * self._n_threads):
+                running.append(self._pool.submit(function, part))
+            while running:
+                result = running.popleft().result()
+                for part in islice(waiting, 1):
+                    running.append(self._pool.submit(function, part))
+                yield result
+        finally:
+            for future in running:
+                future.cancel()
 
     def close(self) -> None:
         if self._pool is not None:

@@ -7,7 +7,7 @@ from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp.features import InertiaForce, InertiaForceGravity
-from skevgp.features.prior import resolve_coef_prior
+from skevgp.features.prior import resolve_coef_prior, wide_scale
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(20, 3)) * [1.0, 10.0, 0.1]
@@ -34,11 +34,11 @@ class Opinionated(TransformerMixin, BaseEstimator):
 
 def resolve(feature_map, coef_mean="auto", coef_scale="auto", targets=TARGETS):
     fitted = feature_map.fit(X)
-    return resolve_coef_prior(coef_mean, coef_scale, fitted, X, fitted.transform(X), targets)
+    return resolve_coef_prior(coef_mean, coef_scale, fitted, X, wide(fitted.transform(X), targets))
 
 
 def wide(features, targets=TARGETS):
-    return 10.0 * targets.std(axis=0)[:, np.newaxis] / np.sqrt(np.mean(features**2, axis=0))
+    return wide_scale(np.sqrt(np.mean(features**2, axis=0)), targets.std(axis=0), np.abs(targets).max(axis=0))
 
 
 @pytest.mark.parametrize("feature_map", [InertiaForce("pendulum"), InertiaForceGravity("pendulum", gravity_gain=20.0)])
@@ -74,7 +74,7 @@ def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
 
 
 def test_without_features_the_prior_is_empty():
-    mean, scale = resolve_coef_prior("auto", "auto", None, X, np.empty((20, 0)), TARGETS)
+    mean, scale = resolve_coef_prior("auto", "auto", None, X, np.empty((2, 0)))
     assert mean.shape == scale.shape == (2, 0)
 
 
@@ -243,7 +243,7 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
 @pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
 def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
     union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
-    mean, scale = resolve_coef_prior("auto", "auto", union.fit(X), X, X, TARGETS)
+    mean, scale = resolve_coef_prior("auto", "auto", union.fit(X), X, wide(X))
     assert_allclose(mean, factor * IF_MEAN)
     assert_allclose(scale, abs(factor) * IF_SCALE)
 

@@ -3,11 +3,13 @@
 import autograd.numpy as anp
 import numpy as np
 
+from skevgp.inference.blocks import LocalBlocks
 from skevgp.inference.bounds import CoefficientPrior
 from skevgp.inference.model import JITTER, SparseModel
 from skevgp.inference.parameters import Start
-from skevgp.inference.rows import Rows
-from skevgp.inference.start import Starts, starting_table
+from skevgp.inference.rows import MakeBlock
+from skevgp.inference.source import LocalSource, Moments
+from skevgp.inference.start import Starts, spread_of, starting_table
 from skevgp.kernels import SquaredExponential
 
 
@@ -44,16 +46,30 @@ def collapsed_bound(lengthscales, signal, noise, Z, rows, prior, family="full"):
     return total
 
 
+class ArrayRows:
+    """Rows in internal units whose arrays a test can look at."""
+
+    def __init__(self, inputs, features, residuals):
+        self.inputs, self.features, self.residuals = inputs, features, residuals
+
+    def __len__(self):
+        return len(self.inputs)
+
+    def blocks(self, kernel, size):
+        source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock(kernel, lambda raw: raw)
+        return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size)
+
+
 def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     """A small model, its rows and a table of parameters away from any optimum."""
     rng = np.random.RandomState(seed)
     X, H = rng.randn(n, d), rng.randn(n, p)
     Y = np.sin(X @ rng.randn(d, o)) + H @ rng.randn(p, o) + 0.1 * rng.randn(n, o)
     prior = CoefficientPrior(np.zeros((o, p)), 0.5 + rng.rand(o, p), 0.3 * rng.randn(o, p))
-    rows = Rows(X, H, Y - H @ prior.offset.T)
+    rows = ArrayRows(X, H, Y - H @ prior.offset.T)
     groups = (slice(0, o),) if shared else tuple(slice(i, i + 1) for i in range(o))
     model = SparseModel(SquaredExponential(d), prior, family, groups)
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
-    table = starting_table(X, Z, np.ones(o), Starts(*starts), np.ones(o), 1e-2, d)
+    table = starting_table(spread_of(Moments.of(X)), Z, np.ones(o), Starts(*starts), np.ones(o), 1e-2, d)
     return model, rows, table

@@ -1,0 +1,193 @@
+"""The rows in internal units as blocks, each small enough for a core's cache, and the sums over them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields, is_dataclass
+from functools import cached_property
+from typing import Any, Protocol
+
+import numpy as np
+
+from .threads import BlockMap, add, ordered_sum
+
+# A block's k(X_m, X) should stay in a core's cache: about this many numbers, but not fewer rows than this.
+_BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**15, 512, 4096
+# Blocks that are made already are kept within this many bytes; the others are made again at each pass.
+CACHE_BYTES = 48 * 2**20
+# If k(X_m, X) and V of all rows fit in this many bytes, they are kept from the first pass for the second.
+KEEP_BYTES = 128 * 2**20
+# Below this size of k(X_m, X), handing blocks to threads costs more than it saves.
+_WORTH_THREADS = 2**17
+# Blocks are summed in at most so many groups, and the groups in order, whatever the number of threads.
+_MAX_GROUPS = 64
+
+
+def block_rows(n_inducing: int) -> int:
+    """How many rows a block has; depends on nothing but the number of inducing points."""
+    return int(np.clip(_BLOCK_NUMBERS // max(n_inducing, 1), _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS))
+
+
+@dataclass
+class Block:
+    """Consecutive rows of the data.
+
+    Attributes
+    ----------
+    prepared : object
+        The kernel's inputs, as its ``prepare`` returns them.
+    linear : ndarray of shape (n, p + o)
+        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums.
+    n_features : int
+        p.
+    may_keep : bool
+        Whether there is room for ``kept``.
+    kept : (L_inv, k(X_m, X), V) or None
+        What the first pass left for the second.
+    """
+
+    prepared: Any
+    linear: np.ndarray
+    n_features: int
+    may_keep: bool = False
+    kept: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+
+    @property
+    def features(self) -> np.ndarray:
+        return self.linear[:, : self.n_features]
+
+    @property
+    def residuals(self) -> np.ndarray:
+        return self.linear[:, self.n_features :]
+
+
+@dataclass(frozen=True)
+class LinearStatistics:
+    """The sums over rows that do not depend on any parameter: computed once per data set.
+
+    Attributes
+    ----------
+    n_rows : int
+    HH : ndarray of shape (p, p)
+        HᵀH.
+    HR : ndarray of shape (p, o)
+        Hᵀr.
+    RR : ndarray of shape (o,)
+        rᵀr of each output.
+    """
+
+    n_rows: int
+    HH: np.ndarray
+    HR: np.ndarray
+    RR: np.ndarray
+
+    @classmethod
+    def of(cls, block: Block) -> LinearStatistics:
+        total, p = block.linear.T @ block.linear, block.n_features
+        return cls(len(block.linear), total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy())
+
+    def __add__(self, other: LinearStatistics) -> LinearStatistics:
+        return LinearStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
+
+
+class Blocks(Protocol):
+    """Rows that a function of a block can be summed over."""
+
+    @property
+    def linear(self) -> LinearStatistics:
+        """The sums that do not depend on any parameter."""
+
+    def sum(self, function: Callable[[Block], Any]) -> Any:
+        """The sum of function(block), by ``+`` (of tuples, entry by entry), in an order that never changes."""
+
+
+class Batch:
+    """One block that stands for itself: a mini-batch."""
+
+    def __init__(self, block: Block):
+        self.block = block
+        block.may_keep = True
+
+    @cached_property
+    def linear(self) -> LinearStatistics:
+        return LinearStatistics.of(self.block)
+
+    def sum(self, function: Callable[[Block], Any]) -> Any:
+        return function(self.block)
+
+
+class LocalBlocks:
+    """Blocks in this process: kept while memory lasts, else made anew at each pass.
+
+    Parameters
+    ----------
+    make : callable
+        A slice of rows -> `Block`.
+    n_rows, n_inducing : int
+    threads : BlockMap
+    share : float, default=1
+        Of `CACHE_BYTES` and `KEEP_BYTES`, for one of several fits at once.
+    keep : bool, default=True
+        Whether the second pass follows in the same process as the first, with the same objects.
+    size : int, default=None
+        Rows per block; None means `block_rows`.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[slice], Block],
+        n_rows: int,
+        n_inducing: int,
+        threads: BlockMap | None = None,
+        share: float = 1.0,
+        keep: bool = True,
+        size: int | None = None,
+    ):
+        size = block_rows(n_inducing) if size is None else size
+        self._make = make
+        self._slices = [slice(first, min(first + size, n_rows)) for first in range(0, n_rows, size)]
+        first = make(self._slices[0])
+        self._n_cached = int(share * CACHE_BYTES / max(_nbytes((first.prepared, first.linear)), 1))
+        all_cached = self._n_cached >= len(self._slices)
+        self._may_keep = first.may_keep = keep and all_cached and 16 * n_inducing * n_rows <= share * KEEP_BYTES
+        self._made = {0: first}
+        per_group = -(-len(self._slices) // _MAX_GROUPS)
+        blocks = range(len(self._slices))
+        self._groups = [blocks[first : first + per_group] for first in range(0, len(blocks), per_group)]
+        self._threads = threads if threads is not None and n_inducing * n_rows >= _WORTH_THREADS else BlockMap()
+
+    def __len__(self) -> int:
+        return len(self._slices)
+
+    def __getitem__(self, index: int) -> Block:
+        block = self._made.get(index)
+        if block is None:
+            block = self._make(self._slices[index])
+            block.may_keep = self._may_keep
+            if index < self._n_cached:
+                self._made[index] = block
+        return block
+
+    @cached_property
+    def linear(self) -> LinearStatistics:
+        return self.sum(LinearStatistics.of)
+
+    def sum(self, function: Callable[[Block], Any]) -> Any:
+        def one(group: range) -> Any:
+            total = function(self[group[0]])
+            for index in group[1:]:
+                total = add(total, function(self[index]))
+            return total
+
+        return ordered_sum(self._threads(one, self._groups))
+
+
+def _nbytes(value: Any) -> int:
+    """Bytes of the arrays that an object holds."""
+    if isinstance(value, np.ndarray):
+        return value.nbytes
+    if isinstance(value, (tuple, list)):
+        return sum(map(_nbytes, value))
+    if is_dataclass(value) and not isinstance(value, type):
+        return sum(_nbytes(getattr(value, field.name)) for field in fields(value))
+    return 0

@@ -1,0 +1,147 @@
+"""A data set in the user's units, wherever its rows are: what can be summed over it, and its columns' moments."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol, Self, TypeVar
+
+import numpy as np
+
+from .blocks import Block, Blocks, LocalBlocks
+from .threads import BlockMap, ordered_sum
+
+Total = TypeVar("Total")
+
+# Rows that a pass over raw rows sees at once.
+PASS_ROWS = 16_384
+
+
+@dataclass(frozen=True)
+class RawRows:
+    """Some rows in the user's units.
+
+    Attributes
+    ----------
+    inputs : ndarray of shape (n, d)
+        The kernel's.
+    features : ndarray of shape (n, p)
+        h(x).
+    targets : ndarray of shape (n, o)
+    """
+
+    inputs: np.ndarray
+    features: np.ndarray
+    targets: np.ndarray
+
+
+class Source(Protocol):
+    """All rows of a data set: in memory, in a file, or on other machines. Their order never changes."""
+
+    n_rows: int
+
+    def sum(self, function: Callable[[RawRows], Total]) -> Total:
+        """The sum of function(piece) over pieces of the rows, by ``+``; ``function`` can be pickled."""
+
+    def take(self, rows: np.ndarray) -> RawRows:
+        """Some rows, by ascending index."""
+
+    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+        """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Count, mean, scatter and range of columns; sums of them are exact (Chan, Golub & LeVeque 1983, eq. 2.1).
+
+    Attributes
+    ----------
+    n : int
+    mean, squares, lowest, highest : ndarray of shape (columns,)
+        ``squares`` is the sum of squared deviations from the mean.
+    """
+
+    n: int
+    mean: np.ndarray
+    squares: np.ndarray
+    lowest: np.ndarray
+    highest: np.ndarray
+
+    @classmethod
+    def of(cls, values: np.ndarray) -> Self:
+        """Of an array (n, columns) with at least one row."""
+        lowest, highest = values.min(axis=0), values.max(axis=0)
+        # The mean of equal numbers may round.
+        mean = np.where(lowest == highest, lowest, values.mean(axis=0))
+        return cls(len(values), mean, np.sum((values - mean) ** 2, axis=0), lowest, highest)
+
+    def __add__(self, other: Self) -> Self:
+        n, difference = self.n + other.n, other.mean - self.mean
+        return type(self)(
+            n,
+            self.mean + difference * (other.n / n),
+            self.squares + other.squares + difference**2 * (self.n * other.n / n),
+            np.minimum(self.lowest, other.lowest),
+            np.maximum(self.highest, other.highest),
+        )
+
+    @property
+    def variance(self) -> np.ndarray:
+        return self.squares / self.n
+
+    @property
+    def rms(self) -> np.ndarray:
+        """Root mean square."""
+        return np.sqrt(self.variance + self.mean**2)
+
+    @property
+    def largest(self) -> np.ndarray:
+        """The largest absolute value."""
+        return np.maximum(np.abs(self.lowest), np.abs(self.highest))
+
+
+def moments_of_rows(raw: RawRows) -> tuple[Moments, Moments, Moments]:
+    """Of inputs, features and targets."""
+    return Moments.of(raw.inputs), Moments.of(raw.features), Moments.of(raw.targets)
+
+
+class LocalSource:
+    """Rows that this process can load.
+
+    Parameters
+    ----------
+    load : callable
+        A slice, or indices -> `RawRows`; may be called from several threads.
+    n_rows : int
+    """
+
+    def __init__(self, load: Callable[[slice | np.ndarray], RawRows], n_rows: int):
+        self.load, self.n_rows = load, n_rows
+
+    @classmethod
+    def of(cls, inputs: np.ndarray, features: np.ndarray, targets: np.ndarray) -> Self:
+        """Of arrays."""
+        return cls(lambda rows: RawRows(inputs[rows], features[rows], targets[rows]), len(inputs))
+
+    def sum(self, function: Callable[[RawRows], Total]) -> Total:
+        pieces = (self.load(slice(first, first + PASS_ROWS)) for first in range(0, self.n_rows, PASS_ROWS))
+        return ordered_sum(map(function, pieces))
+
+    def take(self, rows: np.ndarray) -> RawRows:
+        return self.load(rows)
+
+    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+        return LocalBlocks(self.through(make), self.n_rows, n_inducing, threads, share)
+
+    def through(self, make: Callable[[RawRows], Block]) -> Callable[[slice], Block]:
+        """Load, then make."""
+        return _Through(self.load, make)
+
+
+@dataclass(frozen=True)
+class _Through:
+    load: Callable[[slice | np.ndarray], RawRows]
+    make: Callable[[RawRows], Block]
+
+    def __call__(self, rows: slice) -> Block:
+        return self.make(self.load(rows))
