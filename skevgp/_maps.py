@@ -9,7 +9,7 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.utils import _safe_indexing
 
-from ._validation import as_floats, check_magnitude
+from ._validation import LARGEST, as_floats, check_magnitude
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
@@ -70,21 +70,39 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     for first in range(0, n_rows, MAP_ROWS):
         rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
         values = fitted_map.transform(rows)
-        values = as_floats(values.toarray() if issparse(values) else values, f"What {name}={fitted_map!r} returns")
-        if values.ndim != 2 or len(values) != rows.shape[0]:
-            raise ValueError(
-                f"{name}={fitted_map!r} must return one row per row of X; for {rows.shape[0]} rows it returned the "
-                f"shape {values.shape}."
-            )
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name}={fitted_map!r} returned NaN or infinity for finite rows.")
+        if not _is_good(values, rows.shape[0]):
+            values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
         if blocks and values.shape[1] != blocks[0].shape[1]:
             raise ValueError(
                 f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
                 f"{blocks[0].shape[1]} and {values.shape[1]}."
             )
-        if values.shape[1] == 0:
-            raise ValueError(f"{name}={fitted_map!r} returned no columns.")
-        check_magnitude(values, f"What {name}={fitted_map!r} returns")
         blocks.append(values)
-    return np.concatenate(blocks)
+    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+
+
+def _is_good(values: Any, n_rows: int) -> bool:
+    """Whether it needs no other check: what nearly every map returns, and a message takes longer than the features."""
+    return (
+        type(values) is np.ndarray
+        and values.dtype == np.float64
+        and values.ndim == 2
+        and len(values) == n_rows
+        and values.shape[1] > 0
+        and bool(np.abs(values).max() <= LARGEST)  # False if there is a NaN
+    )
+
+
+def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
+    """What a map returned as an array of floats, or an error that names the map."""
+    values = as_floats(values.toarray() if issparse(values) else values, f"What {called} returns")
+    if values.ndim != 2 or len(values) != n_rows:
+        raise ValueError(
+            f"{called} must return one row per row of X; for {n_rows} rows it returned the shape {values.shape}."
+        )
+    if not np.isfinite(values).all():
+        raise ValueError(f"{called} returned NaN or infinity for finite rows.")
+    if values.shape[1] == 0:
+        raise ValueError(f"{called} returned no columns.")
+    check_magnitude(values, f"What {called} returns")
+    return values

@@ -326,29 +326,25 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self._validated(X)
             shape = () if self._n_outputs == 1 else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
-        given, X, _ = (X, X, None) if is_plain(self, X) else self._validated(X)
+        given: Any = X
+        array: Any = X
+        if not is_plain(self, X):
+            given, array, _ = self._validated(X)
         noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
         if return_cov:
-            inputs, features = map_rows(given, X, self.feature_map_, self.kernel_map_)
-            mean, cov = self._posterior.covariance(inputs - self._fitted.frame.centre, features)
-            cov = cov + np.eye(len(X))[:, :, np.newaxis] * noise
+            mean, cov = self._posterior.covariance(*self._inputs_and_features(given, array, slice(None)))
+            cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
             return self._like_y(mean + self._fitted.frame.target_mean), self._like_y(cov)
-        means, variances = [], []
+        means, deviations = [], []
         size = self._posterior.rows_at_once
-        for first in range(0, len(X), size):
-            block = slice(first, first + size)
-            rows = np.asarray(X[block], dtype=np.float64)
-            inputs, features = map_rows(
-                rows if given is X else _safe_indexing(given, block), rows, self.feature_map_, self.kernel_map_
-            )
-            mean, variance = self._posterior.predict(inputs - self._fitted.frame.centre, features, return_std)
+        for first in range(0, len(array), size):
+            rows = self._inputs_and_features(given, array, slice(first, first + size))
+            mean, variance = self._posterior.predict(*rows, return_std)
             means.append(mean + self._fitted.frame.target_mean)
             if variance is not None:
-                variances.append(np.sqrt(variance + noise))
-        mean = self._like_y(means[0] if len(means) == 1 else np.concatenate(means))
-        if not return_std:
-            return mean
-        return mean, self._like_y(variances[0] if len(variances) == 1 else np.concatenate(variances))
+                deviations.append(np.sqrt(variance + noise))
+        mean = self._like_y(np.concatenate(means))
+        return (mean, self._like_y(np.concatenate(deviations))) if return_std else mean
 
     def sample_y(
         self,
@@ -447,6 +443,13 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_magnitude(X, "X")
         check_magnitude(y, "y")
         return (given if hasattr(given, "iloc") else X), X, y
+
+    def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's centred inputs and the features of rows."""
+        array = np.asarray(X[rows], dtype=np.float64)
+        given = array if given is X else _safe_indexing(given, rows)
+        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
+        return inputs - self._fitted.frame.centre, features
 
     def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
         """The rows through the maps."""
