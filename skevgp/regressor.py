@@ -87,6 +87,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Rows per step of Adam.
     learning_rate : float, default=0.1
         Adam's first step size; it falls to zero along half a cosine.
+    forgetting_factor : float, default=1.0
+        What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers all
+        of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
     warm_start : bool, default=False
         Whether to start from the last fit's kernel, noise and inducing points, where shapes agree.
     n_jobs : int, default=None
@@ -168,6 +171,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "tol": [Interval(Real, 0, None, closed="left")],
         "batch_size": [Interval(Integral, 1, None, closed="left")],
         "learning_rate": [Interval(Real, 0, None, closed="neither")],
+        "forgetting_factor": [Interval(Real, 0, 1, closed="right")],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
         "random_state": ["random_state"],
@@ -194,6 +198,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tol: float = 0.01,
         batch_size: int = 512,
         learning_rate: float = 0.1,
+        forgetting_factor: float = 1.0,
         warm_start: bool = False,
         n_jobs: int | None = None,
         random_state: int | np.random.RandomState | None = None,
@@ -214,6 +219,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.tol = tol
         self.batch_size = batch_size
         self.learning_rate = learning_rate
+        self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
         self.n_jobs = n_jobs
         self.random_state = random_state
@@ -285,7 +291,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
         rows = frame.rows(self._source(given, X, y))
         check_magnitude(rows.residuals.largest, "y, in units of what the first fit left over,")
-        self._fitted = self._fitted.updated(rows)
+        self._fitted = self._fitted.updated(rows, self.forgetting_factor)
         self._set_attributes()
         return self
 

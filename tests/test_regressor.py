@@ -321,6 +321,25 @@ def test_partial_fit_equals_a_fit_of_all_rows():
     assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
 
 
+def test_forgetting_weighs_earlier_rows_as_fewer():
+    """Rows that come twice at a weight of one half are rows that came once."""
+    kernel = ConstantKernel(2.0, "fixed") * RBF([0.8, 1.2], "fixed") + WhiteKernel(0.01, "fixed")
+    arguments = {"feature_map": PolynomialFeatures(1), "kernel": kernel, "n_inducing": 20, "max_iter": 0}
+    arguments |= {"coef_mean": 0.5, "coef_scale": 2.0}
+    once = model(**arguments).fit(X, Y)
+    twice = model(**arguments).fit(X, Y).partial_fit(X, Y)
+    # Half of two times the rows, and once more, are two times the rows.
+    again = model(**arguments).fit(X, Y).partial_fit(X, Y).set_params(forgetting_factor=0.5).partial_fit(X, Y)
+    for part, expected in zip(again.predict(X_NEW, True), twice.predict(X_NEW, True), strict=True):
+        np.testing.assert_allclose(part, expected, rtol=1e-8)
+    drifting = model(forgetting_factor=0.2, **arguments).fit(X, Y)
+    for _ in range(20):
+        drifting.partial_fit(X, -Y)
+    # A long time after, the weight of what came first is 0.2^20, that of the new 1 + 0.2 + ... = 1.25.
+    np.testing.assert_allclose(drifting.predict(X_NEW), -once.predict(X_NEW), atol=0.05 * np.abs(Y).max())
+    assert drifting.lower_bound_ < once.lower_bound_
+
+
 def test_the_first_partial_fit_is_a_fit():
     np.testing.assert_array_equal(
         model(tol=1.0).partial_fit(X, Y).predict(X_NEW), model(tol=1.0).fit(X, Y).predict(X_NEW)

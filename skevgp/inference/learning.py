@@ -77,11 +77,14 @@ class Learned:
     message: str
     interrupted: bool = False
 
-    def updated(self, rows: Rows) -> Learned:
-        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far."""
+    def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
+        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far.
+
+        ``weight`` multiplies the log likelihood of the earlier rows.
+        """
         n_inducing = self.values["inducing_points"].shape[1]
         new = self.model.statistics(self.values, rows.blocks(self.model.kernel, n_inducing))
-        statistics = [old + more for old, more in zip(self.statistics, new, strict=True)]
+        statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
         bound, posterior = self.model.at_optimum(self.values, statistics)
         return replace(self, bound=bound, posterior=posterior, statistics=statistics)
 

@@ -161,9 +161,9 @@ class FittedOutputs:
             threads.close()
         return cls(frame, sharing, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
 
-    def updated(self, rows: Rows) -> FittedOutputs:
-        """Fold new rows, in internal units, into the posteriors."""
-        learned = (one.updated(rows.outputs(own)) for own, one in zip(self.outputs, self.learned, strict=True))
+    def updated(self, rows: Rows, weight: float = 1.0) -> FittedOutputs:
+        """Fold new rows, in internal units, into the posteriors; ``weight`` multiplies what is known of the others."""
+        learned = (one.updated(rows.outputs(own), weight) for own, one in zip(self.outputs, self.learned, strict=True))
         return replace(self, learned=tuple(learned))
 
     def posterior(self) -> Posterior:
