@@ -90,7 +90,7 @@ class DaskSource:
         dask = require("dask", "Fitting to Dask arrays")
         maps = dask.delayed((feature_map, kernel_map), traverse=False)
         chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
-        self._partitions = dask.persist(*(dask.delayed(_partition)(*chunk, maps) for chunk in chunks))
+        self._partitions = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
         self._ends = np.cumsum(X.chunks[0])
         self.n_rows = len(X)
 
@@ -120,7 +120,7 @@ class DaskBlocks:
     def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], Block], n_inducing: int):
         dask = require("dask", "Fitting to Dask arrays")
         shared = dask.delayed(make, traverse=False)
-        self._partitions = dask.persist(*(dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions))
+        self._partitions = _held([dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions])
 
     @cached_property
     def linear(self) -> LinearStatistics:
@@ -128,6 +128,15 @@ class DaskBlocks:
 
     def sum(self, function: Callable[[Block], Any]) -> Any:
         return _sum_over(self._partitions, function)
+
+
+def _held(parts: list[Any]) -> Sequence[Any]:
+    """Kept by the workers of a cluster; without one made anew at each pass, since they might not all fit here."""
+    try:
+        require("distributed", "Fitting on a cluster").get_client()
+    except (ImportError, ValueError):
+        return parts
+    return require("dask", "Fitting to Dask arrays").persist(*parts)
 
 
 def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:

@@ -88,8 +88,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     learning_rate : float, default=0.1
         Adam's first step size; it falls to zero along half a cosine.
     forgetting_factor : float, default=1.0
-        What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers all
-        of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
+        What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers
+        all of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
     warm_start : bool, default=False
         Whether to start from the last fit's kernel, noise and inducing points, where shapes agree.
     n_jobs : int, default=None
@@ -231,9 +231,11 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a data frame stays one.
-        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            Numbers up to 1e100. The maps see it as it is given: a data frame stays one. Memory-mapped arrays of
+            float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
+            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X.
+        y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100.
 
         Returns
@@ -266,8 +268,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 
-        The first call is a `fit`. After ``solver="adam"``, q moves to its optimum. The rows seen before are known by
-        their sums only: where the noise is below 1e-8 of the signal, ``lower_bound_`` is good to about a nat.
+        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After ``solver="adam"``, q
+        moves to its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the
+        signal, ``lower_bound_`` is good to about a nat.
 
         Parameters
         ----------
@@ -302,7 +305,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            For a Dask array the results are lazy Dask arrays of the same chunks.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool, default=False

@@ -70,13 +70,12 @@ def test_adam_takes_its_batches_from_the_chunks():
 
 
 def test_other_chunks_give_the_same():
-    expected = model(max_iter=5).fit(X, Y)
-    in_columns = da.from_array(X, chunks=(100, 1)), da.from_array(Y, chunks=((7, 593), 2))
-    assert_same_model(model(max_iter=5).fit(*in_columns), expected)
-    assert_same_model(model(max_iter=5).fit(in_columns[0], Y), expected)
-    unknown = in_columns[0][in_columns[0][:, 0] > -10.0]
-    assert_same_model(model(max_iter=5).fit(unknown, Y), expected)
-    assert_same_model(model(max_iter=5).fit(in_columns[0].astype(np.float32).astype(float), Y), expected, rtol=1e-4)
+    expected = model(max_iter=1).fit(X, Y)
+    in_columns = da.from_array(X, chunks=(300, 1))
+    assert_same_model(model(max_iter=1).fit(in_columns, da.from_array(Y, chunks=((7, 593), 2))), expected)
+    assert_same_model(model(max_iter=1).fit(in_columns, Y), expected)
+    unknown = in_columns[in_columns[:, 0] > -10.0]
+    assert_same_model(model(max_iter=1).fit(unknown, Y), expected)
 
 
 def test_one_output_has_no_axis():
