@@ -268,9 +268,9 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 
-        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After ``solver="adam"``, q
-        moves to its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the
-        signal, ``lower_bound_`` is good to about a nat.
+        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to its
+        optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
+        ``lower_bound_`` is good to about a nat.
 
         Parameters
         ----------
