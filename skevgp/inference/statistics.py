@@ -47,7 +47,9 @@ class KernelAt(Protocol):
 class Kernel(Protocol):
     """A covariance function of unit signal variance, k̃."""
 
-    n_hyperparameters: int
+    @property
+    def n_hyperparameters(self) -> int:
+        """How many hyperparameters there are."""
 
     def prepare(self, inputs: np.ndarray) -> Any:
         """What `KernelAt` needs of rows (n, d), computed once."""
