@@ -21,7 +21,7 @@ _NEAR = 1e-8
 # ... and (x - x') / r only 8 below this: there a profile that is not smooth at r = 0 counts as flat.
 _COINCIDENT = 1e-16
 
-Derivatives = tuple[np.ndarray, np.ndarray, list[np.ndarray]]
+Derivatives = tuple[np.ndarray, list[np.ndarray]]
 
 
 class Profile(Protocol):
@@ -34,10 +34,10 @@ class Profile(Protocol):
         """Whether φ'(E) is finite at E = 0."""
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """φ(E); may overwrite E."""
+        """φ(E)."""
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        """φ(E), φ'(E), and the derivative in the logarithm of each parameter."""
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        """φ'(E), and the derivative in the logarithm of each parameter; ``value`` is φ(E), which saves exponentials."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,10 @@ class Exponential:
     smooth = True
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(E, out=E)
+        return np.exp(E)
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        value = np.exp(E)
-        return value, value, []
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value, []
 
 
 @dataclass(frozen=True)
@@ -65,34 +64,35 @@ class Matern12:
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         return np.exp(-np.sqrt(-2.0 * E))
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        r = np.sqrt(-2.0 * E)
-        value = np.exp(-r)
-        return value, value / np.maximum(r, 1e-150), []
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
 
 
 @dataclass(frozen=True)
 class Matern32:
-    """φ = (1 + t) exp(-t), t = √3 r (Rasmussen & Williams 2006, eq. 4.17)."""
+    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
 
     n_parameters = 0
     smooth = True
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return self.derivatives(E, parameters)[0]
-
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
         t = np.sqrt(-6.0 * E)
         decay = np.exp(-t)
         t += 1.0
         t *= decay
-        decay *= 3.0
-        return t, decay, []
+        return t
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-6.0 * E)
+        t += 1.0
+        np.divide(value, t, out=t)
+        t *= 3.0
+        return t, []
 
 
 @dataclass(frozen=True)
 class Matern52:
-    """φ = (1 + t + t²/3) exp(-t), t = √5 r (Rasmussen & Williams 2006, eq. 4.17)."""
+    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
 
     n_parameters = 0
     smooth = True
@@ -100,22 +100,24 @@ class Matern52:
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         t = np.sqrt(-10.0 * E)
         decay = np.exp(-t)
-        E *= -10.0 / 3.0
-        E += t
-        E += 1.0
-        E *= decay
-        return E
+        decay *= self._polynomial(E, t)
+        return decay
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
         t = np.sqrt(-10.0 * E)
-        decay = np.exp(-t)
-        slope = t + 1.0
-        value = (-10.0 / 3.0) * E
-        value += slope
-        value *= decay
-        slope *= decay
-        slope *= 5.0 / 3.0
-        return value, slope, []
+        polynomial = self._polynomial(E, t)
+        t += 1.0
+        t *= 5.0 / 3.0
+        t *= value
+        t /= polynomial
+        return t, []
+
+    @staticmethod
+    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
+        polynomial = (-10.0 / 3.0) * E
+        polynomial += t
+        polynomial += 1.0
+        return polynomial
 
 
 @dataclass(frozen=True)
@@ -137,16 +139,16 @@ class Matern:
         return self.nu > 1.0
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-4.0 * self.nu * E)
-        return self._bessel(t, self.nu, 1.0)
+        return self._bessel(E, self.nu, 1.0)
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-4.0 * self.nu * E)
-        slope = 2.0 * self.nu * self._bessel(t, self.nu - 1.0, 0.5 / (self.nu - 1.0) if self.smooth else 0.0)
-        return self._bessel(t, self.nu, 1.0), slope, []
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        slope = self._bessel(E, self.nu - 1.0, 0.5 / (self.nu - 1.0) if self.smooth else 0.0)
+        slope *= 2.0 * self.nu
+        return slope, []
 
-    def _bessel(self, t: np.ndarray, order: float, at_zero: float) -> np.ndarray:
+    def _bessel(self, E: np.ndarray, order: float, at_zero: float) -> np.ndarray:
         """2^(1-ν) / Γ(ν) t^order K_order(t), by logarithms: its factors overflow before it does."""
+        t = np.sqrt(-4.0 * self.nu * E)
         positive = np.maximum(t, 1e-150)
         # Beyond 1e3, exp(-t) is 0 and K need not be known.
         with np.errstate(all="ignore"):
@@ -166,19 +168,26 @@ class RationalQuadratic:
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         alpha = np.exp(parameters[0])
-        return np.exp(-alpha * self._log(E, alpha))
+        log = np.log1p(self._ratio(E, alpha))
+        log *= -alpha
+        return np.exp(log, out=log)
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
         alpha = np.exp(parameters[0])
-        log = self._log(E, alpha)
-        value, inverse = np.exp(-alpha * log), np.exp(-log)
-        return value, value * inverse, [alpha * value * (-np.expm1(-log) - log)]
+        ratio = self._ratio(E, alpha)
+        from_alpha = ratio / (1.0 + ratio)
+        from_alpha -= np.log1p(ratio)
+        from_alpha *= value
+        from_alpha *= alpha
+        ratio += 1.0
+        return np.divide(value, ratio, out=ratio), [from_alpha]
 
     @staticmethod
-    def _log(E: np.ndarray, alpha: float) -> np.ndarray:
-        """log(1 + r² / 2α)."""
+    def _ratio(E: np.ndarray, alpha: float) -> np.ndarray:
+        """r² / 2α, kept finite."""
         with np.errstate(over="ignore"):
-            return np.log1p(np.minimum(E / -alpha, 1e300))
+            ratio = E / -alpha
+        return np.minimum(ratio, 1e300, out=ratio)
 
 
 @dataclass(frozen=True)
@@ -189,15 +198,20 @@ class ExpSineSquared:
     smooth = True
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        sine = np.sin(np.pi * np.sqrt(-2.0 * E))
-        return np.exp(-2.0 * (sine * np.exp(-parameters[0])) ** 2)
+        return np.exp(-2.0 * self._squared(np.sqrt(-2.0 * E), parameters))
 
-    def derivatives(self, E: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        inverse, r = np.exp(-parameters[0]), np.sqrt(-2.0 * E)
-        squared = (np.sin(np.pi * r) * inverse) ** 2
-        value = np.exp(-2.0 * squared)
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        r = np.sqrt(-2.0 * E)
         # d sin²(π r) / dE = -π sin(2π r) / r, finite at r = 0.
-        return value, (2.0 * np.pi * inverse) ** 2 * np.sinc(2.0 * r) * value, [4.0 * squared * value]
+        slope = np.sinc(2.0 * r)
+        slope *= value
+        slope *= (2.0 * np.pi * np.exp(-parameters[0])) ** 2
+        return slope, [4.0 * self._squared(r, parameters) * value]
+
+    @staticmethod
+    def _squared(r: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """sin²(π r) / ℓ²."""
+        return (np.sin(np.pi * r) * np.exp(-parameters[0])) ** 2
 
 
 @dataclass(frozen=True)
@@ -254,20 +268,19 @@ class StationaryAt(CovarianceAt):
         return Sums((np.zeros_like(self._exponent), np.zeros(self.profile.n_parameters)))
 
     def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        U, slopes, others = self._derivatives(*self._exponents(prepared))
+        U = self.cross(prepared)
+        return U, lambda U_bar, diagonal_bar: self.cross_pullback(prepared, U, U_bar, diagonal_bar)
 
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-            own = np.array([np.vdot(U_bar, other) for other in others])
-            np.multiply(U_bar, slopes, out=U_bar)
-            return Sums((U_bar @ prepared.T, own))
-
-        return U, pull
+    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
+        slopes, others = self._derivatives(*self._exponents(prepared), U)
+        own = np.array([np.vdot(U_bar, other) for other in others])
+        np.multiply(U_bar, slopes, out=U_bar)
+        return Sums((U_bar @ prepared.T, own))
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rows, own = total
-        E = self._exponents_within()
         size = -2.0 * float(self._exponent[:, self.inducing_points.shape[1]].min())
-        _, slopes, others = self._derivatives(E, size)
+        slopes, others = self._derivatives(self._exponents_within(), size, self.matrix())
         own = own + np.array([np.vdot(K_bar, other) for other in others])
         length_bar, Z_bar = self._geometry_bar(rows, K_bar * slopes)
         return np.concatenate([own, length_bar]), Z_bar
@@ -301,11 +314,11 @@ class StationaryAt(CovarianceAt):
         E[i, j] = -0.5 * np.einsum("pd,pd->p", differences, differences)
         return E, size
 
-    def _derivatives(self, E: np.ndarray, size: float) -> Derivatives:
-        value, slopes, others = self.profile.derivatives(E, self.parameters)
+    def _derivatives(self, E: np.ndarray, size: float, value: np.ndarray) -> Derivatives:
+        slopes, others = self.profile.derivatives(E, value, self.parameters)
         if not self.profile.smooth:
             slopes[-_COINCIDENT * size <= E] = 0.0
-        return value, slopes, others
+        return slopes, others
 
 
 @dataclass(frozen=True, init=False)
@@ -335,12 +348,12 @@ class SquaredExponential(Stationary):
 class SquaredExponentialAt(StationaryAt):
     """A `SquaredExponential` put in: its own derivative, so that k(X_m, X) serves the way back."""
 
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        U, _ = self._exponents(prepared)
+        return np.exp(U, out=U)
+
     def start_pullback(self) -> np.ndarray:
         return np.zeros_like(self._exponent)
-
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        U = self.cross(prepared)
-        return U, lambda U_bar, diagonal_bar: self.cross_pullback(prepared, U, U_bar, diagonal_bar)
 
     def cross_pullback(
         self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow
