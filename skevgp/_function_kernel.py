@@ -94,7 +94,7 @@ class FunctionKernel(sk.Kernel):
 
         Parameters
         ----------
-        **params : dict
+        params : dict
 
         Returns
         -------
@@ -113,11 +113,16 @@ class FunctionKernel(sk.Kernel):
         return [sk.Hyperparameter(name, "numeric", self._bounds(name)) for name in self._values()]
 
     def covariance(self) -> Function:
-        """What the inference differentiates."""
+        """What the inference differentiates.
+
+        Returns
+        -------
+        covariance : Function
+        """
         return Function(self.function, tuple(self._values()), self.diagonal)
 
     def __call__(self, X: Any, Y: Any = None, eval_gradient: bool = False) -> Any:
-        """k(X, Y), and its gradient in the free logarithms of the hyperparameters.
+        """The matrix k(X, Y), and its gradient in the free logarithms of the hyperparameters.
 
         Parameters
         ----------
@@ -149,7 +154,7 @@ class FunctionKernel(sk.Kernel):
         return K, np.stack(gradient, axis=2) if gradient else np.empty((*K.shape, 0))
 
     def diag(self, X: Any) -> np.ndarray:
-        """k(x, x) of each row.
+        """The variance k(x, x) of each row.
 
         Parameters
         ----------

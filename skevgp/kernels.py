@@ -15,6 +15,7 @@ from .inference.covariances import Constant, Covariance, DotProduct, Product, Su
 from .inference.parameters import Start
 from .inference.start import Starts
 from .inference.stationary import (
+    LARGEST_NU,
     ExpSineSquared,
     Matern,
     Matern12,
@@ -26,7 +27,7 @@ from .inference.stationary import (
     Stationary,
 )
 
-__all__ = ["FunctionKernel", "KernelSpec", "SquaredExponential", "parse_kernel"]
+__all__ = ["FunctionKernel"]
 
 # Their squares neither vanish nor overflow.
 SMALLEST, LARGEST = 1e-100, 1e100
@@ -212,7 +213,7 @@ def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
     if kind is FunctionKernel:
         return kernel.covariance()
     if kind not in (sk.RBF, sk.Matern):
-        raise ValueError(f"kernel: {kernel!r}, a {kind.__name__}, does not work in this place. These work: {WORKING}.")
+        raise ValueError(f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {WORKING}.")
 
     if kernel.anisotropic and len(kernel.length_scale) != n_columns:
         raise ValueError(
@@ -221,8 +222,8 @@ def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
         )
     if kind is sk.RBF or kernel.nu == np.inf:
         return SquaredExponential(n_columns, isotropic=not kernel.anisotropic)
-    if not kernel.nu > 0.0:
-        raise ValueError(f"kernel={kernel!r}: nu must be above 0; got {kernel.nu}.")
+    if not 0.0 < kernel.nu <= LARGEST_NU:
+        raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
     return Stationary(_MATERN.get(kernel.nu, Matern(float(kernel.nu))), n_columns, isotropic=not kernel.anisotropic)
 
 

@@ -20,6 +20,8 @@ from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums
 _NEAR = 1e-8
 # ... and (x - x') / r only 8 below this: there a profile that is not smooth at r = 0 counts as flat.
 _COINCIDENT = 1e-16
+# Of a Matérn covariance by Bessel functions, which overflow beyond it (it is then almost a squared exponential).
+LARGEST_NU = 150.0
 
 Derivatives = tuple[np.ndarray, list[np.ndarray]]
 
@@ -129,6 +131,7 @@ class Matern:
     Parameters
     ----------
     nu : float
+        At most `LARGEST_NU`.
     """
 
     nu: float
@@ -155,8 +158,18 @@ class Matern:
             log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
         factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
         found = np.exp(factor + order * np.log(positive) + log_bessel - positive)
-        # Where K overflows, t is so small that the value is that at 0 to all digits.
-        return np.where(np.isinf(log_bessel) | (t == 0.0), at_zero, found)
+        overflow = np.isinf(log_bessel) | (t == 0.0)
+        found[overflow] = at_zero * self._near_zero(t[overflow], order)
+        return found
+
+    @staticmethod
+    def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
+        """t^order K_order(t) over its value at 0, where K overflows: the first terms of DLMF 10.27.4 with 10.25.2."""
+        term = total = np.ones_like(t)
+        for k in range(1, min(int(order), 20)):
+            term = term * (0.25 * t**2) / (k * (k - order))
+            total = total + term
+        return total
 
 
 @dataclass(frozen=True)
