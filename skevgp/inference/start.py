@@ -130,7 +130,8 @@ def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: 
     Raises
     ------
     ValueError
-        If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, or cannot be differentiated.
+        If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, has another diagonal than
+        k̃(x, x), or cannot be differentiated.
     """
     at = kernel.at(np.log(hyperparameters), inducing_points)
     K = at.matrix()
@@ -148,6 +149,9 @@ def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: 
             "kernel: k(X_m, X_m) must be positive semi-definite and not 0; on the inducing points it is not, with its "
             "hyperparameters where they start. (ExpSineSquared is one of a single column, times others.)"
         ) from None
+    difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
+    if not difference <= 1e-6 * np.diagonal(K).max():
+        raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
     at.finish_pullback(at.start_pullback(), np.zeros_like(K))
     return variance
 
