@@ -2,120 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import Any
 
-import autograd.numpy as anp
 import numpy as np
-from scipy.spatial.distance import cdist
+from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 
+from ._function_kernel import FunctionKernel
+from .inference.covariances import Constant, Covariance, DotProduct, Product, Sum
 from .inference.parameters import Start
 from .inference.start import Starts
+from .inference.stationary import (
+    LARGEST_NU,
+    ExpSineSquared,
+    Matern,
+    Matern12,
+    Matern32,
+    Matern52,
+    Profile,
+    RationalQuadratic,
+    SquaredExponential,
+    Stationary,
+)
+
+__all__ = ["FunctionKernel"]
 
 # Their squares neither vanish nor overflow.
 SMALLEST, LARGEST = 1e-100, 1e100
 
 WORKING = (
-    "RBF (with one length scale or one per column), optionally times a ConstantKernel, optionally plus a WhiteKernel"
+    "ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct, FunctionKernel, sums and products of "
+    "these, and a WhiteKernel as one of the terms of the outermost sum"
 )
 
-
-class SquaredExponential:
-    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9, 5.1).
-
-    Parameters
-    ----------
-    n_columns : int
-        d.
-    isotropic : bool
-        Whether one lengthscale serves all columns.
-    """
-
-    def __init__(self, n_columns: int, isotropic: bool = False):
-        self.n_columns = n_columns
-        self.n_hyperparameters = 1 if isotropic else n_columns
-
-    def prepare(self, inputs: np.ndarray) -> np.ndarray:
-        """[x, 1, x²] of each row as columns, (2 d + 1, n): the exponent is linear in it."""
-        return np.ascontiguousarray(np.hstack([inputs, np.ones((len(inputs), 1)), inputs**2]).T)
-
-    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
-        return SquaredExponentialAt(np.exp(hyperparameters), inducing_points)
-
-    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
-        scaled = inducing_points / anp.exp(hyperparameters)
-        differences = scaled[..., :, None, :] - scaled[..., None, :, :]
-        return anp.exp(-0.5 * anp.sum(differences**2, axis=-1))
-
-
-class SquaredExponentialAt:
-    """A `SquaredExponential` with lengthscales (1,) or (d,) and inducing points (m, d) put in."""
-
-    def __init__(self, lengthscales: np.ndarray, inducing_points: np.ndarray):
-        self.lengthscales = np.broadcast_to(lengthscales, inducing_points.shape[1:])
-        self.isotropic = len(lengthscales) < inducing_points.shape[1]
-        self.inducing_points = inducing_points
-        precision = self.lengthscales**-2.0
-        self._exponent = np.hstack(
-            [
-                inducing_points * precision,
-                -0.5 * (inducing_points**2 @ precision)[:, np.newaxis],
-                np.broadcast_to(-0.5 * precision, inducing_points.shape),
-            ]
-        )
-
-    def matrix(self) -> np.ndarray:
-        scaled = self.inducing_points / self.lengthscales
-        return np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
-
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
-        U = self._exponent @ prepared
-        np.minimum(U, 0.0, out=U)
-        return np.exp(U, out=U)
-
-    def diagonal(self, prepared: np.ndarray) -> float:
-        return 1.0
-
-    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> np.ndarray:
-        """Σ_rows Ū U [x, 1, x²], (m, 2 d + 1); the diagonal is constant and adds nothing."""
-        np.multiply(U_bar, U, out=U_bar)
-        return U_bar @ prepared.T
-
-    def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        Z, d = self.inducing_points, self.inducing_points.shape[1]
-        WX, W, WXX = total[:, :d], total[:, d, np.newaxis], total[:, d + 1 :]
-        within = K_bar * self.matrix()
-        row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
-        # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
-        Z_bar = WX - W * Z + 2.0 * (within_Z - row_sum * Z)
-        length_bar = (WXX - 2.0 * Z * WX + W * Z**2 + 2.0 * Z * (row_sum * Z - within_Z)).sum(axis=0)
-        precision = self.lengthscales**-2.0
-        length_bar = length_bar * precision
-        return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision
-
-
-def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
-    """A hyperparameter's value and bounds, checked."""
-    value = np.atleast_1d(np.asarray(value, dtype=float))
-    if not ((value >= SMALLEST) & (value <= LARGEST)).all():
-        raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
-    if hyperparameter.fixed:
-        return Start(value, None, True)
-    bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
-    if not ((bounds[:, 0] > 0.0) & (bounds[:, 0] <= bounds[:, 1])).all():
-        raise ValueError(
-            f"kernel: {hyperparameter.name}_bounds must be above 0, the lower ones first; got {bounds.tolist()}."
-        )
-    return Start(value, bounds)
-
-
-def _sklearn_bounds(start: Start, bounds: np.ndarray) -> Any:
-    """What a scikit-learn kernel takes as ``..._bounds``."""
-    if start.fixed:
-        return "fixed"
-    return tuple(map(float, bounds[0])) if len(bounds) == 1 else bounds
+_MATERN: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
 
 
 @dataclass(frozen=True)
@@ -124,36 +46,76 @@ class KernelSpec:
 
     Attributes
     ----------
-    covariance : SquaredExponential
+    covariance : Covariance
         k̃.
     starts : Starts
-        Of the lengthscales, s² and, from a top-level WhiteKernel, σ².
+        Of k̃'s hyperparameters, s² and, from a top-level WhiteKernel, σ².
+    tree : Kernel
+        s² k̃ as a scikit-learn kernel.
+    signal : Kernel
+        The ConstantKernel in it that is s².
     """
 
-    covariance: SquaredExponential
+    covariance: Covariance
     starts: Starts
+    tree: sk.Kernel
+    signal: sk.Kernel
 
     def with_noise(self, noise_variance: float) -> KernelSpec:
         """The same kernel with a start of the noise."""
         return replace(self, starts=replace(self.starts, noise=Start(np.array([float(noise_variance)]))))
 
     def to_sklearn(
-        self, lengthscales: np.ndarray, length_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
+        self, hyperparameters: np.ndarray, hyper_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
     ) -> sk.Kernel:
-        """The fitted s² k̃ as a scikit-learn kernel."""
-        scale = lengthscales.copy() if len(lengthscales) > 1 else float(lengthscales[0])
-        return sk.ConstantKernel(signal, _sklearn_bounds(self.starts.signal, signal_bounds)) * sk.RBF(
-            scale, _sklearn_bounds(self.starts.hyperparameters, length_bounds)
-        )
+        """The fitted s² k̃ as a scikit-learn kernel, of the user's form and with the user's bounds.
+
+        Parameters
+        ----------
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        hyper_bounds : ndarray of shape (n_hyper, 2)
+        signal : float
+            s².
+        signal_bounds : ndarray of shape (1, 2)
+
+        Returns
+        -------
+        kernel : Kernel
+        """
+        used = 0
+
+        def fitted(kernel: sk.Kernel) -> sk.Kernel:
+            nonlocal used
+            if isinstance(kernel, sk.KernelOperator):
+                return type(kernel)(fitted(kernel.k1), fitted(kernel.k2))
+            found = clone(kernel)
+            is_signal = kernel is self.signal
+            start = self.starts.signal if is_signal else self.starts.hyperparameters
+            for hyperparameter in kernel.hyperparameters:
+                own = slice(0, 1) if is_signal else slice(used, used + hyperparameter.n_elements)
+                values, bounds = (signal, signal_bounds) if is_signal else (hyperparameters, hyper_bounds)
+                used += 0 if is_signal else hyperparameter.n_elements
+                if hyperparameter.fixed:
+                    continue
+                value = np.atleast_1d(values)[own]
+                found.set_params(**{hyperparameter.name: value.copy() if len(value) > 1 else float(value[0])})
+                if start.bounds is None:
+                    own_bounds = bounds[own] if len(value) > 1 else tuple(map(float, bounds[own][0]))
+                    found.set_params(**{f"{hyperparameter.name}_bounds": own_bounds})
+            return found
+
+        return fitted(self.tree)
 
 
-def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
+def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) -> KernelSpec:
     """Read a scikit-learn kernel.
 
     Parameters
     ----------
-    kernel : sklearn.gaussian_process.kernels.Kernel or None
-        None is a squared exponential with one lengthscale per column, all starts taken from the data.
+    kernel : sklearn.gaussian_process.kernels.Kernel, callable or None
+        A callable is the function of a `FunctionKernel`. None is a squared exponential with one lengthscale per column,
+        all starts taken from the data.
     n_columns : int
         Width of the kernel's inputs.
 
@@ -164,48 +126,141 @@ def parse_kernel(kernel: sk.Kernel | None, n_columns: int) -> KernelSpec:
     Raises
     ------
     TypeError
-        If it is not a scikit-learn kernel.
+        If it is not a kernel.
     ValueError
-        If it is one that does not work yet (the message lists what does), its length scales do not fit the columns, or
-        a value or bound is out of range.
+        If part of it does not work (the message names it and lists what does), its length scales do not fit the
+        columns, or a value or bound is out of range.
     """
+    signal = sk.ConstantKernel()
     if kernel is None:
-        return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()))
+        shape = sk.RBF(np.ones(n_columns) if n_columns > 1 else 1.0)
+        return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()), signal * shape, signal)
+    if callable(kernel) and not isinstance(kernel, sk.Kernel | type):
+        kernel = FunctionKernel(kernel)
     if not isinstance(kernel, sk.Kernel):
         raise TypeError(
-            f"kernel must be a kernel of sklearn.gaussian_process.kernels or None; got {kernel!r}. "
-            f"These work: {WORKING}."
+            "kernel must be a kernel of sklearn.gaussian_process.kernels, a function k(X, Z) in autograd.numpy, or "
+            f"None; got {kernel!r}. These work: {WORKING}."
         )
-    white = [part for part in _parts(kernel, sk.Sum) if isinstance(part, sk.WhiteKernel)]
-    signal = [part for part in _parts(kernel, sk.Sum) if not isinstance(part, sk.WhiteKernel)]
-    factors = list(_parts(signal[0], sk.Product)) if len(signal) == 1 else []
-    constants = [factor for factor in factors if isinstance(factor, sk.ConstantKernel)]
-    # `type is`: Matérn derives from RBF.
-    shapes = [factor for factor in factors if type(factor) is sk.RBF]
-    if len(white) > 1 or len(constants) > 1 or len(shapes) != 1 or len(factors) != len(constants) + 1:
-        raise ValueError(f"kernel={kernel!r} does not work yet. These work: {WORKING}.")
-
-    rbf = shapes[0]
-    lengths = np.atleast_1d(np.asarray(rbf.length_scale, dtype=float))
-    if rbf.anisotropic and len(lengths) != n_columns:
-        raise ValueError(
-            f"kernel={kernel!r} has {len(lengths)} length scales, but its inputs have {n_columns} columns: "
-            "give one length scale, or one per column."
-        )
+    # A copy: the same kernel may be in a tree twice.
+    tree, noise = _without_noise(clone(kernel))
+    if tree is None or len(noise) > 1:
+        said = "it has no other term" if tree is None else f"there are {len(noise)}"
+        raise ValueError(f"kernel={kernel!r}: of WhiteKernel there can be one, plus what it is the noise of; {said}.")
+    constant = _outermost_constant(tree)
+    signal_start = Start()
+    if constant is None:
+        tree = signal * tree
+    else:
+        signal, signal_start = constant, _starts(constant)
+    starts: list[Start] = []
+    covariance = _covariance(tree, signal, n_columns, starts)
+    assert covariance is not None
     return KernelSpec(
-        SquaredExponential(n_columns, isotropic=not rbf.anisotropic),
-        Starts(
-            _start(rbf.hyperparameter_length_scale, lengths),
-            _start(constants[0].hyperparameter_constant_value, constants[0].constant_value) if constants else Start(),
-            _start(white[0].hyperparameter_noise_level, white[0].noise_level) if white else Start(),
-        ),
+        covariance,
+        Starts(_joined(starts), signal_start, _starts(noise[0]) if noise else Start()),
+        tree,
+        signal,
     )
 
 
-def _parts(kernel: Any, operator: Any) -> Iterator[Any]:
-    """The operands of nested sums (or products)."""
-    if isinstance(kernel, operator):
-        yield from _parts(kernel.k1, operator)
-        yield from _parts(kernel.k2, operator)
+def _without_noise(kernel: Any) -> tuple[Any, list[Any]]:
+    """The kernel without the WhiteKernels of its outermost sum (None if that leaves nothing), and these."""
+    if isinstance(kernel, sk.WhiteKernel):
+        return None, [kernel]
+    if type(kernel) is not sk.Sum:
+        return kernel, []
+    (first, noise), (second, more_noise) = _without_noise(kernel.k1), _without_noise(kernel.k2)
+    if first is None or second is None:
+        return (second if first is None else first), noise + more_noise
+    return sk.Sum(first, second), noise + more_noise
+
+
+def _outermost_constant(kernel: Any) -> Any:
+    """The ConstantKernel that is a factor of all else with the fewest products around it; None if there is none."""
+    level = [kernel]
+    while level := [part for product in level if type(product) is sk.Product for part in (product.k1, product.k2)]:
+        for part in level:
+            if type(part) is sk.ConstantKernel:
+                return part
+    return None
+
+
+def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -> Covariance | None:
+    """The covariance of (part of) a tree, None for s²; appends what the user says of its hyperparameters."""
+    if kernel is signal:
+        return None
+    if type(kernel) in (sk.Sum, sk.Product):
+        kind = Sum if type(kernel) is sk.Sum else Product
+        operands = _operands(kernel, type(kernel))
+        parts = [part for own in operands if (part := _covariance(own, signal, n_columns, starts)) is not None]
+        return kind(tuple(parts)) if len(parts) > 1 else parts[0]
+    found = _simple_covariance(kernel, n_columns)
+    starts.append(_starts(kernel))
+    return found
+
+
+def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
+    kind = type(kernel)
+    if kind is sk.ConstantKernel:
+        return Constant()
+    if kind is sk.DotProduct:
+        return DotProduct()
+    if kind is sk.RationalQuadratic:
+        return Stationary(RationalQuadratic(), n_columns, isotropic=True)
+    if kind is sk.ExpSineSquared:
+        return Stationary(ExpSineSquared(), n_columns, isotropic=True)
+    if kind is FunctionKernel:
+        return kernel.covariance()
+    if kind not in (sk.RBF, sk.Matern):
+        raise ValueError(f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {WORKING}.")
+
+    if kernel.anisotropic and len(kernel.length_scale) != n_columns:
+        raise ValueError(
+            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
+            "give one length scale, or one per column."
+        )
+    if kind is sk.RBF or kernel.nu == np.inf:
+        return SquaredExponential(n_columns, isotropic=not kernel.anisotropic)
+    if not 0.0 < kernel.nu <= LARGEST_NU:
+        raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
+    return Stationary(_MATERN.get(kernel.nu, Matern(float(kernel.nu))), n_columns, isotropic=not kernel.anisotropic)
+
+
+def _operands(kernel: Any, operator: Any) -> Iterator[Any]:
+    """The operands of nested sums (or products), from left to right."""
+    if type(kernel) is operator:
+        yield from _operands(kernel.k1, operator)
+        yield from _operands(kernel.k2, operator)
     else:
         yield kernel
+
+
+def _starts(kernel: sk.Kernel) -> Start:
+    """Values and bounds of a simple kernel's hyperparameters, checked."""
+    values = kernel.get_params()
+    return _joined([_start(hyperparameter, values[hyperparameter.name]) for hyperparameter in kernel.hyperparameters])
+
+
+def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
+    """A hyperparameter's value and bounds, checked."""
+    value = np.atleast_1d(np.asarray(value, dtype=float))
+    if not ((value >= SMALLEST) & (value <= LARGEST)).all():
+        raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
+    if hyperparameter.fixed:
+        return Start(value, np.column_stack([value, value]), np.ones(len(value), dtype=bool))
+    bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
+    if not ((bounds[:, 0] > 0.0) & (bounds[:, 0] <= bounds[:, 1])).all():
+        raise ValueError(
+            f"kernel: {hyperparameter.name}_bounds must be above 0, the lower ones first; got {bounds.tolist()}."
+        )
+    return Start(value, bounds, np.zeros(len(value), dtype=bool))
+
+
+def _joined(starts: list[Start]) -> Start:
+    """Several starts one after the other."""
+    return Start(
+        np.concatenate([np.empty(0), *(start.value for start in starts)]),
+        np.concatenate([np.empty((0, 2)), *(start.bounds for start in starts)]),
+        np.concatenate([np.empty(0, dtype=bool), *(start.fixed for start in starts)]),
+    )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -52,11 +53,13 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     feature_map : transformer, default=None
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
         it. None has no explicit features.
-    kernel : sklearn.gaussian_process.kernels.Kernel, default=None
-        Covariance of f: an RBF with one length scale or one per column, optionally times a ConstantKernel, optionally
-        plus a WhiteKernel that sets the noise (start, bounds, fixed). The constant is the signal variance, which each
-        output has of its own. Starts, bounds and ``"fixed"`` are respected. None is an RBF with a length scale per
-        column, all starts and bounds taken from the data.
+    kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
+        Covariance of f: ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct,
+        `skevgp.kernels.FunctionKernel`, sums and products of these; a WhiteKernel as a term of the outermost sum sets
+        the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant factor is the signal variance,
+        which each output has of its own; if there is none, one is put in front, with its start and bounds from the
+        data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`. None is an RBF with a
+        length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
@@ -183,7 +186,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
-        kernel: Kernel | None = None,
+        kernel: Kernel | Callable[..., Any] | None = None,
         *,
         kernel_map: TransformerMixin | None = None,
         n_inducing: int = 100,
@@ -268,8 +271,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 
-        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to its
-        optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
+        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to
+        its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
         ``lower_bound_`` is good to about a nat.
 
         Parameters
@@ -421,7 +424,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._fitted = FittedOutputs.fit(
             frame,
             frame.rows(source),
-            spec.covariance,
+            spec.covariance.seen_from(frame.centre),
             spec.starts,
             self.sharing,
             self.posterior,

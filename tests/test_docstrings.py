@@ -4,9 +4,9 @@ import re
 import pytest
 
 import skevgp
-from skevgp import datasets, features, metrics, plotting
+from skevgp import datasets, features, kernels, metrics, plotting
 
-MODULES = (skevgp, datasets, features, metrics, plotting)
+MODULES = (skevgp, datasets, features, kernels, metrics, plotting)
 PUBLIC = {name: getattr(module, name) for module in MODULES for name in module.__all__}
 CLASSES = [thing for thing in PUBLIC.values() if inspect.isclass(thing)]
 FUNCTIONS = [thing for thing in PUBLIC.values() if inspect.isfunction(thing)]

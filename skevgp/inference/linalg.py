@@ -22,7 +22,7 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
     Parameters
     ----------
     matrix : ndarray of shape (n, n)
-        Symmetric, with a positive diagonal. Only its lower triangle is read.
+        Symmetric, with a diagonal that is nowhere negative. Only its lower triangle is read.
     jitter : float, default=0.0
         Always added, relative to the diagonal; raised by factors of ten, from at least 1e-15, while the
         factorisation fails.
@@ -41,7 +41,8 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
     while True:
         shifted = matrix.copy()
         if jitter > 0.0:
-            np.einsum("ii->i", shifted)[...] += jitter * diagonal
+            # Where a covariance is 0 (a linear one at the origin), the jitter is that of a very small one.
+            np.einsum("ii->i", shifted)[...] += jitter * np.where(diagonal == 0.0, 1e-16 * diagonal.max(), diagonal)
         # The transpose of a C-contiguous matrix is what LAPACK reads without a copy: its upper factor is our lower.
         factor, info = lapack.dpotrf(shifted.T, lower=0, clean=1, overwrite_a=1)
         if info == 0 and np.isfinite(factor[-1:, -1:]).all():

@@ -19,7 +19,7 @@ from .optimize import Report
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
-from .start import FIRST_NOISE, Starts, spread_of, starting_table
+from .start import FIRST_NOISE, Starts, mean_variance, spread_of, starting_table
 from .statistics import Kernel
 from .threads import BlockMap, single_threaded_libraries
 
@@ -118,6 +118,8 @@ class FittedOutputs:
         """
         with single_threaded_libraries():
             points = initial_inducing_points(rows.sample(sample_size(n_inducing), rng), n_inducing, rng)
+            first = starts.hyperparameters.value
+            variance = 1.0 if first is None else mean_variance(kernel, first, points)
         models = _models(sharing, kernel, frame, family)
         tables = []
         for index, (outputs, model) in enumerate(models):
@@ -129,9 +131,15 @@ class FittedOutputs:
                 rows.scatter()[outputs],
                 FIRST_NOISE[options.solver],
                 kernel.n_hyperparameters,
+                variance,
             )
             if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
-                table = table.started_at(previous._values_in(frame, rows, index))
+                values = previous._values_in(frame, rows, index)
+                if previous.learned[index].model.kernel != kernel:
+                    # Of another function: its inducing points and noise may serve.
+                    values.pop("hyperparameters", None)
+                    values.pop("signal", None)
+                table = table.started_at(values)
             tables.append(table)
         seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
         threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()

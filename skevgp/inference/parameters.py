@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import autograd.numpy as anp
 import numpy as np
 
 
@@ -24,8 +25,8 @@ class Parameter:
         Bounds of the value, broadcast to its shape.
     unit : ndarray or float
         Size of a typical change, for ``"identity"``.
-    fixed : bool
-        Whether it stays where it starts.
+    fixed : bool or ndarray of bool
+        Whether it stays where it starts; an array of its shape says so of each entry.
     """
 
     name: str
@@ -34,7 +35,12 @@ class Parameter:
     lower: np.ndarray | float = -np.inf
     upper: np.ndarray | float = np.inf
     unit: np.ndarray | float = 1.0
-    fixed: bool = False
+    fixed: bool | np.ndarray = False
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which of its entries move, flat."""
+        return ~np.broadcast_to(self.fixed, self.start.shape).ravel()
 
     def coordinate(self, value: np.ndarray | float) -> np.ndarray:
         """The optimiser's coordinates of a value, flat."""
@@ -71,21 +77,26 @@ class ParameterTable:
         self.parameters = tuple(parameters)
         self._slices: dict[str, slice] = {}
         end = 0
+        # For parameters of which only some entries move.
+        self._free: dict[str, np.ndarray] = {}
         for parameter in self.parameters:
-            if not parameter.fixed:
-                self._slices[parameter.name] = slice(end, end + parameter.start.size)
-                end += parameter.start.size
+            free = parameter.free
+            if free.any():
+                self._slices[parameter.name] = slice(end, end + free.sum())
+                end += int(free.sum())
+                if not free.all():
+                    self._free[parameter.name] = free
         self.size = end
 
     def __getitem__(self, name: str) -> Parameter:
         return next(parameter for parameter in self.parameters if parameter.name == name)
 
     def started_at(self, values: dict[str, np.ndarray]) -> ParameterTable:
-        """The same table with other starts, for the free parameters whose shapes agree."""
+        """The same table with other starts, for what is free of the parameters whose shapes agree."""
         return ParameterTable(
             [
-                replace(parameter, start=values[parameter.name])
-                if not parameter.fixed and _shape(values, parameter.name) == parameter.start.shape
+                replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
+                if _shape(values, parameter.name) == parameter.start.shape
                 else parameter
                 for parameter in self.parameters
             ]
@@ -106,8 +117,17 @@ class ParameterTable:
         """The coordinates by name, each in its parameter's shape; can be traced by autograd."""
         found = {}
         for parameter in self.parameters:
-            part = parameter.coordinate(parameter.start) if parameter.fixed else flat[self._slices[parameter.name]]
-            found[parameter.name] = part.reshape(parameter.start.shape)
+            name = parameter.name
+            if name in self._free:
+                free, first = self._free[name], self._slices[name].start
+                # What a fixed entry takes from the vector is thrown away.
+                source = first + np.maximum(np.cumsum(free) - 1, 0)
+                part = anp.where(free, flat[source], parameter.coordinate(parameter.start))
+            elif name in self._slices:
+                part = flat[self._slices[name]]
+            else:
+                part = parameter.coordinate(parameter.start)
+            found[name] = part.reshape(parameter.start.shape)
         return found
 
     def values(self, flat: np.ndarray) -> dict[str, np.ndarray]:
@@ -119,7 +139,12 @@ class ParameterTable:
         """Join the free parameters' parts (coordinates or gradients) into a vector (size,)."""
         if not self._slices:
             return np.empty(0)
-        return np.concatenate([np.ravel(parts[name]) for name in self._slices])
+        return np.concatenate(
+            [
+                np.ravel(parts[name])[self._free[name]] if name in self._free else np.ravel(parts[name])
+                for name in self._slices
+            ]
+        )
 
 
 @dataclass(frozen=True)
@@ -130,12 +155,12 @@ class Start:
     ----------
     value : ndarray of shape (n,), or None
     bounds : ndarray of shape (n, 2), or None
-    fixed : bool
+    fixed : bool or ndarray of shape (n,)
     """
 
     value: np.ndarray | None = None
     bounds: np.ndarray | None = None
-    fixed: bool = False
+    fixed: bool | np.ndarray = False
 
     def parameter(self, name: str, default: np.ndarray, lower: np.ndarray, upper: np.ndarray, unit: Any) -> Parameter:
         """A row of the table, in internal units.

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cho_solve
 
-from .linalg import jittered_cholesky
+from .linalg import NotPositiveDefiniteError, jittered_cholesky
 from .parameters import Parameter, ParameterTable, Start
 from .source import Moments, RawRows, Source
+from .statistics import Kernel
 
 # Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
 # all strangers, whatever the number of columns.
@@ -127,6 +128,50 @@ def spread_of(inputs: Moments) -> np.ndarray:
     return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
 
 
+def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
+    """The mean of k̃(x, x) over the first inducing points; on the way it is seen whether k̃ works there.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    hyperparameters : ndarray of shape (n_hyper,)
+        First values of the user's.
+    inducing_points : ndarray of shape (m, d)
+
+    Returns
+    -------
+    variance : float
+        Above 0.
+
+    Raises
+    ------
+    ValueError
+        If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, has another diagonal than
+        k̃(x, x), or cannot be differentiated.
+    """
+    at = kernel.at(np.log(hyperparameters), inducing_points)
+    K = at.matrix()
+    if not np.isfinite(K).all():
+        raise ValueError("kernel: it is not finite on the inducing points, with its hyperparameters where they start.")
+    variance = float(np.mean(np.diagonal(K)))
+    if np.abs(K - K.T).max() > 1e-8 * np.abs(K).max():
+        raise ValueError("kernel: k(X, X) must be symmetric.")
+    try:
+        if not np.diagonal(K).min() >= 0.0 < variance:
+            raise NotPositiveDefiniteError
+        jittered_cholesky(K)
+    except NotPositiveDefiniteError:
+        raise ValueError(
+            "kernel: k(X_m, X_m) must be positive semi-definite and not 0; on the inducing points it is not, with its "
+            "hyperparameters where they start. (ExpSineSquared is one of a single column, times others.)"
+        ) from None
+    difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
+    if not difference <= 1e-6 * np.diagonal(K).max():
+        raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
+    at.finish_pullback(at.start_pullback(), np.zeros_like(K))
+    return variance
+
+
 def starting_table(
     spread: np.ndarray,
     inducing_points: np.ndarray,
@@ -135,6 +180,7 @@ def starting_table(
     scatter: np.ndarray,
     first_noise: float,
     n_hyperparameters: int,
+    mean_variance: float = 1.0,
 ) -> ParameterTable:
     """The parameters of a sparse model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -153,7 +199,9 @@ def starting_table(
     first_noise : float
         Where the noise variance starts, as a share of the scatter, if the user does not say.
     n_hyperparameters : int
-        1 or d.
+        1 or d, unless the user says where they start.
+    mean_variance : float, default=1.0
+        Of k̃(x, x), with the hyperparameters where they start.
 
     Returns
     -------
@@ -164,12 +212,20 @@ def starting_table(
     typical = spread if n_hyperparameters > 1 else np.sqrt(np.mean(spread**2, keepdims=True))
     root_d = np.sqrt(len(spread))
     lower, upper = _LENGTHSCALE_BOUNDS
+    lengthscales = _LENGTHSCALE * root_d * typical
+    signal = o / mean_variance
     return ParameterTable(
         [
             starts.hyperparameters.parameter(
-                "hyperparameters", _LENGTHSCALE * root_d * typical, lower * typical, upper * root_d * typical, 1.0
+                "hyperparameters",
+                lengthscales if starts.hyperparameters.value is None else starts.hyperparameters.value,
+                lower * typical,
+                upper * root_d * typical,
+                1.0,
             ),
-            starts.signal.parameter("signal", o, _SIGNAL_BOUNDS[0] * o, _SIGNAL_BOUNDS[1] * o, target_unit**2),
+            starts.signal.parameter(
+                "signal", signal, _SIGNAL_BOUNDS[0] * signal, _SIGNAL_BOUNDS[1] * signal, target_unit**2
+            ),
             starts.noise.parameter(
                 "noise",
                 first_noise * scatter,

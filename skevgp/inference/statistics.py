@@ -31,6 +31,9 @@ class KernelAt(Protocol):
     def diagonal(self, prepared: Any) -> np.ndarray | float:
         """k(x, x) of each row, of shape (n,), or one number for all."""
 
+    def start_pullback(self) -> Any:
+        """An empty sum for `finish_pullback`."""
+
     def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> Any:
         """What one block adds, by ``+``, to the sum for `finish_pullback`; may overwrite ``U_bar``."""
 
@@ -41,7 +44,9 @@ class KernelAt(Protocol):
 class Kernel(Protocol):
     """A covariance function of unit signal variance, k̃."""
 
-    n_hyperparameters: int
+    @property
+    def n_hyperparameters(self) -> int:
+        """How many hyperparameters there are."""
 
     def prepare(self, inputs: np.ndarray) -> Any:
         """What `KernelAt` needs of rows (n, d), computed once."""

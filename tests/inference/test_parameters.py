@@ -1,4 +1,6 @@
+import autograd.numpy as anp
 import numpy as np
+from autograd import grad
 
 from skevgp.inference.parameters import Parameter, ParameterTable, Start
 
@@ -69,3 +71,39 @@ def test_a_table_where_all_is_fixed_has_no_coordinates():
     fixed = ParameterTable([Parameter("noise", np.array([0.1]), "log", fixed=True)])
     assert fixed.start().shape == (0,)
     np.testing.assert_allclose(fixed.values(fixed.start())["noise"], [0.1])
+
+
+def partly_fixed():
+    fixed = np.array([True, False, False, True])
+    return ParameterTable(
+        [
+            Parameter("shape", np.array([1.0, 2.0, 3.0, 4.0]), "log", 0.5, np.array([1.0, 5.0, 2.5, 3.0]), fixed=fixed),
+            Parameter("points", np.arange(2.0)),
+        ]
+    )
+
+
+def test_single_entries_can_be_fixed():
+    table = partly_fixed()
+    assert table.size == 4
+    np.testing.assert_allclose(table.values(table.start())["shape"], [1.0, 2.0, 2.5, 4.0])
+    lower, upper = table.bounds()
+    np.testing.assert_allclose(upper[:2], np.log([5.0, 2.5]))
+    np.testing.assert_allclose(lower[:2], np.log(0.5))
+    values = table.values(np.array([0.1, 0.2, 7.0, 8.0]))
+    np.testing.assert_allclose(values["shape"], [1.0, np.exp(0.1), np.exp(0.2), 4.0])
+    np.testing.assert_allclose(values["points"], [7.0, 8.0])
+    np.testing.assert_allclose(table.flat({"shape": np.arange(4.0), "points": np.ones(2)}), [1.0, 2.0, 1.0, 1.0])
+    again = table.started_at({"shape": np.array([9.0, 1.0, 2.0, 9.0])})
+    np.testing.assert_allclose(again.values(again.start())["shape"], [1.0, 1.0, 2.0, 4.0])
+
+
+def test_autograd_sees_only_the_free_entries():
+    gradient = grad(lambda flat: anp.sum(partly_fixed().coordinates(flat)["shape"] * np.arange(1.0, 5.0)))(np.ones(4))
+    np.testing.assert_array_equal(gradient, [2.0, 3.0, 0.0, 0.0])
+
+
+def test_a_parameter_without_entries_is_no_trouble():
+    table = ParameterTable([Parameter("none", np.empty(0), "log"), Parameter("points", np.arange(2.0))])
+    assert table.size == 2
+    assert table.values(table.start())["none"].shape == (0,)

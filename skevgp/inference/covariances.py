@@ -1,0 +1,343 @@
+"""Covariance functions with gradients: what they have in common, the simple ones, and sums and products.
+
+Gradients follow the sum and product rules; each part has its own, written by hand. All parts of a covariance see the
+same prepared rows, [x, 1, x²], which depend on no parameter.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from operator import add, mul
+from typing import Any
+
+import numpy as np
+from autograd.extend import defvjp_argnums, primitive
+
+# A derivative per row of k(x, x): an array (n,), or one number for all rows.
+PerRow = np.ndarray | float
+# Takes gradients in k(X_m, X) (which it may overwrite) and in each k(x, x); returns what a block adds to the sum.
+Pull = Callable[[np.ndarray, PerRow], Any]
+
+
+class Sums(tuple):
+    """Sums over rows side by side (arrays, or `Sums` again): ``+`` adds them one by one."""
+
+    __slots__ = ()
+
+    def __add__(self, other: Any) -> Sums:
+        return Sums(map(add, self, other))
+
+
+def sum_of_rows(per_row: PerRow, n_rows: int) -> float:
+    """Σ over rows."""
+    return float(np.sum(per_row)) if np.ndim(per_row) else float(per_row) * n_rows
+
+
+class CovarianceAt(ABC):
+    """A covariance with its hyperparameters and inducing points put in; see `statistics.KernelAt`."""
+
+    inducing_points: np.ndarray
+
+    @abstractmethod
+    def matrix(self) -> np.ndarray:
+        """k(X_m, X_m) of shape (m, m), from exact differences."""
+
+    @abstractmethod
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        """k(X_m, X) of shape (m, n)."""
+
+    def diagonal(self, prepared: np.ndarray) -> PerRow:
+        """k(x, x) of each row, (n,), or one number for all."""
+        return 1.0
+
+    @abstractmethod
+    def start_pullback(self) -> Any:
+        """An empty sum."""
+
+    @abstractmethod
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        """k(X_m, X), and the function that pulls gradients back through it."""
+
+    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
+        """What one block adds to the sum, given gradients in k(X_m, X) and in each k(x, x)."""
+        return self.linearised(prepared)[1](U_bar, diagonal_bar)
+
+    @abstractmethod
+    def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients in the hyperparameters and the inducing points; ``K_bar``, that in `matrix`, is symmetric."""
+
+
+class Covariance(ABC):
+    """A covariance k̃ with positive hyperparameters, which the inference sees as their logarithms.
+
+    Two are equal if they are the same function of hyperparameters and inputs, wherever the inputs are centred.
+    """
+
+    @property
+    @abstractmethod
+    def n_hyperparameters(self) -> int:
+        """How many hyperparameters there are."""
+
+    @property
+    def stationary(self) -> bool:
+        """Whether it depends on differences of inputs only."""
+        return True
+
+    def prepare(self, inputs: np.ndarray) -> np.ndarray:
+        """[x, 1, x²] of each row as columns, (2 d + 1, n)."""
+        return np.ascontiguousarray(np.hstack([inputs, np.ones((len(inputs), 1)), inputs**2]).T)
+
+    def seen_from(self, centre: np.ndarray) -> Covariance:
+        """The same covariance for inputs from which ``centre`` (d,) has been subtracted."""
+        return self
+
+    @abstractmethod
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
+        """The covariance with log hyperparameters (n_hyper,) and inducing points (m, d) put in."""
+
+    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
+        """k(X_m, X_m), (g, m, m), for sets of inducing points (g, m, d); can be traced by autograd."""
+        return _matrices(hyperparameters, inducing_points, self)
+
+
+@primitive
+def _matrices(hyperparameters: np.ndarray, inducing_points: np.ndarray, covariance: Covariance) -> np.ndarray:
+    return np.array([covariance.at(hyperparameters, points).matrix() for points in inducing_points])
+
+
+def _matrices_vjp(argnums: Sequence[int], _value: np.ndarray, args: Any, _kwargs: Any) -> Callable[..., Any]:
+    hyperparameters, inducing_points, covariance = args
+
+    def vjp(bars: np.ndarray) -> tuple[np.ndarray, ...]:
+        gradients = np.zeros_like(hyperparameters), np.empty_like(inducing_points)
+        for index, (points, bar) in enumerate(zip(inducing_points, bars, strict=True)):
+            at = covariance.at(hyperparameters, points)
+            hyper_bar, gradients[1][index] = at.finish_pullback(at.start_pullback(), 0.5 * (bar + bar.T))
+            gradients[0][...] += hyper_bar
+        return tuple(gradients[argnum] for argnum in argnums)
+
+    return vjp
+
+
+defvjp_argnums(_matrices, _matrices_vjp)
+
+
+# --- simple covariances ------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Constant(Covariance):
+    """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter log c."""
+
+    n_hyperparameters = 1
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
+        return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points)
+
+
+class ConstantAt(CovarianceAt):
+    """A `Constant` with its value put in."""
+
+    def __init__(self, constant: float, inducing_points: np.ndarray):
+        self.constant, self.inducing_points = constant, inducing_points
+
+    def matrix(self) -> np.ndarray:
+        return np.full((len(self.inducing_points),) * 2, self.constant)
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        # One number that looks like a matrix.
+        return np.broadcast_to(self.constant, (len(self.inducing_points), prepared.shape[1]))
+
+    def diagonal(self, prepared: np.ndarray) -> float:
+        return self.constant
+
+    def start_pullback(self) -> np.ndarray:
+        return np.zeros(1)
+
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
+            return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, prepared.shape[1]))])
+
+        return self.cross(prepared), pull
+
+    def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return total + self.constant * K_bar.sum(), np.zeros_like(self.inducing_points)
+
+
+@dataclass(frozen=True)
+class DotProduct(Covariance):
+    """k̃(x, x') = σ₀² + xᵀx' (Rasmussen & Williams 2006, section 4.2.2). Hyperparameter log σ₀.
+
+    Parameters
+    ----------
+    centre : ndarray of shape (d,), default=None
+        What has been subtracted from the inputs.
+    """
+
+    centre: np.ndarray | None = field(default=None, compare=False)
+    n_hyperparameters = 1
+    stationary = False
+
+    def seen_from(self, centre: np.ndarray) -> DotProduct:
+        return replace(self, centre=centre)
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> DotProductAt:
+        centre = np.zeros(inducing_points.shape[1]) if self.centre is None else self.centre
+        return DotProductAt(float(np.exp(2.0 * hyperparameters[0])), inducing_points, centre)
+
+
+class DotProductAt(CovarianceAt):
+    """A `DotProduct` with σ₀² and inducing points put in."""
+
+    def __init__(self, bias: float, inducing_points: np.ndarray, centre: np.ndarray):
+        self.bias, self.inducing_points, self.centre = bias, inducing_points, centre
+        self._points = inducing_points + centre
+        self._linear = np.hstack([self._points, (self._points @ centre + bias)[:, np.newaxis]])
+
+    def matrix(self) -> np.ndarray:
+        return self._points @ self._points.T + self.bias
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        return self._linear @ prepared[: len(self.centre) + 1]
+
+    def diagonal(self, prepared: np.ndarray) -> np.ndarray:
+        x = prepared[: len(self.centre)] + self.centre[:, np.newaxis]
+        return np.einsum("dn,dn->n", x, x) + self.bias
+
+    def start_pullback(self) -> Sums:
+        return Sums((np.zeros_like(self._linear), 0.0))
+
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+            return Sums((U_bar @ prepared[: len(self.centre) + 1].T, sum_of_rows(diagonal_bar, prepared.shape[1])))
+
+        return self.cross(prepared), pull
+
+    def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows, from_diagonal = total
+        n_bar = rows[:, -1]
+        bias_bar = n_bar.sum() + from_diagonal + K_bar.sum()
+        points_bar = rows[:, :-1] + np.outer(n_bar, self.centre) + 2.0 * K_bar @ self._points
+        return np.array([2.0 * self.bias * bias_bar]), points_bar
+
+
+# --- sums and products -------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class _Combination(Covariance):
+    """Several covariances of the same inputs; their hyperparameters one after the other.
+
+    Parameters
+    ----------
+    parts : tuple of Covariance
+        At least two.
+    """
+
+    parts: tuple[Covariance, ...]
+
+    @property
+    def n_hyperparameters(self) -> int:
+        return sum(part.n_hyperparameters for part in self.parts)
+
+    @property
+    def stationary(self) -> bool:
+        return all(part.stationary for part in self.parts)
+
+    def seen_from(self, centre: np.ndarray) -> _Combination:
+        return replace(self, parts=tuple(part.seen_from(centre) for part in self.parts))
+
+    def _parts_at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> list[CovarianceAt]:
+        ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
+        own = np.split(hyperparameters, ends)
+        return [part.at(values, inducing_points) for part, values in zip(self.parts, own, strict=True)]
+
+
+class Sum(_Combination):
+    """Σ k̃ᵢ(x, x')."""
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SumAt:
+        return SumAt(self._parts_at(hyperparameters, inducing_points))
+
+
+class Product(_Combination):
+    """Π k̃ᵢ(x, x')."""
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ProductAt:
+        return ProductAt(self._parts_at(hyperparameters, inducing_points))
+
+
+class _CombinationAt(CovarianceAt):
+    def __init__(self, parts: list[CovarianceAt]):
+        self.parts, self.inducing_points = parts, parts[0].inducing_points
+
+    def start_pullback(self) -> Sums:
+        return Sums(part.start_pullback() for part in self.parts)
+
+    def _finish(self, total: Sums, K_bars: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        gradients = [part.finish_pullback(*own) for part, *own in zip(self.parts, total, K_bars, strict=True)]
+        return np.concatenate([hyper_bar for hyper_bar, _ in gradients]), reduce(add, (Z_bar for _, Z_bar in gradients))
+
+
+class SumAt(_CombinationAt):
+    """A `Sum` with hyperparameters and inducing points put in."""
+
+    def matrix(self) -> np.ndarray:
+        return reduce(add, (part.matrix() for part in self.parts))
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        return reduce(add, (part.cross(prepared) for part in self.parts))
+
+    def diagonal(self, prepared: np.ndarray) -> PerRow:
+        return reduce(add, (part.diagonal(prepared) for part in self.parts))
+
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        values, pulls = zip(*(part.linearised(prepared) for part in self.parts), strict=True)
+
+        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+            # Each part may overwrite what it gets; the last one may have the original.
+            own = (U_bar.copy() for _ in pulls[1:])
+            return Sums(part(bar, diagonal_bar) for part, bar in zip(pulls, (*own, U_bar), strict=True))
+
+        return reduce(add, values), pull
+
+    def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._finish(total, [K_bar] * len(self.parts))
+
+
+class ProductAt(_CombinationAt):
+    """A `Product` with hyperparameters and inducing points put in."""
+
+    def matrix(self) -> np.ndarray:
+        return reduce(mul, (part.matrix() for part in self.parts))
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        return reduce(mul, (part.cross(prepared) for part in self.parts))
+
+    def diagonal(self, prepared: np.ndarray) -> PerRow:
+        return reduce(mul, (part.diagonal(prepared) for part in self.parts))
+
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        values, pulls = zip(*(part.linearised(prepared) for part in self.parts), strict=True)
+
+        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+            diagonals = [part.diagonal(prepared) for part in self.parts]
+            return Sums(
+                part(bar, own)
+                for part, bar, own in zip(
+                    pulls, _times_others(U_bar, values), _times_others(diagonal_bar, diagonals), strict=True
+                )
+            )
+
+        return reduce(mul, values), pull
+
+    def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        return self._finish(total, _times_others(K_bar, [part.matrix() for part in self.parts]))
+
+
+def _times_others(bar: Any, values: Sequence[Any]) -> list[Any]:
+    """The product rule: for each factor, the gradient times all other factors (none is divided out: it may be 0)."""
+    return [reduce(mul, (*values[:i], *values[i + 1 :]), bar) for i in range(len(values))]
