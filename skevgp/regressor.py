@@ -164,6 +164,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "tol": [Interval(Real, 0, None, closed="left")],
         "batch_size": [Interval(Integral, 1, None, closed="left")],
         "learning_rate": [Interval(Real, 0, None, closed="neither")],
+        "natural_gradient": ["boolean"],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
         "random_state": ["random_state"],
@@ -190,6 +191,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tol: float = 0.01,
         batch_size: int = 512,
         learning_rate: float = 0.1,
+        natural_gradient: bool = False,
         warm_start: bool = False,
         n_jobs: int | None = None,
         random_state: int | np.random.RandomState | None = None,
@@ -210,6 +212,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.tol = tol
         self.batch_size = batch_size
         self.learning_rate = learning_rate
+        self.natural_gradient = natural_gradient
         self.warm_start = warm_start
         self.n_jobs = n_jobs
         self.random_state = random_state
@@ -397,6 +400,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.tol,
             self.batch_size,
             self.learning_rate,
+            self.natural_gradient,
         )
         self._fitted = FittedOutputs.fit(
             frame,

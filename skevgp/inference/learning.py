@@ -8,9 +8,11 @@ from typing import Any, Literal
 
 import numpy as np
 
+from .adam import adam
+from .elbo import ElboObjective
 from .model import SparseModel, Values
-from .objectives import BoundObjective, ElboObjective
-from .optimize import Minimum, Report, adam, lbfgs
+from .objectives import BoundObjective
+from .optimize import Minimum, Report, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows, block_rows
@@ -20,6 +22,8 @@ from .statistics import SufficientStatistics
 _COLLAPSED = 0.9
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
+# Length of the natural gradients' steps for q.
+_NATURAL_RATE = 0.1
 
 
 @dataclass(frozen=True)
@@ -34,6 +38,8 @@ class Options:
         In nats.
     batch_size : int
     learning_rate : float
+    natural_gradient : bool
+        Of Adam with the full family: q moves by natural gradients.
     map_blocks : callable
     """
 
@@ -42,6 +48,7 @@ class Options:
     tol: float
     batch_size: int
     learning_rate: float
+    natural_gradient: bool = False
     map_blocks: Callable[..., Iterator[Any]] = map
 
 
@@ -116,40 +123,67 @@ def learn(
     -------
     learned : Learned
     """
-    n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
+    n_rows = len(rows)
     per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
-    if options.solver == "adam":
-        elbo = ElboObjective(model, table, rows, size)
-        batches = rows.batches(model.kernel, options.batch_size, rng)
-        minimum = adam(
-            elbo.minibatch(batches),
-            elbo.table.start(),
-            elbo.table.bounds(),
-            options.max_iter,
-            options.learning_rate,
-            per_row,
+    by_solver = _by_adam if options.solver == "adam" else _by_lbfgs
+    return by_solver(model, table, rows, options, rng, per_row)
+
+
+def _by_adam(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    rng: np.random.RandomState,
+    report: Report | None,
+) -> Learned:
+    """Adam over all parameters, or over all but q; ``report`` is per row."""
+    n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
+    elbo = ElboObjective(model, table, rows, size, _NATURAL_RATE if options.natural_gradient else None)
+    start = elbo.table.start()
+    minimum = adam(
+        elbo.minibatch(rows.batches(model.kernel, options.batch_size, rng)),
+        start,
+        elbo.table.bounds(),
+        options.max_iter,
+        options.learning_rate,
+        options.tol / n_rows,
+        report,
+    )
+    blocks = rows.blocks(model.kernel, size)
+    x, found, at_start = minimum.x, elbo.solution(minimum.x, blocks), elbo.solution(start, blocks)
+    message = _message(minimum, options)
+    if not minimum.interrupted and not (minimum.converged and found[0] >= at_start[0]):
+        message = (
+            f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
+            f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
         )
-        blocks = rows.blocks(model.kernel, size)
-        bound, posterior, statistics = elbo.solution(minimum.x, blocks)
-        values = {parameter.name: elbo.table.values(minimum.x)[parameter.name] for parameter in table.parameters}
-        message = _message(minimum, options)
-        if not minimum.interrupted and not (
-            minimum.converged and bound >= elbo.solution(elbo.table.start(), blocks)[0]
-        ):
-            message = (
-                f"Adam diverged: after {minimum.n_iter} steps the bound is below where it started. Lower learning_rate "
-                f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
-            )
-    else:
-        objective = BoundObjective(model, table, rows, size, options.map_blocks)
-        minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, per_row)
-        message = _message(minimum, options)
-        values = table.values(minimum.x)
-        statistics = model.statistics(values, objective.blocks)
-        bound, posterior = model.at_optimum(values, statistics)
-        bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
+    if not found[0] >= at_start[0]:
+        x, found = start, at_start
+    bound, posterior, statistics = found
+    values = {parameter.name: elbo.table.values(x)[parameter.name] for parameter in table.parameters}
     curve = [n_rows * loss for loss in minimum.loss_curve]
     return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
+
+
+def _by_lbfgs(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    rng: np.random.RandomState,
+    report: Report | None,
+) -> Learned:
+    """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""
+    n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
+    objective = BoundObjective(model, table, rows, size, options.map_blocks)
+    minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, report)
+    values = table.values(minimum.x)
+    statistics = model.statistics(values, objective.blocks)
+    bound, posterior = model.at_optimum(values, statistics)
+    bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
+    curve = [n_rows * loss for loss in minimum.loss_curve]
+    return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options), minimum.interrupted)
 
 
 def _lbfgs_unless_collapsed(
