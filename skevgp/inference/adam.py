@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from .linalg import NotPositiveDefiniteError
 from .optimize import Minimum, Objective, Report
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
-# The last part of the steps, in which their size falls to zero.
-_ANNEALED = 1.0 / 3.0
 # A plateau is looked for this often, and not before so many steps.
 _WINDOW, _FEWEST = 50, 600
 
@@ -23,11 +23,11 @@ def adam(
     tol: float = 0.0,
     report: Report | None = None,
 ) -> Minimum:
-    """Adam (Kingma & Ba 2015, algorithm 1), its step size constant at first, then falling to zero along half a cosine.
+    """Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine.
 
-    The fall begins after two thirds of ``max_iter``, or when the loss no longer falls: when the mean over the last
-    third of the steps is below that over the third before by less than ``tol`` or by less than its standard error. It
-    takes half as many steps as came before.
+    The cosine is meant to take ``max_iter`` steps. When the loss is found to fall no longer (its mean over the last
+    third of the steps is below that over the third before by less than ``tol``, or by less than its standard error),
+    a last, shorter one takes over: from the present step size to zero, in half as many steps as came before.
 
     Parameters
     ----------
@@ -47,17 +47,16 @@ def adam(
     Returns
     -------
     minimum : Minimum
-        ``x`` is the last point, whose steps were small, if the loss stayed finite. Otherwise (the loss or its gradient
-        was not finite, or Ctrl-C ended the steps) it is the best of the points kept so far, judged by the mean loss of
-        the steps before each.
+        ``x`` is the last point, if the loss stayed finite and did not end above earlier ones by more than chance.
+        Otherwise, and when Ctrl-C ended the steps, it is the best of the points kept on the way, judged by the mean
+        loss of the steps before each.
     """
     x = np.clip(start, *bounds)
     minimum, best = Minimum(x, np.inf), _BestSoFar(x)
     first, second = np.zeros_like(x), np.zeros_like(x)
-    total = max_iter
-    slow_from = max_iter - int(_ANNEALED * max_iter)
+    since, until, highest, plateau = 0, max_iter, learning_rate, False
     try:
-        while minimum.n_iter < total:
+        while minimum.n_iter < until:
             loss, gradient = objective(x)
             if not (np.isfinite(loss) and np.isfinite(gradient).all()):
                 break
@@ -66,17 +65,18 @@ def adam(
             t = minimum.n_iter
             first += (1.0 - _DECAY_FIRST) * (gradient - first)
             second += (1.0 - _DECAY_SECOND) * (gradient**2 - second)
-            step = learning_rate / (1.0 - _DECAY_FIRST**t)
-            if t > slow_from:
-                step *= 0.5 * (1.0 + np.cos(np.pi * (t - slow_from) / (total - slow_from)))
-            x = x - step * first / (np.sqrt(second / (1.0 - _DECAY_SECOND**t)) + _EPSILON)
-            x = np.clip(x, *bounds)
+            step = 0.5 * highest * (1.0 + np.cos(np.pi * (t - 1 - since) / (until - since)))
+            scale = np.sqrt(second / (1.0 - _DECAY_SECOND**t)) + _EPSILON
+            x = np.clip(x - step / (1.0 - _DECAY_FIRST**t) * first / scale, *bounds)
             if report is not None:
                 report(t, loss)
-            if _FEWEST <= t < slow_from and t % _WINDOW == 0 and _is_plateau(np.array(minimum.loss_curve), tol):
-                slow_from, total = t, t + int(t * _ANNEALED / (1.0 - _ANNEALED))
-        else:
-            minimum.x, minimum.converged = x, True
+            if not plateau and t >= _FEWEST and t % _WINDOW == 0 and t + t // 2 < until:
+                plateau = _is_plateau(np.array(minimum.loss_curve), tol)
+                if plateau:
+                    since, until, highest = t, t + t // 2, step
+        minimum.converged = minimum.n_iter == until and not best.is_above()
+        if minimum.converged:
+            minimum.x = x
             return minimum
     except NotPositiveDefiniteError:
         pass
@@ -86,31 +86,47 @@ def adam(
     return minimum
 
 
+@dataclass(frozen=True)
+class _Mean:
+    """The mean of losses, and the variance of that mean."""
+
+    value: float
+    variance: float
+
+    @classmethod
+    def of(cls, losses: np.ndarray) -> _Mean:
+        return cls(float(losses.mean()), float(losses.var()) / len(losses))
+
+
 def _is_plateau(losses: np.ndarray, tol: float) -> bool:
     """Whether the last third of the losses is no lower than the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
-    before, after = losses[-2 * n : -n], losses[-n:]
-    standard_error = np.sqrt((before.var() + after.var()) / n)
-    return bool(before.mean() - after.mean() < max(tol, standard_error))
+    before, after = _Mean.of(losses[-2 * n : -n]), _Mean.of(losses[-n:])
+    return before.value - after.value < max(tol, np.sqrt(before.variance + after.variance))
 
 
 class _BestSoFar:
-    """The point that ends the window of steps with the lowest mean loss."""
+    """The point that ended the window of steps with the lowest mean loss."""
 
     def __init__(self, start: np.ndarray):
-        self._x, self._loss = start, np.inf
-        self._current, self._sum, self._count = start, 0.0, 0
+        self._best_x, self._best = start, _Mean(np.inf, 0.0)
+        self._last, self._current, self._window = self._best, start, list[float]()
 
     def see(self, x: np.ndarray, loss: float) -> None:
-        self._current, self._sum, self._count = x, self._sum + loss, self._count + 1
-        if self._count == _WINDOW:
-            self._x, self._loss = self._better()
-            self._sum, self._count = 0.0, 0
+        self._current = x
+        self._window.append(loss)
+        if len(self._window) == _WINDOW:
+            self._last = _Mean.of(np.array(self._window))
+            if self._last.value < self._best.value:
+                self._best_x, self._best = x, self._last
+            self._window.clear()
 
     def point(self) -> np.ndarray:
-        return self._better()[0]
+        """The best point, which may belong to a window that has just begun."""
+        begun = bool(self._window) and np.mean(self._window) < self._best.value
+        return self._current if begun else self._best_x
 
-    def _better(self) -> tuple[np.ndarray, float]:
-        if self._count > 0 and self._sum / self._count < self._loss:
-            return self._current, self._sum / self._count
-        return self._x, self._loss
+    def is_above(self) -> bool:
+        """Whether the last whole window is above the best one by more than chance."""
+        chance = 3.0 * np.sqrt(self._last.variance + self._best.variance)
+        return bool(self._last.value - self._best.value > chance)

@@ -137,7 +137,7 @@ class DiagonalFamily:
         from_prior[:, :m] *= np.einsum("ij,ij->j", L_inv, L_inv)
         weighted, total = (ratio * d).sum(axis=0), d.sum(axis=0)
         LD = L_inv * weighted
-        L_bar = -np.tril(L_inv.T @ (VVL * weighted + L_inv * total) @ L_inv.T)
+        L_bar = -(L_inv.T @ (VVL * weighted + L_inv * total) @ L_inv.T)
         diagonal = np.diagonal(group.L)
         np.einsum("ii->i", L_bar)[...] += len(d) / diagonal
         value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * np.log(diagonal).sum()
