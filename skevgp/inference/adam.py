@@ -25,9 +25,9 @@ def adam(
 ) -> Minimum:
     """Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine.
 
-    The cosine is meant to take ``max_iter`` steps. When the loss is found to fall no longer (its mean over the last
-    third of the steps is below that over the third before by less than ``tol``, or by less than its standard error),
-    a last, shorter one takes over: from the present step size to zero, in half as many steps as came before.
+    The cosine is meant to take ``max_iter`` steps. When the loss is found to fall no longer (its median over the
+    last third of the steps is below that over the third before by less than ``tol``, or by less than its standard
+    error), a last, shorter one takes over: from the present step size to zero, in as many steps as came before.
 
     Parameters
     ----------
@@ -48,8 +48,8 @@ def adam(
     -------
     minimum : Minimum
         ``x`` is the last point, if the loss stayed finite and did not end above earlier ones by more than chance.
-        Otherwise, and when Ctrl-C ended the steps, it is the best of the points kept on the way, judged by the mean
-        loss of the steps before each.
+        Otherwise, and when Ctrl-C ended the steps, it is the best of the points kept on the way, judged by the
+        median loss of the steps before each.
     """
     x = np.clip(start, *bounds)
     minimum, best = Minimum(x, np.inf), _BestSoFar(x)
@@ -70,10 +70,10 @@ def adam(
             x = np.clip(x - step / (1.0 - _DECAY_FIRST**t) * first / scale, *bounds)
             if report is not None:
                 report(t, loss)
-            if not plateau and t >= _FEWEST and t % _WINDOW == 0 and t + t // 2 < until:
+            if not plateau and t >= _FEWEST and t % _WINDOW == 0 and 2 * t < until:
                 plateau = _is_plateau(np.array(minimum.loss_curve), tol)
                 if plateau:
-                    since, until, highest = t, t + t // 2, step
+                    since, until, highest = t, 2 * t, step
         minimum.converged = minimum.n_iter == until and not best.is_above()
         if minimum.converged:
             minimum.x = x
@@ -87,43 +87,45 @@ def adam(
 
 
 @dataclass(frozen=True)
-class _Mean:
-    """The mean of losses, and the variance of that mean."""
+class _Typical:
+    """The median of losses (a few steps that went too far do not move it), and the variance of that median."""
 
     value: float
     variance: float
 
     @classmethod
-    def of(cls, losses: np.ndarray) -> _Mean:
-        return cls(float(losses.mean()), float(losses.var()) / len(losses))
+    def of(cls, losses: np.ndarray) -> _Typical:
+        low, median, high = np.percentile(losses, [25.0, 50.0, 75.0])
+        # As for a normal distribution, whose quartiles are 1.35 standard deviations apart.
+        return cls(float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses))
 
 
 def _is_plateau(losses: np.ndarray, tol: float) -> bool:
     """Whether the last third of the losses is no lower than the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
-    before, after = _Mean.of(losses[-2 * n : -n]), _Mean.of(losses[-n:])
+    before, after = _Typical.of(losses[-2 * n : -n]), _Typical.of(losses[-n:])
     return before.value - after.value < max(tol, np.sqrt(before.variance + after.variance))
 
 
 class _BestSoFar:
-    """The point that ended the window of steps with the lowest mean loss."""
+    """The point that ended the window of steps with the lowest median loss."""
 
     def __init__(self, start: np.ndarray):
-        self._best_x, self._best = start, _Mean(np.inf, 0.0)
+        self._best_x, self._best = start, _Typical(np.inf, 0.0)
         self._last, self._current, self._window = self._best, start, list[float]()
 
     def see(self, x: np.ndarray, loss: float) -> None:
         self._current = x
         self._window.append(loss)
         if len(self._window) == _WINDOW:
-            self._last = _Mean.of(np.array(self._window))
+            self._last = _Typical.of(np.array(self._window))
             if self._last.value < self._best.value:
                 self._best_x, self._best = x, self._last
             self._window.clear()
 
     def point(self) -> np.ndarray:
         """The best point, which may belong to a window that has just begun."""
-        begun = bool(self._window) and np.mean(self._window) < self._best.value
+        begun = bool(self._window) and np.median(self._window) < self._best.value
         return self._current if begun else self._best_x
 
     def is_above(self) -> bool:
