@@ -31,8 +31,9 @@ class ElboObjective:
         Of the parameters without q.
     rows : Rows
     block_rows : int
-    natural_rate : float, default=None
-        If given, q (of the full family) moves by natural gradients of this length, and is no part of θ.
+    natural_rates : (float, float), default=None
+        If given, q (of the full family) moves by natural gradients of these lengths, the first and the least, and is no
+        part of θ.
 
     Attributes
     ----------
@@ -46,7 +47,7 @@ class ElboObjective:
         table: ParameterTable,
         rows: Rows,
         block_rows: int,
-        natural_rate: float | None = None,
+        natural_rates: tuple[float, float] | None = None,
     ):
         self.model, self.n_rows = model, len(rows)
         start = table.values(table.start())
@@ -60,7 +61,7 @@ class ElboObjective:
             of_group = model.bound(own, outputs, start["signal"], start["noise"], L, L_inv).posteriors
             optima += of_group
             factors += [L_inv] * len(of_group)
-        self.natural = None if natural_rate is None else NaturalFamily(optima, natural_rate)
+        self.natural = None if natural_rates is None else NaturalFamily(optima, *natural_rates)
         self.family: Family
         if self.natural is not None:
             self.family = self.natural
@@ -82,6 +83,11 @@ class ElboObjective:
             return self.evaluate(x, [block], linear)
 
         return objective
+
+    def pace(self, share: float) -> None:
+        """Told the size of Adam's next step as a share of its first, shorten the natural gradients as much."""
+        if self.natural is not None:
+            self.natural.pace(share)
 
     def evaluate(self, x: np.ndarray, blocks: list[Block], linear: LinearStatistics) -> tuple[float, np.ndarray]:
         """The loss of some rows that stand for all, per row, and its gradient (size,).
@@ -159,7 +165,7 @@ class ElboObjective:
         """
         values = self.table.values(x)
         if self.natural is not None:
-            self.natural.rate = 1.0
+            self.natural.forget()
         bound = -self.evaluate(x, blocks, LinearStatistics.of(blocks))[0] * self.n_rows
         L_inv = [
             factor

@@ -70,7 +70,8 @@ class SpreadTerms:
 
     @classmethod
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
-        return cls(0.0, np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m)), *np.zeros((2, o)), np.zeros((o, k)))
+        VV, VH, L = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
+        return cls(0.0, VV, VH, L, np.zeros(o), np.zeros(o), np.zeros((o, k)))
 
 
 class Family(Protocol):
@@ -258,16 +259,26 @@ class NaturalFamily:
     ----------
     optima : sequence of WhitenedPosterior
         The best q of each output: where the state starts.
-    rate : float
-        ρ, above 0 and at most 1.
+    rate, least_rate : float
+        ρ, above 0 and at most 1: the first one, and what it never falls below.
     """
 
-    def __init__(self, optima: Sequence[WhitenedPosterior], rate: float):
-        self.rate = rate
+    def __init__(self, optima: Sequence[WhitenedPosterior], rate: float, least_rate: float):
+        self.rate, self._first_rate, self._least_rate = rate, rate, least_rate
         self.precision = [q.B.copy() for q in optima]
         self.shift = [q.B @ q.mean for q in optima]
         self._mean = [q.mean for q in optima]
         self._root_inv = [q.root_inv for q in optima]
+
+    def pace(self, share: float) -> None:
+        """Make the steps this share of the first: as the parameters slow down, q may average over more rows."""
+        self.rate = max(share * self._first_rate, self._least_rate)
+
+    def forget(self) -> None:
+        """From now on go all the way at each step, wherever q was."""
+        self.rate = 1.0
+        for state in (*self.precision, *self.shift):
+            state[...] = 0.0
 
     def parameters(self, mean_unit: np.ndarray) -> list[Parameter]:
         return []

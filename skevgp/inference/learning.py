@@ -10,6 +10,7 @@ import numpy as np
 
 from .adam import adam
 from .elbo import ElboObjective
+from .linalg import NotPositiveDefiniteError
 from .model import SparseModel, Values
 from .objectives import BoundObjective
 from .optimize import Minimum, Report, lbfgs
@@ -22,8 +23,8 @@ from .statistics import SufficientStatistics
 _COLLAPSED = 0.9
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
-# Length of the natural gradients' steps for q.
-_NATURAL_RATE = 0.1
+# Length of the natural gradients' steps for q: the first, and the least.
+_NATURAL_RATES = 0.3, 0.02
 
 
 @dataclass(frozen=True)
@@ -125,8 +126,9 @@ def learn(
     """
     n_rows = len(rows)
     per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
-    by_solver = _by_adam if options.solver == "adam" else _by_lbfgs
-    return by_solver(model, table, rows, options, rng, per_row)
+    if options.solver == "adam":
+        return _by_adam(model, table, rows, options, rng, per_row)
+    return _by_lbfgs(model, table, rows, options, per_row)
 
 
 def _by_adam(
@@ -139,7 +141,7 @@ def _by_adam(
 ) -> Learned:
     """Adam over all parameters, or over all but q; ``report`` is per row."""
     n_rows, size = len(rows), block_rows(table["inducing_points"].start.shape[1])
-    elbo = ElboObjective(model, table, rows, size, _NATURAL_RATE if options.natural_gradient else None)
+    elbo = ElboObjective(model, table, rows, size, _NATURAL_RATES if options.natural_gradient else None)
     start = elbo.table.start()
     minimum = adam(
         elbo.minibatch(rows.batches(model.kernel, options.batch_size, rng)),
@@ -149,18 +151,24 @@ def _by_adam(
         options.learning_rate,
         options.tol / n_rows,
         report,
+        elbo.pace,
     )
     blocks = rows.blocks(model.kernel, size)
-    x, found, at_start = minimum.x, elbo.solution(minimum.x, blocks), elbo.solution(start, blocks)
+    # A mini-batch's loss does not tell which point is best: the bound on all rows does.
+    x, (bound, posterior, statistics) = start, elbo.solution(start, blocks)
+    for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
+        try:
+            solution = elbo.solution(other, blocks)
+        except NotPositiveDefiniteError:
+            continue
+        if solution[0] >= bound:
+            x, (bound, posterior, statistics) = other, solution
     message = _message(minimum, options)
-    if not minimum.interrupted and not (minimum.converged and found[0] >= at_start[0]):
+    if not minimum.interrupted and not (minimum.converged and (x is minimum.x or minimum.n_iter == 0)):
         message = (
             f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
             f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
         )
-    if not found[0] >= at_start[0]:
-        x, found = start, at_start
-    bound, posterior, statistics = found
     values = {parameter.name: elbo.table.values(x)[parameter.name] for parameter in table.parameters}
     curve = [n_rows * loss for loss in minimum.loss_curve]
     return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
@@ -171,7 +179,6 @@ def _by_lbfgs(
     table: ParameterTable,
     rows: Rows,
     options: Options,
-    rng: np.random.RandomState,
     report: Report | None,
 ) -> Learned:
     """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""

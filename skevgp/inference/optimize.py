@@ -37,6 +37,8 @@ class Minimum:
     converged : bool
     interrupted : bool
         Whether Ctrl-C ended it.
+    others : tuple of ndarray
+        Where losses are noisy: points that may be better.
     """
 
     x: np.ndarray
@@ -44,6 +46,7 @@ class Minimum:
     loss_curve: list[float] = field(default_factory=list)
     converged: bool = False
     interrupted: bool = False
+    others: tuple[np.ndarray, ...] = ()
 
     @property
     def n_iter(self) -> int:

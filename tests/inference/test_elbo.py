@@ -224,7 +224,7 @@ def test_the_solution_is_what_was_evaluated():
 def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
     """Hensman et al. 2013: from anywhere to the optimum in one step; then the gradient is the collapsed bound's."""
     model, rows, table = problem("full", shared)
-    elbo = ElboObjective(model, table, rows, 17, natural_rate=1.0)
+    elbo = ElboObjective(model, table, rows, 17, natural_rates=(1.0, 1.0))
     rng = np.random.RandomState(0)
     for precision, shift in zip(elbo.family.precision, elbo.family.shift, strict=True):
         precision += np.diag(rng.rand(len(precision)))
@@ -246,12 +246,12 @@ def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
 def test_a_natural_gradient_goes_a_share_of_the_way():
     """Of the way in natural parameters, from where q is to the optimum for the rows at hand."""
     model, rows, table = problem("full")
-    elbo = ElboObjective(model, table, rows, 60, natural_rate=0.25)
+    elbo = ElboObjective(model, table, rows, 60, natural_rates=(0.25, 0.25))
     x = away_from_the_start(elbo)
     before, shift_before = [part.copy() for part in elbo.family.precision], [part.copy() for part in elbo.family.shift]
     rows_of = batch(model, rows, 20, 1)
     elbo.evaluate(x, *rows_of)
-    there = ElboObjective(model, table, rows, 60, natural_rate=1.0)
+    there = ElboObjective(model, table, rows, 60, natural_rates=(1.0, 1.0))
     there.evaluate(x, *rows_of)
     for o in range(2):
         np.testing.assert_allclose(
@@ -265,7 +265,7 @@ def test_a_natural_gradient_goes_a_share_of_the_way():
 def test_gradient_at_a_q_that_natural_gradients_moved():
     """It is that of the loss with q held where the step put it."""
     model, rows, table = problem("full", shared=False, n=30, m=4, p=2)
-    natural = ElboObjective(model, table, rows, 30, natural_rate=0.5)
+    natural = ElboObjective(model, table, rows, 30, natural_rates=(0.5, 0.5))
     rows_of = batch(model, rows, 12)
     x = table.start()
     loss, gradient = natural.evaluate(x, *rows_of)
