@@ -23,6 +23,8 @@ from .statistics import SufficientStatistics
 _COLLAPSED = 0.9
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
+# Relative size of the rounding errors in a bound on all rows.
+_ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
 
@@ -156,15 +158,18 @@ def _by_adam(
     blocks = rows.blocks(model.kernel, size)
     # A mini-batch's loss does not tell which point is best: the bound on all rows does.
     x, (bound, posterior, statistics) = start, elbo.solution(start, blocks)
+    first, reached = bound, bound if minimum.n_iter == 0 else -np.inf
     for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
         try:
             solution = elbo.solution(other, blocks)
         except NotPositiveDefiniteError:
             continue
+        reached = max(reached, solution[0])
         if solution[0] >= bound:
             x, (bound, posterior, statistics) = other, solution
     message = _message(minimum, options)
-    if not minimum.interrupted and not (minimum.converged and (x is minimum.x or minimum.n_iter == 0)):
+    fell = not reached >= first - max(options.tol, _ROUNDING * abs(first))
+    if not minimum.interrupted and (fell or not minimum.converged):
         message = (
             f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
             f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
