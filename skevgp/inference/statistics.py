@@ -13,9 +13,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from autograd.extend import defvjp_argnums, primitive
 
-from .linalg import triangular_inverse
 from .rows import Block, LinearStatistics
 
 # Blocks keep k(X_m, X) and V for the second pass while they fit in this many bytes; beyond it they are recomputed.
@@ -241,90 +239,3 @@ def pull_back(
         VE += block_VE
     VbarV = symmetric @ statistics.VV + VH_bar @ statistics.VH.T + VR_bar @ VE.T
     return rows_bar, -np.tril(L_inv.T @ VbarV), squares, VE
-
-
-# --- the same pass as a primitive that autograd can trace through ------------------------------------------------
-
-
-def _pack(VV: np.ndarray, VH: np.ndarray, VR: np.ndarray, unexplained: float) -> np.ndarray:
-    return np.concatenate([VV.ravel(), VH.ravel(), VR.ravel(), [unexplained]])
-
-
-def _unpack(flat: Any, m: int, p: int, o: int) -> tuple[Any, Any, Any, Any]:
-    """The inverse of `_pack` for each set of inducing points; can be traced by autograd."""
-    ends = np.cumsum([m * m, m * p, m * o])
-    return (
-        flat[:, : ends[0]].reshape((len(flat), m, m)),
-        flat[:, ends[0] : ends[1]].reshape((len(flat), m, p)),
-        flat[:, ends[1] : ends[2]].reshape((len(flat), m, o)),
-        flat[:, ends[2]],
-    )
-
-
-@primitive
-def _flat_statistics(
-    hyperparameters: np.ndarray,
-    inducing_points: np.ndarray,
-    L: np.ndarray,
-    kernel: Kernel,
-    blocks: Sequence[Block],
-    linear: LinearStatistics,
-    memo: list[Any],
-) -> np.ndarray:
-    flat = []
-    for points, factor in zip(inducing_points, L, strict=True):
-        at, L_inv = kernel.at(hyperparameters, points), triangular_inverse(factor)
-        statistics, kept = collect(blocks, linear, at, L_inv, keep=True)
-        memo.append((at, L_inv, statistics, kept))
-        flat.append(_pack(statistics.VV, statistics.VH, statistics.VR, statistics.unexplained))
-    return np.array(flat)
-
-
-def _flat_statistics_vjp(argnums: Sequence[int], _value: np.ndarray, args: Any, _kwargs: Any) -> Callable[..., Any]:
-    hyperparameters, inducing_points, L, _, blocks, linear, memo = args
-
-    def vjp(flat_bar: np.ndarray) -> tuple[np.ndarray, ...]:
-        gradients = np.zeros_like(hyperparameters), np.zeros_like(inducing_points), np.zeros_like(L)
-        m = L.shape[1]
-        bars = zip(*_unpack(flat_bar, m, *linear.HR.shape), strict=True)
-        for index, ((at, L_inv, statistics, kept), bar) in enumerate(zip(memo, bars, strict=True)):
-            rows_bar, gradients[2][index], _, _ = pull_back(blocks, at, L_inv, statistics, kept, *bar)
-            hyper_bar, gradients[1][index] = at.finish_pullback(rows_bar, np.zeros((m, m)))
-            gradients[0][...] += hyper_bar
-        return tuple(gradients[argnum] for argnum in argnums)
-
-    return vjp
-
-
-defvjp_argnums(_flat_statistics, _flat_statistics_vjp)
-
-
-def traceable_statistics(
-    hyperparameters: Any,
-    inducing_points: Any,
-    L: Any,
-    kernel: Kernel,
-    blocks: Sequence[Block],
-    linear: LinearStatistics,
-) -> SufficientStatistics:
-    """The statistics of several sets of inducing points, as a function that autograd differentiates by `pull_back`.
-
-    Parameters
-    ----------
-    hyperparameters : array of shape (n_hyper,)
-    inducing_points : array of shape (g, m, d)
-    L : array of shape (g, m, m)
-        Lower Cholesky factors of k(X_m, X_m), themselves traced.
-    kernel : Kernel
-    blocks : sequence of Block
-    linear : LinearStatistics
-        Of the same blocks.
-
-    Returns
-    -------
-    statistics : SufficientStatistics
-        Traced, with a leading axis g, where it depends on the first three arguments.
-    """
-    flat = _flat_statistics(hyperparameters, inducing_points, L, kernel, blocks, linear, [])
-    VV, VH, VR, unexplained = _unpack(flat, L.shape[1], *linear.HR.shape)
-    return SufficientStatistics(linear.n_rows, VV, VH, VR, linear.HH, linear.HR, linear.RR, unexplained)
