@@ -252,7 +252,7 @@ class NaturalFamily:
     """q as one joint Gaussian, moved by natural gradients: no parameters for an optimiser, but a state of its own.
 
     The state is q's natural parameters Λ = S⁻¹ and Λ mean. A natural gradient of length ρ goes that share of the way
-    to the optimum for the rows at hand (Hensman et al. 2013, section 3, eq. 9 and 10 and the lines below them):
+    to the optimum for the rows at hand (Hensman et al. 2013, section 3, the updates of the canonical parameters):
     Λ <- (1 - ρ) Λ + ρ B, Λ mean <- (1 - ρ) Λ mean + ρ g, with B and g of `bounds`.
 
     Parameters
