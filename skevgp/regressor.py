@@ -79,17 +79,23 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, default="lbfgs"
-        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters.
+        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
+        among them.
     max_iter : int, default=None
-        Iterations of L-BFGS or steps of Adam; None means 1000 or 8000. With 0 nothing is optimised: kernel and inducing
-        points stay where they start, and q is at its optimum.
+        The most iterations of L-BFGS or steps of Adam; None means 1000 or 8000. With 0 nothing is optimised: kernel
+        and inducing points stay where they start, and q is at its optimum.
     tol : float, default=0.01
         In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
-        when that no longer gains a hundred times as much.
+        when that no longer gains a hundred times as much. Adam goes over to its last steps, as many as before, when the
+        loss stays flat: when its median over the last third of the steps differs from that over the third before by
+        less than this, or by no more than chance (mini-batches are noisy, so chance mostly decides).
     batch_size : int, default=512
         Rows per step of Adam.
     learning_rate : float, default=0.1
-        Adam's first step size; it falls to zero along half a cosine.
+        Adam's first step size; it falls to zero along half a cosine: over ``max_iter`` steps, or over the last steps.
+    natural_gradient : bool, default=False
+        Only for ``solver="adam"`` with ``posterior="full"``: whether q moves by natural gradients (Hensman et al.
+        2013), the last one on all rows, so that Adam is left with kernel, noise and inducing points.
     forgetting_factor : float, default=1.0
         What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers
         all of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
@@ -174,6 +180,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "tol": [Interval(Real, 0, None, closed="left")],
         "batch_size": [Interval(Integral, 1, None, closed="left")],
         "learning_rate": [Interval(Real, 0, None, closed="neither")],
+        "natural_gradient": ["boolean"],
         "forgetting_factor": [Interval(Real, 0, 1, closed="right")],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
@@ -201,6 +208,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         tol: float = 0.01,
         batch_size: int = 512,
         learning_rate: float = 0.1,
+        natural_gradient: bool = False,
         forgetting_factor: float = 1.0,
         warm_start: bool = False,
         n_jobs: int | None = None,
@@ -222,6 +230,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.tol = tol
         self.batch_size = batch_size
         self.learning_rate = learning_rate
+        self.natural_gradient = natural_gradient
         self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
         self.n_jobs = n_jobs
@@ -395,6 +404,11 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return samples[:, 0] if single else samples
 
     def _fit(self, X: Any, y: Any) -> None:
+        if self.natural_gradient and (self.solver != "adam" or self.posterior != "full"):
+            raise ValueError(
+                'natural_gradient=True needs solver="adam" and posterior="full"; '
+                f"got solver={self.solver!r} and posterior={self.posterior!r}."
+            )
         given, X, y = self._validated(X, y, reset=True)
         fit_to = fit_map_to_chunks if is_dask(X) else fit_map
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
@@ -420,6 +434,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.tol,
             self.batch_size,
             self.learning_rate,
+            self.natural_gradient,
         )
         self._fitted = FittedOutputs.fit(
             frame,

@@ -141,6 +141,47 @@ def test_adam_learns_in_mini_batches(sharing, posterior):
     assert m.n_iter_ == len(m.loss_curve_) == 600
 
 
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_natural_gradients_learn_in_mini_batches(sharing):
+    m = model(solver="adam", natural_gradient=True, sharing=sharing, batch_size=50, max_iter=600).fit(X, Y)
+    assert m.score(X_NEW, Y_NEW) > 0.98
+    np.testing.assert_allclose(np.sqrt(m.noise_variance_), 0.05, rtol=0.5)
+
+
+def test_natural_gradients_and_lbfgs_agree_at_the_optimum():
+    """Inducing points and noise free, mini-batches of a third of the rows."""
+    rng = np.random.RandomState(0)
+    x, x_new = rng.uniform(-2, 2, (600, 1)), np.linspace(-2, 2, 50)[:, np.newaxis]
+    y = np.sin(3 * x[:, 0]) + 0.5 * x[:, 0] + 0.1 * rng.randn(600)
+    kernel = ConstantKernel(1.0, "fixed") * RBF(0.8, "fixed")
+    arguments = {"kernel": kernel, "n_inducing": 8, "feature_map": PolynomialFeatures(1)}
+    lbfgs = model(**arguments).fit(x, y)
+    natural = model(solver="adam", natural_gradient=True, batch_size=200, max_iter=2000, **arguments).fit(x, y)
+    assert natural.lower_bound_ == pytest.approx(lbfgs.lower_bound_, abs=1.0)
+    for a, b in zip(natural.predict(x_new, return_std=True), lbfgs.predict(x_new, return_std=True), strict=True):
+        np.testing.assert_allclose(a, b, atol=0.01)
+    np.testing.assert_allclose((natural.coef_ - lbfgs.coef_) / lbfgs.coef_std_, 0.0, atol=0.2)
+    np.testing.assert_allclose(natural.coef_std_, lbfgs.coef_std_, rtol=0.1)
+    np.testing.assert_allclose(natural.noise_variance_, lbfgs.noise_variance_, rtol=0.05)
+
+
+def test_natural_gradients_need_no_batch_size_below_the_rows():
+    """With all rows in a batch, and with a kernel that is fixed, the first step is already the last."""
+    fixed = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], "fixed") + WhiteKernel(0.01, "fixed")
+    arguments = {"kernel": fixed, "max_iter": 1, "learning_rate": 1e-12}
+    m = model(solver="adam", natural_gradient=True, **arguments).fit(X, Y)
+    start = model(kernel=fixed, max_iter=0).fit(X, Y)
+    assert m.lower_bound_ == pytest.approx(start.lower_bound_, rel=1e-8)
+    np.testing.assert_allclose(m.predict(X_NEW), start.predict(X_NEW), atol=1e-8)
+
+
+@pytest.mark.parametrize("other", [{"solver": "lbfgs"}, {"posterior": "diagonal"}])
+def test_natural_gradients_are_of_adam_and_the_full_posterior(other):
+    m = model(**{"solver": "adam", "natural_gradient": True} | other)
+    with pytest.raises(ValueError, match=r'natural_gradient=True needs solver="adam" and posterior="full"; got'):
+        m.fit(X, Y)
+
+
 def test_outputs_that_share_nothing_are_independent_models():
     together = model(sharing="none", tol=1.0).fit(X, Y)
     for o in range(2):
@@ -488,10 +529,13 @@ def test_warm_start_forgets_points_of_another_space():
     assert m.lower_bound_ == pytest.approx(cold.lower_bound_, abs=1e-6)
 
 
-def test_adam_that_diverges_says_so():
-    m = model(solver="adam", learning_rate=50.0, max_iter=20, posterior="diagonal")
-    with pytest.warns(ConvergenceWarning, match=r"Adam diverged.* Lower learning_rate \(now 50.0\)"):
+@pytest.mark.parametrize("learning_rate", [50.0, 1e6])
+def test_adam_that_diverges_says_so_and_ends_no_lower_than_it_started(learning_rate):
+    m = model(solver="adam", learning_rate=learning_rate, max_iter=20, posterior="diagonal")
+    with pytest.warns(ConvergenceWarning, match=r"Adam diverged.* Lower learning_rate \(now"):
         m.fit(X, Y)
+    start = model(max_iter=0, posterior="diagonal", solver="adam").fit(X, Y)
+    assert m.lower_bound_ >= start.lower_bound_
     assert np.isfinite(m.predict(X_NEW)).all()
 
 

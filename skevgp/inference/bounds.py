@@ -284,13 +284,14 @@ def negative_elbo(
 ) -> Any:
     """The paper's loss (its eq. elbo, with C free where q is a joint Gaussian), summed over outputs.
 
-    Written in autograd.numpy: it can be traced through every argument but ``prior``.
+    Written in autograd.numpy: it can be traced through every argument but ``prior``, and so is the oracle of the
+    hand-written gradient in `elbo`.
 
     Parameters
     ----------
     statistics : SufficientStatistics
         Of all rows, or of a mini-batch scaled to all rows (the paper's appendix C, times N), with a leading axis of
-        length 1 (inducing points common to all outputs) or o, as `traceable_statistics` returns them.
+        length 1 (inducing points common to all outputs) or o where they depend on the inducing points.
     signal, noise : array of shape (o,)
         s² and σ².
     prior : CoefficientPrior

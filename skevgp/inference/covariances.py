@@ -14,7 +14,6 @@ from operator import add, mul
 from typing import Any
 
 import numpy as np
-from autograd.extend import defvjp_argnums, primitive
 
 # A derivative per row of k(x, x): an array (n,), or one number for all rows.
 PerRow = np.ndarray | float
@@ -97,32 +96,6 @@ class Covariance(ABC):
     @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
         """The covariance with log hyperparameters (n_hyper,) and inducing points (m, d) put in."""
-
-    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
-        """k(X_m, X_m), (g, m, m), for sets of inducing points (g, m, d); can be traced by autograd."""
-        return _matrices(hyperparameters, inducing_points, self)
-
-
-@primitive
-def _matrices(hyperparameters: np.ndarray, inducing_points: np.ndarray, covariance: Covariance) -> np.ndarray:
-    return np.array([covariance.at(hyperparameters, points).matrix() for points in inducing_points])
-
-
-def _matrices_vjp(argnums: Sequence[int], _value: np.ndarray, args: Any, _kwargs: Any) -> Callable[..., Any]:
-    hyperparameters, inducing_points, covariance = args
-
-    def vjp(bars: np.ndarray) -> tuple[np.ndarray, ...]:
-        gradients = np.zeros_like(hyperparameters), np.empty_like(inducing_points)
-        for index, (points, bar) in enumerate(zip(inducing_points, bars, strict=True)):
-            at = covariance.at(hyperparameters, points)
-            hyper_bar, gradients[1][index] = at.finish_pullback(at.start_pullback(), 0.5 * (bar + bar.T))
-            gradients[0][...] += hyper_bar
-        return tuple(gradients[argnum] for argnum in argnums)
-
-    return vjp
-
-
-defvjp_argnums(_matrices, _matrices_vjp)
 
 
 # --- simple covariances ------------------------------------------------------------------------------------------

@@ -7,9 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from .adam import adam
+from .elbo import ElboObjective
+from .linalg import NotPositiveDefiniteError
 from .model import SparseModel, Values
-from .objectives import BoundObjective, ElboObjective
-from .optimize import Minimum, Report, adam, lbfgs
+from .objectives import BoundObjective
+from .optimize import Minimum, Report, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
@@ -20,6 +23,10 @@ from .threads import BlockMap
 _COLLAPSED = 0.9
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
+# Relative size of the rounding errors in a bound on all rows.
+_ROUNDING = 1e-8
+# Length of the natural gradients' steps for q: the first, and the least.
+_NATURAL_RATES = 0.3, 0.02
 
 
 @dataclass(frozen=True)
@@ -34,6 +41,8 @@ class Options:
         In nats.
     batch_size : int
     learning_rate : float
+    natural_gradient : bool
+        Of Adam with the full family: q moves by natural gradients.
     threads : BlockMap
     """
 
@@ -42,6 +51,7 @@ class Options:
     tol: float
     batch_size: int
     learning_rate: float
+    natural_gradient: bool = False
     threads: BlockMap = field(default_factory=BlockMap)
 
 
@@ -117,37 +127,75 @@ def learn(
     learned : Learned
     """
     n_rows = len(rows)
-    blocks = rows.blocks(model.kernel, table["inducing_points"].start.shape[1], options.threads)
     per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
     if options.solver == "adam":
-        elbo = ElboObjective(model, table, blocks)
-        batches = rows.batches(model.kernel, options.batch_size, rng)
-        minimum = adam(
-            elbo.minibatch(batches),
-            elbo.table.start(),
-            elbo.table.bounds(),
-            options.max_iter,
-            options.learning_rate,
-            per_row,
+        return _by_adam(model, table, rows, options, rng, per_row)
+    return _by_lbfgs(model, table, rows, options, per_row)
+
+
+def _by_adam(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    rng: np.random.RandomState,
+    report: Report | None,
+) -> Learned:
+    """Adam over all parameters, or over all but q; ``report`` is per row."""
+    n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
+    blocks = rows.blocks(model.kernel, n_inducing, options.threads)
+    elbo = ElboObjective(model, table, blocks, _NATURAL_RATES if options.natural_gradient else None)
+    start = elbo.table.start()
+    minimum = adam(
+        elbo.minibatch(rows.batches(model.kernel, options.batch_size, rng)),
+        start,
+        elbo.table.bounds(),
+        options.max_iter,
+        options.learning_rate,
+        options.tol / n_rows,
+        report,
+        elbo.pace,
+    )
+    # A mini-batch's loss does not tell which point is best: the bound on all rows does.
+    x, (bound, posterior, statistics) = start, elbo.solution(start)
+    first, reached = bound, bound if minimum.n_iter == 0 else -np.inf
+    for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
+        try:
+            solution = elbo.solution(other)
+        except NotPositiveDefiniteError:
+            continue
+        reached = max(reached, solution[0])
+        if solution[0] >= bound:
+            x, (bound, posterior, statistics) = other, solution
+    message = _message(minimum, options)
+    fell = not reached >= first - max(options.tol, _ROUNDING * abs(first))
+    if not minimum.interrupted and (fell or not minimum.converged):
+        message = (
+            f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
+            f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
         )
-        bound, posterior, statistics = elbo.solution(minimum.x)
-        values = {parameter.name: elbo.table.values(minimum.x)[parameter.name] for parameter in table.parameters}
-        message = _message(minimum, options)
-        if not minimum.interrupted and not (minimum.converged and bound >= elbo.solution(elbo.table.start())[0]):
-            message = (
-                f"Adam diverged: after {minimum.n_iter} steps the bound is below where it started. Lower learning_rate "
-                f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
-            )
-    else:
-        objective = BoundObjective(model, table, blocks)
-        minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, per_row)
-        message = _message(minimum, options)
-        values = table.values(minimum.x)
-        statistics = model.statistics(values, blocks)
-        bound, posterior = model.at_optimum(values, statistics)
-        bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
+    values = {parameter.name: elbo.table.values(x)[parameter.name] for parameter in table.parameters}
     curve = [n_rows * loss for loss in minimum.loss_curve]
     return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
+
+
+def _by_lbfgs(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    report: Report | None,
+) -> Learned:
+    """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""
+    n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
+    objective = BoundObjective(model, table, rows.blocks(model.kernel, n_inducing, options.threads))
+    minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, report)
+    values = table.values(minimum.x)
+    statistics = model.statistics(values, objective.blocks)
+    bound, posterior = model.at_optimum(values, statistics)
+    bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
+    curve = [n_rows * loss for loss in minimum.loss_curve]
+    return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options), minimum.interrupted)
 
 
 def _lbfgs_unless_collapsed(

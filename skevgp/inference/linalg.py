@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
-from autograd.extend import defvjp, primitive
 from scipy.linalg import lapack
 
 # The largest relative jitter that is tried before a matrix counts as not finite or hopelessly indefinite.
@@ -87,52 +84,3 @@ def cholesky_pullback(L: np.ndarray, L_inv: np.ndarray, L_bar: np.ndarray) -> np
     phi = phi + phi.T
     np.einsum("ii->i", phi)[...] *= 0.5
     return 0.5 * (L_inv.T @ phi @ L_inv)
-
-
-# --- the same for stacks of matrices, as primitives that autograd can trace through ------------------------------
-
-
-@primitive
-def cholesky(matrices: np.ndarray, jitter: float = 0.0) -> np.ndarray:
-    """`jittered_cholesky` of each matrix of a stack (g, n, n)."""
-    return np.array([jittered_cholesky(matrix, jitter) for matrix in matrices])
-
-
-@primitive
-def inverse_factor(L: np.ndarray) -> np.ndarray:
-    """`triangular_inverse` of each matrix of a stack (g, n, n)."""
-    return np.array([triangular_inverse(factor) for factor in L])
-
-
-@primitive
-def lower_triangular(flat: np.ndarray, size: int) -> np.ndarray:
-    """Lower triangular matrices (g, n, n) from rows (g, n (n + 1) / 2): the diagonal, then the entries below it."""
-    matrices = np.zeros((len(flat), size, size))
-    np.einsum("gii->gi", matrices)[...] = flat[:, :size]
-    rows, columns = np.tril_indices(size, -1)
-    matrices[:, rows, columns] = flat[:, size:]
-    return matrices
-
-
-def _lower_triangular_vjp(_matrices: np.ndarray, _flat: np.ndarray, size: int) -> Callable[[np.ndarray], np.ndarray]:
-    rows, columns = np.tril_indices(size, -1)
-    return lambda bar: np.hstack([np.einsum("gii->gi", bar), bar[:, rows, columns]])
-
-
-def _cholesky_vjp(L: np.ndarray, _matrices: np.ndarray, _jitter: float = 0.0) -> Callable[[np.ndarray], np.ndarray]:
-    def vjp(L_bar: np.ndarray) -> np.ndarray:
-        return np.array(
-            [cholesky_pullback(factor, triangular_inverse(factor), bar) for factor, bar in zip(L, L_bar, strict=True)]
-        )
-
-    return vjp
-
-
-def _inverse_factor_vjp(L_inv: np.ndarray, _L: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    transposed = np.swapaxes(L_inv, 1, 2)
-    return lambda bar: -np.tril(transposed @ bar @ transposed)
-
-
-defvjp(cholesky, _cholesky_vjp, argnums=(0,))
-defvjp(lower_triangular, _lower_triangular_vjp, argnums=(0,))
-defvjp(inverse_factor, _inverse_factor_vjp, argnums=(0,))

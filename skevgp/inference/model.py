@@ -65,7 +65,7 @@ class SparseModel:
             total += bound.value(bound.residuals())
             for q in bound.posteriors:
                 mean.append(q.mean)
-                root.append(q.root_inv if self.family == "full" else _diagonal_root(*log_variances(q.B, L_inv), L_inv))
+                root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
         return total, self.posterior(values, mean, root)
 
     def posterior(self, values: Values, mean: Sequence[np.ndarray], root: Sequence[np.ndarray]) -> Posterior:
@@ -113,7 +113,7 @@ def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndar
     return -np.log(precision), -np.log(np.diagonal(B)[m:])
 
 
-def _diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
+def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
     """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
     m = len(L_inv)
     root = np.zeros((m + len(log_w), m + len(log_w)))

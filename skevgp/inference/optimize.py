@@ -1,4 +1,4 @@
-"""Minimise f(θ) -> (value, gradient): L-BFGS for a function of all rows, Adam for mini-batches."""
+"""Minimise f(θ) -> (value, gradient) of all rows: L-BFGS. (Mini-batches: `adam`.)"""
 
 from __future__ import annotations
 
@@ -37,6 +37,8 @@ class Minimum:
     converged : bool
     interrupted : bool
         Whether Ctrl-C ended it.
+    others : tuple of ndarray
+        Where losses are noisy: points that may be better.
     """
 
     x: np.ndarray
@@ -44,6 +46,7 @@ class Minimum:
     loss_curve: list[float] = field(default_factory=list)
     converged: bool = False
     interrupted: bool = False
+    others: tuple[np.ndarray, ...] = ()
 
     @property
     def n_iter(self) -> int:
@@ -151,59 +154,4 @@ def lbfgs(
     except KeyboardInterrupt:
         minimum.interrupted = True
     minimum.x, minimum.loss = guarded.x, guarded.loss
-    return minimum
-
-
-def adam(
-    objective: Objective,
-    start: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
-    max_iter: int,
-    learning_rate: float,
-    report: Report | None = None,
-) -> Minimum:
-    """Adam (Kingma & Ba 2015) with a step size that falls to zero along half a cosine.
-
-    Parameters
-    ----------
-    objective : callable
-        x -> (loss, gradient), of the next mini-batch at each call.
-    start, bounds
-        As in `lbfgs`; steps are clipped to the bounds.
-    max_iter : int
-    learning_rate : float
-        The first step size.
-    report : callable, default=None
-
-    Returns
-    -------
-    minimum : Minimum
-        Its ``x`` is the last point (a mini-batch's loss does not tell which point was best), or the last at which the
-        loss was finite.
-    """
-    x = np.clip(start, *bounds)
-    minimum = Minimum(x, np.inf)
-    first, second = np.zeros_like(x), np.zeros_like(x)
-    decay_first, decay_second = 0.9, 0.999
-    try:
-        for iteration in range(max_iter):
-            try:
-                loss, gradient = objective(x)
-            except NotPositiveDefiniteError:
-                return minimum
-            if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-                return minimum
-            minimum.x = x
-            minimum.loss_curve.append(loss)
-            first = decay_first * first + (1.0 - decay_first) * gradient
-            second = decay_second * second + (1.0 - decay_second) * gradient**2
-            corrected = np.sqrt(second / (1.0 - decay_second ** (iteration + 1)))
-            step = learning_rate * 0.5 * (1.0 + np.cos(np.pi * iteration / max_iter))
-            x = x - step * first / (1.0 - decay_first ** (iteration + 1)) / (corrected + 1e-8)
-            x = np.clip(x, *bounds)
-            if report is not None:
-                report(minimum.n_iter, loss)
-        minimum.x, minimum.converged = x, True
-    except KeyboardInterrupt:
-        minimum.interrupted = True
     return minimum

@@ -9,7 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-import autograd.numpy as anp
 import numpy as np
 from scipy.spatial.distance import cdist
 from scipy.special import gammaln, kve
@@ -351,11 +350,6 @@ class SquaredExponential(Stationary):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
         return SquaredExponentialAt(self.profile, hyperparameters, inducing_points)
-
-    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
-        scaled = inducing_points / anp.exp(hyperparameters)
-        differences = scaled[..., :, None, :] - scaled[..., None, :, :]
-        return anp.exp(-0.5 * anp.sum(differences**2, axis=-1))
 
 
 class SquaredExponentialAt(StationaryAt):

@@ -8,15 +8,13 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
-from autograd.extend import defvjp_argnums, primitive
 
 from .blocks import Block, Blocks
-from .linalg import triangular_inverse
 
 
 class KernelAt(Protocol):
@@ -53,9 +51,6 @@ class Kernel(Protocol):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> KernelAt:
         """The covariance with hyperparameters (n_hyper,) and inducing points (m, d) put in."""
-
-    def traceable_matrices(self, hyperparameters: Any, inducing_points: Any) -> Any:
-        """k(X_m, X_m) of shape (g, m, m) for sets of inducing points (g, m, d), in autograd.numpy."""
 
 
 @dataclass(frozen=True)
@@ -231,86 +226,3 @@ def pull_back(
     rows_bar, squares, VE = rows.sum(_SecondPass(kernel, L_inv, from_whitened, from_linear, unexplained_bar, fitted))
     VbarV = symmetric @ statistics.VV + VH_bar @ statistics.VH.T + VR_bar @ VE.T
     return rows_bar, -np.tril(L_inv.T @ VbarV), squares, VE
-
-
-# --- the same pass as a primitive that autograd can trace through ------------------------------------------------
-
-
-def _pack(VV: np.ndarray, VH: np.ndarray, VR: np.ndarray, unexplained: float) -> np.ndarray:
-    return np.concatenate([VV.ravel(), VH.ravel(), VR.ravel(), [unexplained]])
-
-
-def _unpack(flat: Any, m: int, p: int, o: int) -> tuple[Any, Any, Any, Any]:
-    """The inverse of `_pack` for each set of inducing points; can be traced by autograd."""
-    ends = np.cumsum([m * m, m * p, m * o])
-    return (
-        flat[:, : ends[0]].reshape((len(flat), m, m)),
-        flat[:, ends[0] : ends[1]].reshape((len(flat), m, p)),
-        flat[:, ends[1] : ends[2]].reshape((len(flat), m, o)),
-        flat[:, ends[2]],
-    )
-
-
-@primitive
-def _flat_statistics(
-    hyperparameters: np.ndarray,
-    inducing_points: np.ndarray,
-    L: np.ndarray,
-    kernel: Kernel,
-    rows: Blocks,
-    memo: list[Any],
-) -> np.ndarray:
-    flat = []
-    for points, factor in zip(inducing_points, L, strict=True):
-        at, L_inv = kernel.at(hyperparameters, points), triangular_inverse(factor)
-        statistics = collect(rows, at, L_inv)
-        memo.append((at, L_inv, statistics))
-        flat.append(_pack(statistics.VV, statistics.VH, statistics.VR, statistics.unexplained))
-    return np.array(flat)
-
-
-def _flat_statistics_vjp(argnums: Sequence[int], _value: np.ndarray, args: Any, _kwargs: Any) -> Callable[..., Any]:
-    hyperparameters, inducing_points, L, _, rows, memo = args
-
-    def vjp(flat_bar: np.ndarray) -> tuple[np.ndarray, ...]:
-        gradients = np.zeros_like(hyperparameters), np.zeros_like(inducing_points), np.zeros_like(L)
-        m = L.shape[1]
-        bars = zip(*_unpack(flat_bar, m, *rows.linear.HR.shape), strict=True)
-        for index, ((at, L_inv, statistics), bar) in enumerate(zip(memo, bars, strict=True)):
-            rows_bar, gradients[2][index], _, _ = pull_back(rows, at, L_inv, statistics, *bar)
-            hyper_bar, gradients[1][index] = at.finish_pullback(rows_bar, np.zeros((m, m)))
-            gradients[0][...] += hyper_bar
-        return tuple(gradients[argnum] for argnum in argnums)
-
-    return vjp
-
-
-defvjp_argnums(_flat_statistics, _flat_statistics_vjp)
-
-
-def traceable_statistics(
-    hyperparameters: Any,
-    inducing_points: Any,
-    L: Any,
-    kernel: Kernel,
-    rows: Blocks,
-) -> SufficientStatistics:
-    """The statistics of several sets of inducing points, as a function that autograd differentiates by `pull_back`.
-
-    Parameters
-    ----------
-    hyperparameters : array of shape (n_hyper,)
-    inducing_points : array of shape (g, m, d)
-    L : array of shape (g, m, m)
-        Lower Cholesky factors of k(X_m, X_m), themselves traced.
-    kernel : Kernel
-    rows : Blocks
-
-    Returns
-    -------
-    statistics : SufficientStatistics
-        Traced, with a leading axis g, where it depends on the first three arguments.
-    """
-    flat, linear = _flat_statistics(hyperparameters, inducing_points, L, kernel, rows, []), rows.linear
-    VV, VH, VR, unexplained = _unpack(flat, L.shape[1], *linear.HR.shape)
-    return SufficientStatistics(linear.n_rows, VV, VH, VR, linear.HH, linear.HR, linear.RR, unexplained)

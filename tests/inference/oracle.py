@@ -13,6 +13,14 @@ from skevgp.inference.start import Starts, spread_of, starting_table
 from skevgp.kernels import SquaredExponential
 
 
+def central_differences(function, x, step=1e-6):
+    return np.array([(function(x + step * e) - function(x - step * e)) / (2 * step) for e in np.eye(len(x))])
+
+
+def relative_error(actual, expected):
+    return np.abs(actual - expected).max() / np.abs(expected).max()
+
+
 def squared_exponential(A, B, lengthscales):
     return anp.exp(-0.5 * anp.sum(((A[:, None, :] - B[None, :, :]) / lengthscales) ** 2, axis=2))
 

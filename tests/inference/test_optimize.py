@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from skevgp.inference.linalg import NotPositiveDefiniteError
-from skevgp.inference.optimize import adam, lbfgs
+from skevgp.inference.optimize import lbfgs
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
@@ -67,8 +67,7 @@ def test_lbfgs_ends_when_rounding_has_the_last_word():
     assert minimum.loss < 0.01
 
 
-@pytest.mark.parametrize("optimise", [lbfgs, adam])
-def test_ctrl_c_keeps_the_best_point_so_far(optimise):
+def test_ctrl_c_keeps_the_best_point_so_far():
     calls = []
 
     def interrupted(x):
@@ -77,24 +76,7 @@ def test_ctrl_c_keeps_the_best_point_so_far(optimise):
             raise KeyboardInterrupt
         return rosenbrock(x)
 
-    minimum = optimise(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1)
+    minimum = lbfgs(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1)
     assert minimum.interrupted
     assert not minimum.converged
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
-
-
-def test_adam_finds_the_minimum_of_a_noisy_bowl():
-    rng = np.random.RandomState(0)
-
-    def bowl(x):
-        return ((x - 3.0) ** 2).sum(), 2.0 * (x - 3.0) + rng.randn(2)
-
-    minimum = adam(bowl, np.zeros(2), FREE, 2000, 0.1)
-    np.testing.assert_allclose(minimum.x, 3.0, atol=0.1)
-    assert minimum.converged
-    assert minimum.n_iter == 2000
-
-
-def test_adam_respects_bounds():
-    minimum = adam(lambda x: (x.sum(), np.ones(2)), np.zeros(2), (np.full(2, -0.5), np.ones(2)), 100, 0.1)
-    np.testing.assert_array_equal(minimum.x, -0.5)
