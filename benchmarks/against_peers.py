@@ -223,7 +223,10 @@ class Table:
 
     def __init__(self, path: Path, columns: tuple[str, ...]):
         self.path, self.columns = path, columns
-        self.rows: list[Row] = list(csv.DictReader(path.open(newline=""))) if path.exists() else []
+        self.rows: list[Row] = []
+        if path.exists():
+            with path.open(newline="") as file:
+                self.rows = list(csv.DictReader(file))
 
     def of(self, key: Row) -> list[Row]:
         return [row for row in self.rows if all(row[name] == value for name, value in key.items())]

@@ -107,9 +107,14 @@ def measure(n: int, m: int, d: int, n_outputs: int, cores: int, repeats: int) ->
     return 1e3 * np.array([np.median(seconds[2:], axis=0), seconds.min(axis=0)])
 
 
+def _first(rows: list[dict[str, str]], sweep: str) -> dict[str, str]:
+    return next(row for row in rows if row["sweep"] == sweep)
+
+
 def draw(rows: list[dict[str, str]], path: Path) -> None:
     """The ratio over rows and over inducing points, and for the data sets; the aim of 2 as a line."""
     import matplotlib.pyplot as plt
+    from matplotlib.ticker import FixedLocator, NullLocator
 
     figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), sharey=True, layout="constrained")
     # Okabe & Ito's colours, and other markers.
@@ -122,8 +127,8 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
             ratio = [float(row["ratio"]) for row in own]
             ax.plot(x, ratio, marker, linestyle="" if column == "name" else line, color=colour, label=label)
     for ax, title, xlabel in (
-        (axes[0], "100 inducing points, 4 outputs", "rows"),
-        (axes[1], "9300 rows, 4 outputs", "inducing points"),
+        (axes[0], "{m} inducing points, {outputs} outputs".format(**_first(rows, "rows")), "rows"),
+        (axes[1], "{n} rows, {outputs} outputs".format(**_first(rows, "points")), "inducing points"),
         (axes[2], "sizes of the data sets", ""),
     ):
         ax.axhline(2.0, color="#555555", linewidth=1, linestyle=":")
@@ -135,10 +140,16 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         ax.set_xscale("log")
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes[2].margins(x=0.15)
-    axes[0].set_ylim(0.0, None)
+    axes[0].set_yscale("log")
+    axes[0].set_ylim(0.9, None)
+    axes[0].yaxis.set_major_locator(FixedLocator([1, 2, 5, 10, 20, 50, 100]))
+    axes[0].yaxis.set_minor_locator(NullLocator())
+    axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes[0].set_ylabel("time / time of the dense products")
     axes[0].legend(frameon=False)
-    axes[2].text(1.0, 2.02, "2×", color="#555555", transform=axes[2].get_yaxis_transform(), va="bottom", ha="right")
+    axes[2].text(
+        1.0, 2.02, "aim: 2×", color="#555555", transform=axes[2].get_yaxis_transform(), va="bottom", ha="right"
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
@@ -157,6 +168,7 @@ def main() -> None:
     versions = f"skevgp {skevgp.__version__} numpy {np.__version__}"
     machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
     rows = []
+    options.output.parent.mkdir(parents=True, exist_ok=True)
     titles = ("", "rows", "points", "columns", "outputs", "cores", "ms", "floor", "ratio", "of fastest")
     print("".join(f"{title:>11s}" for title in titles))
     for sweep, name, size in sizes:
@@ -167,11 +179,10 @@ def main() -> None:
             rows.append(dict(zip(COLUMNS, map(str, values), strict=True)))
             numbers = "".join(f"{value:11d}" for value in (*size, cores))
             print(f"{name:>11s}{numbers}{median[0]:11.2f}{median[1]:11.2f}{ratio:11.2f}{of_fastest:11.2f}", flush=True)
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    with options.output.open("w", newline="") as file:
-        writer = csv.DictWriter(file, COLUMNS)
-        writer.writeheader()
-        writer.writerows(rows)
+            with options.output.open("w", newline="") as file:
+                writer = csv.DictWriter(file, COLUMNS)
+                writer.writeheader()
+                writer.writerows(rows)
     draw(rows, options.output.with_suffix(".png"))
 
 

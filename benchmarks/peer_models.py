@@ -272,7 +272,7 @@ class Peer:
 _SKEVGP, _GPFLOW, _GPYTORCH = ("skevgp.regressor", "scipy"), ("gpflow", "tensorflow", "scipy"), ("gpytorch", "torch")
 PEERS = {
     "skevgp": Peer(_SKEVGP, fit_skevgp, ("all", "none"), own_rule=True),
-    "skevgp, same limit": Peer(_SKEVGP, fit_skevgp, ("none",)),
+    "skevgp, same limit": Peer(_SKEVGP, fit_skevgp, ("all", "none")),
     "GPflow SGPR": Peer(_GPFLOW, fit_gpflow, ("none", "all")),
     "GPflow SGPR, noise 1e-4": Peer(_GPFLOW, lambda job, watch: fit_gpflow(job, watch, 1e-4)),
     "GPyTorch SGPR": Peer(_GPYTORCH, lambda job, watch: fit_gpytorch(job, watch, False)),

@@ -20,9 +20,11 @@ STYLES = {
     ("GPyTorch SGPR", "none"): ("#009E73", "-", "GPyTorch SGPR"),
     ("GPyTorch SVGP", "none"): ("#CC79A7", "-", "GPyTorch SVGP"),
     ("scikit-learn GPR", "none"): ("#555555", "-", "scikit-learn GPR, 600 rows"),
-    ("scikit-learn BayesianRidge", "none"): ("#999999", "-", "a straight line"),
 }
+LINEAR = "scikit-learn BayesianRidge"
 _SIZE = 8.0
+# Room for the names, to the right of where the fits ended: a share of the axis before.
+_ROOM = 0.45
 
 
 def draw(rows: list[Row], curves: list[Row], path: Path, model: str = "RES-VGP") -> None:
@@ -52,43 +54,58 @@ def draw(rows: list[Row], curves: list[Row], path: Path, model: str = "RES-VGP")
         n_train = max(int(row["n_train"]) for row in own)
         m = next(row["m"] for row in own if int(row["n_train"]) == n_train)
         first = min(int(row["seed"]) for row in own)
-        _bounds(grid[0, column], [row for row in curves if row["dataset"] == dataset and int(row["seed"]) == first])
-        _errors(grid[1, column], own)
+        linear = [row for row in rows if row["peer"] == LINEAR and (row["dataset"], row["model"]) == (dataset, model)]
+        on_the_way = [row for row in curves if row["dataset"] == dataset and int(row["seed"]) == first]
+        # Names are placed by where points are on the page: the axis that both share comes first.
+        _time_axis(grid[0, column], own, on_the_way)
+        _errors(grid[1, column], own, [float(row["error_mean"]) for row in linear if row["seconds"]])
+        _bounds(grid[0, column], on_the_way)
         grid[0, column].set_title(f"{dataset}: {n_train} rows, {m} inducing points", fontsize=10)
         grid[1, column].set_xlabel("seconds to fit all outputs")
-    grid[0, 0].set_ylabel("bound, nats per row")
+    grid[0, 0].set_ylabel("bound so far, nats per row, all outputs")
     grid[1, 0].set_ylabel("test Error (mean)")
     figure.savefig(path, dpi=110)
     plt.close(figure)
 
 
+def _time_axis(axes: Axes, rows: list[Row], curves: list[Row]) -> None:
+    """From about where the first curve is worth looking at."""
+    last = [float(row["seconds"]) for row in rows]
+    lowest = min((_per_row(row, "bound") for row in rows if row["bound"] != "nan"), default=np.inf)
+    begun = [float(row["seconds_so_far"]) for row in curves if _per_row(row, "bound_so_far") > lowest]
+    first = 0.6 * min([*last, *begun])
+    axes.set_xscale("log")
+    axes.set_xlim(first, max(last) * (max(last) / first) ** _ROOM)
+
+
+def _per_row(row: Row, column: str) -> float:
+    return float(row[column]) / int(row["n_train"])
+
+
 def _bounds(axes: Axes, curves: list[Row]) -> None:
     """The best bound so far; where a line ends, its fit ended."""
-    ends, lowest = [], []
+    ends = []
     for (peer, sharing), (colour, line, label) in STYLES.items():
         own = [row for row in curves if (row["peer"], row["sharing"]) == (peer, sharing)]
         if not own:
             continue
         seconds = np.array([float(row["seconds_so_far"]) for row in own])
-        bound = np.array([float(row["bound_so_far"]) / int(row["n_train"]) for row in own])
+        bound = np.array([_per_row(row, "bound_so_far") for row in own])
         if len(own) > 1:
             axes.plot(seconds, bound, line, color=colour, linewidth=1.8, drawstyle="steps-post")
-            # The climb from the very first point is the same for all and says little.
-            lowest.append(np.quantile(bound, 0.3))
         axes.plot(seconds[-1], bound[-1], "o", color=colour, markersize=5)
         ends.append((seconds[-1], bound[-1], label, colour))
-    axes.set_xscale("log")
     _grid(axes)
     if ends:
         values = [bound for _, bound, *_ in ends]
-        bottom, top = min([*values, *lowest]), max(values)
-        room = max(top - bottom, 0.1)
-        axes.set_ylim(bottom - 0.1 * room, top + 0.12 * room)
+        # The climb up to where the first fit ended says little.
+        bottom, room = min(values), max(np.ptp(values), 1.0)
+        axes.set_ylim(bottom - room, max(values) + 0.15 * room)
         _label(axes, ends)
 
 
-def _errors(axes: Axes, rows: list[Row]) -> None:
-    """The median over seeds as a point, and each seed as a smaller one."""
+def _errors(axes: Axes, rows: list[Row], linear: list[float]) -> None:
+    """The median over seeds as a point, and each seed as a smaller one; what a linear model leaves as a line."""
     points = []
     for (peer, sharing), (colour, _, label) in STYLES.items():
         own = [row for row in rows if (row["peer"], row["sharing"]) == (peer, sharing)]
@@ -98,7 +115,18 @@ def _errors(axes: Axes, rows: list[Row]) -> None:
         axes.plot(seconds, error, "o", color=colour, markersize=3, alpha=0.5)
         points.append((float(np.median(seconds)), float(np.median(error)), label, colour))
         axes.plot(*points[-1][:2], "o", color=colour, markersize=6)
-    axes.set_xscale("log")
+    if linear:
+        axes.axhline(np.median(linear), color="#999999", linestyle=":", linewidth=1.2)
+        axes.annotate(
+            "linear regression",
+            (0.02, float(np.median(linear))),
+            (0, -3),
+            xycoords=axes.get_yaxis_transform(),
+            textcoords="offset points",
+            va="top",
+            fontsize=_SIZE,
+            color="#777777",
+        )
     axes.set_yscale("log")
     axes.margins(y=0.15)
     axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
@@ -115,17 +143,14 @@ def _grid(axes: Axes) -> None:
 
 
 def _label(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
-    """Write each name beside its point: on the side where there is room, and clear of the names already there."""
+    """Write each name to the right of its point, clear of other names and points."""
     axes.figure.canvas.draw()
     to_points: Any = axes.transData.transform
-    frame, taken = axes.bbox, []
+    taken: list[tuple[float, ...]] = []
     dots = [to_points(end[:2]) for end in ends]
     for dot, (seconds, value, label, colour) in sorted(zip(dots, ends, strict=True), key=lambda pair: pair[0][1]):
         width, height = 0.62 * _SIZE * len(label) * axes.figure.dpi / 72, 1.5 * _SIZE * axes.figure.dpi / 72
-        left = dot[0] + width > frame.x1
-        x0 = dot[0] - width - 8 if left else dot[0] + 8
-        y0 = dot[1] - height / 2
-        box = (x0, y0, x0 + width, y0 + height)
+        box = (dot[0] + 8, dot[1] - height / 2, dot[0] + 8 + width, dot[1] + height / 2)
         obstacles = [*taken, *((x - 4, y - 4, x + 4, y + 4) for x, y in dots)]
         lifts = sorted(np.arange(-6, 7) * height / 2, key=abs)
         lift = next((lift for lift in lifts if not any(_overlap(box, lift, other) for other in obstacles)), 0.0)
@@ -133,9 +158,8 @@ def _label(axes: Axes, ends: list[tuple[float, float, str, str]]) -> None:
         axes.annotate(
             label,
             (seconds, value),
-            ((-8 if left else 8) * 72 / axes.figure.dpi, lift * 72 / axes.figure.dpi),
+            (8 * 72 / axes.figure.dpi, lift * 72 / axes.figure.dpi),
             textcoords="offset points",
-            ha="right" if left else "left",
             va="center",
             fontsize=_SIZE,
             color=colour,
