@@ -138,7 +138,9 @@ def fit(python: str, peer: str, job: Job) -> Result:
     """
     environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
     if PEERS[peer].package == "skevgp":
-        environment["PYTHONPATH"] = os.pathsep.join([str(Path(skevgp.__file__).parents[1]), *sys.path[1:]])
+        # The same skevgp as here, installed or not.
+        here = str(Path(skevgp.__file__).parents[1])
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
     with tempfile.TemporaryDirectory() as folder:
         given, result = Path(folder, "job.npz"), Path(folder, "result.npz")
         job.save(given)
