@@ -1,0 +1,190 @@
+"""One evaluation of the bound and its gradient against the dense products that it cannot do without.
+
+The floor is four products over all rows, `L_inv @ U`, `V @ V.T`, `G @ V` and `L_inv.T @ (G @ V)`, in NumPy in the same
+process. Evaluation and floor take turns; medians are compared. Both use one core, or both use all: skevgp in threads of
+its own, the floor in those of BLAS.
+
+    python benchmarks/evaluation_cost.py          # the sizes of the data sets, and sweeps over rows and points
+    python benchmarks/evaluation_cost.py --quick  # a few small sizes
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import platform
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+import skevgp
+from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.frame import Frame
+from skevgp.inference.inducing import initial_inducing_points
+from skevgp.inference.model import SparseModel
+from skevgp.inference.objectives import BoundObjective
+from skevgp.inference.parameters import Start
+from skevgp.inference.rows import block_rows
+from skevgp.inference.start import FIRST_NOISE, Starts, starting_table
+from skevgp.inference.threads import BlockMap, single_threaded_libraries
+from skevgp.kernels import SquaredExponential
+
+# Rows, inducing points, columns, outputs: of the pendulum, the cartpole, the acrobot, the IIWA.
+NAMED = {
+    "pendulum": (4800, 10, 3, 2),
+    "cartpole": (4800, 100, 5, 4),
+    "acrobot": (9300, 150, 5, 4),
+    "iiwa14": (23250, 350, 21, 14),
+}
+ROWS = [(n, 100, 5, 4) for n in (1000, 3000, 10_000, 30_000, 100_000)]
+POINTS = [(9300, m, 5, 4) for m in (10, 25, 50, 100, 200, 400)]
+QUICK = {"data": {"pendulum": NAMED["pendulum"]}, "rows": [(1000, 20, 3, 2)], "points": [(1000, 10, 3, 2)]}
+COLUMNS = ["sweep", "name", "n", "m", "d", "outputs", "cores", "evaluation_ms", "floor_ms", "ratio"]
+COLUMNS += ["evaluation_fastest_ms", "floor_fastest_ms", "repeats", "versions", "machine"]
+
+
+@contextmanager
+def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[Callable[[], object]]:
+    """What is measured: () -> bound and gradient in all parameters, of all outputs, with shared inducing points."""
+    rng = np.random.RandomState(0)
+    X = rng.randn(n, d)
+    Y = np.sin(X @ rng.randn(d, n_outputs)) + 0.01 * rng.randn(n, n_outputs)
+    nothing = np.zeros((n_outputs, 0))
+    frame = Frame.of(X, np.empty((n, 0)), Y, np.zeros(n_outputs), nothing, nothing)
+    rows, kernel = frame.rows(X, np.empty((n, 0)), Y), SquaredExponential(d)
+    prior: CoefficientPrior = frame.internal_prior()
+    model = SparseModel(kernel, prior, "full", (slice(0, n_outputs),))
+    points = initial_inducing_points(rows.inputs[: 20 * m], m, rng)
+    starts = Starts(Start(), Start(), Start())
+    table = starting_table(
+        rows.inputs, points[np.newaxis], frame.target_unit, starts, rows.scatter(), FIRST_NOISE["lbfgs"], d
+    )
+    blocks = BlockMap(cores)
+    objective = BoundObjective(model, table, rows, block_rows(m), blocks)
+    start = table.start()
+
+    def evaluate() -> object:
+        # As in a fit, where BLAS is held to one thread once, not at each evaluation.
+        return objective(start)
+
+    try:
+        yield evaluate
+    finally:
+        blocks.close()
+
+
+def products(n: int, m: int) -> Callable[[], object]:
+    """The floor: four dense products on all rows."""
+    rng = np.random.RandomState(0)
+    L_inv, U, G = np.tril(rng.randn(m, m)), rng.rand(m, n), rng.randn(m, m)
+
+    def floor() -> object:
+        V = L_inv @ U
+        return V @ V.T, L_inv.T @ (G @ V)
+
+    return floor
+
+
+def measure(n: int, m: int, d: int, n_outputs: int, cores: int, repeats: int) -> np.ndarray:
+    """Medians (first row) and fastest of the evaluation and the floor, in milliseconds, taken in turns."""
+    floor, seconds = products(n, m), np.empty((repeats + 2, 2))
+    with evaluation(n, m, d, n_outputs, cores) as evaluate:
+        for i in range(len(seconds)):
+            with single_threaded_libraries():
+                begin = time.perf_counter()
+                evaluate()
+                seconds[i, 0] = time.perf_counter() - begin
+            with threadpool_limits(cores):
+                begin = time.perf_counter()
+                floor()
+                seconds[i, 1] = time.perf_counter() - begin
+    # The first two of each warm up caches and threads.
+    return 1e3 * np.array([np.median(seconds[2:], axis=0), seconds.min(axis=0)])
+
+
+def _first(rows: list[dict[str, str]], sweep: str) -> dict[str, str]:
+    return next(row for row in rows if row["sweep"] == sweep)
+
+
+def draw(rows: list[dict[str, str]], path: Path) -> None:
+    """The ratio over rows and over inducing points, and for the data sets; the aim of 2 as a line."""
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import FixedLocator, NullLocator
+
+    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), sharey=True, layout="constrained")
+    # Okabe & Ito's colours, and other markers.
+    styles = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"))
+    for cores, (colour, marker, line) in zip(sorted({int(row["cores"]) for row in rows}), styles, strict=False):
+        label = "1 core" if cores == 1 else f"{cores} cores"
+        for ax, sweep, column in ((axes[0], "rows", "n"), (axes[1], "points", "m"), (axes[2], "data", "name")):
+            own = [row for row in rows if row["sweep"] == sweep and int(row["cores"]) == cores]
+            x = [row["name"] if column == "name" else int(row[column]) for row in own]
+            ratio = [float(row["ratio"]) for row in own]
+            ax.plot(x, ratio, marker, linestyle="" if column == "name" else line, color=colour, label=label)
+    for ax, title, xlabel in (
+        (axes[0], "{m} inducing points, {outputs} outputs".format(**_first(rows, "rows")), "rows"),
+        (axes[1], "{n} rows, {outputs} outputs".format(**_first(rows, "points")), "inducing points"),
+        (axes[2], "sizes of the data sets", ""),
+    ):
+        ax.axhline(2.0, color="#555555", linewidth=1, linestyle=":")
+        ax.set_title(title, fontsize=10)
+        ax.set_xlabel(xlabel)
+        ax.grid(alpha=0.25)
+        ax.spines[["top", "right"]].set_visible(False)
+    for ax in axes[:2]:
+        ax.set_xscale("log")
+        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes[2].margins(x=0.15)
+    axes[0].set_yscale("log")
+    axes[0].set_ylim(0.9, None)
+    axes[0].yaxis.set_major_locator(FixedLocator([1, 2, 5, 10, 20, 50, 100]))
+    axes[0].yaxis.set_minor_locator(NullLocator())
+    axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
+    axes[0].set_ylabel("time / time of the dense products")
+    axes[0].legend(frameon=False)
+    axes[2].text(
+        1.0, 2.02, "aim: 2×", color="#555555", transform=axes[2].get_yaxis_transform(), va="bottom", ha="right"
+    )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="a few small sizes")
+    parser.add_argument("--repeats", type=int, default=20, help="default: %(default)s")
+    parser.add_argument("--cores", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}))
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "evaluation_cost.csv")
+    options = parser.parse_args()
+
+    sweeps = QUICK if options.quick else {"data": NAMED, "rows": ROWS, "points": POINTS}
+    sizes = [("data", name, size) for name, size in sweeps["data"].items()]
+    sizes += [(sweep, "", size) for sweep in ("rows", "points") for size in sweeps[sweep]]
+    versions = f"skevgp {skevgp.__version__} numpy {np.__version__}"
+    machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
+    rows = []
+    options.output.parent.mkdir(parents=True, exist_ok=True)
+    titles = ("", "rows", "points", "columns", "outputs", "cores", "ms", "floor", "ratio", "of fastest")
+    print("".join(f"{title:>11s}" for title in titles))
+    for sweep, name, size in sizes:
+        for cores in options.cores:
+            median, fastest = measure(*size, cores, options.repeats)
+            ratio, of_fastest = (times[0] / times[1] for times in (median, fastest))
+            values = (sweep, name, *size, cores, *median, ratio, *fastest, options.repeats, versions, machine)
+            rows.append(dict(zip(COLUMNS, map(str, values), strict=True)))
+            numbers = "".join(f"{value:11d}" for value in (*size, cores))
+            print(f"{name:>11s}{numbers}{median[0]:11.2f}{median[1]:11.2f}{ratio:11.2f}{of_fastest:11.2f}", flush=True)
+            with options.output.open("w", newline="") as file:
+                writer = csv.DictWriter(file, COLUMNS)
+                writer.writeheader()
+                writer.writerows(rows)
+    draw(rows, options.output.with_suffix(".png"))
+
+
+if __name__ == "__main__":
+    main()
