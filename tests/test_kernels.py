@@ -446,6 +446,14 @@ def test_a_function_without_hyperparameters():
     assert model.n_parameters_ == 2 + 8 * 2 + 8 + 8 * 9 // 2
 
 
+def test_a_function_that_is_0_at_a_row():
+    inputs = np.arange(10.0).reshape(-1, 1)
+    model = EVGPRegressor(kernel=lambda X, Z: X @ Z.T, n_inducing=10, random_state=0).fit(inputs, 3.0 * inputs[:, 0])
+    mean, std = model.predict(inputs, return_std=True)
+    np.testing.assert_allclose(mean, 3.0 * inputs[:, 0], atol=1e-3)
+    assert (std > 0.0).all()
+
+
 def negative(X, Z, shift=-1.0):
     return X @ Z.T
 

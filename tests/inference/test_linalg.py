@@ -28,6 +28,13 @@ def test_the_matrix_is_left_alone():
     np.testing.assert_array_equal(A, before)
 
 
+def test_a_zero_on_the_diagonal_gets_a_jitter_too():
+    A = np.diag([4.0, 0.0, 1.0])
+    L = jittered_cholesky(A, 1e-12)
+    np.testing.assert_allclose(L @ L.T, A, atol=1e-11)
+    assert L[1, 1] > 0.0
+
+
 def test_jitter_is_relative_to_the_diagonal():
     A = np.diag([1.0, 1e8, 1e-8])
     L = jittered_cholesky(A, 1e-2)
