@@ -23,14 +23,13 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import skevgp
-from skevgp.inference.bounds import CoefficientPrior
 from skevgp.inference.frame import Frame
 from skevgp.inference.inducing import initial_inducing_points
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.parameters import Start
-from skevgp.inference.rows import block_rows
-from skevgp.inference.start import FIRST_NOISE, Starts, starting_table
+from skevgp.inference.source import LocalSource, moments_of_rows
+from skevgp.inference.start import FIRST_NOISE, Starts, spread_of, starting_table
 from skevgp.inference.threads import BlockMap, single_threaded_libraries
 from skevgp.kernels import SquaredExponential
 
@@ -54,18 +53,19 @@ def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[C
     rng = np.random.RandomState(0)
     X = rng.randn(n, d)
     Y = np.sin(X @ rng.randn(d, n_outputs)) + 0.01 * rng.randn(n, n_outputs)
+    source = LocalSource.of(X, np.empty((n, 0)), Y)
+    inputs, _, targets = source.sum(moments_of_rows)
     nothing = np.zeros((n_outputs, 0))
-    frame = Frame.of(X, np.empty((n, 0)), Y, np.zeros(n_outputs), nothing, nothing)
-    rows, kernel = frame.rows(X, np.empty((n, 0)), Y), SquaredExponential(d)
-    prior: CoefficientPrior = frame.internal_prior()
-    model = SparseModel(kernel, prior, "full", (slice(0, n_outputs),))
-    points = initial_inducing_points(rows.inputs[: 20 * m], m, rng)
-    starts = Starts(Start(), Start(), Start())
+    frame = Frame.of(source, inputs, targets, np.zeros(n_outputs), nothing, nothing)
+    rows, kernel = frame.rows(source), SquaredExponential(d)
+    model = SparseModel(kernel, frame.internal_prior(), "full", (slice(0, n_outputs),))
+    points = initial_inducing_points(rows.sample(20 * m, rng), m, rng)
+    starts, spread = Starts(Start(), Start(), Start()), spread_of(rows.inputs)
     table = starting_table(
-        rows.inputs, points[np.newaxis], frame.target_unit, starts, rows.scatter(), FIRST_NOISE["lbfgs"], d
+        spread, points[np.newaxis], frame.target_unit, starts, rows.scatter(), FIRST_NOISE["lbfgs"], d
     )
-    blocks = BlockMap(cores)
-    objective = BoundObjective(model, table, rows, block_rows(m), blocks)
+    threads = BlockMap(cores)
+    objective = BoundObjective(model, table, rows.blocks(kernel, m, threads))
     start = table.start()
 
     def evaluate() -> object:
@@ -75,7 +75,7 @@ def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[C
     try:
         yield evaluate
     finally:
-        blocks.close()
+        threads.close()
 
 
 def products(n: int, m: int) -> Callable[[], object]:
