@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 
 LARGEST = 1e100
+# The square of a noise far below it is not yet rounded to 0.
+SMALLEST = 1e-140
 
 
 def check_integer(value: Any, name: str, *, minimum: int) -> int:
@@ -34,6 +36,14 @@ def check_magnitude(values: np.ndarray, name: str) -> None:
     largest = np.abs(values).max(initial=0.0)
     if largest > LARGEST:
         raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")
+
+
+def check_not_vanishing(values: np.ndarray, name: str) -> None:
+    """Refuse columns, other than of zeros, whose squares would vanish."""
+    largest = np.abs(values).max(axis=0, initial=0.0)
+    if ((largest > 0.0) & (largest < SMALLEST)).any():
+        smallest = np.min(largest[largest > 0.0])
+        raise ValueError(f"{name} must be 0 or exceed {SMALLEST:g} in size; a column's largest value is {smallest:g}.")
 
 
 def as_floats(values: Any, name: str) -> np.ndarray:

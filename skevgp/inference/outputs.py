@@ -12,7 +12,7 @@ import numpy as np
 
 from .bounds import PosteriorFamily
 from .frame import Frame
-from .inducing import initial_inducing_points
+from .inducing import Placement
 from .learning import Learned, Options, learn
 from .model import SparseModel
 from .optimize import Report
@@ -83,7 +83,7 @@ class FittedOutputs:
         starts: Starts,
         sharing: Sharing,
         family: PosteriorFamily,
-        n_inducing: int,
+        placement: Placement,
         options: Options,
         rng: np.random.RandomState,
         n_threads: int = 1,
@@ -102,7 +102,8 @@ class FittedOutputs:
             What the user says of kernel and noise.
         sharing : {"all", "kernel", "none"}
         family : {"full", "diagonal"}
-        n_inducing : int
+        placement : Placement
+            Of the inducing points.
         options : Options
         rng : RandomState
         n_threads : int, default=1
@@ -116,20 +117,27 @@ class FittedOutputs:
         -------
         fitted : FittedOutputs
         """
-        with single_threaded_libraries():
-            points = initial_inducing_points(rows.inputs, n_inducing, rng)
         models = _models(sharing, kernel, frame, family)
-        tables = []
-        for index, (outputs, model) in enumerate(models):
-            table = starting_table(
+
+        def table_of(outputs: slice, points: np.ndarray) -> ParameterTable:
+            return starting_table(
                 rows.inputs,
-                np.repeat(points[np.newaxis], len(model.groups), axis=0),
+                points,
                 frame.target_unit[outputs],
                 starts,
                 rows.scatter()[outputs],
                 FIRST_NOISE[options.solver],
                 kernel.n_hyperparameters,
             )
+
+        # The kernel starts alike in all models and without regard to the points, which may depend on it.
+        alone = table_of(slice(0, 1), np.empty((1, 0, rows.inputs.shape[1])))
+        hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
+        with single_threaded_libraries():
+            points = placement.points(rows.inputs, kernel, hyperparameters, rng)
+        tables = []
+        for index, (outputs, model) in enumerate(models):
+            table = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0))
             if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
                 table = table.started_at(previous._values_in(frame, rows, index))
             tables.append(table)
@@ -146,7 +154,9 @@ class FittedOutputs:
                 if inner is not None:
                     inner(iteration, loss)
 
-            learned = learn(model, table, rows.outputs(outputs), options, np.random.RandomState(seed), report)
+            learned = learn(
+                model, table, rows.outputs(outputs), options, placement, np.random.RandomState(seed), report
+            )
             if learned.interrupted:
                 stop.set()
             return learned
