@@ -435,7 +435,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _placement(self, centre: np.ndarray) -> Placement:
         """How inducing points start, for inputs from which ``centre`` is subtracted."""
         if isinstance(self.inducing_init, str):
-            return Placement(self.inducing_init, self.n_inducing)
+            return Placement("greedy" if self.inducing_init == "greedy" else "k-means", self.n_inducing)
         points = as_floats(self.inducing_init, "inducing_init")
         if points.ndim != 2 or len(points) == 0 or points.shape[1] != len(centre):
             raise ValueError(

@@ -15,6 +15,7 @@ from .optimize import Minimum, Report, adam, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows, block_rows
+from .start import alike_neighbours
 from .statistics import SufficientStatistics
 
 # An output counts as not learned when this share of what the features alone leave over ends as noise.
@@ -160,12 +161,16 @@ def _nothing_learned(learned: Learned, table: ParameterTable, rows: Rows, option
     if learned.interrupted or options.max_iter == 0 or table["noise"].fixed:
         return ""
     nothing = learned.values["noise"] > _NOTHING_LEARNED * rows.scatter()
+    if nothing.any():
+        # Where residuals look like noise, noise is the answer.
+        nothing &= alike_neighbours(rows.inputs, rows.residuals)
     if not nothing.any():
         return ""
     return (
         f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
-        "fitted together: from no start did the Gaussian process learn any of it. If there is more than noise, raise "
-        "n_restarts, let the kernel or noise_variance start elsewhere, or look at the scales in kernel_map."
+        "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
+        "Raise n_inducing or n_restarts, let kernel or noise_variance start elsewhere, or look at the scales of the "
+        "kernel's columns."
     )
 
 

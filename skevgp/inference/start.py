@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.spatial import cKDTree
 
 from .linalg import jittered_cholesky
 from .parameters import Parameter, ParameterTable, Start
@@ -24,6 +25,7 @@ _NOISE_BOUNDS = 1e-10, 1e2
 _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
+_NEIGHBOUR_SAMPLE = 2000
 _SIGNAL_BOUNDS = 1e-8, 1e8
 
 
@@ -109,6 +111,32 @@ def spread_of(inputs: np.ndarray) -> np.ndarray:
     """The standard deviation (d,) of each centred column; 1 where the column is constant."""
     spread = rms(inputs)
     return np.where(spread > _SMALLEST_UNIT, spread, 1.0)
+
+
+def alike_neighbours(inputs: np.ndarray, residuals: np.ndarray) -> np.ndarray:
+    """Whether neighbouring rows have residuals more alike than noise has: then there is something to learn.
+
+    The mean square difference of residuals between each row and its nearest neighbour is about twice their variance if
+    they are noise (von Neumann 1941, for rows in order); less by four of its standard errors, about 1.6 / √n each, is
+    more than chance.
+
+    Parameters
+    ----------
+    inputs : ndarray of shape (n, d)
+        The kernel's, centred.
+    residuals : ndarray of shape (n, o)
+
+    Returns
+    -------
+    alike : ndarray of shape (o,)
+    """
+    rows = np.unique(np.linspace(0, len(inputs) - 1, _NEIGHBOUR_SAMPLE).astype(int))
+    if len(rows) < 2:
+        return np.zeros(residuals.shape[1], dtype=bool)
+    inputs, residuals = inputs[rows] / spread_of(inputs), residuals[rows]
+    _, nearest = cKDTree(inputs).query(inputs, 2)
+    difference = np.mean((residuals[nearest[:, 0]] - residuals[nearest[:, 1]]) ** 2, axis=0)
+    return difference < 2.0 * residuals.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(rows)))
 
 
 def starting_table(

@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skevgp.inference.start import features_alone, rms, unit_of
+from skevgp.inference.start import alike_neighbours, features_alone, rms, unit_of
 
 
 def test_features_alone_are_least_squares_under_a_wide_prior():
@@ -44,3 +44,18 @@ def test_units_survive_extreme_scales():
 
 def test_the_unit_is_not_below_the_rounding_of_the_target():
     assert unit_of(np.full((3, 1), 1e-20), np.full((3, 1), 1e5))[0] == pytest.approx(1e-9)
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e-9])
+def test_neighbours_of_a_smooth_function_are_alike_and_of_noise_are_not(scale):
+    rng = np.random.RandomState(0)
+    X = scale * rng.rand(3000, 2)
+    wave, noise = np.sin(10 * X[:, 0] / scale), rng.randn(3000)
+    alike = alike_neighbours(X, np.column_stack([wave, wave + 0.5 * noise, noise, np.ones(3000)]))
+    np.testing.assert_array_equal(alike, [True, True, False, False])
+
+
+def test_noise_is_seldom_alike():
+    rng = np.random.RandomState(0)
+    for n in (1, 2, 10, 50, 500):
+        assert not alike_neighbours(rng.randn(n, 3), rng.randn(n, 100)).any()
