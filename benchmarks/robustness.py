@@ -38,7 +38,19 @@ from skevgp.inference import model as sparse_model
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
 COLUMNS = [
-    *("part", "case", "variant", "seed", "outcome", "bound_per_row", "error", "noise_share", "n_iter", "seconds"),
+    *(
+        "part",
+        "case",
+        "variant",
+        "seed",
+        "outcome",
+        "bound_per_row",
+        "gain_per_row",
+        "error",
+        "noise_share",
+        "n_iter",
+        "seconds",
+    ),
     *("versions", "machine"),
 ]
 FIXED_JITTERS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
@@ -166,6 +178,16 @@ def dynamics(system: str, name: str, seed: int) -> Data:
     )
 
 
+def noise_alone(data: Data, target: np.ndarray) -> np.ndarray:
+    """Noise variance of each output if features and noise were to explain everything: the collapsed state."""
+    features, left_over = data.arguments.get("feature_map"), target - target.mean(axis=0)
+    if features is not None:
+        H = features.fit_transform(data.X, target)
+        left_over = left_over - H @ np.linalg.lstsq(H, left_over, rcond=None)[0]
+    # A target that the features explain is never explained better than it is rounded.
+    return np.maximum(left_over.var(axis=0), 1e-30 * np.maximum(np.abs(target).max(axis=0), 1e-12) ** 2)
+
+
 def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
     """Fit and look at what comes out; what fails is the outcome."""
     start = time.perf_counter()
@@ -185,11 +207,12 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
     # Of a target that does not vary, rounding is the unit.
     unit = np.maximum(target.std(axis=0), 1e-14 * np.abs(target).max(axis=0))
     errors = (data.Y_test.reshape(-1, len(unit)) - mean.reshape(-1, len(unit))) / np.where(unit > 0.0, unit, 1.0)
-    rows = model._fitted.frame.rows(*model._mapped(data.X, data.X), target).residuals
-    left_over = np.maximum(rows.var(axis=0), 1e-28) * model._fitted.frame.target_unit**2
+    left_over = noise_alone(data, target)
+    bound = model.lower_bound_ / len(data.X)
     return {
         "outcome": outcome,
-        "bound_per_row": model.lower_bound_ / len(data.X),
+        "bound_per_row": bound,
+        "gain_per_row": bound + 0.5 * (1.0 + np.log(2.0 * np.pi * left_over)).sum(),
         "error": np.linalg.norm(errors, axis=1).mean(),
         "noise_share": np.max(model.noise_variance_ / left_over),
         "n_iter": model.n_iter_,
@@ -208,13 +231,13 @@ def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:
-    """Range of a case's bounds per row, relative to their median."""
-    bounds = [
-        float(row["bound_per_row"])
+    """Range of a case's bounds, relative to what they gain over noise alone: a measure without a unit."""
+    gains = [
+        float(row["gain_per_row"])
         for row in rows
         if (row["part"], row["case"], row["variant"], row["outcome"]) == ("seeds", case, variant, "ok")
     ]
-    return float(np.ptp(bounds) / abs(np.median(bounds))) if bounds else 0.0
+    return float(np.ptp(gains) / abs(np.median(gains))) if gains else 0.0
 
 
 def jobs(part: str, quick: bool, restarts: int, rows: list[dict[str, Any]]) -> Iterator[tuple[str, str, int, Any]]:
@@ -300,6 +323,7 @@ def summary(part: str, rows: list[dict[str, Any]]) -> None:
         for case in cases:
             for variant in variants:
                 bound = of("bound_per_row", case=case, variant=variant)
+                gain = of("gain_per_row", case=case, variant=variant)
                 if len(bound):
                     error, share = (
                         of("error", case=case, variant=variant),
@@ -307,7 +331,7 @@ def summary(part: str, rows: list[dict[str, Any]]) -> None:
                     )
                     print(
                         f"  {case:22s} {variant:13s} {bound.min():15.4f} {np.median(bound):9.4f} {bound.max():9.4f} "
-                        f"{np.ptp(bound) / abs(np.median(bound)):8.2%} {np.median(error):10.3g} {share.max():12.1e} "
+                        f"{np.ptp(gain) / np.median(gain):8.2%} {np.median(error):10.3g} {share.max():12.1e} "
                         f"{np.median(of('seconds', case=case, variant=variant)):8.2f}"
                     )
 
@@ -331,7 +355,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             if (part, case, variant, seed) in done or options.cases not in case:
                 continue
             values = run()
-            for name in ("bound_per_row", "error", "noise_share", "seconds"):
+            for name in ("bound_per_row", "gain_per_row", "error", "noise_share", "seconds"):
                 if name in values:
                     values[name] = f"{values[name]:.10g}"
             row = dict.fromkeys(COLUMNS, "") | values

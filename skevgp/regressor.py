@@ -97,7 +97,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     n_jobs : int, default=None
         Threads; None means 1, -1 all cores. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Places inducing points and draws mini-batches.
+        Places inducing points, draws mini-batches and restarts.
     verbose : int, default=0
         1 prints iteration, bound and time about once a second, 2 at each iteration.
 
