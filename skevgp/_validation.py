@@ -10,6 +10,8 @@ import numpy as np
 LARGEST = 1e100
 # So many rows can be looked at in one go.
 _FEW_ROWS = 16
+# The square of a noise far below it is not yet rounded to 0.
+SMALLEST = 1e-140
 
 
 def check_integer(value: Any, name: str, *, minimum: int) -> int:
@@ -49,6 +51,13 @@ def check_magnitude(values: np.ndarray, name: str) -> None:
     largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
     if largest > LARGEST:
         raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")
+
+
+def check_not_vanishing(largest: np.ndarray, name: str) -> None:
+    """Refuse columns, other than of zeros, whose squares would vanish, by their largest absolute values."""
+    if ((largest > 0.0) & (largest < SMALLEST)).any():
+        smallest = np.min(largest[largest > 0.0])
+        raise ValueError(f"{name} must be 0 or exceed {SMALLEST:g} in size; a column's largest value is {smallest:g}.")
 
 
 def as_floats(values: Any, name: str) -> np.ndarray:

@@ -22,9 +22,10 @@ from ._dask import DaskSource, aligned, fit_map_to_chunks, is_dask, predict_chun
 from ._data import MappedRows, map_rows
 from ._maps import fit_map
 from ._progress import Progress
-from ._validation import check_magnitude, is_plain
+from ._validation import as_floats, check_magnitude, check_not_vanishing, is_plain
 from .features.prior import resolve_coef_prior, wide_scale
 from .inference.frame import Frame
+from .inference.inducing import Placement
 from .inference.learning import Options
 from .inference.outputs import FittedOutputs
 from .inference.posterior import Posterior
@@ -64,6 +65,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
         Inducing points; fewer if there are fewer distinct rows.
+    inducing_init : {"k-means", "greedy"} or array-like of shape (m, d), default="k-means"
+        Where inducing points start: at cluster centres of the kernel's inputs; one after the other at the row that the
+        kernel, as it starts, knows least from those before (Burt et al. 2020); or at given points in the space of
+        ``kernel_map``, whose number then replaces ``n_inducing``. With ``max_iter=0`` they stay there.
     sharing : {"all", "kernel", "none"}, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Signal variance, noise and weights are always per output.
@@ -84,6 +89,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     max_iter : int, default=None
         The most iterations of L-BFGS or steps of Adam; None means 1000 or 8000. With 0 nothing is optimised: kernel
         and inducing points stay where they start, and q is at its optimum.
+    n_restarts : int, default=0
+        Further fits from other starts, of which the one with the best bound is kept: other inducing points (unless
+        ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
+        start. Each takes the time of a fit.
     tol : float, default=0.01
         In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
         when that no longer gains a hundred times as much. Adam goes over to its last steps, as many as before, when the
@@ -104,7 +113,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     n_jobs : int, default=None
         Threads; None means 1, -1 all cores. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Places inducing points and draws mini-batches.
+        Places inducing points, draws mini-batches and restarts.
     verbose : int, default=0
         1 prints iteration, bound and time about once a second, 2 at each iteration.
 
@@ -169,6 +178,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "kernel": "no_validation",
         "kernel_map": "no_validation",
         "n_inducing": [Interval(Integral, 1, None, closed="left")],
+        "inducing_init": [StrOptions({"k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none"})],
         "posterior": [StrOptions({"full", "diagonal"})],
         "coef_mean": ["array-like", Real, StrOptions({"auto"})],
@@ -177,6 +187,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "normalize_y": ["boolean"],
         "solver": [StrOptions({"lbfgs", "adam"})],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
+        "n_restarts": [Interval(Integral, 0, None, closed="left")],
         "tol": [Interval(Real, 0, None, closed="left")],
         "batch_size": [Interval(Integral, 1, None, closed="left")],
         "learning_rate": [Interval(Real, 0, None, closed="neither")],
@@ -197,6 +208,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         *,
         kernel_map: TransformerMixin | None = None,
         n_inducing: int = 100,
+        inducing_init: Literal["k-means", "greedy"] | ArrayLike = "k-means",
         sharing: Literal["all", "kernel", "none"] = "all",
         posterior: Literal["full", "diagonal"] = "full",
         coef_mean: ArrayLike | Literal["auto"] = "auto",
@@ -205,6 +217,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] = "lbfgs",
         max_iter: int | None = None,
+        n_restarts: int = 0,
         tol: float = 0.01,
         batch_size: int = 512,
         learning_rate: float = 0.1,
@@ -219,6 +232,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.kernel = kernel
         self.kernel_map = kernel_map
         self.n_inducing = n_inducing
+        self.inducing_init = inducing_init
         self.sharing = sharing
         self.posterior = posterior
         self.coef_mean = coef_mean
@@ -227,6 +241,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
+        self.n_restarts = n_restarts
         self.tol = tol
         self.batch_size = batch_size
         self.learning_rate = learning_rate
@@ -248,7 +263,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
             they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
-            Numbers up to 1e100.
+            Numbers up to 1e100; the largest of a column 0 or above 1e-140.
 
         Returns
         -------
@@ -263,7 +278,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Warns
         -----
         ConvergenceWarning
-            If the iterations were used up, or the fit was interrupted by Ctrl-C (the best parameters so far are kept).
+            If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
+            kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
         """
         before = dict(vars(self))
         try:
@@ -415,6 +431,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
         source = self._source(given, X, y)
         inputs, features, targets = source.sum(moments_of_rows)
+        check_not_vanishing(targets.largest, "y")
         spec = parse_kernel(self.kernel, len(inputs.mean))
         if self.noise_variance is not None:
             if spec.starts.noise.value is not None:
@@ -434,6 +451,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.tol,
             self.batch_size,
             self.learning_rate,
+            self.n_restarts,
             self.natural_gradient,
         )
         self._fitted = FittedOutputs.fit(
@@ -443,7 +461,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             spec.starts,
             self.sharing,
             self.posterior,
-            self.n_inducing,
+            self._placement(frame.centre),
             options,
             check_random_state(self.random_state),
             effective_n_jobs(self.n_jobs),
@@ -452,6 +470,21 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         self._spec, self._single_output = spec, y.ndim == 1
         self._set_attributes()
+
+    def _placement(self, centre: np.ndarray) -> Placement:
+        """How inducing points start, for inputs from which ``centre`` is subtracted."""
+        if isinstance(self.inducing_init, str):
+            return Placement("greedy" if self.inducing_init == "greedy" else "k-means", self.n_inducing)
+        points = as_floats(self.inducing_init, "inducing_init")
+        if points.ndim != 2 or len(points) == 0 or points.shape[1] != len(centre):
+            raise ValueError(
+                f"inducing_init must be 'k-means', 'greedy' or an array of shape (m, {len(centre)}): points in the "
+                f"space of kernel_map; got the shape {points.shape}."
+            )
+        if not np.isfinite(points).all():
+            raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
+        check_magnitude(points, "inducing_init")
+        return Placement(points - centre, len(points))
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_posterior")

@@ -106,7 +106,7 @@ def test_a_constant_column_may_move_a_little_afterwards(constant):
     assert model.score(X * [1.0, 1.0 + 1e-9], y) > 0.99
 
 
-@pytest.mark.parametrize("offset", [1e2, 1e4])
+@pytest.mark.parametrize("offset", [1e2, 5e3])
 def test_a_wave_far_from_zero_is_learned(offset):
     rng = np.random.RandomState(0)
     X = rng.uniform(-2, 2, (300, 1))

@@ -9,6 +9,7 @@ import numpy as np
 
 from .adam import adam
 from .elbo import ElboObjective
+from .inducing import Placement
 from .linalg import NotPositiveDefiniteError
 from .model import SparseModel, Values
 from .objectives import BoundObjective
@@ -16,17 +17,24 @@ from .optimize import Minimum, Report, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
+from .start import alike_neighbours
 from .statistics import SufficientStatistics
 from .threads import BlockMap
 
 # An output counts as not learned when this share of what the features alone leave over ends as noise.
 _COLLAPSED = 0.9
+# When no start got below this share, the user should know.
+_NOTHING_LEARNED = 0.99
+# y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
+_FAR, _FAR_WEIGHT = 1e4, 100.0
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
 # Relative size of the rounding errors in a bound on all rows.
 _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
+# A restart multiplies the first values by a number between 1 / factor and the factor, drawn log-uniformly.
+_RESTART_FACTORS = {"hyperparameters": 3.0, "noise": 30.0}
 
 
 @dataclass(frozen=True)
@@ -41,6 +49,8 @@ class Options:
         In nats.
     batch_size : int
     learning_rate : float
+    n_restarts : int
+        Further fits from other starts.
     natural_gradient : bool
         Of Adam with the full family: q moves by natural gradients.
     threads : BlockMap
@@ -51,6 +61,7 @@ class Options:
     tol: float
     batch_size: int
     learning_rate: float
+    n_restarts: int = 0
     natural_gradient: bool = False
     threads: BlockMap = field(default_factory=BlockMap)
 
@@ -100,6 +111,100 @@ class Learned:
 
 
 def learn(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    placement: Placement,
+    rng: np.random.RandomState,
+    report: Report | None = None,
+) -> Learned:
+    """Maximise the bound from the table's starts, then from others; the best is kept.
+
+    Parameters
+    ----------
+    model : SparseModel
+    table : ParameterTable
+        Of `start.starting_table`.
+    rows : Rows
+        In internal units.
+    options : Options
+    placement : Placement
+        Of the inducing points of other starts.
+    rng : RandomState
+        Draws the mini-batches and the other starts.
+    report : callable, default=None
+        report(iteration, minus the bound), once per iteration.
+
+    Returns
+    -------
+    learned : Learned
+    """
+    best = _learn_once(model, table, rows, options, rng, report)
+    for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
+        if best.interrupted:
+            break
+        other = _learn_once(model, _other_start(model, table, rows, placement, rng), rows, options, rng, report)
+        if other.bound > best.bound:
+            best = other
+        elif other.interrupted:
+            best = replace(best, interrupted=True, message=other.message)
+    advice = [best.message, _far_from_prior(model, rows), _nothing_learned(best, table, rows, options)]
+    return replace(best, message=" ".join(part for part in advice if part))
+
+
+def _far_from_prior(model: SparseModel, rows: Rows) -> str:
+    if (rows.scatter() < _FAR**-2).any():
+        return (
+            f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
+            "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
+        )
+    if (np.abs(model.prior.reference) > _FAR_WEIGHT).any():
+        return (
+            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
+            "raise coef_scale or, if it is an intercept's, set normalize_y=True."
+        )
+    return ""
+
+
+def _nothing_learned(learned: Learned, table: ParameterTable, rows: Rows, options: Options) -> str:
+    if learned.interrupted or options.max_iter == 0 or table["noise"].fixed:
+        return ""
+    nothing = learned.values["noise"] > _NOTHING_LEARNED * rows.scatter()
+    if nothing.any():
+        # Where residuals look like noise, noise is the answer.
+        nothing &= alike_neighbours(rows)
+    if not nothing.any():
+        return ""
+    return (
+        f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
+        "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
+        "Raise n_inducing or n_restarts, let kernel or noise_variance start elsewhere, or look at the scales of the "
+        "kernel's columns."
+    )
+
+
+def _other_start(
+    model: SparseModel, table: ParameterTable, rows: Rows, placement: Placement, rng: np.random.RandomState
+) -> ParameterTable:
+    """The same table with kernel, noise and inducing points elsewhere, within their bounds."""
+    coordinates = table.coordinates(table.start())
+    for name, factor in _RESTART_FACTORS.items():
+        spread = np.log(factor)
+        coordinates[name] = coordinates[name] + rng.uniform(-spread, spread, coordinates[name].shape)
+    moved = table.values(np.clip(table.flat(coordinates), *table.bounds()))
+    hyperparameters = np.log(moved["hyperparameters"])
+    moved["inducing_points"] = np.array(
+        [
+            placement.points(rows.sample(placement.sample_size, rng).inputs, model.kernel, hyperparameters, rng)
+            for _ in model.groups
+        ]
+    )
+    # Where clusters coincide there are fewer: such a start keeps the first points.
+    return table.started_at(moved)
+
+
+def _learn_once(
     model: SparseModel,
     table: ParameterTable,
     rows: Rows,

@@ -12,7 +12,7 @@ import numpy as np
 
 from .bounds import PosteriorFamily
 from .frame import Frame
-from .inducing import initial_inducing_points, sample_size
+from .inducing import Placement
 from .learning import Learned, Options, learn
 from .model import SparseModel
 from .optimize import Report
@@ -83,7 +83,7 @@ class FittedOutputs:
         starts: Starts,
         sharing: Sharing,
         family: PosteriorFamily,
-        n_inducing: int,
+        placement: Placement,
         options: Options,
         rng: np.random.RandomState,
         n_threads: int = 1,
@@ -102,7 +102,8 @@ class FittedOutputs:
             What the user says of kernel and noise.
         sharing : {"all", "kernel", "none"}
         family : {"full", "diagonal"}
-        n_inducing : int
+        placement : Placement
+            Of the inducing points.
         options : Options
         rng : RandomState
         n_threads : int, default=1
@@ -116,16 +117,13 @@ class FittedOutputs:
         -------
         fitted : FittedOutputs
         """
-        with single_threaded_libraries():
-            points = initial_inducing_points(rows.sample(sample_size(n_inducing), rng), n_inducing, rng)
-            first = starts.hyperparameters.value
-            variance = 1.0 if first is None else mean_variance(kernel, first, points)
         models = _models(sharing, kernel, frame, family)
-        tables = []
-        for index, (outputs, model) in enumerate(models):
-            table = starting_table(
-                spread_of(rows.inputs),
-                np.repeat(points[np.newaxis], len(model.groups), axis=0),
+        spread = spread_of(rows.inputs)
+
+        def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
+            return starting_table(
+                spread,
+                points,
                 frame.target_unit[outputs],
                 starts,
                 rows.scatter()[outputs],
@@ -133,6 +131,17 @@ class FittedOutputs:
                 kernel.n_hyperparameters,
                 variance,
             )
+
+        # The kernel starts alike in all models and without regard to the points, which may depend on it.
+        alone = table_of(slice(0, 1), np.empty((1, 0, len(spread))))
+        hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
+        with single_threaded_libraries():
+            points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
+            first = starts.hyperparameters.value
+            variance = 1.0 if first is None else mean_variance(kernel, first, points)
+        tables = []
+        for index, (outputs, model) in enumerate(models):
+            table = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0), variance)
             if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
                 values = previous._values_in(frame, rows, index)
                 if previous.learned[index].model.kernel != kernel:
@@ -156,7 +165,7 @@ class FittedOutputs:
                     inner(iteration, loss)
 
             own = rows.outputs(outputs, 1.0 / at_once)
-            learned = learn(model, table, own, options, np.random.RandomState(seed), report)
+            learned = learn(model, table, own, options, placement, np.random.RandomState(seed), report)
             if learned.interrupted:
                 stop.set()
             return learned

@@ -98,12 +98,17 @@ class Rows:
         scatter = self._moments[1].variance[self.columns]
         return np.where(scatter > 0.0, scatter, 1.0)
 
-    def sample(self, size: int, rng: np.random.RandomState) -> np.ndarray:
-        """The inputs of all rows, or of ``size`` of them drawn at random, in their order."""
+    def some(self, chosen: np.ndarray) -> RawRows:
+        """Rows by index, in internal units."""
+        rows = self.to_internal(self.source.take(chosen))
+        return replace(rows, targets=rows.targets[:, self.columns])
+
+    def sample(self, size: int, rng: np.random.RandomState) -> RawRows:
+        """All rows, or ``size`` of them drawn at random, in their order."""
         chosen = np.arange(len(self))
         if len(self) > size:
             chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
-        return self.to_internal(self.source.take(chosen)).inputs
+        return self.some(chosen)
 
     def blocks(self, kernel: Preparer, n_inducing: int, threads: BlockMap | None = None) -> Blocks:
         """The rows as blocks for a kernel with so many inducing points."""

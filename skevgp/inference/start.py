@@ -6,9 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.linalg import cho_solve
+from scipy.spatial import cKDTree
 
 from .linalg import NotPositiveDefiniteError, jittered_cholesky
 from .parameters import Parameter, ParameterTable, Start
+from .rows import Rows
 from .source import Moments, RawRows, Source
 from .statistics import Kernel
 
@@ -26,6 +28,7 @@ _NOISE_BOUNDS = 1e-10, 1e2
 _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
+_NEIGHBOUR_SAMPLE = 2000
 _SIGNAL_BOUNDS = 1e-8, 1e8
 
 
@@ -170,6 +173,30 @@ def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: 
         raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
     at.finish_pullback(at.start_pullback(), np.zeros_like(K))
     return variance
+
+
+def alike_neighbours(rows: Rows) -> np.ndarray:
+    """Whether neighbouring rows have residuals more alike than noise has: then there is something to learn.
+
+    The mean square difference of residuals between each row and its nearest neighbour is about twice their variance if
+    they are noise (von Neumann 1941, for rows in order); less by four of its standard errors, about 1.6 / √n each, is
+    more than chance.
+
+    Parameters
+    ----------
+    rows : Rows
+
+    Returns
+    -------
+    alike : ndarray of shape (o,)
+    """
+    some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
+    inputs, residuals = some.inputs / spread_of(rows.inputs), some.targets
+    if len(inputs) < 2:
+        return np.zeros(residuals.shape[1], dtype=bool)
+    _, nearest = cKDTree(inputs).query(inputs, 2)
+    difference = np.mean((residuals[nearest[:, 0]] - residuals[nearest[:, 1]]) ** 2, axis=0)
+    return difference < 2.0 * residuals.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(inputs)))
 
 
 def starting_table(

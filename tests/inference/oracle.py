@@ -7,7 +7,7 @@ from skevgp.inference.blocks import LocalBlocks
 from skevgp.inference.bounds import CoefficientPrior
 from skevgp.inference.model import JITTER, SparseModel
 from skevgp.inference.parameters import Start
-from skevgp.inference.rows import MakeBlock
+from skevgp.inference.rows import MakeBlock, Rows
 from skevgp.inference.source import LocalSource, Moments
 from skevgp.inference.start import Starts, spread_of, starting_table
 from skevgp.kernels import SquaredExponential
@@ -66,6 +66,11 @@ class ArrayRows:
     def blocks(self, kernel, size):
         source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock(kernel, lambda raw: raw)
         return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size)
+
+
+def identity_rows(inputs, residuals):
+    """Rows whose internal units are the user's."""
+    return Rows(LocalSource.of(inputs, np.empty((len(inputs), 0)), residuals), lambda raw: raw)
 
 
 def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):

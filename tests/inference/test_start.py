@@ -1,9 +1,10 @@
 import numpy as np
 import pytest
 
-from skevgp.inference.inducing import initial_inducing_points
 from skevgp.inference.source import LocalSource
-from skevgp.inference.start import features_alone, unit_of
+from skevgp.inference.start import alike_neighbours, features_alone, unit_of
+
+from .oracle import identity_rows
 
 
 def weights_alone(H, r, scale):
@@ -54,29 +55,16 @@ def test_the_unit_is_not_below_the_rounding_of_the_target():
     assert unit_of(np.full(1, 1e-20), np.full(1, 1e5))[0] == pytest.approx(1e-9)
 
 
-def test_all_distinct_rows_serve_if_there_are_few():
-    X = np.array([[1.0], [0.0], [1.0], [2.0]])
-    points = initial_inducing_points(X, 10, np.random.RandomState(0))
-    np.testing.assert_array_equal(points, [[1.0], [0.0], [2.0]])
-
-
-def test_points_spread_over_the_data_whatever_the_scales():
+@pytest.mark.parametrize("scale", [1.0, 1e-9])
+def test_neighbours_of_a_smooth_function_are_alike_and_of_noise_are_not(scale):
     rng = np.random.RandomState(0)
-    X = rng.rand(2000, 2) * [1e-6, 1e6]
-    points = initial_inducing_points(X, 25, rng) / [1e-6, 1e6]
-    assert points.shape == (25, 2)
-    nearest = np.linalg.norm(X[:, np.newaxis] / [1e-6, 1e6] - points, axis=2).min(axis=1)
-    assert nearest.max() < 0.35
+    X = scale * rng.rand(3000, 2)
+    wave, noise = np.sin(10 * X[:, 0] / scale), rng.randn(3000)
+    alike = alike_neighbours(identity_rows(X, np.column_stack([wave, wave + 0.5 * noise, noise, np.ones(3000)])))
+    np.testing.assert_array_equal(alike, [True, True, False, False])
 
 
-def test_a_sample_serves_for_many_rows(monkeypatch):
-    monkeypatch.setattr("skevgp.inference.inducing.MAX_SAMPLE", 100)
-    X = np.random.RandomState(0).rand(5000, 1)
-    assert initial_inducing_points(X, 100, np.random.RandomState(0)).shape == (100, 1)
-
-
-def test_the_first_points_are_far_apart():
-    """Adam moves in coordinates whitened in this order; sorted points make each nearly follow from the one before."""
-    X = np.random.RandomState(0).rand(2000, 1)
-    points = initial_inducing_points(X, 20, np.random.RandomState(0))[:, 0]
-    assert np.abs(np.diff(points[:5])).min() > 2.0 * np.diff(np.sort(points)).mean()
+def test_noise_is_seldom_alike():
+    rng = np.random.RandomState(0)
+    for n in (1, 2, 10, 50, 500):
+        assert not alike_neighbours(identity_rows(rng.randn(n, 3), rng.randn(n, 100))).any()
