@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -83,29 +84,30 @@ class KernelSpec:
         -------
         kernel : Kernel
         """
-        used = 0
+        rows = iter(np.column_stack([hyperparameters, hyper_bounds]))
 
         def fitted(kernel: sk.Kernel) -> sk.Kernel:
-            nonlocal used
             if isinstance(kernel, sk.KernelOperator):
                 return type(kernel)(fitted(kernel.k1), fitted(kernel.k2))
-            found = clone(kernel)
-            is_signal = kernel is self.signal
-            start = self.starts.signal if is_signal else self.starts.hyperparameters
-            for hyperparameter in kernel.hyperparameters:
-                own = slice(0, 1) if is_signal else slice(used, used + hyperparameter.n_elements)
-                values, bounds = (signal, signal_bounds) if is_signal else (hyperparameters, hyper_bounds)
-                used += 0 if is_signal else hyperparameter.n_elements
-                if hyperparameter.fixed:
-                    continue
-                value = np.atleast_1d(values)[own]
-                found.set_params(**{hyperparameter.name: value.copy() if len(value) > 1 else float(value[0])})
-                if start.bounds is None:
-                    own_bounds = bounds[own] if len(value) > 1 else tuple(map(float, bounds[own][0]))
-                    found.set_params(**{f"{hyperparameter.name}_bounds": own_bounds})
-            return found
+            if kernel is self.signal:
+                return _fitted(kernel, iter([(signal, *signal_bounds[0])]), self.starts.signal.bounds is None)
+            return _fitted(kernel, rows, self.starts.hyperparameters.bounds is None)
 
         return fitted(self.tree)
+
+
+def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kernel:
+    """A copy of a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""
+    found = clone(kernel)
+    for hyperparameter in kernel.hyperparameters:
+        own = np.array(list(islice(rows, hyperparameter.n_elements)))
+        # What is fixed keeps all its digits.
+        if not hyperparameter.fixed:
+            one = len(own) == 1
+            found.set_params(**{hyperparameter.name: float(own[0, 0]) if one else own[:, 0]})
+            if set_bounds:
+                found.set_params(**{f"{hyperparameter.name}_bounds": tuple(own[0, 1:].tolist()) if one else own[:, 1:]})
+    return found
 
 
 def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) -> KernelSpec:
