@@ -24,7 +24,7 @@ from threadpoolctl import threadpool_limits
 
 import skevgp
 from skevgp.inference.frame import Frame
-from skevgp.inference.inducing import initial_inducing_points
+from skevgp.inference.inducing import Placement
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.parameters import Start
@@ -59,7 +59,7 @@ def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[C
     frame = Frame.of(source, inputs, targets, np.zeros(n_outputs), nothing, nothing)
     rows, kernel = frame.rows(source), SquaredExponential(d)
     model = SparseModel(kernel, frame.internal_prior(), "full", (slice(0, n_outputs),))
-    points = initial_inducing_points(rows.sample(20 * m, rng), m, rng)
+    points = Placement("k-means", m).points(rows.sample(20 * m, rng).inputs, kernel, np.zeros(d), rng)
     starts, spread = Starts(Start(), Start(), Start()), spread_of(rows.inputs)
     table = starting_table(
         spread, points[np.newaxis], frame.target_unit, starts, rows.scatter(), FIRST_NOISE["lbfgs"], d

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process.kernels import RBF, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
@@ -190,3 +190,12 @@ def test_targets_whose_squares_vanish_are_refused():
     with pytest.raises(ValueError, match=r"y must be 0 or exceed 1e-140 in size; a column's largest value is 1.*e-150"):
         model().fit(X, 1e-150 * Y)
     assert model().fit(X, np.zeros(len(X))).predict(X) == pytest.approx(np.zeros(len(X)))
+
+
+def test_nothing_moves_without_iterations_even_if_the_noise_explains_everything():
+    X = np.random.RandomState(0).randn(200, 1)
+    kernel = ConstantKernel(1e-6) * RBF(0.7) + WhiteKernel(2.0)
+    model = EVGPRegressor(kernel=kernel, n_inducing=5, max_iter=0, random_state=0)
+    model.fit(X, np.random.RandomState(1).randn(200))
+    assert model.kernel_.k2.length_scale == pytest.approx(0.7)
+    assert model.noise_variance_ == pytest.approx(2.0)

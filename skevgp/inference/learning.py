@@ -168,7 +168,7 @@ def _far_from_prior(model: SparseModel, rows: Rows) -> str:
 
 
 def _nothing_learned(learned: Learned, table: ParameterTable, rows: Rows, options: Options) -> str:
-    if learned.interrupted or options.max_iter == 0 or table["noise"].fixed:
+    if learned.interrupted or options.max_iter == 0 or not table["noise"].free.any():
         return ""
     nothing = learned.values["noise"] > _NOTHING_LEARNED * rows.scatter()
     if nothing.any():
@@ -317,7 +317,9 @@ def _lbfgs_unless_collapsed(
         minimum = lbfgs(objective, first, table.bounds(), options.max_iter, tol, report)
         if best is None or minimum.loss < best.loss:
             best = minimum
-        if best.interrupted or table["noise"].fixed or not (table.values(best.x)["noise"] > collapsed).any():
+        if best.interrupted or options.max_iter == 0 or not table["noise"].free.any():
+            break
+        if not (table.values(best.x)["noise"] > collapsed).any():
             break
     assert best is not None
     return best
