@@ -2,7 +2,7 @@
 
 Writes one row per fit to a CSV (fits that are there already are not repeated) and prints a summary of each part.
 
-    python benchmarks/robustness.py                  # everything: about an hour on one core
+    python benchmarks/robustness.py                  # everything: an hour or two on one core
     python benchmarks/robustness.py --parts nasty    # 500 random data sets: no error, no NaN, std > 0
     python benchmarks/robustness.py --parts jitter   # the noise-free ones of them against fixed jitters
     python benchmarks/robustness.py --parts seeds    # ten random states on the same data: spread, collapse; restarts
@@ -357,10 +357,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
             values = run()
             for name in ("bound_per_row", "gain_per_row", "error", "noise_share", "seconds"):
                 if name in values:
-                    values[name] = f"{values[name]:.10g}"
+                    values[name] = f"{values[name]:.7g}"
             row = dict.fromkeys(COLUMNS, "") | values
             row |= {"part": part, "case": case, "variant": variant, "seed": seed}
+            # Once per run: the file stays small.
             row |= {"versions": versions, "machine": machine}
+            versions = machine = ""
             row = {name: str(value) for name, value in row.items()}
             rows.append(row)
             new = not options.output.exists()
