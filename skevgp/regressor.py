@@ -27,7 +27,7 @@ from .inference.outputs import FittedOutputs
 from .inference.posterior import Posterior
 from .kernels import parse_kernel
 
-_MAX_ITER = {"lbfgs": 1000, "adam": 8000}
+_MAX_ITER = {"lbfgs": 1000, "adam": 16000}
 _PREDICT_ROWS = 4096
 
 
@@ -75,7 +75,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
         among them.
     max_iter : int, default=None
-        The most iterations of L-BFGS or steps of Adam; None means 1000 or 8000. With 0 nothing is optimised: kernel
+        The most iterations of L-BFGS or steps of Adam; None means 1000 or 16000. With 0 nothing is optimised: kernel
         and inducing points stay where they start, and q is at its optimum.
     tol : float, default=0.01
         In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
