@@ -32,7 +32,7 @@ from .inference.posterior import Posterior
 from .inference.source import LocalSource, Source, moments_of_rows
 from .kernels import parse_kernel
 
-_MAX_ITER = {"lbfgs": 1000, "adam": 8000}
+_MAX_ITER = {"lbfgs": 1000, "adam": 16000}
 # float32 is not copied as a whole: pieces of it become float64.
 _DTYPES = [np.float64, np.float32]
 
@@ -87,7 +87,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
         among them.
     max_iter : int, default=None
-        The most iterations of L-BFGS or steps of Adam; None means 1000 or 8000. With 0 nothing is optimised: kernel
+        The most iterations of L-BFGS or steps of Adam; None means 1000 or 16000. With 0 nothing is optimised: kernel
         and inducing points stay where they start, and q is at its optimum.
     n_restarts : int, default=0
         Further fits from other starts, of which the one with the best bound is kept: other inducing points (unless

@@ -59,6 +59,20 @@ def test_finite_data_never_fail(seed):
     assert np.isfinite(model.sample_y(X[:3])).all()
 
 
+@pytest.mark.parametrize("seed", range(30))
+def test_finite_data_never_fail_natural_gradients(seed):
+    X, Y, arguments = nasty(seed)
+    arguments |= {"solver": "adam", "posterior": "full", "natural_gradient": True}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model = EVGPRegressor(**arguments, max_iter=30, batch_size=64, random_state=0).fit(X, Y)
+    mean, std = model.predict(np.vstack([X, X + X.std(axis=0)]), return_std=True)
+    assert np.isfinite(mean).all()
+    assert (std > 0.0).all()
+    assert np.isfinite(std).all()
+    assert np.isfinite(model.lower_bound_)
+
+
 @pytest.mark.parametrize("scale", [1e-120, 1e-12, 1e12, 1e90])
 def test_targets_of_any_scale(scale):
     X = np.linspace(0, 3, 40)[:, np.newaxis]

@@ -47,7 +47,7 @@ def test_without_physics(data):
 
 
 def test_the_papers_setup(data):
-    """Adam, diagonal posterior, inducing points per output; an eighth of the default steps."""
+    """Adam, diagonal posterior, inducing points per output; a sixteenth of the default steps."""
     paper = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "max_iter": 1000, "random_state": 0}
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, **paper)
     assert error(model, data) <= 0.006

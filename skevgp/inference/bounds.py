@@ -17,7 +17,7 @@ from typing import Any, Literal
 import autograd.numpy as anp
 import numpy as np
 
-from .linalg import jittered_cholesky, symmetric_inverse, triangular_inverse
+from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from .statistics import SufficientStatistics
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -99,12 +99,13 @@ def projected(statistics: SufficientStatistics, index: int, signal: float, scale
     m, s = len(statistics.VV), np.sqrt(signal)
     size = m + len(scale)
     PP, Pr = np.empty((size, size)), np.empty(size)
-    PP[:m, :m] = signal * statistics.VV
-    PP[:m, m:] = s * statistics.VH * scale
-    PP[m:, :m] = PP[:m, m:].T
-    PP[m:, m:] = scale[:, np.newaxis] * statistics.HH * scale
-    Pr[:m] = s * statistics.VR[:, index]
-    Pr[m:] = scale * statistics.HR[:, index]
+    np.multiply(statistics.VV, signal, out=PP[:m, :m])
+    np.multiply(statistics.VR[:, index], s, out=Pr[:m])
+    if len(scale):
+        np.multiply(statistics.VH, s * scale, out=PP[:m, m:])
+        PP[m:, :m] = PP[:m, m:].T
+        np.multiply(statistics.HH, np.multiply.outer(scale, scale), out=PP[m:, m:])
+        np.multiply(statistics.HR[:, index], scale, out=Pr[m:])
     return PP, Pr
 
 
@@ -132,10 +133,10 @@ def optimal_posterior(
         If the sums are not finite.
     """
     m = len(statistics.VV)
-    PP, Pr = projected(statistics, index, signal, prior.scale[index])
-    B = PP / noise
-    np.einsum("ii->i", B)[...] += 1.0
-    g = Pr / noise
+    B, g = projected(statistics, index, signal, prior.scale[index])
+    B /= noise
+    diagonal_of(B)[...] += 1.0
+    g /= noise
     g[m:] -= prior.reference[index]
     root = jittered_cholesky(B)
     root_inv = triangular_inverse(root)
@@ -210,8 +211,10 @@ class BoundAtOptimum:
             q = optimal_posterior(statistics, o, s2, sigma2, prior)
             self.posteriors.append(q)
             self.fitted[:m, o], self.fitted[m:, o] = s * q.mean[:m], scale * q.mean[m:]
-            log_det = 2.0 * np.log(np.diagonal(q.root)).sum()
-            penalty = q.mean @ q.mean + prior.reference[o] @ (2.0 * q.mean[m:] + prior.reference[o])
+            log_det = 2.0 * float(np.log(diagonal_of(q.root)).sum())
+            penalty = float(q.mean @ q.mean)
+            if p:
+                penalty += float(prior.reference[o] @ (2.0 * q.mean[m:] + prior.reference[o]))
             unexplained = s2 * statistics.unexplained / sigma2
             value = -0.5 * (statistics.n_rows * (LOG_2PI + np.log(sigma2)) + log_det + penalty + unexplained)
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
@@ -230,7 +233,8 @@ class BoundAtOptimum:
             self._log_signal[o] = (
                 np.vdot(VV_bar, statistics.VV) + 0.5 * np.vdot(VH_bar, statistics.VH) - 0.5 * unexplained
             )
-            self._log_noise[o] = -0.5 * statistics.n_rows - np.vdot(B_bar, q.B) + np.trace(B_bar) + 0.5 * unexplained
+            from_B = np.vdot(B_bar, q.B) - diagonal_of(B_bar).sum()
+            self._log_noise[o] = 0.5 * (unexplained - statistics.n_rows) - from_B
 
     def residuals(self) -> Residuals:
         """eᵀe and V e from the statistics: good while the signal is not above about 1e4 times the noise."""
@@ -269,7 +273,7 @@ def _diagonal_gap(
     B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
     np.einsum("ii->i", B_bar[m:, m:])[...] += 0.5 / coef_diagonal
     L_bar = -np.tril((weighted @ precision).T)
-    np.einsum("ii->i", L_bar)[...] += 1.0 / np.diagonal(L)
+    diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
     return float(gap), B_bar, L_bar
 
 

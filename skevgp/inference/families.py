@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from .bounds import CoefficientPrior, WhitenedPosterior, projected
-from .linalg import jittered_cholesky, symmetric_inverse, triangular_inverse
+from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from .model import Values, diagonal_root, log_variances
 from .parameters import Parameter
 from .statistics import SufficientStatistics
@@ -140,7 +140,7 @@ class DiagonalFamily:
         LD = L_inv * weighted
         L_bar = -(L_inv.T @ (VVL * weighted + L_inv * total) @ L_inv.T)
         diagonal = np.diagonal(group.L)
-        np.einsum("ii->i", L_bar)[...] += len(d) / diagonal
+        diagonal_of(L_bar)[...] += len(d) / diagonal
         value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * np.log(diagonal).sum()
         return SpreadTerms(
             float(value),
@@ -243,7 +243,7 @@ class FullFamily:
 
     def _triangular(self, coordinates: np.ndarray) -> np.ndarray:
         T = np.zeros((self._size, self._size))
-        np.einsum("ii->i", T)[...] = np.exp(coordinates[: self._size])
+        diagonal_of(T)[...] = np.exp(coordinates[: self._size])
         T[self._below] = coordinates[self._size :]
         return T
 
@@ -290,7 +290,7 @@ class NaturalFamily:
             PP, Pr = projected(group.statistics, o, group.signal[o], group.prior.scale[o])
             precision, shift = self.precision[output], self.shift[output]
             PP *= self.rate / group.noise[o]
-            np.einsum("ii->i", PP)[...] += self.rate
+            diagonal_of(PP)[...] += self.rate
             Pr *= self.rate / group.noise[o]
             Pr[m:] -= self.rate * group.prior.reference[o]
             precision *= 1.0 - self.rate

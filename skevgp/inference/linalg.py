@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from math import isfinite
+
 import numpy as np
 from scipy.linalg import lapack
 
@@ -34,21 +36,29 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
     NotPositiveDefiniteError
         If even `MAX_JITTER` does not help, or the matrix is not finite.
     """
-    diagonal = np.diagonal(matrix)
+    diagonal = diagonal_of(matrix)
     while True:
         shifted = matrix.copy()
         if jitter > 0.0:
             # Where a covariance is 0 (a linear one at the origin), the jitter is that of a very small one.
-            np.einsum("ii->i", shifted)[...] += jitter * np.where(diagonal == 0.0, 1e-16 * diagonal.max(), diagonal)
+            sizes = diagonal if diagonal.all() else np.where(diagonal == 0.0, 1e-16 * diagonal.max(), diagonal)
+            diagonal_of(shifted)[...] += jitter * sizes
         # The transpose of a C-contiguous matrix is what LAPACK reads without a copy: its upper factor is our lower.
         factor, info = lapack.dpotrf(shifted.T, lower=0, clean=1, overwrite_a=1)
-        if info == 0 and np.isfinite(factor[-1:, -1:]).all():
+        if info == 0 and (len(factor) == 0 or isfinite(factor[-1, -1])):
             return factor.T
         if not np.isfinite(matrix).all():
             raise NotPositiveDefiniteError("the matrix is not finite")
         jitter = max(10.0 * jitter, 1e-15)
         if jitter > MAX_JITTER:
             raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {MAX_JITTER}")
+
+
+def diagonal_of(matrix: np.ndarray) -> np.ndarray:
+    """The diagonal of a matrix (n, n), to read and to write."""
+    if matrix.flags.c_contiguous:
+        return matrix.reshape(-1)[:: len(matrix) + 1]
+    return np.einsum("ii->i", matrix)
 
 
 def triangular_inverse(L: np.ndarray) -> np.ndarray:
@@ -82,5 +92,5 @@ def cholesky_pullback(L: np.ndarray, L_inv: np.ndarray, L_bar: np.ndarray) -> np
     """
     phi = np.tril(L.T @ np.tril(L_bar))
     phi = phi + phi.T
-    np.einsum("ii->i", phi)[...] *= 0.5
+    diagonal_of(phi)[...] *= 0.5
     return 0.5 * (L_inv.T @ phi @ L_inv)

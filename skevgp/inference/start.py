@@ -8,7 +8,7 @@ import numpy as np
 from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 
-from .linalg import NotPositiveDefiniteError, jittered_cholesky
+from .linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
 from .parameters import Parameter, ParameterTable, Start
 from .rows import Rows
 from .source import Moments, RawRows, Source
@@ -98,7 +98,7 @@ def features_alone(
         roots = {}
         for o in moving:
             precision = scale[o][:, np.newaxis] * HH * scale[o]
-            np.einsum("ii->i", precision)[...] += noise[o]
+            diagonal_of(precision)[...] += noise[o]
             roots[o] = jittered_cholesky(precision) if noise[o] > 0.0 else None
         for _ in range(3):
             for o in moving:

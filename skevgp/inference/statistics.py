@@ -15,6 +15,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from .blocks import Block, Blocks
+from .linalg import diagonal_of
 
 
 class KernelAt(Protocol):
@@ -221,7 +222,7 @@ def pull_back(
         V e, or V r.
     """
     symmetric = VV_bar + VV_bar.T
-    np.einsum("ii->i", symmetric)[...] -= 2.0 * unexplained_bar
+    diagonal_of(symmetric)[...] -= 2.0 * unexplained_bar
     from_whitened, from_linear = L_inv.T @ symmetric, L_inv.T @ np.hstack([VH_bar, VR_bar])
     rows_bar, squares, VE = rows.sum(_SecondPass(kernel, L_inv, from_whitened, from_linear, unexplained_bar, fitted))
     VbarV = symmetric @ statistics.VV + VH_bar @ statistics.VH.T + VR_bar @ VE.T
