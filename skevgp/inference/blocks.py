@@ -12,7 +12,7 @@ import numpy as np
 from .threads import BlockMap, add, ordered_sum
 
 # A block's k(X_m, X) should stay in a core's cache: about this many numbers, but not fewer rows than this.
-_BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**15, 512, 4096
+_BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**16, 512, 8192
 # Blocks that are made already are kept within this many bytes; the others are made again at each pass.
 CACHE_BYTES = 48 * 2**20
 # If k(X_m, X) and V of all rows fit in this many bytes, they are kept from the first pass for the second.
