@@ -29,7 +29,9 @@ _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
 _NEIGHBOUR_SAMPLE = 2000
-_SIGNAL_BOUNDS = 1e-8, 1e8
+# A function that varies by more than ten times the data's scatter would do so outside of them only: without an upper
+# bound L-BFGS makes long waves of huge height from small ones (on the cartpole, Errors outside the data of 50).
+_SIGNAL_BOUNDS = 1e-8, 1e2
 
 
 @dataclass(frozen=True)
