@@ -312,6 +312,8 @@ def run(peer: str, job: Job) -> Result:
 
 
 def main() -> None:
+    if len(sys.argv) != 4:
+        raise SystemExit(f"usage: {Path(__file__).name} PEER JOB RESULT (started by against_peers.py)")
     name, job, result = sys.argv[1:]
     if name not in PEERS:
         raise SystemExit(f"error: unknown peer {name!r}; known: {', '.join(PEERS)}.")

@@ -90,6 +90,6 @@ axes[1].plot(
     label="inducing points",
 )
 axes[1].legend(loc="upper left", fontsize=8)
-if len(sys.argv) > 1:
+if len(sys.argv) > 1 and not sys.argv[1].startswith("-"):
     figure.savefig(sys.argv[1], dpi=100)
 plt.show()

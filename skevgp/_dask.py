@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from copy import deepcopy
+from copy import copy, deepcopy
 from functools import cached_property
 from typing import Any
 
@@ -13,7 +13,7 @@ from sklearn.utils import check_array
 from ._data import MappedRows
 from ._maps import fit_map, fresh_map
 from ._optional import require
-from ._validation import check_magnitude
+from ._validation import as_floats, check_magnitude
 from .inference.blocks import Block, Blocks, LinearStatistics, LocalBlocks
 from .inference.source import LocalSource, RawRows
 from .inference.threads import BlockMap, ordered_sum, single_threaded_libraries
@@ -29,9 +29,17 @@ def is_dask(values: Any) -> bool:
     return type(values).__module__.partition(".")[0] == "dask" or hasattr(values, "__dask_graph__")
 
 
-def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,)) -> Any:
-    """A Dask array whose chunks are whole rows of known number, or an error that names it."""
-    da = require("dask.array", "Fitting to Dask arrays")
+def _dask() -> Any:
+    return require("dask", "Working with Dask arrays")
+
+
+def _dask_array() -> Any:
+    return require("dask.array", "Working with Dask arrays")
+
+
+def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,), known: bool = True) -> Any:
+    """A Dask array whose chunks are whole rows, at least one and of known number if so asked, or an error."""
+    da = _dask_array()
     if not isinstance(values, da.Array):
         raise TypeError(
             f"{name} must be a Dask array (of a Dask data frame: .to_dask_array(lengths=True)); got {values!r}."
@@ -40,18 +48,18 @@ def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,)) -> Any:
         raise ValueError(f"{name} must have {' or '.join(map(str, ndims))} dimensions; got the shape {values.shape}.")
     if values.ndim > 1 and values.numblocks[1] > 1:
         values = values.rechunk({1: -1})
-    if np.isnan(values.shape[0]):
-        values = values.compute_chunk_sizes()
-    if 0 in values.shape:
+    if known and np.isnan(values.shape[0]):
+        values = values.copy().compute_chunk_sizes()  # in place
+    if known and 0 in values.shape:
         raise ValueError(f"{name} is empty: its shape is {values.shape}.")
     return values
 
 
 def aligned(X: Any, y: Any) -> tuple[Any, Any]:
     """X and y as Dask arrays of the same chunks of rows, none of them empty."""
-    da = require("dask.array", "Fitting to Dask arrays")
+    da = _dask_array()
     X = as_rows(X, "X")
-    y = as_rows(y if is_dask(y) else da.from_array(np.asarray(y), chunks="auto"), "y", (1, 2))
+    y = as_rows(y if is_dask(y) else da.from_array(as_floats(y, "y"), chunks="auto"), "y", (1, 2))
     if len(X) != len(y):
         raise ValueError(f"X has {len(X)} rows, but y has {len(y)}.")
     rows = tuple(n for n in X.chunks[0] if n)
@@ -62,11 +70,11 @@ def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
     """A fitted clone of a transformer, or None: chunk by chunk if it has ``partial_fit``, else to a sample of rows."""
     if feature_map is None:
         return None
-    delayed = require("dask", "Fitting to Dask arrays").delayed
+    delayed = _dask().delayed
     fitted = fresh_map(feature_map, name)
     if not hasattr(fitted, "partial_fit"):
         chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAP_SAMPLE)).astype(int))
-        sample_X, sample_y = require("dask", "Fitting to Dask arrays").compute(X[chosen], y[chosen])
+        sample_X, sample_y = _dask().compute(X[chosen], y[chosen])
         return fit_map(feature_map, sample_X, sample_y, name)
     fitted = delayed(fitted, traverse=False)
     for X_chunk, y_chunk in zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True):
@@ -87,7 +95,7 @@ class DaskSource:
     """
 
     def __init__(self, X: Any, y: Any, feature_map: Any, kernel_map: Any):
-        dask = require("dask", "Fitting to Dask arrays")
+        dask = _dask()
         maps = dask.delayed((feature_map, kernel_map), traverse=False)
         chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
         self._partitions = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
@@ -98,7 +106,7 @@ class DaskSource:
         return _sum_over(self._partitions, function)
 
     def take(self, rows: np.ndarray) -> RawRows:
-        dask = require("dask", "Fitting to Dask arrays")
+        dask = _dask()
         owners = np.searchsorted(self._ends, rows, side="right")
         order = np.argsort(owners, kind="stable")
         parts = []
@@ -118,7 +126,7 @@ class DaskBlocks:
     """Blocks that Dask's workers make of their partitions and keep."""
 
     def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], Block], n_inducing: int):
-        dask = require("dask", "Fitting to Dask arrays")
+        dask = _dask()
         shared = dask.delayed(make, traverse=False)
         self._partitions = _held([dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions])
 
@@ -136,12 +144,12 @@ def _held(parts: list[Any]) -> Sequence[Any]:
         require("distributed", "Fitting on a cluster").get_client()
     except (ImportError, ValueError):
         return parts
-    return require("dask", "Fitting to Dask arrays").persist(*parts)
+    return _dask().persist(*parts)
 
 
 def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:
     """One map-reduce round; the order of summation depends on nothing but the number of partitions."""
-    delayed = require("dask", "Fitting to Dask arrays").delayed
+    delayed = _dask().delayed
     shared = delayed(function, traverse=False)
     sums = [delayed(_partition_sum)(partition, shared) for partition in partitions]
     while len(sums) > 1:
@@ -163,9 +171,9 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
     shape : tuple
         () or (o,): of one prediction.
     """
-    delayed = require("dask", "Predicting Dask arrays").delayed
-    if X.numblocks[1] > 1:
-        X = X.rechunk({1: -1})
+    delayed = _dask().delayed
+    # As it is now, whatever is folded into it before the result is computed.
+    model = copy(model)
     n_outputs = shape[0] if shape else 1
     width = n_outputs * (1 + return_std)
     both = X.map_blocks(
@@ -187,6 +195,8 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
 
 
 def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any]) -> LocalSource:
+    # Partitions are worked on at the same time, and transformers need not be safe for that.
+    maps = deepcopy(maps)
     X = check_array(X, dtype=[np.float64, np.float32], input_name="X")
     y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
     check_magnitude(X, "X")
@@ -219,5 +229,7 @@ def _partly_fitted(fitted: Any, X: np.ndarray, y: np.ndarray) -> Any:
 def _predicted(X: np.ndarray, model: Any, return_std: bool, include_noise: bool, width: int) -> np.ndarray:
     if len(X) == 0:
         return np.empty((0, width))
+    model = copy(model)
+    model.feature_map_, model.kernel_map_ = deepcopy((model.feature_map_, model.kernel_map_))
     found = model.predict(X, return_std=return_std, include_noise=include_noise)
     return np.hstack([part.reshape(len(X), -1) for part in (found if return_std else (found,))])

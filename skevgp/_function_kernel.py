@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable, Mapping
+from copy import deepcopy
 from typing import Any, Self
 
 import numpy as np
@@ -107,6 +108,10 @@ class FunctionKernel(sk.Kernel):
             self.values = {**(self.values or {}), **own}
         return self
 
+    def __sklearn_clone__(self) -> Self:
+        # The same functions, not copies of them: a clone is then the same covariance, from which a fit can go on.
+        return type(self)(self.function, deepcopy(self.values), deepcopy(self.values_bounds), self.diagonal)
+
     @property
     def hyperparameters(self) -> list[sk.Hyperparameter]:
         """Name and bounds of each hyperparameter."""
@@ -202,9 +207,19 @@ class FunctionKernel(sk.Kernel):
 
     def _bounds(self, name: str) -> Any:
         if not isinstance(self.values_bounds, Mapping):
+            if not isinstance(self.values_bounds, str) and np.shape(self.values_bounds) != (2,):
+                raise ValueError(
+                    "values_bounds must be two numbers, the lower first, 'fixed', or a dict of parameter names to "
+                    f"either; got {self.values_bounds!r}."
+                )
             return self.values_bounds
         self._check_names(self.values_bounds, "values_bounds")
-        return self.values_bounds.get(name, (1e-5, 1e5))
+        bounds = self.values_bounds.get(name, (1e-5, 1e5))
+        if not isinstance(bounds, str) and np.shape(bounds) != (2,):
+            raise ValueError(
+                f"values_bounds of {name!r} must be two numbers, the lower first, or 'fixed'; got {bounds!r}."
+            )
+        return bounds
 
     def _check_names(self, named: Mapping[str, Any], argument: str) -> None:
         unknown = sorted(set(named) - set(self._defaults()))

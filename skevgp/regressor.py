@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -18,7 +19,7 @@ from sklearn.utils import _safe_indexing, check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._dask import DaskSource, aligned, fit_map_to_chunks, is_dask, predict_chunks
+from ._dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from ._data import MappedRows, map_rows
 from ._maps import fit_map
 from ._progress import Progress
@@ -30,6 +31,7 @@ from .inference.learning import Options
 from .inference.outputs import FittedOutputs
 from .inference.posterior import Posterior
 from .inference.source import LocalSource, Source, moments_of_rows
+from .inference.threads import single_threaded_libraries
 from .kernels import parse_kernel
 
 _MAX_ITER = {"lbfgs": 1000, "adam": 16000}
@@ -259,9 +261,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a data frame stays one. Memory-mapped arrays of
+            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one. Memory-mapped arrays of
             float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
-            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X.
+            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
+            ``dask.distributed.Client`` chunks are read anew at each pass.)
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
 
@@ -281,13 +284,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
             kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
         """
-        before = dict(vars(self))
-        try:
+        with self._unchanged_if_it_fails(), single_threaded_libraries():
             self._fit(X, y)
-        except BaseException:
-            # A failed fit leaves the model as it was.
-            self.__dict__ = before
-            raise
         for message in self._fitted.messages:
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
         return self
@@ -302,8 +300,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
-        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            The first rows should be like all: they place the inducing points (no more than there are rows), kernel and
+            noise.
+        y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
 
         Returns
         -------
@@ -316,14 +316,16 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if not hasattr(self, "_fitted"):
             return self.fit(X, y)
-        given, X, y = self._validated(X, y)
-        frame, n_outputs = self._fitted.frame, 1 if y.ndim == 1 else y.shape[1]
-        if n_outputs != self._n_outputs:
-            raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
-        rows = frame.rows(self._source(given, X, y))
-        check_magnitude(rows.residuals.largest, "y, in units of what the first fit left over,")
-        self._fitted = self._fitted.updated(rows, self.forgetting_factor)
-        self._set_attributes()
+        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        with self._unchanged_if_it_fails(), single_threaded_libraries():
+            given, X, y = self._validated(X, y)
+            frame, n_outputs = self._fitted.frame, 1 if y.ndim == 1 else y.shape[1]
+            if n_outputs != self._n_outputs:
+                raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
+            rows = frame.rows(self._source(given, X, y))
+            check_magnitude(rows.residuals.largest, "y, in units of what the first fit left over,")
+            self._fitted = self._fitted.updated(rows, self.forgetting_factor)
+            self._set_attributes()
         return self
 
     def predict(
@@ -361,6 +363,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if is_dask(X):
             if return_cov:
                 raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+            X = as_rows(X, "X", known=False)
             self._validated(X)
             shape = () if self._n_outputs == 1 else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
@@ -432,6 +435,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         source = self._source(given, X, y)
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
+        check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
         spec = parse_kernel(self.kernel, len(inputs.mean))
         if self.noise_variance is not None:
             if spec.starts.noise.value is not None:
@@ -470,6 +474,15 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         self._spec, self._single_output = spec, y.ndim == 1
         self._set_attributes()
+
+    @contextmanager
+    def _unchanged_if_it_fails(self) -> Iterator[None]:
+        before = dict(vars(self))
+        try:
+            yield
+        except BaseException:
+            self.__dict__ = before
+            raise
 
     def _placement(self, centre: np.ndarray) -> Placement:
         """How inducing points start, for inputs from which ``centre`` is subtracted."""

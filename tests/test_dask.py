@@ -3,9 +3,11 @@
 import os
 import pickle
 import signal
+import time
 
 import numpy as np
 import pytest
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor, _dask
@@ -149,6 +151,64 @@ def test_a_worker_that_dies_does_not_change_the_result(cluster, monkeypatch):
     assert survived.lower_bound_ == expected.lower_bound_
 
 
+class Scratch(TransformerMixin, BaseEstimator):
+    """A map with a buffer of its own, as Pinocchio's data are: not safe for two threads at once."""
+
+    def fit(self, X, y=None):
+        self.buffer_ = np.empty(2)
+        return self
+
+    def transform(self, X):
+        H = np.empty((len(X), 2))
+        for row, x in enumerate(X):
+            self.buffer_[:] = x
+            time.sleep(0)
+            H[row] = self.buffer_
+        return H
+
+
+def test_maps_need_not_be_safe_for_threads():
+    parameters = {"feature_map": Scratch(), "max_iter": 1}
+    local = model(**parameters).fit(X, Y)
+    with dask.config.set(scheduler="threads", num_workers=8):
+        lazy = model(**parameters).fit(*chunked(X, Y, rows=(100,) * 6))
+        predicted = lazy.predict(da.from_array(X, chunks=(50, 2))).compute()
+    assert lazy.lower_bound_ == pytest.approx(local.lower_bound_, rel=1e-6)
+    np.testing.assert_allclose(predicted, local.predict(X), rtol=1e-6)
+
+
+def test_what_is_predicted_later_is_predicted_by_the_model_as_it_was():
+    fitted = model().fit(X, Y)
+    expected = fitted.predict(X_NEW)
+    (rows,) = chunked(X_NEW, rows=(20, 30))
+    later = fitted.predict(rows)
+    fitted.partial_fit(X + 0.1, -Y)
+    np.testing.assert_allclose(later.compute(), expected, rtol=1e-12)
+    assert np.abs(fitted.predict(X_NEW) - expected).max() > 0.1
+
+
+def test_the_users_array_stays_as_it_is():
+    unknown = da.from_array(X, chunks=(300, 2))
+    unknown = unknown[unknown[:, 0] > -10.0]
+    model(max_iter=0).fit(unknown, Y)
+    assert np.isnan(unknown.shape[0])
+
+
+def test_forgetting_score_and_warm_start(cluster):
+    lazy = model(forgetting_factor=0.5).fit(*chunked(X, Y)).partial_fit(*chunked(X, Y))
+    local = model(forgetting_factor=0.5).fit(X, Y).partial_fit(X, Y)
+    assert_same_model(lazy, local, rtol=1e-4)
+    assert lazy.score(*chunked(X, Y)) == pytest.approx(local.score(X, Y), rel=1e-6)
+    bound = local.set_params(warm_start=True, max_iter=0).fit(*chunked(X, Y)).lower_bound_
+    assert bound == pytest.approx(model().fit(X, Y).lower_bound_, rel=1e-6)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.int32, bool])
+def test_other_dtypes(dtype):
+    rows, target = (X * 3).astype(dtype), (Y[:, 0] * 3).astype(dtype)
+    assert_same_model(model(max_iter=0).fit(*chunked(rows, target)), model(max_iter=0).fit(rows, target))
+
+
 @pytest.mark.parametrize(
     ("bad_X", "bad_y", "message"),
     [
@@ -174,3 +234,7 @@ def test_what_needs_all_rows_at_once_says_so():
         fitted.predict(da.zeros((5, 3)))
     with pytest.raises(TypeError, match="to_dask_array"):
         model().fit(rows.to_delayed().ravel()[0], Y)
+    with pytest.raises(TypeError, match="to_dask_array"):
+        fitted.predict(rows.to_delayed().ravel()[0])
+    with pytest.raises(ValueError, match="X must have 2 dimensions"):
+        fitted.predict(rows[:, 0])

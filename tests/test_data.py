@@ -1,16 +1,19 @@
 """Rows in files and in memory: the same model, without a copy of the data."""
 
+import os
 import tracemalloc
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
 import pytest
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from threadpoolctl import threadpool_info
 
 from skevgp import EVGPRegressor
 from skevgp.inference.blocks import LocalBlocks, block_rows
 from skevgp.inference.source import LocalSource, Moments, moments_of_rows
-from skevgp.inference.threads import BlockMap
+from skevgp.inference.threads import BlockMap, single_threaded_libraries, thread_pool
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -54,29 +57,28 @@ def test_pieces_in_threads_have_the_same_bits(in_pieces):
         np.testing.assert_array_equal(other.predict(X_NEW), fits[0].predict(X_NEW))
 
 
-@pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_memory_mapped_files_are_not_copied(tmp_path, dtype):
-    n = 200_000
-    rng = np.random.RandomState(0)
-    np.save(tmp_path / "X.npy", rng.uniform(-2.0, 2.0, (n, 8)).astype(dtype))
-    np.save(tmp_path / "y.npy", np.sin(rng.randn(n)).astype(dtype))
-    mapped = [np.load(tmp_path / name, mmap_mode="r") for name in ("X.npy", "y.npy")]
-    fitted = EVGPRegressor(n_inducing=5, max_iter=1, random_state=0)
-    tracemalloc.start()
-    fitted.fit(*mapped)
-    fitted.predict(mapped[0], return_std=True)
-    _, peak = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    # The blocks that are kept, k(X_m, X) and V, 10,000 rows for the inducing points: not the 8 columns of float64.
-    copies = 8 * 8 * n
-    assert peak < 48 * 2**20 + 16 * 2**20
-    assert peak < 5 * copies
-
-
-def test_memory_does_not_grow_with_the_rows(monkeypatch, tmp_path):
-    """Beyond what may be kept, four times the rows need no more memory."""
+@pytest.fixture
+def little_memory(monkeypatch):
     for name in ("_data.MAPPED_BYTES", "inference.blocks.CACHE_BYTES", "inference.blocks.KEEP_BYTES"):
         monkeypatch.setattr(f"skevgp.{name}", 2**20)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
+    n, d = 500_000, 8
+    rng = np.random.RandomState(0)
+    np.save(tmp_path / "X.npy", rng.uniform(-2.0, 2.0, (n, d)).astype(dtype))
+    np.save(tmp_path / "y.npy", np.sin(rng.randn(n)).astype(dtype))
+    mapped = [np.load(tmp_path / name, mmap_mode="r") for name in ("X.npy", "y.npy")]
+    tracemalloc.start()
+    EVGPRegressor(n_inducing=5, max_iter=1, random_state=0).fit(*mapped)
+    _, peak = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert peak < 0.9 * mapped[0].nbytes
+
+
+def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
+    """Beyond what may be kept, four times the rows need no more memory."""
     peaks = []
     for n in (50_000, 200_000):
         np.save(tmp_path / "X.npy", RNG.uniform(-2.0, 2.0, (n, 8)))
@@ -154,3 +156,58 @@ def test_blocks_cover_all_rows_once(n_inducing):
     assert sum(sizes) == n
     assert set(sizes[:-1]) == {block_rows(n_inducing)}
     assert blocks.linear.n_rows == n
+
+
+def test_every_row_gets_into_mini_batches_however_many_there_are(monkeypatch):
+    from skevgp.inference.rows import Rows
+
+    monkeypatch.setattr("skevgp.inference.rows._SHUFFLED_ROWS", 40)
+    n = 150
+    rows = Rows(
+        LocalSource.of(np.arange(n, dtype=float)[:, np.newaxis], np.empty((n, 0)), np.zeros((n, 1))), lambda r: r
+    )
+
+    class Identity:
+        def prepare(self, inputs):
+            return inputs
+
+    batches = rows.batches(Identity(), 32, np.random.RandomState(0))
+    seen = [next(batches).block.prepared[:, 0] for _ in range(60)]
+    assert {len(batch) for batch in seen} == {32}
+    assert all(len(set(batch)) == 32 for batch in seen)
+    assert set(np.concatenate(seen)) == set(range(n))
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
+def test_fits_have_the_same_bits_in_any_thread():
+    """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
+    rng = np.random.RandomState(0)
+    rows = rng.randn(12_000, 4)
+    target = np.column_stack([np.sin(rows[:, 0]), rows[:, 1] * rows[:, 2]])
+
+    def points(n_jobs):
+        fitted = EVGPRegressor(n_inducing=20, sharing="none", n_restarts=1, max_iter=2, n_jobs=n_jobs, random_state=0)
+        return fitted.fit(rows, target).inducing_points_
+
+    expected = points(1)
+    np.testing.assert_array_equal(points(2), expected)
+    with ThreadPoolExecutor(1) as other:
+        np.testing.assert_array_equal(other.submit(points, 1).result(), expected)
+
+
+@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
+def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
+    def threads():
+        return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
+
+    def limited():
+        with single_threaded_libraries():
+            return threads()
+
+    before = threads()
+    assert set(limited().values()) == {1}
+    with ThreadPoolExecutor(1) as other:
+        assert set(other.submit(limited).result().values()) == {1}
+    with single_threaded_libraries(), single_threaded_libraries(), thread_pool(1) as pool:
+        assert set(pool.submit(threads).result().values()) == {1}
+    assert threads() == before

@@ -483,3 +483,29 @@ def test_functions_that_do_not_work_say_why(kernel, message):
 def test_the_exact_gp_is_told_of_numbers_that_are_not_finite():
     with pytest.raises(ValueError, match="returned numbers that are not finite"):
         FunctionKernel(lambda X, Z: X @ Z.T * np.nan)(X)
+
+
+def kinked(X, Z, scale=1.0):
+    return anp.exp(-anp.sqrt(anp.sum((X[:, None, :] - Z[None, :, :]) ** 2, axis=2)) / scale)
+
+
+def test_a_function_without_a_gradient_at_distance_zero_is_named():
+    with pytest.raises(ValueError, match=r"gradient is not finite where x = x'"):
+        EVGPRegressor(kernel=kinked, n_inducing=5, random_state=0).fit(X, Y[:, 0])
+
+
+class Callable:
+    def __call__(self, X, Z, scale=1.0):
+        return smooth(X, Z, scale)
+
+
+def test_warm_starts_know_callable_objects_again():
+    m = EVGPRegressor(kernel=Callable(), n_inducing=8, warm_start=True, random_state=0).fit(X, Y[:, 0])
+    expected = m.kernel_.theta
+    np.testing.assert_allclose(m.set_params(max_iter=0).fit(X, Y[:, 0]).kernel_.theta, expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("bounds", [3.0, {"scale": 3.0}, (1.0, 2.0, 3.0)])
+def test_bounds_of_a_function_are_pairs(bounds):
+    with pytest.raises(ValueError, match="values_bounds"):
+        EVGPRegressor(kernel=FunctionKernel(Callable().__call__, values_bounds=bounds)).fit(X, Y[:, 0])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
@@ -199,3 +199,41 @@ def test_nothing_moves_without_iterations_even_if_the_noise_explains_everything(
     model.fit(X, np.random.RandomState(1).randn(200))
     assert model.kernel_.k2.length_scale == pytest.approx(0.7)
     assert model.noise_variance_ == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
+    """From a low first noise alone, such fits end on a plateau on which the kernel explains every row by itself."""
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-2, 2, (60, 3))
+    y = np.sin(2 * X[:, 0]) + 0.3 * X.sum(axis=1) + 0.1 * rng.randn(60)
+    model = EVGPRegressor(random_state=0).fit(X, y)
+    fewer = EVGPRegressor(n_inducing=50, noise_variance=0.05, random_state=0).fit(X, y)
+    assert model.lower_bound_ > fewer.lower_bound_ - 1.0
+    assert 1e-3 < model.noise_variance_ < 0.1
+
+
+def test_a_kernel_that_explains_less_than_noise_is_tried_from_other_starts():
+    rng = np.random.RandomState(0)
+    X = np.sort(rng.uniform(-2, 2, (60, 1)), axis=0)
+    y = np.sin(2 * X[:, 0]) + 0.3 * X[:, 0] + 0.1 * rng.randn(60)
+    model = EVGPRegressor(kernel=ExpSineSquared(), n_inducing=60, random_state=0).fit(X, y)
+    assert model.lower_bound_ > -0.5 * 60 * (np.log(2 * np.pi * np.mean(y**2)) + 1.0)
+
+
+def test_a_warm_start_that_leads_nowhere_is_left():
+    cold = model(n_inducing=12).fit(1e3 * X, Y)
+    warm = model(n_inducing=12, warm_start=True).fit(X, Y).fit(1e3 * X, Y)
+    assert warm.lower_bound_ > cold.lower_bound_ - 0.02 * abs(cold.lower_bound_)
+
+
+def test_given_points_win_over_those_of_a_warm_start():
+    m = model(warm_start=True, max_iter=0, inducing_init=X[:5]).fit(X, Y)
+    m.set_params(inducing_init=X[5:10]).fit(X, Y)
+    np.testing.assert_allclose(m.inducing_points_, X[5:10], atol=1e-12)
+
+
+def test_alike_rows_teach_nothing_and_nobody_is_told_to_raise_n_inducing():
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        EVGPRegressor(random_state=0).fit(np.ones((80, 2)), RNG.randn(80))

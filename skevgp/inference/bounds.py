@@ -17,6 +17,7 @@ from typing import Any, Literal
 import autograd.numpy as anp
 import numpy as np
 
+from .blocks import LinearStatistics
 from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from .statistics import SufficientStatistics
 
@@ -253,6 +254,19 @@ class BoundAtOptimum:
         """Gradients (o,) in log s² and log σ²."""
         from_mean = 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
         return self._log_signal + from_mean, self._log_noise + 0.5 * residuals.squares / self.noise
+
+
+def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: CoefficientPrior) -> float:
+    """The bound without a Gaussian process, all that the features leave over being noise; summed over outputs."""
+    noise = np.maximum(sums.RR / sums.n_rows, np.finfo(float).tiny)
+    if prior.scale.shape[1] == 0:
+        return float(-0.5 * sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)).sum())
+    o, p = prior.scale.shape
+    nothing = SufficientStatistics(
+        sums.n_rows, np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0
+    )
+    bound = BoundAtOptimum(nothing, np.ones(o), noise, prior)
+    return bound.value(bound.residuals())
 
 
 def _diagonal_gap(

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from .adam import adam
+from .bounds import features_alone_bound
 from .elbo import ElboObjective
 from .inducing import Placement
 from .linalg import NotPositiveDefiniteError
@@ -28,7 +29,10 @@ _NOTHING_LEARNED = 0.99
 # y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
-_OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0))
+_OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0), (1.0, 1e3))
+# With about as many inducing points as rows, a low first noise may lead to a plateau on which the kernel explains every
+# row by itself: such fits, which cost little, start from a noise so many times higher too.
+_INTERPOLATES, _MUCH_NOISE = 1.5, 1e3
 # Relative size of the rounding errors in a bound on all rows.
 _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
@@ -118,6 +122,7 @@ def learn(
     placement: Placement,
     rng: np.random.RandomState,
     report: Report | None = None,
+    cold: ParameterTable | None = None,
 ) -> Learned:
     """Maximise the bound from the table's starts, then from others; the best is kept.
 
@@ -135,22 +140,31 @@ def learn(
         Draws the mini-batches and the other starts.
     report : callable, default=None
         report(iteration, minus the bound), once per iteration.
+    cold : ParameterTable, default=None
+        If the table starts where another fit ended: the start without it, for when that leads nowhere.
 
     Returns
     -------
     learned : Learned
     """
     best = _learn_once(model, table, rows, options, rng, report)
+    if cold is not None and not best.interrupted and options.max_iter > 0:
+        alone = features_alone_bound(best.statistics[0], model.prior)
+        if _stuck(best.values["noise"], best.bound, rows.scatter(), alone):
+            best = _better(best, _learn_once(model, cold, rows, options, rng, report))
     for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
         if best.interrupted:
             break
         other = _learn_once(model, _other_start(model, table, rows, placement, rng), rows, options, rng, report)
-        if other.bound > best.bound:
-            best = other
-        elif other.interrupted:
-            best = replace(best, interrupted=True, message=other.message)
+        best = _better(best, other)
     advice = [best.message, _far_from_prior(model, rows), _nothing_learned(best, table, rows, options)]
     return replace(best, message=" ".join(part for part in advice if part))
+
+
+def _better(best: Learned, other: Learned) -> Learned:
+    if other.bound > best.bound:
+        return other
+    return replace(best, interrupted=True, message=other.message) if other.interrupted else best
 
 
 def _far_from_prior(model: SparseModel, rows: Rows) -> str:
@@ -274,7 +288,13 @@ def _by_adam(
             x, (bound, posterior, statistics) = other, solution
     message = _message(minimum, options)
     fell = not reached >= first - max(options.tol, _ROUNDING * abs(first))
-    if not minimum.interrupted and (fell or not minimum.converged):
+    if fell and minimum.converged:
+        message = (
+            f"Adam ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters are "
+            "kept. Raise max_iter (steps become small only towards the end) or batch_size, or lower learning_rate (now "
+            f"{options.learning_rate})."
+        )
+    elif not minimum.interrupted and not minimum.converged:
         message = (
             f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
             f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
@@ -294,7 +314,7 @@ def _by_lbfgs(
     """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""
     n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
     objective = BoundObjective(model, table, rows.blocks(model.kernel, n_inducing, options.threads))
-    minimum = _lbfgs_unless_collapsed(objective, table, rows.scatter(), options, report)
+    minimum = _lbfgs_unless_stuck(model, objective, table, rows.scatter(), options, report)
     values = table.values(minimum.x)
     statistics = model.statistics(values, objective.blocks)
     bound, posterior = model.at_optimum(values, statistics)
@@ -303,26 +323,42 @@ def _by_lbfgs(
     return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options), minimum.interrupted)
 
 
-def _lbfgs_unless_collapsed(
-    objective: BoundObjective, table: ParameterTable, scatter: np.ndarray, options: Options, report: Report | None
+def _lbfgs_unless_stuck(
+    model: SparseModel,
+    objective: BoundObjective,
+    table: ParameterTable,
+    scatter: np.ndarray,
+    options: Options,
+    report: Report | None,
 ) -> Minimum:
-    """L-BFGS from the table's start; from other starts too where the noise came to explain everything."""
+    """L-BFGS from the table's start; from other starts too where that may have ended in a bad optimum."""
+    linear = objective.blocks.linear
+    alone = features_alone_bound(linear, model.prior)
     best: Minimum | None = None
-    tol, collapsed = options.tol / objective.blocks.linear.n_rows, _COLLAPSED * scatter
-    for length_factor, noise_factor in ((1.0, 1.0), *_OTHER_STARTS):
+
+    def descend(length_factor: float, noise_factor: float) -> Minimum:
         start = table.coordinates(table.start())
         start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
         start["noise"] = start["noise"] + np.log(noise_factor)
         first = np.clip(table.flat(start), *table.bounds())
-        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, tol, report)
-        if best is None or minimum.loss < best.loss:
-            best = minimum
-        if best.interrupted or options.max_iter == 0 or not table["noise"].free.any():
+        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, options.tol / linear.n_rows, report)
+        return minimum if best is None or minimum.loss < best.loss else replace(best, interrupted=minimum.interrupted)
+
+    best = descend(1.0, 1.0)
+    if options.max_iter == 0 or not table["noise"].free.any():
+        return best
+    if _INTERPOLATES * table["inducing_points"].start.shape[1] >= linear.n_rows and not best.interrupted:
+        best = descend(1.0, _MUCH_NOISE)
+    for factors in _OTHER_STARTS:
+        if best.interrupted or not _stuck(table.values(best.x)["noise"], -best.loss * linear.n_rows, scatter, alone):
             break
-        if not (table.values(best.x)["noise"] > collapsed).any():
-            break
-    assert best is not None
+        best = descend(*factors)
     return best
+
+
+def _stuck(noise: np.ndarray, bound: float, scatter: np.ndarray, alone: float) -> bool:
+    """Whether noise came to explain everything, or the kernel explains less than nothing would."""
+    return bool((noise > _COLLAPSED * scatter).any()) or bound < alone
 
 
 def _message(minimum: Minimum, options: Options) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass, replace
 from threading import Event
 from typing import Any, Literal
@@ -21,7 +21,7 @@ from .posterior import Posterior
 from .rows import Rows
 from .start import FIRST_NOISE, Starts, mean_variance, spread_of, starting_table
 from .statistics import Kernel
-from .threads import BlockMap, single_threaded_libraries
+from .threads import BlockMap, thread_pool
 
 Sharing = Literal["all", "kernel", "none"]
 
@@ -41,11 +41,16 @@ def _side_by_side(one: Callable[..., Learned], jobs: list[Any], n_threads: int, 
     if n_threads < 2:
         return [one(*job) for job in jobs]
     futures: list[Future[Learned]] = []
-    with ThreadPoolExecutor(n_threads) as pool:
+    with thread_pool(n_threads) as pool:
         try:
             for job in jobs:
                 futures.append(pool.submit(one, *job))
-            wait(futures)
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+            if any(future.exception() for future in done):
+                # The error is the result: nobody waits for the others.
+                stop.set()
+                pool.shutdown(wait=False, cancel_futures=True)
+                next(future for future in futures if future in done and future.exception()).result()
         except KeyboardInterrupt:
             stop.set()
             futures += [pool.submit(one, *job) for job in jobs[len(futures) :]]
@@ -135,27 +140,31 @@ class FittedOutputs:
         # The kernel starts alike in all models and without regard to the points, which may depend on it.
         alone = table_of(slice(0, 1), np.empty((1, 0, len(spread))))
         hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
-        with single_threaded_libraries():
-            points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
-            first = starts.hyperparameters.value
-            variance = 1.0 if first is None else mean_variance(kernel, first, points)
-        tables = []
+        points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
+        first = starts.hyperparameters.value
+        variance = 1.0 if first is None else mean_variance(kernel, first, points)
+        tables, colds = [], []
         for index, (outputs, model) in enumerate(models):
-            table = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0), variance)
+            table = cold = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0), variance)
             if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
                 values = previous._values_in(frame, rows, index)
                 if previous.learned[index].model.kernel != kernel:
                     # Of another function: its inducing points and noise may serve.
                     values.pop("hyperparameters", None)
                     values.pop("signal", None)
+                if isinstance(placement.method, np.ndarray):
+                    values.pop("inducing_points", None)
                 table = table.started_at(values)
             tables.append(table)
+            colds.append(None if table is cold else cold)
         seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
         threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
         options = replace(options, threads=threads)
         at_once = min(n_threads, len(models))
 
-        def one(outputs: slice, model: SparseModel, table: ParameterTable, seed: int) -> Learned:
+        def one(
+            outputs: slice, model: SparseModel, table: ParameterTable, cold: ParameterTable | None, seed: int
+        ) -> Learned:
             inner = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
 
             def report(iteration: int, loss: float) -> None:
@@ -165,15 +174,14 @@ class FittedOutputs:
                     inner(iteration, loss)
 
             own = rows.outputs(outputs, 1.0 / at_once)
-            learned = learn(model, table, own, options, placement, np.random.RandomState(seed), report)
+            learned = learn(model, table, own, options, placement, np.random.RandomState(seed), report, cold)
             if learned.interrupted:
                 stop.set()
             return learned
 
-        jobs = [(*model, table, seed) for model, table, seed in zip(models, tables, seeds, strict=True)]
+        jobs = [(*model, *start, seed) for model, *start, seed in zip(models, tables, colds, seeds, strict=True)]
         try:
-            with single_threaded_libraries():
-                learned = _side_by_side(one, jobs, at_once, stop)
+            learned = _side_by_side(one, jobs, at_once, stop)
         finally:
             threads.close()
         return cls(frame, sharing, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))

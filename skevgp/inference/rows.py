@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from itertools import pairwise
 from typing import Any, Protocol
 
 import numpy as np
@@ -119,11 +120,13 @@ class Rows:
         """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""
         size = min(size, len(self))
         make = MakeBlock(kernel, self.to_internal, self.columns)
-        shard = max(_SHUFFLED_ROWS // size, 1) * size
-        starts = np.arange(0, len(self), shard) if len(self) > shard else np.zeros(1, dtype=int)
+        # Parts of nearly equal length, none of them shorter than a batch.
+        ends = np.linspace(0, len(self), max(len(self) // max(_SHUFFLED_ROWS, size), 1) + 1).astype(int)
+        parts = list(pairwise(ends))
         while True:
-            for first in rng.permutation(starts) if len(starts) > 1 else starts:
-                order = first + rng.permutation(min(shard, len(self) - first))
+            for part in rng.permutation(len(parts)) if len(parts) > 1 else (0,):
+                first, last = parts[part]
+                order = first + rng.permutation(last - first)
                 for begin in range(0, len(order) - size + 1, size):
                     yield Batch(make(self.source.take(order[begin : begin + size])))
 

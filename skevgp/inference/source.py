@@ -44,7 +44,7 @@ class Source(Protocol):
         """The sum of function(piece) over pieces of the rows, by ``+``; ``function`` can be pickled."""
 
     def take(self, rows: np.ndarray) -> RawRows:
-        """Some rows, by ascending index."""
+        """Some rows, by index."""
 
     def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""

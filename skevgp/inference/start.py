@@ -152,7 +152,7 @@ def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: 
     ------
     ValueError
         If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, has another diagonal than
-        k̃(x, x), or cannot be differentiated.
+        k̃(x, x), or cannot be differentiated where x = x'.
     """
     at = kernel.at(np.log(hyperparameters), inducing_points)
     K = at.matrix()
@@ -173,7 +173,11 @@ def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: 
     difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
     if not difference <= 1e-6 * np.diagonal(K).max():
         raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
-    at.finish_pullback(at.start_pullback(), np.zeros_like(K))
+    if not all(np.isfinite(gradient).all() for gradient in at.finish_pullback(at.start_pullback(), np.eye(len(K)))):
+        raise ValueError(
+            "kernel: its gradient is not finite where x = x'. A function of the distance needs a squared distance that "
+            "is not quite 0 there: anp.sqrt(squares + 1e-12)."
+        )
     return variance
 
 
@@ -192,6 +196,8 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     -------
     alike : ndarray of shape (o,)
     """
+    if not (rows.inputs.variance > _SMALLEST_UNIT**2).any():
+        return np.zeros(len(rows.scatter()), dtype=bool)
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
     inputs, residuals = some.inputs / spread_of(rows.inputs), some.targets
     if len(inputs) < 2:

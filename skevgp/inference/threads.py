@@ -10,33 +10,48 @@ from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
-from threadpoolctl import threadpool_limits
+from threadpoolctl import ThreadpoolController, threadpool_limits
 
 Part = TypeVar("Part")
 Total = TypeVar("Total")
 
-_lock, _users, _limits = Lock(), 0, None
+_lock, _users, _originals = Lock(), 0, list[tuple[Any, int]]()
 
 
 @contextmanager
 def single_threaded_libraries() -> Iterator[None]:
     """Hold BLAS and OpenMP to one thread: results then do not depend on how many there could be.
 
-    The limit is the process's. Of several fits at once the first sets it and the last lifts it.
+    The limit on BLAS is the process's: of several fits at once the first sets it and the last lifts it. That on OpenMP
+    is each thread's own.
     """
-    global _users, _limits
-    with _lock:
-        if _users == 0:
-            _limits = threadpool_limits(1)
-        _users += 1
-    try:
-        yield
-    finally:
+    global _users
+    with threadpool_limits(1, user_api="openmp"):
         with _lock:
-            _users -= 1
-            if _users == 0 and _limits is not None:
-                _limits.restore_original_limits()
-                _limits = None
+            if _users == 0:
+                for library in ThreadpoolController().select(user_api="blas").lib_controllers:
+                    _originals.append((library, library.num_threads))
+                    _set_threads(library, 1)
+            _users += 1
+        try:
+            yield
+        finally:
+            with _lock:
+                _users -= 1
+                if _users == 0:
+                    while _originals:
+                        _set_threads(*_originals.pop())
+
+
+def _set_threads(library: Any, number: int) -> None:
+    # From threadpoolctl 3.6 on the first thread that sets a limit is the only one that can, while it lives; a fit may
+    # run in any thread, and the lock above keeps several from fighting.
+    getattr(library, "_real_set_num_threads", library.set_num_threads)(number)
+
+
+def thread_pool(n_threads: int) -> ThreadPoolExecutor:
+    """Threads in which BLAS and OpenMP are held to one thread."""
+    return ThreadPoolExecutor(n_threads, initializer=threadpool_limits, initargs=(1,))
 
 
 def add(first: Any, second: Any) -> Any:
@@ -64,7 +79,7 @@ class BlockMap:
 
     def __init__(self, n_threads: int = 1):
         self._n_threads = n_threads
-        self._pool = ThreadPoolExecutor(n_threads) if n_threads > 1 else None
+        self._pool = thread_pool(n_threads) if n_threads > 1 else None
 
     def __call__(self, function: Callable[[Part], Total], parts: Iterable[Part]) -> Iterator[Total]:
         if self._pool is None:
