@@ -1,8 +1,8 @@
 """One evaluation of the bound and its gradient against the dense products that it cannot do without.
 
 The floor is four products over all rows, `L_inv @ U`, `V @ V.T`, `G @ V` and `L_inv.T @ (G @ V)`, in NumPy in the same
-process. Evaluation and floor take turns; medians are compared. Both use one core, or both use all: skevgp in threads of
-its own, the floor in those of BLAS.
+process. Evaluation and floor take turns in rounds; medians are compared. Both use one core, or both use all: skevgp in
+threads of its own, the floor in those of BLAS.
 
     python benchmarks/evaluation_cost.py          # the sizes of the data sets, and sweeps over rows and points
     python benchmarks/evaluation_cost.py --quick  # a few small sizes
@@ -91,20 +91,27 @@ def products(n: int, m: int) -> Callable[[], object]:
 
 
 def measure(n: int, m: int, d: int, n_outputs: int, cores: int, repeats: int) -> np.ndarray:
-    """Medians (first row) and fastest of the evaluation and the floor, in milliseconds, taken in turns."""
-    floor, seconds = products(n, m), np.empty((repeats + 2, 2))
+    """Medians (first row) and fastest of the evaluation and the floor, in milliseconds.
+
+    They take turns in four rounds of several, with a pause between: BLAS's threads wait for more work for a while after
+    a product, and would take the cores from the evaluation's.
+    """
+    floor, per_round = products(n, m), -(-repeats // 4)
+    seconds: tuple[list[float], list[float]] = ([], [])
     with evaluation(n, m, d, n_outputs, cores) as evaluate:
-        for i in range(len(seconds)):
-            with single_threaded_libraries():
-                begin = time.perf_counter()
-                evaluate()
-                seconds[i, 0] = time.perf_counter() - begin
-            with threadpool_limits(cores):
-                begin = time.perf_counter()
-                floor()
-                seconds[i, 1] = time.perf_counter() - begin
-    # The first two of each warm up caches and threads.
-    return 1e3 * np.array([np.median(seconds[2:], axis=0), seconds.min(axis=0)])
+        for _ in range(4):
+            for own, run, limited in (
+                (seconds[0], evaluate, single_threaded_libraries()),
+                (seconds[1], floor, threadpool_limits(cores)),
+            ):
+                time.sleep(0.2)
+                with limited:
+                    run()
+                    for _ in range(per_round):
+                        begin = time.perf_counter()
+                        run()
+                        own.append(time.perf_counter() - begin)
+    return 1e3 * np.array([np.median(seconds, axis=1), np.min(seconds, axis=1)])
 
 
 def _first(rows: list[dict[str, str]], sweep: str) -> dict[str, str]:

@@ -150,7 +150,8 @@ def learn(
     best = _learn_once(model, table, rows, options, rng, report)
     if cold is not None and not best.interrupted and options.max_iter > 0:
         alone = features_alone_bound(best.statistics[0], model.prior)
-        if _stuck(best.values["noise"], best.bound, rows.scatter(), alone):
+        bound = np.inf if best.message else best.bound
+        if _stuck(best.values["noise"], bound, rows.scatter(), alone):
             best = _better(best, _learn_once(model, cold, rows, options, rng, report))
     for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
         if best.interrupted:
@@ -350,7 +351,9 @@ def _lbfgs_unless_stuck(
     if _INTERPOLATES * table["inducing_points"].start.shape[1] >= linear.n_rows and not best.interrupted:
         best = descend(1.0, _MUCH_NOISE)
     for factors in _OTHER_STARTS:
-        if best.interrupted or not _stuck(table.values(best.x)["noise"], -best.loss * linear.n_rows, scatter, alone):
+        # A fit that has not ended yet may still be below.
+        bound = -best.loss * linear.n_rows if best.converged else np.inf
+        if best.interrupted or not _stuck(table.values(best.x)["noise"], bound, scatter, alone):
             break
         best = descend(*factors)
     return best
