@@ -258,7 +258,7 @@ class BoundAtOptimum:
 
 def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: CoefficientPrior) -> float:
     """The bound without a Gaussian process, all that the features leave over being noise; summed over outputs."""
-    noise = np.maximum(sums.RR / sums.n_rows, np.finfo(float).tiny)
+    noise = np.maximum(sums.RR / sums.n_rows, 1e-20)  # of targets that they explain to the last digit
     if prior.scale.shape[1] == 0:
         return float(-0.5 * sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)).sum())
     o, p = prior.scale.shape
