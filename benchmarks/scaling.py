@@ -156,13 +156,15 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
             continue
         n, seconds, memory = np.array(of).T
         left.loglog(n, seconds, marker + "-", color=colour, label=engine)
-        right.semilogx(n, memory, marker + "-", color=colour, label=engine)
+        right.semilogx(
+            n, memory, marker + "-", color=colour, label=engine + (": the client" if "Dask" in engine else "")
+        )
     data = sorted({(float(r["n_rows"]), float(r["data_mb"])) for r in rows})
     right.semilogx(*np.array(data).T, ":", color="0.4", label="the data themselves (not counted)")
     right.axhline(300, color="0.4", linewidth=0.8)
-    right.annotate("300 MB", (data[0][0], 300), (0, 3), textcoords="offset points", color="0.4")
+    right.annotate("300 MB", (data[0][0], 300), (0, -11), textcoords="offset points", color="0.4")
     left.set(xlabel="rows", ylabel="seconds", title="One evaluation of bound and gradient")
-    right.set(xlabel="rows", ylabel="MB", title="Peak memory of the fit above the data", ylim=(0, None))
+    right.set(xlabel="rows", ylabel="MB", title="Peak memory of the fit above the data", ylim=(0, 320))
     left.legend(frameon=False)
     right.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.88))
     figure.suptitle(f"{N_COLUMNS} columns, {N_INDUCING} inducing points", fontsize=10)
