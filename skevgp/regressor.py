@@ -359,7 +359,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        check_is_fitted(self)
+        if not hasattr(self, "_posterior"):
+            check_is_fitted(self)
         if is_dask(X):
             if return_cov:
                 raise ValueError("return_cov needs all rows at once: not for Dask arrays.")

@@ -87,7 +87,8 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
         H : ndarray of shape (n_samples, n_features_out)
             h(x) of each row.
         """
-        check_is_fitted(self)
+        if not hasattr(self, "n_features_in_"):
+            check_is_fitted(self)
         rows: np.ndarray = X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[assignment]
         return np.hstack([rows, self._gravity_columns(rows)])
 

@@ -62,7 +62,7 @@ class Posterior:
     mean: tuple[np.ndarray, ...]
     root: tuple[np.ndarray, ...]
 
-    @property
+    @cached_property
     def rows_at_once(self) -> int:
         """How many rows to predict at once, so that memory stays small and products are large."""
         stacked = sum(len(mean) for mean in self.mean)
