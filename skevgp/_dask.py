@@ -26,7 +26,7 @@ _MAP_SAMPLE = 10_000
 
 def is_dask(values: Any) -> bool:
     """Whether it is a Dask collection; does not import Dask."""
-    return type(values).__module__.partition(".")[0] == "dask" or hasattr(values, "__dask_graph__")
+    return hasattr(values, "__dask_graph__")
 
 
 def _dask() -> Any:
@@ -153,9 +153,8 @@ def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:
     shared = delayed(function, traverse=False)
     sums = [delayed(_partition_sum)(partition, shared) for partition in partitions]
     while len(sums) > 1:
-        sums = [
-            delayed(_added)(sums[first : first + _SUMMED_AT_ONCE]) for first in range(0, len(sums), _SUMMED_AT_ONCE)
-        ]
+        groups = (sums[first : first + _SUMMED_AT_ONCE] for first in range(0, len(sums), _SUMMED_AT_ONCE))
+        sums = [delayed(ordered_sum)(group) for group in groups]
     return sums[0].compute()
 
 
@@ -211,10 +210,6 @@ def _blocks(partition: LocalSource, make: Callable[[RawRows], Block], n_inducing
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:
     with single_threaded_libraries():
         return partition.sum(function)
-
-
-def _added(parts: list[Any]) -> Any:
-    return ordered_sum(parts)
 
 
 def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -33,14 +33,11 @@ class MappedRows:
         self.feature_map, self.kernel_map = feature_map, kernel_map
         self._mapped: tuple[np.ndarray, np.ndarray] | None = None
         self._lock = Lock()
+        self._widths: tuple[int, int] | None = None
         first = self._through_maps(slice(0, MAP_ROWS))
-        self._widths = first[0].shape[1], first[1].shape[1]
-        made = (self._widths[0] if kernel_map is not None else 0) + self._widths[1]
+        made = (first[0].shape[1] if kernel_map is not None else 0) + first[1].shape[1]
         if made and 8 * made * len(X) <= MAPPED_BYTES:
             self._mapped = first if len(X) <= MAP_ROWS else self._through_maps(slice(0, len(X)))
-
-    def __len__(self) -> int:
-        return len(self.X)
 
     def __call__(self, rows: slice | np.ndarray) -> RawRows:
         if self._mapped is not None:
@@ -55,7 +52,15 @@ class MappedRows:
         """The kernel's inputs and the features of rows."""
         X = np.asarray(self.X[rows], dtype=np.float64)
         given = X if self.given is self.X else _safe_indexing(self.given, rows)
-        return map_rows(given, X, self.feature_map, self.kernel_map)
+        mapped = map_rows(given, X, self.feature_map, self.kernel_map)
+        widths = mapped[0].shape[1], mapped[1].shape[1]
+        if self._widths not in (None, widths):
+            raise ValueError(
+                "kernel_map and feature_map must return the same number of columns for all rows; they returned "
+                f"{self._widths} and {widths}."
+            )
+        self._widths = widths
+        return mapped
 
     def __getstate__(self) -> dict[str, Any]:
         return {**vars(self), "_lock": None}

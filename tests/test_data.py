@@ -7,7 +7,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 import pandas as pd
 import pytest
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 from threadpoolctl import threadpool_info
 
 from skevgp import EVGPRegressor
@@ -49,6 +49,13 @@ def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver
     rtol, atol = {"lbfgs": (1e-6, 0.0), "adam": (0.0, 1e-4)}[solver]
     np.testing.assert_allclose(pieces.predict(X_NEW), expected.predict(X_NEW), rtol=rtol, atol=atol)
     assert pieces.lower_bound_ == pytest.approx(expected.lower_bound_, rel=1e-4 if atol else 1e-8)
+
+
+def test_a_map_whose_width_changes_from_piece_to_piece_is_named(in_pieces, monkeypatch):
+    monkeypatch.setattr("skevgp._data.MAP_ROWS", 70)
+    widening = FunctionTransformer(lambda rows: np.ones((len(rows), 1 if len(rows) == 70 else 2)))
+    with pytest.raises(ValueError, match=r"same number of columns for all rows; they returned \(2, 1\) and \(2, 2\)"):
+        model(feature_map=widening, kernel_map=None).fit(X, Y)
 
 
 def test_pieces_in_threads_have_the_same_bits(in_pieces):

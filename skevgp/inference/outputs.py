@@ -19,7 +19,7 @@ from .optimize import Report
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
-from .start import FIRST_NOISE, Starts, mean_variance, spread_of, starting_table
+from .start import FIRST_NOISE, Starts, checked_variance, spread_of, starting_table
 from .statistics import Kernel
 from .threads import BlockMap, thread_pool
 
@@ -142,7 +142,7 @@ class FittedOutputs:
         hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
         points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
         first = starts.hyperparameters.value
-        variance = 1.0 if first is None else mean_variance(kernel, first, points)
+        variance = 1.0 if first is None else checked_variance(kernel, first, points)
         tables, colds = [], []
         for index, (outputs, model) in enumerate(models):
             table = cold = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0), variance)

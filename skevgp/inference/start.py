@@ -55,15 +55,17 @@ class Starts:
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (p, o), lᵀl (o,) and HᵀH of l = y - target_mean - H coefᵀ."""
+    """Rows -> Hᵀl (p, o) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH too, if asked for."""
 
     target_mean: np.ndarray
     coef: np.ndarray
+    with_products: bool = False
 
-    def __call__(self, raw: RawRows) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
         left_over = raw.targets - self.target_mean - raw.features @ self.coef.T
         H = raw.features
-        return H.T @ left_over, np.einsum("no,no->o", left_over, left_over), H.T @ H
+        sums = H.T @ left_over, np.einsum("no,no->o", left_over, left_over)
+        return (*sums, H.T @ H) if self.with_products else sums
 
 
 def features_alone(
@@ -91,7 +93,7 @@ def features_alone(
         Root mean square of what they leave over.
     """
     w = np.zeros(scale.shape)
-    HL, squares, HH = source.sum(_LeftOver(target_mean, mean))
+    HL, squares, HH = source.sum(_LeftOver(target_mean, mean, with_products=True))
     moving = [o for o in range(len(scale)) if squares[o] > 0.0 and scale[o].any()]
     share = 1e-12
     for _ in range(2 if moving else 0):
@@ -106,7 +108,7 @@ def features_alone(
             for o in moving:
                 if roots[o] is not None:
                     w[o] += cho_solve((roots[o], True), scale[o] * HL[:, o] - noise[o] * w[o])
-            HL, squares, _ = source.sum(_LeftOver(target_mean, mean + scale * w))
+            HL, squares = source.sum(_LeftOver(target_mean, mean + scale * w))
     return w, np.sqrt(squares / source.n_rows)
 
 
@@ -133,7 +135,7 @@ def spread_of(inputs: Moments) -> np.ndarray:
     return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
 
 
-def mean_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
+def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
     """The mean of k̃(x, x) over the first inducing points; on the way it is seen whether k̃ works there.
 
     Parameters

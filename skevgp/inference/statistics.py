@@ -61,7 +61,7 @@ class SufficientStatistics:
     Attributes
     ----------
     n_rows : float
-        N. (A mini-batch is scaled to N rows.)
+        N; less than there were, once earlier rows have been forgotten in part.
     VV : ndarray of shape (m, m)
         V Vᵀ.
     VH : ndarray of shape (m, p)
@@ -91,7 +91,7 @@ class SufficientStatistics:
         return SufficientStatistics(*(getattr(self, name) + getattr(other, name) for name in self._fields()))
 
     def scaled(self, factor: float) -> SufficientStatistics:
-        """Each sum times ``factor``: a mini-batch that stands for more rows, or a past that fades."""
+        """Each sum times ``factor``: a past that fades."""
         return SufficientStatistics(*(factor * getattr(self, name) for name in self._fields()))
 
     def outputs(self, columns: slice) -> SufficientStatistics:

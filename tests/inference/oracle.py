@@ -4,7 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from skevgp.inference.blocks import LocalBlocks
-from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.bounds import LOG_2PI, CoefficientPrior
 from skevgp.inference.model import JITTER, SparseModel
 from skevgp.inference.parameters import Start
 from skevgp.inference.rows import MakeBlock, Rows
@@ -86,3 +86,49 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
     table = starting_table(spread_of(Moments.of(X)), Z, np.ones(o), Starts(*starts), np.ones(o), 1e-2, d)
     return model, rows, table
+
+
+def negative_elbo(statistics, signal, noise, prior, mean, root, log_det):
+    """The paper's loss (its eq. elbo, with C free where q is a joint Gaussian), summed over outputs.
+
+    Written in autograd.numpy: it can be traced through every argument but ``prior``, and so is the oracle of the
+    hand-written gradient in `elbo`.
+
+    Parameters
+    ----------
+    statistics : SufficientStatistics
+        Of all rows, or of a mini-batch scaled to all rows (the paper's appendix C, times N), with a leading axis of
+        length 1 (inducing points common to all outputs) or o where they depend on the inducing points.
+    signal, noise : array of shape (o,)
+        s² and σ².
+    prior : CoefficientPrior
+    mean : array of shape (o, m + p)
+        Mean of q(ω), whitened: (L⁻¹ a / s, (b - μ_β) / c - w₀).
+    root : array of shape (o, m + p, m + p)
+        Any R with covariance of q(ω) = R Rᵀ.
+    log_det : array of shape (o,)
+        log |R Rᵀ|.
+
+    Returns
+    -------
+    loss : float
+        In nats.
+    """
+    o, p = prior.scale.shape
+    m = mean.shape[1] - p
+    own = np.arange(o) if len(statistics.VV) == o else np.zeros(o, dtype=int)
+    s = anp.sqrt(signal)[:, None]
+    cross = s[:, :, None] * (statistics.VH * prior.scale[:, None, :])
+    HH = prior.scale[:, :, None] * statistics.HH * prior.scale[:, None, :]
+    VV = signal[:, None, None] * statistics.VV
+    PP = anp.concatenate(
+        [anp.concatenate([VV, cross], axis=2), anp.concatenate([anp.swapaxes(cross, 1, 2), HH], axis=2)], axis=1
+    )
+    Pr = anp.concatenate([s * statistics.VR[own, :, np.arange(o)], prior.scale * statistics.HR.T], axis=1)
+    # All of σ⁻² (eᵀe + Tr(PP R Rᵀ)) as one trace: Tr(PP (R Rᵀ + mean meanᵀ)).
+    spread = anp.concatenate([root, mean[:, :, None]], axis=2)
+    squares = anp.sum(anp.matmul(PP, spread) * spread, axis=(1, 2)) - 2.0 * anp.sum(Pr * mean, axis=1) + statistics.RR
+    data = statistics.n_rows * (LOG_2PI + anp.log(noise)) + (squares + signal * statistics.unexplained) / noise
+    shift = mean + np.hstack([np.zeros((o, m)), prior.reference])
+    divergence = anp.sum(root**2, axis=(1, 2)) + anp.sum(shift**2, axis=1) - (m + p) - log_det
+    return 0.5 * anp.sum(data + divergence)

@@ -13,7 +13,7 @@ from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.parameters import Start
 from skevgp.inference.source import Moments
-from skevgp.inference.start import Starts, mean_variance, spread_of, starting_table
+from skevgp.inference.start import Starts, checked_variance, spread_of, starting_table
 from skevgp.inference.stationary import Exponential, SquaredExponential, Stationary
 from skevgp.kernels import FunctionKernel, parse_kernel
 
@@ -292,7 +292,7 @@ def model_with(kernel, shared=True, **sizes):
     points = table["inducing_points"].start - centre
     rows = ArrayRows(rows.inputs - centre, rows.features, rows.residuals)
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
-    variance = mean_variance(covariance, first, points[0])
+    variance = checked_variance(covariance, first, points[0])
     spread = spread_of(Moments.of(rows.inputs))
     table = starting_table(spread, points, np.ones(2), starts, np.ones(2), 1e-2, covariance.n_hyperparameters, variance)
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
@@ -359,4 +359,4 @@ def test_the_value_of_a_bound_that_depends_on_the_diagonal():
 def test_kernels_that_do_not_work_on_the_points_say_why(kernel, message):
     covariance, hyperparameters = parsed(kernel)
     with pytest.raises(ValueError, match=message):
-        mean_variance(covariance, np.exp(hyperparameters), Z)
+        checked_variance(covariance, np.exp(hyperparameters), Z)
