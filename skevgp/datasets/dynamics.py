@@ -11,7 +11,8 @@ import numpy as np
 from sklearn.utils import Bunch, check_random_state
 
 from .._validation import check_integer, check_real
-from ..robots import System, get_system
+from ..robots import layout_of
+from ..robots.loading import Robot
 from .simulation import simulate
 
 RandomState = int | np.random.RandomState | None
@@ -38,7 +39,7 @@ _PAPER: Mapping[str, _Sampling] = MappingProxyType(
 
 @overload
 def make_dynamics(
-    system: str | System,
+    system: Robot,
     n_trajectories: int | None = ...,
     n_steps: int | None = ...,
     *,
@@ -50,7 +51,7 @@ def make_dynamics(
 ) -> Bunch: ...
 @overload
 def make_dynamics(
-    system: str | System,
+    system: Robot,
     n_trajectories: int | None = ...,
     n_steps: int | None = ...,
     *,
@@ -61,7 +62,7 @@ def make_dynamics(
     return_X_y: Literal[True],
 ) -> tuple[np.ndarray, np.ndarray]: ...
 def make_dynamics(
-    system: str | System,
+    system: Robot,
     n_trajectories: int | None = None,
     n_steps: int | None = None,
     *,
@@ -126,7 +127,7 @@ def make_dynamics(
     >>> pendulum.feature_names, pendulum.groups.tolist()
     (['q', 'dq/dt', 'u_q'], [0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
     """
-    robot, system = system, get_system(system)
+    robot, system = system, layout_of(system)
     if system.name not in _PAPER or len(_PAPER[system.name].state_scale) != 2 * system.n_joints:
         raise ValueError(f"No sampling scales are known for {system.name!r}; the known systems are {sorted(_PAPER)}.")
     sampling = _PAPER[system.name]
@@ -142,7 +143,7 @@ def make_dynamics(
     n_states = 2 * system.n_joints
     z0 = np.array(sampling.state_scale) * rng.uniform(-1.0, 1.0, (n_trajectories, n_states))
     inputs = sampling.input_scale * rng.standard_normal((n_trajectories, n_steps, system.n_inputs))
-    trajectories = simulate(system, z0, inputs, dt)
+    trajectories = simulate(robot, z0, inputs, dt)
 
     states = trajectories[:, :-1].reshape(-1, n_states)
     target = trajectories[:, 1:].reshape(-1, n_states)

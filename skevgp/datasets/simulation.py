@@ -6,32 +6,31 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.integrate import solve_ivp
 
-from .._optional import require
 from .._validation import as_floats, check_real
-from ..robots import System, get_system, pinocchio_model
+from ..robots import RigidBody, layout_of, load_robot
+from ..robots.loading import Robot
 
 # Measured against the stored reference: one-step errors below 1e-10 on the pendulum, cartpole and acrobot.
 _RTOL, _ATOL = 1e-11, 1e-13
 
 
-class _ForwardDynamics:
-    """Joint accelerations of many states at once, by the articulated-body algorithm."""
+class Plant:
+    """A robot as the simulator sees it: motors on the driven joints, viscous damping on all."""
 
-    def __init__(self, system: System):
-        self._pin = require("pinocchio", "Simulating a robot")
-        self._model = pinocchio_model(system)
-        self._data = self._model.createData()
-        self._damping = np.array([link.damping for link in system.links])
-        self._driven = np.array(system.driven)
+    def __init__(self, robot: Robot):
+        model = load_robot(robot)
+        self.layout = layout_of(robot)
+        self.body = RigidBody(model)
+        self._damping = np.array(model.damping)
+        self._driven = np.array(self.layout.driven)
 
-    def __call__(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+    def accelerations(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
         force = -self._damping * v
         force[:, self._driven] += u
-        aba, model, data = self._pin.aba, self._model, self._data
-        return np.array([aba(model, data, *row) for row in zip(q, v, force, strict=True)])
+        return self.body.accelerations(q, v, force)
 
 
-def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03) -> np.ndarray:
+def simulate(system: Robot, z0: ArrayLike, U: ArrayLike, dt: float = 0.03) -> np.ndarray:
     """Integrate a system's equations of motion with the input held over each step.
 
     Accelerations come from Pinocchio's articulated-body algorithm, with viscous damping subtracted from the joint
@@ -73,7 +72,8 @@ def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03
            [ 0.0965, -0.1148],
            [ 0.0923, -0.1686]])
     """
-    system = get_system(system)
+    plant = Plant(system)
+    system = plant.layout
     n, n_inputs = system.n_joints, system.n_inputs
     check_real(dt, "dt", minimum=0.0, strict=True)
     z0, U = as_floats(z0, "z0"), as_floats(U, "U")
@@ -89,12 +89,10 @@ def simulate(system: str | System, z0: ArrayLike, U: ArrayLike, dt: float = 0.03
     if not (np.isfinite(z).all() and np.isfinite(inputs).all()):
         raise ValueError("z0 and U must be finite.")
 
-    accelerations = _ForwardDynamics(system)
-
     def derivative(_t: float, flat: np.ndarray, u: np.ndarray) -> np.ndarray:
         state = flat.reshape(-1, 2 * n)
         q, v = state[:, :n], state[:, n:]
-        change = np.hstack([v, accelerations(q, v, u)]).ravel()
+        change = np.hstack([v, plant.accelerations(q, v, u)]).ravel()
         if not np.isfinite(change).all():
             raise ValueError(f"The accelerations of {system.name!r} overflow: z0 or U is too large.")
         return change

@@ -4,140 +4,45 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin, _fit_context
 from sklearn.utils._param_validation import Interval
-from sklearn.utils.metaestimators import available_if
-from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
 
-from .._validation import as_floats, is_plain
-from ..robots import System, get_system
-
-
-def _has_robot(transformer: _NewtonFeatures) -> bool:
-    if transformer.robot is None:
-        raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
-    return True
+from .._validation import as_floats
+from ..robots import GravityTerm, Layout, get_system
+from ..robots.loading import Robot
+from .robot_map import RobotMap
 
 
-class _NewtonFeatures(TransformerMixin, BaseEstimator):
+class _NewtonFeatures(RobotMap):
     """What `InertiaForce` and `InertiaForceGravity` share: h starts with x = [q, q̇, u]."""
 
-    robot: str | System | None
     dt: float
     inverse_inertia: ArrayLike
-    outputs: Sequence[int | str] | None
     known_scale: float
     unknown_scale: float
     free_scale: float
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
-        "robot": "no_validation",
+        **RobotMap._parameter_constraints,
         "dt": [Interval(Real, 0, None, closed="neither")],
         "inverse_inertia": [Real, "array-like"],
-        "outputs": ["array-like", None],
         "known_scale": [Interval(Real, 0, None, closed="left")],
         "unknown_scale": [Interval(Real, 0, None, closed="left")],
         "free_scale": [Interval(Real, 0, None, closed="left")],
     }
 
-    @_fit_context(prefer_skip_nested_validation=True)
-    def fit(self, X: ArrayLike, y: object = None) -> Self:
-        """Check the columns.
+    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Euler's rule (the paper's eq. inertia_prior), and what a subclass knows of gravity.
 
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Rows [q, q̇, u]; any width without a robot.
-        y : None
-            Ignored.
-
-        Returns
-        -------
-        self : object
-
-        Raises
-        ------
-        ValueError
-            If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
+        Known entries (1 and Δt) have ``known_scale``; unknown ones (Δt/J and gravity's factors) the user's guess and
+        ``unknown_scale``; the rest mean 0 and ``free_scale``.
         """
-        validate_data(self, X, dtype=np.float64)
-        if self.robot is not None:
-            system = get_system(self.robot)
-            width = 2 * system.n_joints + system.n_inputs
-            if self.n_features_in_ != width:
-                raise ValueError(
-                    f"X has {self.n_features_in_} columns, but {type(self).__name__}({system.name!r}) needs {width}: "
-                    f"{system.state_names + system.input_names}."
-                )
-        return self
-
-    def transform(self, X: ArrayLike) -> np.ndarray:
-        """Evaluate the features.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-
-        Returns
-        -------
-        H : ndarray of shape (n_samples, n_features_out)
-            h(x) of each row.
-        """
-        if not hasattr(self, "n_features_in_"):
-            check_is_fitted(self)
-        rows: np.ndarray = X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[assignment]
-        return np.hstack([rows, self._gravity_columns(rows)])
-
-    def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
-        """Names of the features.
-
-        Parameters
-        ----------
-        input_features : array-like of str, default=None
-            Names of the columns of X; by default those seen in `fit`, or the robot's own.
-
-        Returns
-        -------
-        names : ndarray of str of shape (n_features_out,)
-        """
-        check_is_fitted(self)
-        if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
-            system = get_system(self.robot)
-            input_features = np.array(system.state_names + system.input_names, dtype=object)
-        names = _check_feature_names_in(self, input_features)
-        return np.concatenate([names, self._gravity_names(names)]).astype(object)
-
-    @available_if(_has_robot)
-    def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Prior mean and standard deviation of the weights β.
-
-        Known entries (1 and Δt) have the mean that Euler's rule gives and ``known_scale``; unknown ones (Δt/J and
-        gravity's factors) the user's guess and ``unknown_scale``; the rest mean 0 and ``free_scale``.
-
-        Parameters
-        ----------
-        n_outputs : int
-            How many states are predicted: all 2 * n_joints, or as many as ``outputs`` says.
-
-        Returns
-        -------
-        mean, scale : ndarray of shape (n_outputs, n_features_out)
-
-        Raises
-        ------
-        ValueError
-            If ``n_outputs`` does not fit the robot, or a parameter is out of its range.
-        """
-        assert self.robot is not None
-        self._validate_params()
-        system = get_system(self.robot)
-        n, n_inputs = system.n_joints, system.n_inputs
+        n, n_inputs = layout.n_joints, layout.n_inputs
         joints = np.arange(n)
-        width = 2 * n + n_inputs + self._n_gravity(system)
+        width = layout.n_columns + self._n_gravity(layout)
         mean = np.zeros((2 * n, width))
         scale = np.full((2 * n, width), self.free_scale, dtype=float)
         for row, column, value in (
@@ -146,28 +51,17 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
             (n + joints, n + joints, 1.0),  # q̇' = q̇ + ...
         ):
             mean[row, column], scale[row, column] = value, self.known_scale
-        driven, inputs = n + np.array(system.driven), 2 * n + np.arange(n_inputs)
+        driven, inputs = n + np.array(layout.driven), 2 * n + np.arange(n_inputs)
         mean[driven, inputs] = self.dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
         scale[driven, inputs] = self.unknown_scale
-        self._gravity_prior(system, mean, scale)
-        rows = self._predicted_states(system)
-        if n_outputs != len(rows):
-            names = [system.state_names[row] for row in rows]
-            raise ValueError(
-                f"y has {n_outputs} columns, but {type(self).__name__}({system.name!r}) predicts {len(rows)} states: "
-                f"{names}. Say which ones y holds with outputs=[...]; the names are {system.state_names}."
-            )
-        return mean[rows], scale[rows]
+        self._gravity_prior(layout, mean, scale)
+        return mean, scale
 
-    def _predicted_states(self, system: System) -> list[int]:
-        names = system.state_names
-        if self.outputs is None:
-            return list(range(len(names)))
-        rows = [names.index(output) if output in names else output for output in self.outputs]
-        for row in rows:
-            if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
-                raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
-        return [int(row) for row in rows]
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        return np.hstack([X, self._gravity_columns(X)])
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        return [*columns, *self._gravity_names(columns)]
 
     def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
         return np.empty((len(X), 0))
@@ -175,10 +69,10 @@ class _NewtonFeatures(TransformerMixin, BaseEstimator):
     def _gravity_names(self, names: np.ndarray) -> list[str]:
         return []
 
-    def _n_gravity(self, system: System) -> int:
+    def _n_gravity(self, layout: Layout) -> int:
         return 0
 
-    def _gravity_prior(self, system: System, mean: np.ndarray, scale: np.ndarray) -> None:
+    def _gravity_prior(self, layout: Layout, mean: np.ndarray, scale: np.ndarray) -> None:
         """Fill in the gravity columns; none here."""
 
 
@@ -246,7 +140,7 @@ class InertiaForce(_NewtonFeatures):
 
     def __init__(
         self,
-        robot: str | System | None = None,
+        robot: Robot | None = None,
         *,
         dt: float = 0.03,
         inverse_inertia: ArrayLike = 0.0,
@@ -323,7 +217,7 @@ class InertiaForceGravity(_NewtonFeatures):
 
     def __init__(
         self,
-        robot: str | System | None = None,
+        robot: Robot | None = None,
         *,
         dt: float = 0.03,
         inverse_inertia: ArrayLike = 0.0,
@@ -349,7 +243,11 @@ class InertiaForceGravity(_NewtonFeatures):
 
     def _angles(self) -> list[tuple[int, ...]] | None:
         """Columns that add up to each angle; None without a robot: every column is one."""
-        return None if self.robot is None else [term.angle for term in get_system(self.robot).gravity]
+        return None if self.robot is None else [term.angle for term in self._terms()]
+
+    def _terms(self) -> tuple[GravityTerm, ...]:
+        assert self.robot is not None
+        return get_system(self.robot).gravity
 
     def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
         angles = self._angles()
@@ -363,16 +261,17 @@ class InertiaForceGravity(_NewtonFeatures):
             angles = [(column,) for column in range(len(names))]
         return [f"sin({' + '.join(names[list(columns)])})" for columns in angles]
 
-    def _n_gravity(self, system: System) -> int:
-        return len(system.gravity)
+    def _n_gravity(self, layout: Layout) -> int:
+        return len(self._terms())
 
-    def _gravity_prior(self, system: System, mean: np.ndarray, scale: np.ndarray) -> None:
-        n, n_terms = system.n_joints, len(system.gravity)
+    def _gravity_prior(self, layout: Layout, mean: np.ndarray, scale: np.ndarray) -> None:
+        terms = self._terms()
+        n, n_terms = layout.n_joints, len(terms)
         gain = as_floats(self.gravity_gain, "gravity_gain")
         if gain.shape != (n, n_terms) or not np.isfinite(gain).all():
             gain = np.broadcast_to(_per_term(gain, n_terms, "gravity_gain"), (n, n_terms))
-        first = 2 * system.n_joints + system.n_inputs
-        for index, term in enumerate(system.gravity):
+        first = layout.n_columns
+        for index, term in enumerate(terms):
             for joint in term.acts_on:
                 mean[n + joint, first + index] = 0.0 - self.dt * gain[joint, index]
                 scale[n + joint, first + index] = self.unknown_scale

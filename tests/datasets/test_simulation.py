@@ -6,8 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 from skevgp.datasets import simulate
-from skevgp.datasets.simulation import _ForwardDynamics
-from skevgp.robots import SYSTEMS, get_system
+from skevgp.datasets.simulation import Plant
+from skevgp.robots import SYSTEMS, get_system, layout_of
 
 G = 9.81
 DT = 0.03
@@ -61,7 +61,7 @@ INPUT_SCALE = {"pendulum": 1.0, "cartpole": 100.0, "acrobot": 0.5}
 
 def random_states(name, n_states, seed):
     rng = np.random.default_rng(seed)
-    n = get_system(name).n_joints
+    n = layout_of(name).n_joints
     q, v = rng.uniform(-np.pi, np.pi, (n_states, n)), rng.uniform(-3.0, 3.0, (n_states, n))
     return q, v, INPUT_SCALE[name] * rng.standard_normal((n_states, 1))
 
@@ -82,7 +82,7 @@ def assert_accelerations(actual, expected):
 @pytest.mark.parametrize("name", CLOSED_FORM)
 def test_accelerations_equal_the_closed_form(name):
     q, v, u = random_states(name, 100, seed=0)
-    assert_accelerations(_ForwardDynamics(get_system(name))(q, v, u), CLOSED_FORM[name](q, v, u))
+    assert_accelerations(Plant(name).accelerations(q, v, u), CLOSED_FORM[name](q, v, u))
 
 
 @pytest.mark.parametrize("name", CLOSED_FORM)
@@ -105,7 +105,7 @@ def test_one_step_equals_the_stored_reference(name):
 @pytest.mark.parametrize("name", STORED)
 def test_accelerations_equal_the_stored_reference(name):
     stored = np.load(REFERENCE / f"{name}.npz")
-    accelerations = _ForwardDynamics(get_system(name))(stored["acc_q"], stored["acc_v"], stored["acc_u"])
+    accelerations = Plant(name).accelerations(stored["acc_q"], stored["acc_v"], stored["acc_u"])
     assert_accelerations(accelerations, stored["acc_qddot"])
 
 
@@ -188,7 +188,7 @@ ZEROS = np.zeros((3, 1))
         (("pendulum", [0.0, 0.0], ZEROS, -0.03), "dt must be .*-0.03"),
         (("pendulum", [0.0, 0.0], ZEROS, np.nan), "dt must be .*nan"),
         (("pendulum", [0.0, 0.0], ZEROS, np.inf), "dt must be .*inf"),
-        (("robot", [0.0, 0.0], ZEROS), r"Unknown system 'robot'.*\['acrobot', 'cartpole', 'pendulum'\]"),
+        (("robot", [0.0, 0.0], ZEROS), r"Unknown robot 'robot'.*'acrobot', 'cartpole', 'iiwa14', 'pendulum'"),
         (("pendulm", [0.0, 0.0], ZEROS), "Did you mean 'pendulum'"),
     ],
 )
@@ -198,7 +198,7 @@ def test_bad_arguments_are_named(arguments, message):
 
 
 def test_an_integration_that_gives_up_is_an_error():
-    with np.errstate(all="ignore"), pytest.raises(ValueError, match="integration of 'pendulum' failed in step 0"):
+    with np.errstate(all="ignore"), pytest.raises(ValueError, match="'pendulum' overflow|failed in step 0"):
         simulate("pendulum", [1.0, 1e200], ZEROS)
 
 

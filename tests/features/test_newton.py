@@ -177,14 +177,17 @@ def test_a_parameter_that_is_no_number_is_named(parameter):
 
 @pytest.mark.parametrize("feature_map", MAPS)
 def test_a_wrong_number_of_columns_is_an_error(feature_map):
-    message = rf"X has 4 columns, but {feature_map.__name__}\('pendulum'\) needs 3: \['q', 'dq/dt', 'u_q'\]"
+    message = rf"X has 4 columns, but {feature_map.__name__} of the robot 'pendulum' needs 3: \['q', 'dq/dt', 'u_q'\]"
     with pytest.raises(ValueError, match=message):
         feature_map("pendulum").fit(np.zeros((2, 4)))
 
 
 @pytest.mark.parametrize("feature_map", MAPS)
 def test_an_unknown_robot_lists_the_known_ones(feature_map):
-    with pytest.raises(ValueError, match=r"Unknown system 'carpole'.*\['acrobot', 'cartpole', 'pendulum'\]"):
+    with pytest.raises(
+        ValueError,
+        match=r"Unknown robot 'carpole'.*'acrobot', 'cartpole', 'iiwa14', 'pendulum'.*Did you mean 'cartpole'",
+    ):
         feature_map("carpole").fit(np.zeros((2, 5)))
 
 

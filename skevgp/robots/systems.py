@@ -1,6 +1,6 @@
-"""The named systems as tables, and their Pinocchio models.
+"""The named systems as tables.
 
-A system is data: what its joints, masses and actuators are. Feature maps and data sets both read it here, so that a
+A system is data: what its joints, masses and motors are. Feature maps and data sets both read it here, so that a
 new system is one entry of ``SYSTEMS``. Everything is in SI units, angles in radians, gravity 9.81 m/s² along -z.
 """
 
@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from difflib import get_close_matches
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
-
-from ._optional import require
 
 GRAVITY = 9.81
 
@@ -40,8 +38,14 @@ class Link:
         Moments of inertia (xx, yy, zz) about the centre of mass, kg m².
     xyz : tuple of 3 floats
         Origin of the joint in its parent's frame, m.
+    rpy : tuple of 3 floats
+        Orientation of the joint in its parent's frame: roll, pitch and yaw about that frame's fixed axes, rad.
+    armature : float
+        Reflected inertia of the motor's rotor (squared gear ratio times rotor inertia), kg m² or kg.
     damping : float
         Viscous damping, N m s/rad or N s/m.
+    effort : float
+        The largest torque or force of the motor, N m or N; 0 for a joint without a motor.
     """
 
     name: str
@@ -51,7 +55,10 @@ class Link:
     com: Vector3 = (0.0, 0.0, 0.0)
     inertia: Vector3 = (0.0, 0.0, 0.0)
     xyz: Vector3 = (0.0, 0.0, 0.0)
+    rpy: Vector3 = (0.0, 0.0, 0.0)
+    armature: float = 0.0
     damping: float = 0.0
+    effort: float = np.inf
 
 
 @dataclass(frozen=True)
@@ -71,6 +78,52 @@ class GravityTerm:
 
 
 @dataclass(frozen=True)
+class Layout:
+    """What the columns of a robot's states and inputs are: x = [q, q̇, u].
+
+    Attributes
+    ----------
+    name : str
+        Of the robot.
+    position_names : tuple of str
+        One per joint.
+    driven : tuple of int
+        The joints that an input drives, in the order of the inputs.
+    revolute : tuple of bool
+        Whether each joint's position is an angle.
+    """
+
+    name: str
+    position_names: tuple[str, ...]
+    driven: tuple[int, ...]
+    revolute: tuple[bool, ...]
+
+    @property
+    def n_joints(self) -> int:
+        return len(self.position_names)
+
+    @property
+    def n_inputs(self) -> int:
+        return len(self.driven)
+
+    @property
+    def n_columns(self) -> int:
+        return 2 * self.n_joints + self.n_inputs
+
+    @property
+    def state_names(self) -> list[str]:
+        return [*self.position_names, *(f"d{name}/dt" for name in self.position_names)]
+
+    @property
+    def input_names(self) -> list[str]:
+        return [f"u_{self.position_names[joint]}" for joint in self.driven]
+
+    @property
+    def column_names(self) -> list[str]:
+        return self.state_names + self.input_names
+
+
+@dataclass(frozen=True)
 class System:
     """A robot with a fixed base: a chain of joints, some of them driven.
 
@@ -79,38 +132,48 @@ class System:
     name : str
     links : tuple of Link
         From the base to the tip.
-    driven : tuple of int
-        The joints that an input drives, in the order of the inputs.
     gravity : tuple of GravityTerm
+        Of a planar system; empty if gravity's pull is not a sine.
     """
 
     name: str
     links: tuple[Link, ...]
-    driven: tuple[int, ...]
-    gravity: tuple[GravityTerm, ...]
+    gravity: tuple[GravityTerm, ...] = ()
 
     @property
-    def n_joints(self) -> int:
-        return len(self.links)
-
-    @property
-    def n_inputs(self) -> int:
-        return len(self.driven)
-
-    @property
-    def position_names(self) -> list[str]:
-        return [link.name for link in self.links]
-
-    @property
-    def state_names(self) -> list[str]:
-        return self.position_names + [f"d{name}/dt" for name in self.position_names]
-
-    @property
-    def input_names(self) -> list[str]:
-        return [f"u_{self.links[joint].name}" for joint in self.driven]
+    def layout(self) -> Layout:
+        """What the columns of its states and inputs are."""
+        return Layout(
+            self.name,
+            position_names=tuple(link.name for link in self.links),
+            driven=tuple(joint for joint, link in enumerate(self.links) if link.effort > 0.0),
+            revolute=tuple(link.kind == "revolute" for link in self.links),
+        )
 
 
-_Y = (0.0, 1.0, 0.0)
+_Y, _Z = (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)
+_UP = np.pi / 2
+
+# fmt: off
+_IIWA14 = (
+    # mass, com, inertia about it, origin in the parent, rpy, gear ratio, rotor inertia, effort
+    (5.76, (0, -0.03, 0.12), (0.033, 0.0333, 0.0123), (0, 0, 0.1575), (0, 0, 0), 160, 1.321e-4, 320.0),
+    (6.35, (0.0003, 0.059, 0.042), (0.0305, 0.011, 0.0304), (0, 0, 0.2025), (_UP, 0, np.pi), 160, 1.321e-4, 320.0),
+    (3.5, (0, 0.03, 0.13), (0.025, 0.0238, 0.0076), (0, 0.2045, 0), (_UP, 0, np.pi), 160, 1.321e-4, 176.0),
+    (3.5, (0, 0.067, 0.034), (0.017, 0.006, 0.0164), (0, 0, 0.2155), (_UP, 0, 0), 160, 1.321e-4, 176.0),
+    (3.5, (0.0001, 0.021, 0.076), (0.01, 0.0087, 0.00449), (0, 0.1845, 0), (-_UP, np.pi, 0), 100, 1.321e-4, 110.0),
+    (1.8, (0, 0.0006, 0.0004), (0.0049, 0.0047, 0.0036), (0, 0, 0.2155), (_UP, 0, 0), 160, 4.54e-5, 40.0),
+    (1.2, (0, 0, 0.02), (0.001, 0.001, 0.001), (0, 0.081, 0), (-_UP, np.pi, 0), 160, 4.54e-5, 40.0),
+)
+# fmt: on
+
+
+def _iiwa14_links() -> tuple[Link, ...]:
+    return tuple(
+        Link(f"q{number}", "revolute", _Z, mass, com, inertia, xyz, rpy, armature=gear**2 * rotor, effort=effort)
+        for number, (mass, com, inertia, xyz, rpy, gear, rotor, effort) in enumerate(_IIWA14, start=1)
+    )
+
 
 SYSTEMS: Mapping[str, System] = MappingProxyType(
     {
@@ -119,36 +182,43 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
             System(
                 "pendulum",
                 links=(Link("q", "revolute", _Y, mass=1.0, com=(0.0, 0.0, -0.5), damping=0.1),),
-                driven=(0,),
                 gravity=(GravityTerm(angle=(0,), acts_on=(0,)),),
             ),
             System(
                 "cartpole",
                 links=(
                     Link("x", "prismatic", (1.0, 0.0, 0.0), mass=10.0),
-                    Link("theta", "revolute", (0.0, -1.0, 0.0), mass=1.0, com=(0.0, 0.0, -0.5)),
+                    Link("theta", "revolute", (0.0, -1.0, 0.0), mass=1.0, com=(0.0, 0.0, -0.5), effort=0.0),
                 ),
-                driven=(0,),
                 gravity=(GravityTerm(angle=(1,), acts_on=(1,)),),
             ),
             System(
                 "acrobot",
                 links=(
-                    Link("q1", "revolute", _Y, 1.0, com=(0.0, 0.0, -0.5), inertia=(0.0, 0.083, 0.0), damping=0.1),
+                    Link(
+                        "q1",
+                        "revolute",
+                        _Y,
+                        mass=1.0,
+                        com=(0.0, 0.0, -0.5),
+                        inertia=(0.0, 0.083, 0.0),
+                        damping=0.1,
+                        effort=0.0,
+                    ),
                     Link(
                         "q2",
                         "revolute",
                         _Y,
-                        1.0,
+                        mass=1.0,
                         com=(0.0, 0.0, -1.0),
                         inertia=(0.0, 0.33, 0.0),
                         xyz=(0.0, 0.0, -1.0),
                         damping=0.1,
                     ),
                 ),
-                driven=(1,),
                 gravity=(GravityTerm(angle=(0,), acts_on=(0,)), GravityTerm(angle=(0, 1), acts_on=(0, 1))),
             ),
+            System("iiwa14", links=_iiwa14_links()),
         )
     }
 )
@@ -183,37 +253,3 @@ def get_system(name: str | System) -> System:
         close = get_close_matches(name, SYSTEMS, n=1)
         hint = f" Did you mean {close[0]!r}?" if close else ""
         raise ValueError(f"Unknown system {name!r}; the known ones are {sorted(SYSTEMS)}.{hint}") from None
-
-
-def pinocchio_model(system: str | System) -> Any:
-    """Build the rigid-body model of a system.
-
-    Viscous damping is not part of it: `skevgp.datasets.simulate` subtracts it from the joint forces.
-
-    Parameters
-    ----------
-    system : str or System
-
-    Returns
-    -------
-    model : pinocchio.Model
-        With ``nq == nv == system.n_joints``.
-
-    Raises
-    ------
-    ImportError
-        If Pinocchio is not installed.
-    """
-    system = get_system(system)
-    pin = require("pinocchio", "Rigid-body dynamics")
-    joints = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
-    model = pin.Model()
-    model.name = system.name
-    model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
-    parent = 0
-    for link in system.links:
-        placement = pin.SE3(np.eye(3), np.array(link.xyz))
-        parent = model.addJoint(parent, joints[link.kind](np.array(link.axis)), placement, link.name)
-        body = pin.Inertia(link.mass, np.array(link.com), np.diag(link.inertia))
-        model.appendBodyToJoint(parent, body, pin.SE3.Identity())
-    return model

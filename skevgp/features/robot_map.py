@@ -1,0 +1,160 @@
+"""What all feature maps of a robot share: they take rows x = [q, q̇, u] and know which states y holds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, TransformerMixin, _fit_context
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
+
+from .._validation import is_plain
+from ..robots import Layout, layout_of
+from ..robots.loading import Robot
+
+
+def _has_robot(transformer: RobotMap) -> bool:
+    if transformer.robot is None:
+        raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
+    return True
+
+
+class RobotMap(TransformerMixin, BaseEstimator):
+    """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
+
+    What a subclass says: `_features` and `_names` of them, `_prepare` what it needs of the robot, and `_prior`.
+    """
+
+    robot: Robot | None
+    outputs: Sequence[int | str] | None
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "robot": "no_validation",
+        "outputs": ["array-like", None],
+    }
+
+    @_fit_context(prefer_skip_nested_validation=True)
+    def fit(self, X: ArrayLike, y: object = None) -> Self:
+        """Load the robot and check the columns.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Rows [q, q̇, u]; any width without a robot.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ImportError
+            If the robot needs Pinocchio and it is not installed; the message gives the pip command.
+        ValueError, TypeError
+            If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
+        """
+        validate_data(self, X, dtype=np.float64)
+        if self.robot is not None:
+            self._layout = layout_of(self.robot)
+            if self.n_features_in_ != self._layout.n_columns:
+                raise ValueError(
+                    f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
+                    f"{self._layout.name!r} needs {self._layout.n_columns}: {self._layout.column_names}."
+                )
+        self._prepare()
+        return self
+
+    def transform(self, X: ArrayLike) -> np.ndarray:
+        """Evaluate the features.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+
+        Returns
+        -------
+        H : ndarray of shape (n_samples, n_features_out)
+            h(x) of each row.
+        """
+        if not hasattr(self, "n_features_in_"):
+            check_is_fitted(self)
+        rows: np.ndarray = X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[assignment]
+        return self._features(rows)
+
+    def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
+        """Names of the features.
+
+        Parameters
+        ----------
+        input_features : array-like of str, default=None
+            Names of the columns of X; by default those seen in `fit`, or the robot's own.
+
+        Returns
+        -------
+        names : ndarray of str of shape (n_features_out,)
+        """
+        check_is_fitted(self)
+        if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
+            input_features = np.array(self._layout.column_names, dtype=object)
+        return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
+
+    @available_if(_has_robot)
+    def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """Prior mean and standard deviation of the weights β.
+
+        Parameters
+        ----------
+        n_outputs : int
+            How many states are predicted: all 2 * n_joints, or as many as ``outputs`` says.
+
+        Returns
+        -------
+        mean, scale : ndarray of shape (n_outputs, n_features_out)
+
+        Raises
+        ------
+        ValueError
+            If ``n_outputs`` does not fit the robot, or a parameter is out of its range.
+        """
+        self._validate_params()
+        layout = self._layout if hasattr(self, "_layout") else layout_of(self.robot)
+        mean, scale = self._prior(layout)
+        rows = self._predicted_states(layout)
+        if n_outputs != len(rows):
+            names = [layout.state_names[row] for row in rows]
+            raise ValueError(
+                f"y has {n_outputs} columns, but {type(self).__name__} of the robot {layout.name!r} predicts "
+                f"{len(rows)} states: {names}. Say which ones y holds with outputs=[...]; the names are "
+                f"{layout.state_names}."
+            )
+        return mean[rows], scale[rows]
+
+    def _predicted_states(self, layout: Layout) -> list[int]:
+        names = layout.state_names
+        if self.outputs is None:
+            return list(range(len(names)))
+        rows = [names.index(output) if output in names else output for output in self.outputs]
+        for row in rows:
+            if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
+                raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
+        return [int(row) for row in rows]
+
+    def _prepare(self) -> None:
+        """What `fit` keeps of the robot besides its layout; nothing here."""
+
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        """h(x) of rows (n, n_features_in_); without a robot too."""
+        raise NotImplementedError
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        """Names of the features, given those of the columns of X."""
+        raise NotImplementedError
+
+    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and scale (2 * n_joints, n_features_out) of the weights for all states; before `fit` too."""
+        raise NotImplementedError

@@ -1,0 +1,273 @@
+"""Any robot as a Pinocchio model with one position and one velocity per joint."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import sys
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from difflib import get_close_matches
+from functools import lru_cache
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from .._optional import require
+from .systems import GRAVITY, SYSTEMS, Layout, System
+
+_COLLECTION = "example-robot-data"
+_MOVABLE = ("revolute", "continuous", "prismatic")
+
+Robot = Any  # str | os.PathLike | System | pinocchio.Model: Pinocchio may not be there to name its type
+
+
+def load_robot(robot: Robot) -> Any:
+    """A robot as a Pinocchio model.
+
+    Parameters
+    ----------
+    robot : str, path-like, System or pinocchio.Model
+        One of `list_robots`: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"iiwa14"``) or,
+        with the package example-robot-data, one of its robots (``"panda"``, ``"ur5"``, ...); the path of a URDF file;
+        or a model, which is checked.
+
+    Returns
+    -------
+    model : pinocchio.Model
+        With a fixed base and ``nq == nv``: a continuous joint's position is its angle (where Pinocchio's own loader
+        has its cosine and sine). Reflected rotor inertias are in ``armature``. `skevgp.datasets.simulate` also heeds
+        viscous ``damping`` and ``effortLimit``; a joint of limit 0 has no motor, unless all limits are 0 (then none is
+        known).
+
+    Raises
+    ------
+    ImportError
+        If Pinocchio is not installed; the message gives the pip command.
+    ValueError
+        If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
+        joint moves, or a joint is neither revolute nor prismatic (a floating base, a ball joint).
+    TypeError
+        If ``robot`` is none of the above.
+
+    See Also
+    --------
+    list_robots : The names.
+
+    Examples
+    --------
+    >>> from skevgp.datasets import load_robot
+    >>> model = load_robot("acrobot")
+    >>> model.nq, list(model.names)[1:]
+    (2, ['q1', 'q2'])
+    >>> model.damping
+    array([0.1, 0.1])
+    """
+    if isinstance(robot, System):
+        return _model_of_table(robot)
+    if isinstance(robot, str) and robot in SYSTEMS:
+        return _model_of_table(SYSTEMS[robot])
+    if isinstance(robot, (str, os.PathLike)):
+        path = _path_of(robot)
+        pin = require("pinocchio", "Loading a robot")
+        try:
+            model = pin.buildModelFromUrdf(str(path))
+        except (ValueError, RuntimeError) as error:
+            raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
+        return _plain(model, f"The robot {str(robot)!r}")
+    pin = require("pinocchio", "Loading a robot")
+    if isinstance(robot, pin.Model):
+        return _plain(robot, f"The model {robot.name!r}")
+    raise TypeError(
+        f"A robot must be a name (skevgp.datasets.list_robots() gives them), the path of a URDF file, a System or a "
+        f"pinocchio.Model; got {robot!r}."
+    )
+
+
+def list_robots() -> list[str]:
+    """The names that `load_robot` knows.
+
+    Returns
+    -------
+    names : list of str
+        The systems of the paper, then what the installed package example-robot-data brings, sorted: each URDF file
+        with a joint that moves, by its name without ``_robot``; where two have the same, with its folder in front.
+
+    Examples
+    --------
+    >>> from skevgp.datasets import list_robots
+    >>> names = list_robots()
+    >>> names[:4]
+    ['acrobot', 'cartpole', 'iiwa14', 'pendulum']
+    >>> "panda" in names
+    True
+    """
+    return sorted(SYSTEMS) + sorted(_collection())
+
+
+def layout_of(robot: Robot) -> Layout:
+    """What the columns of a robot's states and inputs are.
+
+    Parameters
+    ----------
+    robot : str, path-like, System or pinocchio.Model
+        As in `load_robot`; the named systems need no Pinocchio.
+
+    Returns
+    -------
+    layout : Layout
+    """
+    if isinstance(robot, System):
+        return robot.layout
+    if isinstance(robot, str) and robot in SYSTEMS:
+        return SYSTEMS[robot].layout
+    model = load_robot(robot)
+    motors = np.flatnonzero(model.upperEffortLimit > 0.0)
+    return Layout(
+        model.name,
+        position_names=tuple(model.names)[1:],
+        driven=tuple(motors.tolist()) if len(motors) else tuple(range(model.nv)),
+        revolute=tuple(bool(np.any(axis[3:])) for axis in joint_axes(model)),
+    )
+
+
+def joint_axes(model: Any) -> np.ndarray:
+    """Motion of each joint per unit of its velocity, in its own frame.
+
+    Parameters
+    ----------
+    model : pinocchio.Model
+        With one velocity per joint.
+
+    Returns
+    -------
+    axes : ndarray of shape (n_joints, 6)
+        Linear (of a prismatic joint), then angular part (of a revolute one).
+    """
+    return np.array([_axis(joint) for joint in list(model.joints)[1:]])
+
+
+def _axis(joint: Any) -> np.ndarray:
+    data = joint.createData()
+    joint.calc(data, np.eye(joint.nq)[0])  # neutral, also for an angle kept as (cos, sin)
+    return np.asarray(data.S, dtype=float).reshape(-1)
+
+
+def _path_of(robot: str | os.PathLike[str]) -> Path:
+    """The URDF file of a name or path."""
+    names = _collection()
+    if isinstance(robot, str) and robot in names:
+        return names[robot]
+    path = Path(robot)
+    if path.is_file():
+        return path
+    if not isinstance(robot, str) or path.suffix or len(path.parts) > 1:
+        raise ValueError(f"There is no file {str(path)!r}; the names that are known are {list_robots()}.")
+    close = get_close_matches(robot, list_robots(), n=3)
+    hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+    more = "" if names else f" (pip install {_COLLECTION} brings more)"
+    raise ValueError(f"Unknown robot {robot!r}; the known ones are {list_robots()}{more}, and any URDF path.{hint}")
+
+
+@lru_cache(maxsize=1)
+def _collection() -> Mapping[str, Path]:
+    """Name -> URDF file of the robots in example-robot-data, if it is installed."""
+    folder = _collection_folder()
+    files = [] if folder is None else [path for path in sorted(folder.rglob("*.urdf")) if _has_moving_joint(path)]
+    stems = [path.stem.removesuffix("_robot") for path in files]
+    return MappingProxyType(
+        {
+            stem if stems.count(stem) == 1 else f"{path.relative_to(folder).parts[0]}/{stem}": path  # type: ignore[arg-type]
+            for stem, path in zip(stems, files, strict=True)
+        }
+    )
+
+
+def _collection_folder() -> Path | None:
+    # Version 6 of the package has files and no Python module; conda's has no list of files.
+    candidates = [Path(sys.prefix) / "share" / _COLLECTION / "robots"]
+    try:
+        files = importlib.metadata.files(_COLLECTION) or []
+    except importlib.metadata.PackageNotFoundError:
+        files = []
+    for file in files:
+        if "robots" in file.parts[:-1]:
+            parts = Path(str(file.locate())).parts
+            candidates.insert(0, Path(*parts[: parts.index("robots", parts.index(_COLLECTION)) + 1]))
+            break
+    return next((folder for folder in candidates if folder.is_dir()), None)
+
+
+def _has_moving_joint(path: Path) -> bool:
+    try:
+        root = ElementTree.parse(path).getroot()
+    except ElementTree.ParseError:
+        return False
+    return bool(root.get("name")) and any(joint.get("type") in _MOVABLE for joint in root.iter("joint"))
+
+
+def _model_of_table(system: System) -> Any:
+    pin = require("pinocchio", "Rigid-body dynamics")
+    kinds = {"revolute": pin.JointModelRevoluteUnaligned, "prismatic": pin.JointModelPrismaticUnaligned}
+    model = pin.Model()
+    model.name = system.name
+    model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
+    parent = 0
+    for link in system.links:
+        placement = pin.SE3(pin.rpy.rpyToMatrix(*link.rpy), np.array(link.xyz))
+        parent = model.addJoint(parent, kinds[link.kind](np.array(link.axis)), placement, link.name)
+        model.appendBodyToJoint(
+            parent, pin.Inertia(link.mass, np.array(link.com), np.diag(link.inertia)), pin.SE3.Identity()
+        )
+    model.armature = np.array([link.armature for link in system.links])
+    model.damping = np.array([link.damping for link in system.links])
+    set_effort_limits(model, np.array([link.effort for link in system.links]))
+    return model
+
+
+def set_effort_limits(model: Any, limits: np.ndarray) -> None:
+    """Symmetric limits of a model's torques and forces.
+
+    Parameters
+    ----------
+    model : pinocchio.Model
+    limits : ndarray of shape (n_joints,)
+    """
+    model.upperEffortLimit, model.lowerEffortLimit = limits, -limits
+
+
+def _plain(model: Any, called: str) -> Any:
+    """The model itself, or a copy whose continuous joints have an angle each; an error if that is not possible."""
+    joints = list(model.joints)[1:]
+    if not joints:
+        raise ValueError(f"{called} has no joint that moves.")
+    for joint, name in zip(joints, list(model.names)[1:], strict=True):
+        if joint.nv != 1 or joint.nq > 2 or np.count_nonzero(_axis(joint).reshape(2, 3).any(axis=1)) != 1:
+            raise ValueError(
+                f"{called} has the joint {name!r} of the type {joint.shortname()}; joints must be revolute or "
+                "prismatic and the base fixed (load the URDF without a free-flyer)."
+            )
+    return model if model.nq == model.nv else _with_angles(model)
+
+
+def _with_angles(model: Any) -> Any:
+    """A copy without joints whose position is kept as (cos, sin)."""
+    pin = require("pinocchio", "Loading a robot")
+    copy = pin.Model()
+    copy.name, copy.gravity = model.name, model.gravity
+    bounded = np.ones(model.nv, dtype=bool)
+    for index in range(1, model.njoints):
+        joint = model.joints[index]
+        if joint.nq == 2:
+            bounded[joint.idx_v] = False
+            joint = pin.JointModelRevoluteUnaligned(_axis(joint)[3:])
+        copy.addJoint(model.parents[index], joint, model.jointPlacements[index], model.names[index])
+        copy.inertias[index] = model.inertias[index]
+    for name in ("armature", "damping", "friction", "upperEffortLimit", "lowerEffortLimit", "velocityLimit"):
+        setattr(copy, name, getattr(model, name))
+    positions = np.array([joint.idx_q for joint in list(model.joints)[1:]])
+    copy.lowerPositionLimit = np.where(bounded, model.lowerPositionLimit[positions], -np.inf)
+    copy.upperPositionLimit = np.where(bounded, model.upperPositionLimit[positions], np.inf)
+    return copy
