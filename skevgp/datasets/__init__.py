@@ -1,8 +1,8 @@
 """Data sets: simulated robots (with Pinocchio) and toys."""
 
-from ..robots import list_robots, load_robot
+from ..robots import list_robots, load_robot, perturb_robot
 from .dynamics import make_dynamics
 from .simulation import simulate
 from .toy import make_toy
 
-__all__ = ["list_robots", "load_robot", "make_dynamics", "make_toy", "simulate"]
+__all__ = ["list_robots", "load_robot", "make_dynamics", "make_toy", "perturb_robot", "simulate"]

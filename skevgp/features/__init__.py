@@ -1,5 +1,7 @@
 """Explicit features h(x): scikit-learn transformers that say what physics knows."""
 
+from .angles import AngleEncoder
 from .newton import InertiaForce, InertiaForceGravity
+from .nominal import NominalDynamics
 
-__all__ = ["InertiaForce", "InertiaForceGravity"]
+__all__ = ["AngleEncoder", "InertiaForce", "InertiaForceGravity", "NominalDynamics"]

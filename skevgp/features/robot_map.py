@@ -1,4 +1,4 @@
-"""What all feature maps of a robot share: they take rows x = [q, q̇, u] and know which states y holds."""
+"""What all maps of a robot share: they take rows x = [q, q̇, u]; those of features know which states y holds."""
 
 from __future__ import annotations
 
@@ -16,25 +16,15 @@ from ..robots import Layout, layout_of
 from ..robots.loading import Robot
 
 
-def _has_robot(transformer: RobotMap) -> bool:
-    if transformer.robot is None:
-        raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
-    return True
-
-
-class RobotMap(TransformerMixin, BaseEstimator):
+class RobotTransformer(TransformerMixin, BaseEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
-    What a subclass says: `_features` and `_names` of them, `_prepare` what it needs of the robot, and `_prior`.
+    What a subclass says: `_features` and `_names` of them, and `_prepare` what it needs of the robot.
     """
 
     robot: Robot | None
-    outputs: Sequence[int | str] | None
 
-    _parameter_constraints: ClassVar[dict[str, Any]] = {
-        "robot": "no_validation",
-        "outputs": ["array-like", None],
-    }
+    _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
     @_fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: object = None) -> Self:
@@ -103,6 +93,34 @@ class RobotMap(TransformerMixin, BaseEstimator):
             input_features = np.array(self._layout.column_names, dtype=object)
         return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
 
+    def _prepare(self) -> None:
+        """What `fit` keeps of the robot besides its layout; nothing here."""
+
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        """h(x) of rows (n, n_features_in_); without a robot too."""
+        raise NotImplementedError
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        """Names of the features, given those of the columns of X."""
+        raise NotImplementedError
+
+
+def _has_robot(transformer: RobotMap) -> bool:
+    if transformer.robot is None:
+        raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
+    return True
+
+
+class RobotMap(RobotTransformer):
+    """Features of a robot that know which states y holds, and a prior of their weights: `_prior`."""
+
+    outputs: Sequence[int | str] | None
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **RobotTransformer._parameter_constraints,
+        "outputs": ["array-like", None],
+    }
+
     @available_if(_has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
         """Prior mean and standard deviation of the weights β.
@@ -143,17 +161,6 @@ class RobotMap(TransformerMixin, BaseEstimator):
             if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
                 raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
         return [int(row) for row in rows]
-
-    def _prepare(self) -> None:
-        """What `fit` keeps of the robot besides its layout; nothing here."""
-
-    def _features(self, X: np.ndarray) -> np.ndarray:
-        """h(x) of rows (n, n_features_in_); without a robot too."""
-        raise NotImplementedError
-
-    def _names(self, columns: np.ndarray) -> list[str]:
-        """Names of the features, given those of the columns of X."""
-        raise NotImplementedError
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Mean and scale (2 * n_joints, n_features_out) of the weights for all states; before `fit` too."""

@@ -1,6 +1,7 @@
 """Robots: the named systems as tables, any other as a Pinocchio model, and what both say of a row x = [q, q̇, u]."""
 
 from .loading import layout_of, list_robots, load_robot
+from .perturbation import perturb_robot
 from .rigid_body import RigidBody
 from .systems import GRAVITY, SYSTEMS, GravityTerm, Layout, System, get_system
 
@@ -15,4 +16,5 @@ __all__ = [
     "layout_of",
     "list_robots",
     "load_robot",
+    "perturb_robot",
 ]

@@ -45,6 +45,25 @@ class RigidBody:
         """
         return self._over_rows("aba", q, v, force)
 
+    def accelerations_by_force(self, q: np.ndarray, force: np.ndarray) -> np.ndarray:
+        """M(q)⁻¹ τ, what joint forces add to the accelerations.
+
+        Parameters
+        ----------
+        q, force : ndarray of shape (n, n_joints)
+            Positions and joint forces τ.
+
+        Returns
+        -------
+        a : ndarray of shape (n, n_joints)
+            NaN or infinite where the mass matrix is singular.
+        """
+        if not hasattr(self, "_weightless"):
+            model = self.model.copy()
+            model.gravity.linear = np.zeros(3)
+            self._weightless = RigidBody(model, self.n_threads)
+        return self._weightless.accelerations(q, np.zeros_like(q), force)
+
     def forces(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """τ = M(q)q̈ + C(q, q̇)q̇ + g(q), by the recursive Newton-Euler algorithm.
 
@@ -72,6 +91,21 @@ class RigidBody:
         """
         still = np.zeros_like(q)
         return self.forces(q, still, still)
+
+    def mass_matrix(self, q: np.ndarray) -> np.ndarray:
+        """M(q) at one configuration, with reflected rotor inertias on its diagonal.
+
+        Parameters
+        ----------
+        q : ndarray of shape (n_joints,)
+
+        Returns
+        -------
+        mass : ndarray of shape (n_joints, n_joints)
+        """
+        each = np.eye(len(q))
+        rows = np.broadcast_to(q, each.shape)
+        return self.forces(rows, np.zeros_like(each), each) - self.gravity(rows)
 
     def _over_rows(self, algorithm: str, *rows: np.ndarray) -> np.ndarray:
         pin = require("pinocchio", "Rigid-body dynamics")

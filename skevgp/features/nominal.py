@@ -1,0 +1,187 @@
+"""What an approximate rigid-body model says of the next state."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from numbers import Real
+from typing import Any, ClassVar
+
+import numpy as np
+from sklearn.utils._param_validation import Interval
+
+from ..robots import Layout, RigidBody, load_robot
+from ..robots.loading import Robot
+from .robot_map import RobotMap
+
+_NAMES = {
+    "acceleration": "acc({})",
+    "gravity": "gravity torque({})",
+    "bias": "bias torque({})",
+    "input": "acc by u({})",
+}
+
+
+class NominalDynamics(RobotMap):
+    r"""Features from an approximate model of the robot: a URDF whose masses are wrong, without friction.
+
+    The model's equation of motion is
+
+    .. math:: M(q) \ddot q + C(q, \dot q) \dot q + D \dot q + g(q) = B u
+
+    with its viscous damping D and the inputs on the driven joints. Each term gives one column per joint. Beside
+    `InertiaForce`, as in the example, a true model and the prior mean alone predict what Euler's rule does,
+    :math:`\dot q' = \dot q + \Delta t\,\ddot q`.
+
+    Parameters
+    ----------
+    robot : str, path-like, System, pinocchio.Model or None, default=None
+        The approximate model, as in `skevgp.datasets.load_robot`. Without one X passes through and the weights get the
+        regressor's wide default prior.
+    terms : sequence of str, default=("acceleration",)
+        Which columns, in this order:
+
+        - ``"acceleration"``: :math:`\ddot q`, rad/s² or m/s²;
+        - ``"gravity"``: :math:`g(q)`, N m or N;
+        - ``"bias"``: :math:`C \dot q + g`, N m or N;
+        - ``"input"``: :math:`M^{-1} B u`, the part of the acceleration that is the input's.
+    dt : float, default=0.03
+        Length of a time step Δt, s; that of the data.
+    outputs : sequence of int or str, default=None
+        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+    known_scale : float, default=0.3
+        Prior standard deviation of the weights whose mean is Δt (of a joint's acceleration in the row of its velocity),
+        as a multiple of Δt: the relative error of the model's accelerations.
+    unknown_scale : float, default=1.0
+        Prior standard deviation of the weights of ``"gravity"`` and ``"bias"`` in the rows of velocities. They are Δt
+        times an inverse inertia; their mean is 0.
+    free_scale : float, default=1.0
+        Prior standard deviation of all other weights, as a multiple of Δt; their mean is 0, and 0 pins them there.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    InertiaForce : The other half of Euler's rule.
+    skevgp.datasets.perturb_robot : A wrong model, for experiments.
+
+    Notes
+    -----
+    Scales are multiples of Δt because an acceleration can be in the hundreds, where a weight of 1 means nothing: the
+    weights themselves are about Δt. Known ones are as wide as masses that are wrong by some 20 % make accelerations.
+
+    With ``"acceleration"`` the weights of ``"input"`` are corrections, of mean 0; without it their mean is Δt.
+
+    Effort limits are not applied: u is what acted. Dry friction is left out. Do not scale the columns of x before this
+    map; scaling belongs in the regressor's ``kernel_map``, which only the kernel sees.
+
+    Examples
+    --------
+    >>> from sklearn.pipeline import make_union
+    >>> from skevgp.features import InertiaForce, NominalDynamics
+    >>> nominal = NominalDynamics("pendulum", terms=["acceleration", "gravity"])
+    >>> nominal.fit_transform([[0.1, 0.0, 1.0]]).round(4)
+    array([[2.0413, 0.4897]])
+    >>> nominal.get_feature_names_out().tolist()
+    ['acc(q)', 'gravity torque(q)']
+    >>> nominal.coef_prior(n_outputs=2)[0]
+    array([[0.  , 0.  ],
+           [0.03, 0.  ]])
+    >>> make_union(InertiaForce("pendulum"), nominal).fit_transform([[0.1, 0.0, 1.0]]).shape
+    (1, 5)
+    """
+
+    def __init__(
+        self,
+        robot: Robot | None = None,
+        *,
+        terms: Sequence[str] = ("acceleration",),
+        dt: float = 0.03,
+        outputs: Sequence[int | str] | None = None,
+        known_scale: float = 0.3,
+        unknown_scale: float = 1.0,
+        free_scale: float = 1.0,
+    ):
+        self.robot = robot
+        self.terms = terms
+        self.dt = dt
+        self.outputs = outputs
+        self.known_scale = known_scale
+        self.unknown_scale = unknown_scale
+        self.free_scale = free_scale
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **RobotMap._parameter_constraints,
+        "terms": ["array-like"],
+        "dt": [Interval(Real, 0, None, closed="neither")],
+        "known_scale": [Interval(Real, 0, None, closed="left")],
+        "unknown_scale": [Interval(Real, 0, None, closed="left")],
+        "free_scale": [Interval(Real, 0, None, closed="left")],
+    }
+
+    def _prepare(self) -> None:
+        self._check_terms()
+        if self.robot is None:
+            return
+        model = load_robot(self.robot)
+        self._body = RigidBody(model)
+        self._damping = np.array(model.damping)
+        self._driven = np.array(self._layout.driven)
+        # A massless tip makes the mass matrix singular in nearly every configuration: say so before the data are seen.
+        self._features(np.random.RandomState(0).uniform(-1.0, 1.0, (1, self._layout.n_columns)))
+
+    def _check_terms(self) -> None:
+        terms = [term for term in self.terms if isinstance(term, str) and term in _NAMES]
+        if not terms or len(terms) < len(self.terms) or len(set(terms)) < len(terms):
+            raise ValueError(f"terms={self.terms!r} must be one or more of {list(_NAMES)}, each once.")
+
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        if self.robot is None:
+            return X.copy()
+        n = self._layout.n_joints
+        q, v = X[:, :n], X[:, n : 2 * n]
+        force = np.zeros_like(q)
+        force[:, self._driven] = X[:, 2 * n :]
+        body = self._body
+        columns = {
+            "acceleration": lambda: body.accelerations(q, v, force - self._damping * v),
+            "gravity": lambda: body.gravity(q),
+            "bias": lambda: body.forces(q, v, np.zeros_like(v)),
+            "input": lambda: body.accelerations_by_force(q, force),
+        }
+        features = np.hstack([columns[term]() for term in self.terms])
+        if not np.isfinite(features).all():
+            raise ValueError(self._why_not_finite(q[~np.isfinite(features).all(axis=1)][0]))
+        return features
+
+    def _why_not_finite(self, q: np.ndarray) -> str:
+        """An error's text, for one configuration."""
+        names, inertias = self._layout.position_names, np.diag(self._body.mass_matrix(q))
+        light = [name for name, inertia in zip(names, inertias, strict=True) if inertia == 0.0]
+        return f"The dynamics of the robot {self._layout.name!r} are not finite at q = {q.tolist()}: " + (
+            f"its joints {light} move no mass." if light else "its mass matrix is singular, or q̇ or u is too large."
+        )
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        if self.robot is None:
+            return columns.tolist()
+        return [_NAMES[term].format(name) for term in self.terms for name in columns[: self._layout.n_joints]]
+
+    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Blocks (2 * n_joints, n_joints) of the terms, side by side."""
+        self._check_terms()
+        n = layout.n_joints
+        own = np.eye(n, dtype=bool)
+        means, scales = [], []
+        for term in self.terms:
+            mean, scale = np.zeros((2 * n, n)), np.full((2 * n, n), self.free_scale * self.dt)
+            if term in ("gravity", "bias"):
+                scale[n:] = self.unknown_scale
+            elif term == "acceleration" or "acceleration" not in self.terms:
+                mean[n:][own], scale[n:][own] = self.dt, self.known_scale * self.dt
+            means.append(mean)
+            scales.append(scale)
+        return np.hstack(means), np.hstack(scales)

@@ -1,0 +1,66 @@
+"""A robot's model made wrong, as a user's model of a real robot is."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from sklearn.utils import check_random_state
+
+from .._optional import require
+from .._validation import check_real
+from .loading import Robot, load_robot
+
+
+def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.random.RandomState | None = None) -> Any:
+    """A copy of a robot's model with wrong masses, centres of mass, inertias and armatures.
+
+    Each mass, each coordinate of a centre of mass in its joint's frame, each link's inertia about its centre of mass
+    and each armature is multiplied by its own ``1 + scale * U(-1, 1)``. All moments of a link's inertia share a factor,
+    so that it stays one that a body can have. Joints, damping and limits stay.
+
+    Parameters
+    ----------
+    robot : str, path-like, System or pinocchio.Model
+        As in `load_robot`; a model is not changed.
+    scale : float, default=0.2
+        The largest relative error, in [0, 1).
+    random_state : int, RandomState instance or None, default=None
+        Draws the factors, link by link from the base on.
+
+    Returns
+    -------
+    model : pinocchio.Model
+        With the name of the original.
+
+    Raises
+    ------
+    ImportError
+        If Pinocchio is not installed; the message gives the pip command.
+    ValueError, TypeError
+        If ``scale`` is not a number in [0, 1), or the robot is not one that `load_robot` takes.
+
+    See Also
+    --------
+    skevgp.features.NominalDynamics : Features from such a model.
+
+    Examples
+    --------
+    >>> from skevgp.datasets import load_robot, perturb_robot
+    >>> wrong = perturb_robot("acrobot", scale=0.2, random_state=0)
+    >>> [round(link.mass, 3) for link in wrong.inertias[1:]]
+    [1.02, 0.975]
+    >>> [link.mass for link in load_robot("acrobot").inertias[1:]]
+    [1.0, 1.0]
+    """
+    if check_real(scale, "scale", minimum=0.0) >= 1.0:
+        raise ValueError(f"scale must be in [0, 1), so that masses stay positive; got {scale!r}.")
+    rng = check_random_state(random_state)
+    pin = require("pinocchio", "Perturbing a robot")
+    model = load_robot(robot).copy()
+    factors = 1.0 + scale * rng.uniform(-1.0, 1.0, (model.nv, 6))
+    for index, (mass, x, y, z, inertia, _) in enumerate(factors, start=1):
+        link = model.inertias[index]
+        model.inertias[index] = pin.Inertia(mass * link.mass, link.lever * [x, y, z], inertia * link.inertia)
+    model.armature = model.armature * factors[:, 5]
+    return model

@@ -1,0 +1,358 @@
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pandas as pd
+import pinocchio
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import clone
+from sklearn.exceptions import NotFittedError
+from sklearn.pipeline import FeatureUnion
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics, perturb_robot, simulate
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, NominalDynamics
+from skevgp.features.prior import resolve_coef_prior
+from skevgp.metrics import prediction_error
+from skevgp.robots import System, get_system, layout_of, load_robot
+from skevgp.robots.systems import Link
+
+ROBOTS = ["pendulum", "cartpole", "acrobot", "iiwa14", "ur5", "panda", "kinova"]
+TERMS = ("acceleration", "gravity", "bias", "input")
+DT = 0.03
+
+
+def rows(robot, n_rows=6, seed=0):
+    return np.random.default_rng(seed).uniform(-1.5, 1.5, (n_rows, layout_of(robot).n_columns))
+
+
+def parts(robot, X):
+    """Positions, velocities and the joint forces B u."""
+    layout = layout_of(robot)
+    n = layout.n_joints
+    force = np.zeros((len(X), n))
+    for column, joint in enumerate(layout.driven):
+        force[:, joint] = X[:, 2 * n + column]
+    return X[:, :n], X[:, n : 2 * n], force
+
+
+def by_pinocchio(robot, term, X):
+    model = load_robot(robot)
+    data = model.createData()
+    values = []
+    for q, v, f in zip(*parts(robot, X), strict=True):
+        if term == "acceleration":
+            values.append(pinocchio.aba(model, data, q, v, f - model.damping * v).copy())
+        elif term == "gravity":
+            values.append(pinocchio.computeGeneralizedGravity(model, data, q).copy())
+        elif term == "bias":
+            values.append(pinocchio.rnea(model, data, q, v, np.zeros_like(v)).copy())
+        else:
+            values.append(np.linalg.solve(pinocchio.crba(model, data, q), f))
+    return np.array(values)
+
+
+def union(robot, nominal):
+    return FeatureUnion([("if", InertiaForce(robot)), ("nominal", nominal)])
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("term", TERMS)
+def test_a_term_is_what_pinocchio_says_row_by_row(robot, term):
+    X = rows(robot)
+    expected = by_pinocchio(robot, term, X)
+    features = NominalDynamics(robot, terms=[term]).fit_transform(X)
+    assert_allclose(features, expected, rtol=1e-8, atol=1e-10 * np.abs(expected).max())
+
+
+def test_only_the_elbow_of_the_acrobot_is_driven():
+    still = np.array([[0.0, 0.0, 0.0, 0.0, 1.0]])
+    mass = pinocchio.crba(load_robot("acrobot"), load_robot("acrobot").createData(), np.zeros(2))
+    features = NominalDynamics("acrobot", terms=["input"]).fit_transform(still)
+    assert_allclose(features, [np.linalg.inv(mass)[:, 1]], rtol=1e-12)
+
+
+def test_the_pendulum_is_its_closed_form():
+    X = rows("pendulum")
+    q, v, u = X.T
+    features = NominalDynamics("pendulum", terms=TERMS).fit_transform(X)
+    gravity = 9.81 * 0.5 * np.sin(q)
+    acceleration = (u - 0.1 * v - gravity) / 0.25
+    assert_allclose(features, np.column_stack([acceleration, gravity, gravity, u / 0.25]), rtol=1e-11, atol=1e-12)
+
+
+def test_damping_of_the_model_is_subtracted():
+    damped, free = load_robot("iiwa14"), load_robot("iiwa14")
+    damped.damping = np.linspace(0.1, 0.7, 7)
+    X = rows("iiwa14")
+    _, v, _ = parts("iiwa14", X)
+    difference = NominalDynamics(damped).fit_transform(X) - NominalDynamics(free).fit_transform(X)
+    model, expected = load_robot("iiwa14"), []
+    for x, velocity in zip(X, v, strict=True):
+        mass = pinocchio.crba(model, model.createData(), x[:7])
+        expected.append(-np.linalg.solve(mass, damped.damping * velocity))
+    assert_allclose(difference, expected, rtol=1e-9, atol=1e-11)
+
+
+def test_reflected_inertia_of_the_model_counts():
+    light = load_robot("iiwa14")
+    light.armature = np.zeros(7)
+    X = rows("iiwa14")
+    assert (
+        np.abs(NominalDynamics(light).fit_transform(X)).max()
+        > 10 * np.abs(NominalDynamics("iiwa14").fit_transform(X)).max()
+    )
+
+
+def test_effort_limits_are_not_applied():
+    X = rows("iiwa14")
+    X[:, 14:] = 1000.0
+    assert_allclose(
+        NominalDynamics("iiwa14").fit_transform(X), by_pinocchio("iiwa14", "acceleration", X), rtol=1e-9, atol=1e-9
+    )
+
+
+def test_terms_come_in_the_order_given():
+    X = rows("acrobot")
+    both = NominalDynamics("acrobot", terms=["bias", "acceleration"]).fit(X)
+    each = [NominalDynamics("acrobot", terms=[term]).fit_transform(X) for term in ("bias", "acceleration")]
+    assert_array_equal(both.transform(X), np.hstack(each))
+    assert both.get_feature_names_out().tolist() == ["bias torque(q1)", "bias torque(q2)", "acc(q1)", "acc(q2)"]
+    assert_array_equal(
+        both.coef_prior(4)[1],
+        np.hstack([NominalDynamics("acrobot", terms=[term]).coef_prior(4)[1] for term in ("bias", "acceleration")]),
+    )
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("terms", [TERMS, ["acceleration"]])
+def test_the_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, terms):
+    X, n = rows(robot), layout_of(robot).n_joints
+    features = union(robot, NominalDynamics(robot, terms=terms))
+    H = features.fit_transform(X)
+    mean, _ = resolve_coef_prior("auto", "auto", features, X, np.ones((2 * n, H.shape[1])))
+    _, v, _ = parts(robot, X)
+    step = np.hstack([v, by_pinocchio(robot, "acceleration", X)])
+    assert_allclose(H @ mean.T, X[:, : 2 * n] + DT * step, rtol=1e-9, atol=1e-10 * np.abs(step).max())
+
+
+def test_the_prior_mean_is_what_a_short_step_does():
+    dt, X = 1e-4, rows("acrobot")
+    features = FeatureUnion([("if", InertiaForce("acrobot", dt=dt)), ("nominal", NominalDynamics("acrobot", dt=dt))])
+    H = features.fit_transform(X)
+    mean, _ = resolve_coef_prior("auto", "auto", features, X, np.ones((4, H.shape[1])))
+    after = simulate("acrobot", X[:, :4], X[:, np.newaxis, 4:], dt)[:, 1]
+    assert_allclose(H @ mean.T, after, rtol=0, atol=2e-6)
+    assert np.abs(X[:, :4] - after).max() > 1e-4
+
+
+# Rows q1', q2', dq1/dt', dq2/dt'. Known (k), torques (t), and free (.).
+@pytest.mark.parametrize(
+    ("terms", "roles"),
+    [
+        (["acceleration"], ["..", "..", "k.", ".k"]),
+        (["gravity"], ["..", "..", "tt", "tt"]),
+        (["bias"], ["..", "..", "tt", "tt"]),
+        (["input"], ["..", "..", "k.", ".k"]),
+        (["acceleration", "input"], ["....", "....", "k...", ".k.."]),
+        (["input", "acceleration"], ["....", "....", "..k.", "...k"]),
+        (["input", "gravity"], ["....", "....", "k.tt", ".ktt"]),
+    ],
+)
+def test_the_prior_knows_which_acceleration_moves_which_velocity(terms, roles):
+    features = NominalDynamics("acrobot", terms=terms, dt=0.1, known_scale=0.5, unknown_scale=7.0, free_scale=2.0)
+    mean, scale = features.coef_prior(4)
+    assert_allclose(mean, [[0.1 if role == "k" else 0.0 for role in row] for row in roles])
+    assert_allclose(scale, [[{"k": 0.05, "t": 7.0, ".": 0.2}[role] for role in row] for row in roles])
+
+
+def test_a_free_scale_of_zero_pins_the_zeros():
+    mean, scale = NominalDynamics("acrobot", terms=["acceleration", "input"], free_scale=0.0).coef_prior(4)
+    assert_array_equal(scale == 0, mean == 0)
+
+
+def test_outputs_choose_states():
+    mean, scale = NominalDynamics("acrobot", outputs=["dq2/dt"]).coef_prior(1)
+    assert_allclose(mean, [[0.0, DT]])
+    assert_allclose(scale, [[DT, 0.3 * DT]])
+    with pytest.raises(ValueError, match="y has 1 columns, but NominalDynamics of the robot 'acrobot' predicts 4"):
+        NominalDynamics("acrobot").coef_prior(1)
+
+
+def test_only_a_robot_gives_a_prior():
+    assert not hasattr(NominalDynamics(), "coef_prior")
+    assert hasattr(NominalDynamics("ur5"), "coef_prior")
+
+
+def test_without_a_robot_rows_pass_through():
+    X = np.random.default_rng(0).normal(size=(4, 3))
+    features = NominalDynamics(terms=["gravity"]).fit(X)
+    assert_array_equal(features.transform(X), X)
+    assert features.get_feature_names_out().tolist() == ["x0", "x1", "x2"]
+
+
+def test_features_are_named_after_term_and_joint():
+    names = NominalDynamics("cartpole", terms=TERMS).fit(rows("cartpole")).get_feature_names_out()
+    assert names.tolist() == [
+        "acc(x)",
+        "acc(theta)",
+        "gravity torque(x)",
+        "gravity torque(theta)",
+        "bias torque(x)",
+        "bias torque(theta)",
+        "acc by u(x)",
+        "acc by u(theta)",
+    ]
+
+
+def test_data_frames_give_names_and_keep_their_index():
+    frame = pd.DataFrame(rows("acrobot"), columns=list("abcde"), index=range(10, 16))
+    features = NominalDynamics("acrobot").set_output(transform="pandas").fit(frame)
+    transformed = features.transform(frame)
+    assert list(transformed.columns) == ["acc(a)", "acc(b)"]
+    assert list(transformed.index) == list(frame.index)
+    assert_array_equal(transformed, NominalDynamics("acrobot").fit_transform(frame.to_numpy()))
+
+
+@pytest.mark.parametrize(
+    "terms",
+    [["speed"], ["acceleration", "friction"], [], ["gravity", "gravity"], [3], [["bias"]], np.array(["mass"])],
+)
+def test_unknown_terms_list_the_known_ones(terms):
+    message = r"terms=.* must be one or more of \['acceleration', 'gravity', 'bias', 'input'\], each once"
+    with pytest.raises(ValueError, match=message):
+        NominalDynamics("acrobot", terms=terms).fit(rows("acrobot"))
+    with pytest.raises(ValueError, match=message):
+        NominalDynamics("acrobot", terms=terms).coef_prior(4)
+
+
+def test_a_term_alone_is_no_sequence():
+    with pytest.raises(
+        ValueError, match="The 'terms' parameter of NominalDynamics must be an array-like. Got 'gravity'"
+    ):
+        NominalDynamics("acrobot", terms="gravity").fit(rows("acrobot"))
+
+
+def test_a_model_of_another_size_is_an_error():
+    with pytest.raises(ValueError, match=r"X has 5 columns, but NominalDynamics of the robot 'iiwa14' needs 21: \['"):
+        NominalDynamics(load_robot("iiwa14")).fit(rows("acrobot"))
+
+
+def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
+    path = tmp_path / "arm.urdf"
+    path.write_text("<robot name='arm'><link", encoding="utf-8")
+    with pytest.raises(ValueError, match=r"arm\.urdf' is not a URDF that Pinocchio can read"):
+        NominalDynamics(path).fit(np.zeros((2, 3)))
+
+
+@pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
+@pytest.mark.parametrize("value", [-1.0, np.inf, np.nan, "much"])
+def test_a_bad_parameter_is_named(parameter, value):
+    with pytest.raises(ValueError, match=f"The '{parameter}' parameter of NominalDynamics must be"):
+        NominalDynamics("acrobot", **{parameter: value}).coef_prior(4)
+
+
+def planar_arm(*masses):
+    """Point masses at the ends of links of 1 m, on joints about y."""
+    return System(
+        "arm",
+        tuple(
+            Link(f"q{i}", "revolute", (0.0, 1.0, 0.0), mass, com=(0.0, 0.0, -1.0), xyz=(0.0, 0.0, -1.0 * (i > 0)))
+            for i, mass in enumerate(masses)
+        ),
+    )
+
+
+def test_a_link_without_mass_at_the_tip_is_an_error_that_names_its_joint():
+    with pytest.raises(
+        ValueError, match=r"of the robot 'arm' are not finite .* its joints \['q1', 'q2'\] move no mass"
+    ):
+        NominalDynamics(planar_arm(1.0, 0.0, 0.0)).fit(np.zeros((2, 9)))
+
+
+def test_a_robot_of_the_collection_without_masses_is_an_error():
+    n_columns = layout_of("romeo_laas_small").n_columns
+    with pytest.raises(ValueError, match=r"\['l_gripper_joint', 'r_gripper_joint'\] move no mass"):
+        NominalDynamics("romeo_laas_small").fit(np.zeros((2, n_columns)))
+
+
+def test_a_link_without_mass_in_the_middle_matters_in_singular_positions_only():
+    features = NominalDynamics(planar_arm(0.0, 1.0)).fit(np.zeros((2, 6)))
+    assert np.isfinite(features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0]])).all()
+    with pytest.raises(ValueError, match=r"not finite at q = \[0\.5, 0\.0\]: its mass matrix is singular"):
+        features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0], [0.5, 0.0, 0.0, 0.0, 1.0, 1.0]])
+
+
+def test_velocities_whose_squares_overflow_are_an_error():
+    features = NominalDynamics("acrobot").fit(rows("acrobot"))
+    with pytest.raises(ValueError, match=r"is singular, or q̇ or u is too large"):
+        features.transform([[0.1, 0.2, 1e200, 1e200, 0.0]])
+
+
+def test_transform_before_fit_is_an_error():
+    with pytest.raises(NotFittedError):
+        NominalDynamics("acrobot").transform(rows("acrobot"))
+
+
+def test_a_single_row_is_like_many():
+    X = rows("iiwa14")
+    features = NominalDynamics("iiwa14", terms=TERMS).fit(X)
+    assert_array_equal(np.vstack([features.transform(X[[i]]) for i in range(len(X))]), features.transform(X))
+
+
+def test_the_rows_are_left_as_they_are():
+    X = rows("acrobot")
+    before = X.copy()
+    features = NominalDynamics("acrobot", terms=TERMS).fit(X)
+    features.transform(X)
+    assert_array_equal(X, before)
+
+
+@pytest.mark.parametrize("robot", ["acrobot", get_system("acrobot"), load_robot("acrobot"), None])
+def test_a_pickled_map_works_the_same(robot):
+    X = rows("acrobot")
+    features = NominalDynamics(robot, terms=TERMS).fit(X)
+    features.transform(X)
+    assert_array_equal(pickle.loads(pickle.dumps(features)).transform(X), features.transform(X))
+
+
+def test_a_clone_has_the_same_parameters():
+    features = NominalDynamics("acrobot", terms=["bias"], dt=0.1, outputs=["q1"], known_scale=0.2, free_scale=0.0)
+    copy = clone(features.fit(rows("acrobot")))
+    assert copy.get_params() == features.get_params()
+    assert not hasattr(copy, "n_features_in_")
+
+
+def test_a_map_of_a_model_can_be_cloned():
+    model, X = perturb_robot("acrobot", random_state=0), rows("acrobot")
+    copy = clone(NominalDynamics(model))
+    assert_array_equal(copy.fit_transform(X), NominalDynamics(model).fit_transform(X))
+
+
+def test_threads_get_the_same_numbers():
+    X = rows("iiwa14", n_rows=2000)
+    features = NominalDynamics("iiwa14", terms=TERMS).fit(X)
+    blocks = np.array_split(X, 16)
+    with ThreadPoolExecutor(4) as pool:
+        threaded = np.vstack(list(pool.map(features.transform, blocks)))
+    assert_array_equal(threaded, features.transform(X))
+
+
+def error(model, data):
+    train, test = data
+    return prediction_error(test.target, model.fit(train.data, train.target).predict(test.data))
+
+
+@pytest.mark.filterwarnings("ignore:The bound was still rising")
+def test_a_wrong_model_and_encoded_angles_help_the_regressor():
+    data = [make_dynamics("acrobot", n_trajectories=n, n_steps=40, random_state=n) for n in (8, 4)]
+    wrong = perturb_robot("acrobot", 0.2, random_state=0)
+    settings = {"n_inducing": 20, "max_iter": 60, "random_state": 0}
+    nominal = union("acrobot", NominalDynamics(wrong))
+    plain = error(EVGPRegressor(InertiaForceGravity("acrobot"), **settings), data)
+    with_model = error(EVGPRegressor(nominal, **settings), data)
+    with_both = error(EVGPRegressor(nominal, kernel_map=AngleEncoder("acrobot"), **settings), data)
+    print(plain, with_model, with_both)
+    assert with_model < 0.5 * plain
+    assert with_both < 0.5 * with_model
