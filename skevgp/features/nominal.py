@@ -161,8 +161,10 @@ class NominalDynamics(RobotMap):
         """An error's text, for one configuration."""
         names, inertias = self._layout.position_names, np.diag(self._body.mass_matrix(q))
         light = [name for name, inertia in zip(names, inertias, strict=True) if inertia == 0.0]
-        return f"The dynamics of the robot {self._layout.name!r} are not finite at q = {q.tolist()}: " + (
-            f"its joints {light} move no mass." if light else "its mass matrix is singular, or q̇ or u is too large."
+        return f"The dynamics of the robot {self._layout.name!r} are not finite: " + (
+            f"its joints {light} move no mass."
+            if light
+            else f"its mass matrix is singular at q = {q.tolist()}, or q̇ or u is too large there."
         )
 
     def _names(self, columns: np.ndarray) -> list[str]:

@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 from sklearn.utils import check_random_state
 
-from .._optional import require
 from .._validation import check_real
 from .loading import Robot, load_robot
 
@@ -56,11 +55,10 @@ def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.ra
     if check_real(scale, "scale", minimum=0.0) >= 1.0:
         raise ValueError(f"scale must be in [0, 1), so that masses stay positive; got {scale!r}.")
     rng = check_random_state(random_state)
-    pin = require("pinocchio", "Perturbing a robot")
     model = load_robot(robot).copy()
     factors = 1.0 + scale * rng.uniform(-1.0, 1.0, (model.nv, 6))
     for index, (mass, x, y, z, inertia, _) in enumerate(factors, start=1):
         link = model.inertias[index]
-        model.inertias[index] = pin.Inertia(mass * link.mass, link.lever * [x, y, z], inertia * link.inertia)
+        link.mass, link.lever, link.inertia = mass * link.mass, link.lever * [x, y, z], inertia * link.inertia
     model.armature = model.armature * factors[:, 5]
     return model

@@ -265,9 +265,7 @@ def planar_arm(*masses):
 
 
 def test_a_link_without_mass_at_the_tip_is_an_error_that_names_its_joint():
-    with pytest.raises(
-        ValueError, match=r"of the robot 'arm' are not finite .* its joints \['q1', 'q2'\] move no mass"
-    ):
+    with pytest.raises(ValueError, match=r"of the robot 'arm' are not finite: its joints \['q1', 'q2'\] move no mass"):
         NominalDynamics(planar_arm(1.0, 0.0, 0.0)).fit(np.zeros((2, 9)))
 
 
@@ -280,13 +278,13 @@ def test_a_robot_of_the_collection_without_masses_is_an_error():
 def test_a_link_without_mass_in_the_middle_matters_in_singular_positions_only():
     features = NominalDynamics(planar_arm(0.0, 1.0)).fit(np.zeros((2, 6)))
     assert np.isfinite(features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0]])).all()
-    with pytest.raises(ValueError, match=r"not finite at q = \[0\.5, 0\.0\]: its mass matrix is singular"):
+    with pytest.raises(ValueError, match=r"not finite: its mass matrix is singular at q = \[0\.5, 0\.0\]"):
         features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0], [0.5, 0.0, 0.0, 0.0, 1.0, 1.0]])
 
 
 def test_velocities_whose_squares_overflow_are_an_error():
     features = NominalDynamics("acrobot").fit(rows("acrobot"))
-    with pytest.raises(ValueError, match=r"is singular, or q̇ or u is too large"):
+    with pytest.raises(ValueError, match="is singular at .* or q̇ or u is too large there"):
         features.transform([[0.1, 0.2, 1e200, 1e200, 0.0]])
 
 

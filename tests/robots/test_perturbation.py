@@ -6,7 +6,8 @@ from numpy.testing import assert_allclose, assert_array_equal
 from skevgp import datasets
 from skevgp.robots import get_system, load_robot, perturb_robot
 
-ROBOTS = ["pendulum", "acrobot", "iiwa14", "panda", "romeo"]  # romeo has massless links
+# romeo has massless links, icub inertias that no body can have
+ROBOTS = ["pendulum", "acrobot", "iiwa14", "panda", "romeo", "icub"]
 
 
 def factors(seed, n_joints, scale):
