@@ -71,7 +71,8 @@ class NominalDynamics(RobotMap):
     Notes
     -----
     Scales are multiples of Δt because an acceleration can be in the hundreds, where a weight of 1 means nothing: the
-    weights themselves are about Δt. Known ones are as wide as masses that are wrong by some 20 % make accelerations.
+    weights themselves are about Δt. Masses that are wrong by 20 % change the known ones by about as much; the default
+    is somewhat wider.
 
     With ``"acceleration"`` the weights of ``"input"`` are corrections, of mean 0; without it their mean is Δt.
 
