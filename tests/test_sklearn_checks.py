@@ -3,9 +3,9 @@ from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from skevgp import EVGPRegressor
-from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.features import InertiaForce, InertiaForceGravity, LinkGravity
 
-MAPS = [InertiaForce(), InertiaForceGravity()]
+MAPS = [InertiaForce(), InertiaForceGravity(), LinkGravity()]
 ESTIMATORS = [EVGPRegressor(), *MAPS]
 
 

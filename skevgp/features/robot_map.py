@@ -22,6 +22,15 @@ def _has_robot(transformer: RobotMap) -> bool:
     return True
 
 
+def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
+    """Indices from 0 of what a user chose by index or name, or an error that names the argument and lists the names."""
+    indices = [names.index(choice) if choice in names else choice for choice in chosen]
+    for index in indices:
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
+            raise ValueError(f"{argument}={list(chosen)!r} must be indices or names of the {things} {list(names)}.")
+    return [int(index) for index in indices]
+
+
 class RobotMap(TransformerMixin, BaseEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
@@ -138,11 +147,7 @@ class RobotMap(TransformerMixin, BaseEstimator):
         names = layout.state_names
         if self.outputs is None:
             return list(range(len(names)))
-        rows = [names.index(output) if output in names else output for output in self.outputs]
-        for row in rows:
-            if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
-                raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
-        return [int(row) for row in rows]
+        return indices_of(self.outputs, names, "outputs", "states")
 
     def _prepare(self) -> None:
         """What `fit` keeps of the robot besides its layout; nothing here."""
