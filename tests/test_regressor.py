@@ -14,6 +14,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
+from skevgp.features import InertiaForce, InertiaForceGravity
 
 
 def smooth(n=150, outputs=2, noise=0.05, seed=0):
@@ -214,6 +215,18 @@ def test_parameter_counts_are_the_papers(n_columns, n_features, m, outputs, expe
     features = FunctionTransformer(lambda x: np.hstack([x, x, x])[:, :n_features]) if n_features else None
     fitted = model(feature_map=features, n_inducing=m, posterior="diagonal", sharing="kernel", max_iter=0)
     assert fitted.fit(x, rng.randn(300, outputs)).n_parameters_ == expected
+
+
+@pytest.mark.parametrize(
+    ("features", "m", "expected"),
+    [(None, 500, 161049), (InertiaForce("iiwa14"), 350, 113337), (InertiaForceGravity("iiwa14"), 350, 113673)],
+    ids=["VGP", "IF", "IFG"],
+)
+def test_parameter_counts_of_the_arm_are_the_papers(features, m, expected):
+    rng = np.random.RandomState(0)
+    x = rng.randn(510, 21)
+    fitted = model(feature_map=features, n_inducing=m, posterior="diagonal", sharing="kernel", max_iter=0)
+    assert fitted.fit(x, rng.randn(510, 14)).n_parameters_ == expected
 
 
 def test_parameter_counts_of_the_other_settings():

@@ -3,9 +3,9 @@ from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
 from skevgp import EVGPRegressor
-from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, NominalDynamics
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
-MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), NominalDynamics()]
+MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
 ESTIMATORS = [EVGPRegressor(), *MAPS]
 
 

@@ -1,7 +1,8 @@
 """Explicit features h(x): scikit-learn transformers that say what physics knows."""
 
 from .angles import AngleEncoder
+from .gravity import LinkGravity
 from .newton import InertiaForce, InertiaForceGravity
 from .nominal import NominalDynamics
 
-__all__ = ["AngleEncoder", "InertiaForce", "InertiaForceGravity", "NominalDynamics"]
+__all__ = ["AngleEncoder", "InertiaForce", "InertiaForceGravity", "LinkGravity", "NominalDynamics"]

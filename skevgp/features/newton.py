@@ -8,11 +8,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
+from sklearn.base import clone
 from sklearn.utils._param_validation import Interval
 
 from .._validation import as_floats
-from ..robots import GravityTerm, Layout, get_system
+from ..robots import SYSTEMS, Layout, System, get_system
 from ..robots.loading import Robot
+from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
 from .robot_map import RobotMap
 
 
@@ -35,16 +37,15 @@ class _NewtonFeatures(RobotMap):
     }
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Euler's rule (the paper's eq. inertia_prior), and what a subclass knows of gravity.
+        """Euler's rule (the paper's eq. inertia_prior).
 
-        Known entries (1 and Δt) have ``known_scale``; unknown ones (Δt/J and gravity's factors) the user's guess and
-        ``unknown_scale``; the rest mean 0 and ``free_scale``.
+        Known entries (1 and Δt) have ``known_scale``; unknown ones (Δt/J) the user's guess and ``unknown_scale``; the
+        rest mean 0 and ``free_scale``.
         """
         n, n_inputs = layout.n_joints, layout.n_inputs
         joints = np.arange(n)
-        width = layout.n_columns + self._n_gravity(layout)
-        mean = np.zeros((2 * n, width))
-        scale = np.full((2 * n, width), self.free_scale, dtype=float)
+        mean = np.zeros((2 * n, layout.n_columns))
+        scale = np.full((2 * n, layout.n_columns), self.free_scale, dtype=float)
         for row, column, value in (
             (joints, joints, 1.0),  # q' = q + ...
             (joints, n + joints, self.dt),  # ... + Δt q̇
@@ -54,26 +55,7 @@ class _NewtonFeatures(RobotMap):
         driven, inputs = n + np.array(layout.driven), 2 * n + np.arange(n_inputs)
         mean[driven, inputs] = self.dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
         scale[driven, inputs] = self.unknown_scale
-        self._gravity_prior(layout, mean, scale)
         return mean, scale
-
-    def _features(self, X: np.ndarray) -> np.ndarray:
-        return np.hstack([X, self._gravity_columns(X)])
-
-    def _names(self, columns: np.ndarray) -> list[str]:
-        return [*columns, *self._gravity_names(columns)]
-
-    def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
-        return np.empty((len(X), 0))
-
-    def _gravity_names(self, names: np.ndarray) -> list[str]:
-        return []
-
-    def _n_gravity(self, layout: Layout) -> int:
-        return 0
-
-    def _gravity_prior(self, layout: Layout, mean: np.ndarray, scale: np.ndarray) -> None:
-        """Fill in the gravity columns; none here."""
 
 
 def _per_term(value: ArrayLike, n_terms: int, name: str) -> np.ndarray:
@@ -94,9 +76,9 @@ class InertiaForce(_NewtonFeatures):
 
     Parameters
     ----------
-    robot : str or None, default=None
-        A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, any number of columns is taken as
-        it is and the weights get the regressor's wide default prior.
+    robot : str, path-like, System or pinocchio.Model, default=None
+        A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
+        Without one, any number of columns is taken as it is and the weights get the regressor's wide default prior.
     dt : float, default=0.03
         Length of a time step, s; that of the data.
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
@@ -157,26 +139,39 @@ class InertiaForce(_NewtonFeatures):
         self.unknown_scale = unknown_scale
         self.free_scale = free_scale
 
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        return X.copy()
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        return list(columns)
+
 
 class InertiaForceGravity(_NewtonFeatures):
-    r"""Inertia + force + gravity features (IFG): IF and the sine of each link's angle against the vertical.
+    r"""Inertia + force + gravity features (IFG): IF and gravity's pull on each link.
 
-    :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (the paper's eq. gravity_prior and section III-B) with the sines
-    :math:`\sin q` (pendulum), :math:`\sin\theta` (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot).
-    Gravity slows a link down by :math:`\Delta t` times its gain times the sine.
+    For a planar system of the paper :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (its eq. gravity_prior and section
+    III-B), with the sine of each link's angle against the vertical: :math:`\sin q` (pendulum), :math:`\sin\theta`
+    (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot). For any other robot the features of
+    `LinkGravity` take the place of the sines. Gravity slows a link down by :math:`\Delta t` times its gain times the
+    feature.
 
     Parameters
     ----------
-    robot : str or None, default=None
-        A named system (``"pendulum"``, ``"cartpole"``, ``"acrobot"``). Without one, the sine of every column is added
-        and the weights get the regressor's wide default prior.
+    robot : str, path-like, System or pinocchio.Model, default=None
+        A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
+        Without one, the sine of every column is added and the weights get the regressor's wide default prior.
     dt : float, default=0.03
         Length of a time step, s; that of the data.
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
-    gravity_gain : float or array-like of shape (n_sines,) or (n_joints, n_sines), default=0.0
-        Guess of gravity's acceleration at sine 1, rad/s² (g/l for a point mass): one for all, one per sine, or one per
-        joint and sine (of which those that the prior names are used).
+    gravity : LinkGravity, default=None
+        Other features of gravity, with their own prior scales; their robot is this one if they have none. None means
+        the sines for the pendulum, cartpole and acrobot, and for other robots `LinkGravity` with ``axes="xy"`` and
+        the links whose features differ from 0 in some position (iiwa14: all but the first, whose axis is vertical).
+    gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
+        Guess of gravity's deceleration per unit of each feature of gravity: one for all, one per feature, or one per
+        joint and feature (of which those that the prior names are used). For a sine in rad/s² (g/l for a point mass);
+        for a lever of `LinkGravity` in 1/m (1/l for a point mass that lies at -l times the lever).
     outputs : sequence of int or str, default=None
         Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
     known_scale : float, default=0.1
@@ -196,6 +191,7 @@ class InertiaForceGravity(_NewtonFeatures):
     See Also
     --------
     InertiaForce : Without gravity.
+    LinkGravity : Gravity on links in 3D, alone.
 
     Notes
     -----
@@ -213,6 +209,12 @@ class InertiaForceGravity(_NewtonFeatures):
     >>> features.coef_prior(n_outputs=2)[0]
     array([[ 1.  ,  0.03,  0.  ,  0.  ],
            [ 0.  ,  1.  ,  0.12, -0.6 ]])
+
+    An arm in 3D, with two levers for each of the links 2 to 7:
+
+    >>> arm = InertiaForceGravity("iiwa14").fit([[0.0] * 21])
+    >>> arm.get_feature_names_out()[21:24].tolist()
+    ['gravity(q2, u_x)', 'gravity(q2, u_y)', 'gravity(q3, u_x)']
     """
 
     def __init__(
@@ -221,6 +223,7 @@ class InertiaForceGravity(_NewtonFeatures):
         *,
         dt: float = 0.03,
         inverse_inertia: ArrayLike = 0.0,
+        gravity: LinkGravity | None = None,
         gravity_gain: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
         known_scale: float = 0.1,
@@ -230,6 +233,7 @@ class InertiaForceGravity(_NewtonFeatures):
         self.robot = robot
         self.dt = dt
         self.inverse_inertia = inverse_inertia
+        self.gravity = gravity
         self.gravity_gain = gravity_gain
         self.outputs = outputs
         self.known_scale = known_scale
@@ -238,40 +242,47 @@ class InertiaForceGravity(_NewtonFeatures):
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **_NewtonFeatures._parameter_constraints,
+        "gravity": [LinkGravity, None],
         "gravity_gain": [Real, "array-like"],
     }
 
-    def _angles(self) -> list[tuple[int, ...]] | None:
-        """Columns that add up to each angle; None without a robot: every column is one."""
-        return None if self.robot is None else [term.angle for term in self._terms()]
+    def _prepare(self) -> None:
+        self._gravity = self._gravity_map(self.n_features_in_)
 
-    def _terms(self) -> tuple[GravityTerm, ...]:
-        assert self.robot is not None
-        return get_system(self.robot).gravity
+    def _gravity_map(self, n_columns: int) -> GravityMap:
+        """The fitted features of gravity."""
+        if self.gravity is not None:
+            features = clone(self.gravity)
+            if features.robot is None:
+                features.robot = self.robot
+        elif self.robot is None or _has_sines(self.robot):
+            features = SineGravity(self.robot, self.unknown_scale, self.free_scale)
+        else:
+            features = LinkGravity(
+                self.robot,
+                links=links_under_gravity(self.robot),
+                unknown_scale=self.unknown_scale,
+                free_scale=self.free_scale,
+            )
+        return features.fit(np.zeros((1, n_columns)))
 
-    def _gravity_columns(self, X: np.ndarray) -> np.ndarray:
-        angles = self._angles()
-        if angles is None:
-            return np.sin(X)
-        return np.sin(np.column_stack([X[:, list(columns)].sum(axis=1) for columns in angles]))
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        return np.hstack([X, self._gravity._features(X)])
 
-    def _gravity_names(self, names: np.ndarray) -> list[str]:
-        angles = self._angles()
-        if angles is None:
-            angles = [(column,) for column in range(len(names))]
-        return [f"sin({' + '.join(names[list(columns)])})" for columns in angles]
+    def _names(self, columns: np.ndarray) -> list[str]:
+        return [*columns, *self._gravity._names(columns)]
 
-    def _n_gravity(self, layout: Layout) -> int:
-        return len(self._terms())
+    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        features = self._gravity if hasattr(self, "_gravity") else self._gravity_map(layout.n_columns)
+        mean, scale = features._prior(layout)
+        acts_on, gain = features._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
+        if gain.shape != acts_on.shape or not np.isfinite(gain).all():
+            gain = _per_term(gain, acts_on.shape[1], "gravity_gain")
+        mean[layout.n_joints :] = np.where(acts_on, 0.0 - self.dt * gain, 0.0)
+        of_inertia, scale_of_inertia = super()._prior(layout)
+        return np.hstack([of_inertia, mean]), np.hstack([scale_of_inertia, scale])
 
-    def _gravity_prior(self, layout: Layout, mean: np.ndarray, scale: np.ndarray) -> None:
-        terms = self._terms()
-        n, n_terms = layout.n_joints, len(terms)
-        gain = as_floats(self.gravity_gain, "gravity_gain")
-        if gain.shape != (n, n_terms) or not np.isfinite(gain).all():
-            gain = np.broadcast_to(_per_term(gain, n_terms, "gravity_gain"), (n, n_terms))
-        first = layout.n_columns
-        for index, term in enumerate(terms):
-            for joint in term.acts_on:
-                mean[n + joint, first + index] = 0.0 - self.dt * gain[joint, index]
-                scale[n + joint, first + index] = self.unknown_scale
+
+def _has_sines(robot: Robot) -> bool:
+    named = isinstance(robot, System) or (isinstance(robot, str) and robot in SYSTEMS)
+    return named and bool(get_system(robot).gravity)

@@ -16,6 +16,15 @@ from ..robots import Layout, layout_of
 from ..robots.loading import Robot
 
 
+def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
+    """Indices from 0 of what a user chose by index or name, or an error that names the argument and lists the names."""
+    indices = [names.index(choice) if choice in names else choice for choice in chosen]
+    for index in indices:
+        if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
+            raise ValueError(f"{argument}={list(chosen)!r} must be indices or names of the {things} {list(names)}.")
+    return [int(index) for index in indices]
+
+
 class RobotTransformer(TransformerMixin, BaseEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
@@ -156,11 +165,7 @@ class RobotMap(RobotTransformer):
         names = layout.state_names
         if self.outputs is None:
             return list(range(len(names)))
-        rows = [names.index(output) if output in names else output for output in self.outputs]
-        for row in rows:
-            if isinstance(row, bool) or not isinstance(row, (int, np.integer)) or not 0 <= row < len(names):
-                raise ValueError(f"outputs={list(self.outputs)!r} must be indices or names of the states {names}.")
-        return [int(row) for row in rows]
+        return indices_of(self.outputs, names, "outputs", "states")
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Mean and scale (2 * n_joints, n_features_out) of the weights for all states; before `fit` too."""

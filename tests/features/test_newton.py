@@ -1,4 +1,5 @@
 import pickle
+import sys
 
 import numpy as np
 import pandas as pd
@@ -7,8 +8,9 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import clone
 from sklearn.exceptions import NotFittedError
 
-from skevgp.features import InertiaForce, InertiaForceGravity
-from skevgp.robots import get_system
+from skevgp.features import InertiaForce, InertiaForceGravity, LinkGravity
+from skevgp.robots import get_system, layout_of, load_robot
+from skevgp.robots.systems import Link, System
 
 MAPS = [InertiaForce, InertiaForceGravity]
 COLUMNS = {
@@ -269,3 +271,125 @@ def test_a_pickled_map_works_the_same(robot):
     X = rows("acrobot")
     features = InertiaForceGravity(robot).fit(X)
     assert_array_equal(pickle.loads(pickle.dumps(features)).transform(X), features.transform(X))
+
+
+# --- gravity on links in 3D ---------------------------------------------------------------------------------------
+
+
+def arm_rows(robot="iiwa14", n_rows=5):
+    return np.random.default_rng(0).normal(size=(n_rows, layout_of(robot).n_columns))
+
+
+def test_an_arm_gets_both_levers_of_the_links_that_gravity_turns():
+    X = arm_rows()
+    features = InertiaForceGravity("iiwa14").fit(X)
+    levers = [f"gravity(q{link}, u_{axis})" for link in range(2, 8) for axis in "xy"]
+    assert features.get_feature_names_out().tolist() == layout_of("iiwa14").column_names + levers
+    assert_array_equal(features.transform(X), np.hstack([X, LinkGravity("iiwa14").fit_transform(X)[:, 2:]]))
+
+
+@pytest.mark.parametrize(
+    ("robot", "first", "n_terms"), [("ur5", "shoulder_lift_joint, u_x", 10), ("panda", "panda_joint2, u_x", 14)]
+)
+def test_any_robot_has_features_of_gravity(robot, first, n_terms):
+    names = InertiaForceGravity(robot).fit(arm_rows(robot)).get_feature_names_out()[layout_of(robot).n_columns :]
+    assert names[0] == f"gravity({first})"
+    assert len(names) == n_terms
+
+
+def test_a_model_of_a_planar_system_gets_levers_in_place_of_sines():
+    names = InertiaForceGravity(load_robot("cartpole")).fit(rows("cartpole")).get_feature_names_out()
+    assert names.tolist() == [*COLUMNS["cartpole"], "gravity(theta, u_x)", "gravity(theta, u_y)"]
+
+
+@pytest.mark.parametrize(("roll", "n_terms"), [(np.pi / 2, 0), (1.5707, 0), (1.5, 2)])
+def test_an_axis_that_a_file_rounds_to_the_vertical_counts_as_vertical(roll, n_terms):
+    turntable = System("turntable", links=(Link("q", "revolute", (0.0, 1.0, 0.0), mass=1.0, rpy=(roll, 0.0, 0.0)),))
+    assert InertiaForceGravity(turntable).fit_transform(rows("pendulum")).shape == (5, 3 + n_terms)
+
+
+def test_without_gravity_nothing_is_added():
+    model = load_robot("acrobot").copy()
+    model.gravity.linear = np.zeros(3)
+    X = rows("acrobot")
+    features = InertiaForceGravity(model).fit(X)
+    assert_array_equal(features.transform(X), X)
+    assert_array_equal(features.coef_prior(4)[0], InertiaForce("acrobot").coef_prior(4)[0])
+
+
+@pytest.mark.parametrize("fitted", [False, True])
+def test_the_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_link(fitted):
+    features = InertiaForceGravity("iiwa14", gravity_gain=2.0, unknown_scale=3.0, free_scale=0.5)
+    if fitted:
+        features.fit(arm_rows())
+    mean, scale = features.coef_prior(14)
+    inertia_mean, inertia_scale = InertiaForce("iiwa14", unknown_scale=3.0, free_scale=0.5).coef_prior(14)
+    assert_array_equal(mean[:, :21], inertia_mean)
+    assert_array_equal(scale[:, :21], inertia_scale)
+    borne = np.zeros((14, 12), dtype=bool)
+    for column, link in enumerate(np.repeat(range(2, 8), 2)):
+        borne[7 : 7 + link, column] = True
+    assert_array_equal(mean[:, 21:], np.where(borne, -0.06, 0.0))
+    assert_array_equal(scale[:, 21:], np.where(borne, 3.0, 0.5))
+
+
+def test_there_may_be_a_guess_per_lever():
+    gain = np.arange(1.0, 13.0)
+    mean, _ = InertiaForceGravity("iiwa14", gravity_gain=gain).coef_prior(14)
+    assert_allclose(mean[7, 21:], -0.03 * gain)
+
+
+def test_levers_can_be_asked_for_and_have_their_own_scales():
+    levers = LinkGravity(axes="x", unknown_scale=5.0, free_scale=0.0)
+    features = InertiaForceGravity("acrobot", gravity=levers).fit(rows("acrobot"))
+    assert features.get_feature_names_out().tolist() == [*COLUMNS["acrobot"], "gravity(q1, u_x)", "gravity(q2, u_x)"]
+    assert_allclose(
+        features.transform(rows("acrobot"))[:, 5:], 9.81 * np.sin(np.cumsum(rows("acrobot")[:, :2], axis=1))
+    )
+    assert_array_equal(features.coef_prior(4)[1][:, 5:], [[0, 0], [0, 0], [5, 5], [0, 5]])
+    assert levers.robot is None  # the user's own is not touched
+
+
+def test_the_prior_mean_is_one_step_of_the_pendulum_by_euler():
+    """q̈ = 4 u - g/l sin q: the mass hangs at minus the lever."""
+    features = InertiaForceGravity(
+        "pendulum", inverse_inertia=4.0, gravity=LinkGravity(axes="x"), gravity_gain=1.0 / 0.5
+    )
+    X = rows("pendulum")
+    q, v, u = X.T
+    expected = np.column_stack([q + 0.03 * v, v + 0.03 * (4.0 * u - 9.81 / 0.5 * np.sin(q))])
+    assert_allclose(features.fit_transform(X) @ features.coef_prior(2)[0].T, expected, rtol=1e-12)
+
+
+def test_the_levers_of_another_robot_must_fit():
+    with pytest.raises(ValueError, match="X has 21 columns, but LinkGravity of the robot 'ur5' needs 18"):
+        InertiaForceGravity("iiwa14", gravity=LinkGravity("ur5")).fit(arm_rows())
+
+
+@pytest.mark.parametrize("gravity", ["sine", InertiaForce("iiwa14")])
+def test_gravity_that_is_not_link_gravity_is_named(gravity):
+    with pytest.raises(ValueError, match="'gravity' parameter .* must be an instance of .*LinkGravity' or None"):
+        InertiaForceGravity("iiwa14", gravity=gravity).fit(arm_rows())
+
+
+def test_levers_can_be_tuned_by_name():
+    features = InertiaForceGravity("iiwa14", gravity=LinkGravity())
+    features.set_params(gravity__axes="x", gravity__links=["q2"])
+    assert clone(features).fit_transform(arm_rows()).shape == (5, 22)
+
+
+def test_sines_need_no_pinocchio(monkeypatch):
+    monkeypatch.setitem(sys.modules, "pinocchio", None)
+    features = InertiaForceGravity("acrobot").fit(rows("acrobot"))
+    assert features.coef_prior(4)[0].shape == (4, 7)
+    with pytest.raises(ImportError, match="pip install pin"):
+        InertiaForceGravity("iiwa14").fit(arm_rows())
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", load_robot("ur5")], ids=["name", "model"])
+def test_a_pickled_map_of_an_arm_works_the_same(robot):
+    X = arm_rows(robot)
+    features = InertiaForceGravity(robot).fit(X)
+    copy = pickle.loads(pickle.dumps(features))
+    assert_array_equal(copy.transform(X), features.transform(X))
+    assert_array_equal(clone(features).fit_transform(X), features.transform(X))

@@ -1,0 +1,296 @@
+"""Gravity's torque on each link as explicit features, the section on links in 3D of the paper."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any, ClassVar
+
+import numpy as np
+from sklearn.utils._param_validation import Interval, StrOptions
+
+from ..robots import GravityTerm, Layout, get_system, layout_of, load_robot
+from ..robots.loading import Robot, joint_axes
+from .robot_map import RobotMap, indices_of
+
+# An axis is vertical up to this angle, rad: URDF files round π/2.
+_TILT = 1e-3
+# Rows at a time: their rotations stay in the cache.
+_BLOCK = 1024
+# Of w = Rᵀg along (u_x, u_y, u_z): (u_x × w)·u_z = w·u_y, (u_y × w)·u_z = -w·u_x; a slider's axis is its u_z.
+_COMPONENTS = {"u_x": (1, 1.0), "u_y": (0, -1.0), "": (2, 1.0)}
+
+
+class GravityMap(RobotMap):
+    """Features of gravity alone; the prior knows which joints each of them accelerates, and no more."""
+
+    unknown_scale: float
+    free_scale: float
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **RobotMap._parameter_constraints,
+        "unknown_scale": [Interval(Real, 0, None, closed="left")],
+        "free_scale": [Interval(Real, 0, None, closed="left")],
+    }
+
+    def _terms(self) -> Sequence[GravityTerm | Lever]:
+        """One per feature; before `fit` too, if there is a robot."""
+        raise NotImplementedError
+
+    def _acts_on(self, layout: Layout) -> np.ndarray:
+        """Whether gravity by each feature accelerates each joint, (n_joints, n_features_out)."""
+        terms = self._terms()
+        acts_on = np.zeros((layout.n_joints, len(terms)), dtype=bool)
+        for column, term in enumerate(terms):
+            acts_on[list(term.acts_on), column] = True
+        return acts_on
+
+    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        acts_on = self._acts_on(layout)
+        of_velocities = np.where(acts_on, self.unknown_scale, self.free_scale)
+        scale = np.vstack([np.full(acts_on.shape, self.free_scale, dtype=float), of_velocities])
+        return np.zeros_like(scale), scale
+
+
+class SineGravity(GravityMap):
+    """The sine of each angle against the vertical of a planar system; without a robot that of every column."""
+
+    def __init__(self, robot: Robot | None, unknown_scale: float, free_scale: float):
+        self.robot = robot
+        self.outputs = None
+        self.unknown_scale = unknown_scale
+        self.free_scale = free_scale
+
+    def _terms(self) -> Sequence[GravityTerm]:
+        assert self.robot is not None
+        return get_system(self.robot).gravity
+
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        if self.robot is None:
+            return np.sin(X)
+        return np.sin(np.column_stack([X[:, list(term.angle)].sum(axis=1) for term in self._terms()]))
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        if self.robot is None:
+            return [f"sin({name})" for name in columns]
+        return [f"sin({' + '.join(columns[list(term.angle)])})" for term in self._terms()]
+
+
+@dataclass(frozen=True)
+class Lever:
+    """A feature of `LinkGravity`.
+
+    Attributes
+    ----------
+    link : int
+    name : str
+        ``"u_x"`` or ``"u_y"``; empty for a prismatic joint, which has none.
+    acts_on : tuple of int
+        The joints that bear the link.
+    """
+
+    link: int
+    name: str
+    acts_on: tuple[int, ...]
+
+
+class LinkGravity(GravityMap):
+    r"""Gravity's torque about each joint's axis, for a unit mass at the end of a unit lever on its link.
+
+    For each link i that a revolute joint turns
+
+    .. math:: (u_x \times R_i^\top g) \cdot u_z, \qquad (u_y \times R_i^\top g) \cdot u_z
+
+    (the paper's section on the IIWA has the first), where :math:`R_i` is the rotation of the link by forward
+    kinematics, :math:`g` the gravity vector of the model and :math:`u_z` the joint's axis in its own frame. For a
+    prismatic joint there is one feature, gravity along its axis, :math:`u_z \cdot R_i^\top g`. All are in m/s². Where
+    the link's centre of mass is, and how heavy it is, the weights have to learn.
+
+    Parameters
+    ----------
+    robot : str, path-like, System or pinocchio.Model, default=None
+        A named system (``"iiwa14"``, ``"acrobot"``, ...), a robot of example-robot-data (``"panda"``, ``"ur5"``, ...),
+        the path of a URDF file or a model, as in `skevgp.datasets.load_robot`. Without one, X passes through and the
+        weights get the regressor's wide default prior.
+    axes : {"xy", "x"}, default="xy"
+        The levers: :math:`u_x` and :math:`u_y`, which stand for any centre of mass, or :math:`u_x` alone (the paper's
+        formula).
+    links : sequence of int or str, default=None
+        The links, by the name of their joint or its index from 0 (the paper counts from 1); None means all.
+    outputs : sequence of int or str, default=None
+        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+    unknown_scale : float, default=1.0
+        Prior standard deviation of the weights for the velocities of the joints that bear the link: its own and those
+        between it and the base.
+    free_scale : float, default=1.0
+        Prior standard deviation of the other weights; 0 pins them to 0.
+
+    Attributes
+    ----------
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    InertiaForceGravity : The whole row of x and these.
+
+    Notes
+    -----
+    :math:`(u_x, u_y, u_z)` is right-handed. :math:`u_x` is the coordinate axis that follows the largest component of
+    :math:`u_z` (x follows z, y follows x, z follows y) made orthogonal to :math:`u_z`; for a joint that turns about z
+    the levers are its frame's x and y.
+
+    The features of a link span the torque that its own weight, and that of all it carries at a fixed place, exerts
+    about its own joint. So gravity's torque is linear in them at a joint if all later ones turn about parallel axes:
+    at the last joint of any arm, at every joint of a planar one. At the others it is not: there a later link acts
+    about an axis that turns in the link's frame.
+
+    A link whose axis is always vertical (the first of most arms) has features that are 0.
+
+    X is the whole row [q, q̇, u], of which q alone is used. Do not scale its columns before this map: scaling belongs
+    in the regressor's ``kernel_map``, which only the kernel sees.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from skevgp.features import LinkGravity
+    >>> features = LinkGravity("pendulum")
+    >>> features.fit_transform([[np.pi / 6, 0.0, 1.0]]).round(3)
+    array([[4.905, 8.496]])
+    >>> features.get_feature_names_out().tolist()
+    ['gravity(q, u_x)', 'gravity(q, u_y)']
+
+    Beside other features:
+
+    >>> from sklearn.pipeline import FeatureUnion
+    >>> from skevgp.features import InertiaForce
+    >>> union = FeatureUnion([("inertia", InertiaForce("iiwa14")), ("gravity", LinkGravity("iiwa14", axes="x"))])
+    >>> union.fit_transform(np.zeros((1, 21))).shape
+    (1, 28)
+    """
+
+    def __init__(
+        self,
+        robot: Robot | None = None,
+        *,
+        axes: str = "xy",
+        links: Sequence[int | str] | None = None,
+        outputs: Sequence[int | str] | None = None,
+        unknown_scale: float = 1.0,
+        free_scale: float = 1.0,
+    ):
+        self.robot = robot
+        self.axes = axes
+        self.links = links
+        self.outputs = outputs
+        self.unknown_scale = unknown_scale
+        self.free_scale = free_scale
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **GravityMap._parameter_constraints,
+        "axes": [StrOptions({"xy", "x"})],
+        "links": ["array-like", None],
+    }
+
+    def _prepare(self) -> None:
+        if self.robot is not None:
+            model = load_robot(self.robot)
+            self._levers = self._levers_of(model)
+            self._links = _Links(model)
+            components = [_COMPONENTS[lever.name] for lever in self._levers]
+            self._columns = np.array(
+                [3 * lever.link + axis for lever, (axis, _) in zip(self._levers, components, strict=True)], dtype=int
+            )
+            self._signs = np.array([sign for _, sign in components])
+
+    def _terms(self) -> Sequence[Lever]:
+        return self._levers if hasattr(self, "_levers") else self._levers_of(load_robot(self.robot))
+
+    def _levers_of(self, model: Any) -> list[Lever]:
+        names = list(model.names)[1:]
+        links = list(range(len(names)))
+        if self.links is not None:
+            links = indices_of(self.links, names, "links", "links")
+            if len(set(links)) < len(links):
+                raise ValueError(f"links={list(self.links)!r} must not name a link twice.")
+        turns = np.any(joint_axes(model)[:, 3:], axis=1)
+        return [
+            Lever(link, name, tuple(joint - 1 for joint in model.supports[link + 1] if joint > 0))
+            for link in links
+            for name in ([f"u_{axis}" for axis in self.axes] if turns[link] else [""])
+        ]
+
+    def _features(self, X: np.ndarray) -> np.ndarray:
+        if self.robot is None:
+            return X.copy()
+        if len(X) > _BLOCK:
+            return np.vstack([self._features(X[start : start + _BLOCK]) for start in range(0, len(X), _BLOCK)])
+        return self._links.gravity(X[:, : self._layout.n_joints])[:, self._columns] * self._signs
+
+    def _names(self, columns: np.ndarray) -> list[str]:
+        if self.robot is None:
+            return list(columns)
+        return [f"gravity({', '.join(filter(None, (columns[lever.link], lever.name)))})" for lever in self._levers]
+
+
+class _Links:
+    """Forward kinematics of many rows at once, as far as gravity needs it: rotations alone.
+
+    Gravity is passed on from each link to the next, as components along (u_x, u_y, u_z) of its joint. The rotation of
+    a link in its parent is ``fixed + cos(q) * cosine + sin(q) * sine``.
+    """
+
+    def __init__(self, model: Any):
+        axes = joint_axes(model)
+        self._turns = np.any(axes[:, 3:], axis=1).astype(float)[:, np.newaxis, np.newaxis, np.newaxis]
+        self._parents = [parent - 1 for parent in list(model.parents)[1:]]
+        self._weight = np.reshape(model.gravity.linear, (1, 1, 3))
+        frames = [_right_handed(axis[:3] + axis[3:]) for axis in axes]
+        at_zero = [
+            (frames[parent].T if parent >= 0 else np.eye(3)) @ placement.rotation @ frame
+            for parent, placement, frame in zip(self._parents, list(model.jointPlacements)[1:], frames, strict=True)
+        ]
+        self._fixed, self._cosine, self._sine = (
+            (np.array(at_zero) @ np.array(part, dtype=float))[:, np.newaxis]
+            for part in (np.diag([0, 0, 1]), np.diag([1, 1, 0]), [[0, -1, 0], [1, 0, 0], [0, 0, 0]])
+        )
+
+    def gravity(self, q: np.ndarray) -> np.ndarray:
+        """Rᵢᵀg along u_x, u_y and u_z of each link i, (n, 3 * n_joints), of positions (n, n_joints)."""
+        angles = q.T[:, :, np.newaxis, np.newaxis] * self._turns
+        rotations = np.cos(angles) * self._cosine
+        rotations += np.sin(angles) * self._sine
+        rotations += self._fixed
+        weights: list[np.ndarray] = []  # of (n, 1, 3)
+        for parent, rotation in zip(self._parents, rotations, strict=True):
+            weights.append((weights[parent] if parent >= 0 else self._weight) @ rotation)
+        return np.concatenate(weights, axis=2)[:, 0]
+
+
+def _right_handed(axis: np.ndarray) -> np.ndarray:
+    """The columns u_x, u_y and u_z, the joint's axis."""
+    lever = np.eye(3)[(np.argmax(np.abs(axis)) + 1) % 3]
+    lever = lever - (lever @ axis) * axis
+    lever /= np.linalg.norm(lever)
+    return np.column_stack([lever, np.cross(axis, lever), axis])
+
+
+def links_under_gravity(robot: Robot) -> list[int]:
+    """The links of which a feature of `LinkGravity` differs from 0 in some position.
+
+    Parameters
+    ----------
+    robot : str, path-like, System or pinocchio.Model
+
+    Returns
+    -------
+    links : list of int
+        Seen in a few fixed random positions; an axis within a thousandth of a radian of the vertical counts as
+        vertical.
+    """
+    X = np.random.RandomState(0).uniform(-np.pi, np.pi, (5, layout_of(robot).n_columns))
+    features = LinkGravity(robot).fit(X)
+    pulled = np.abs(features.transform(X)).max(axis=0) > _TILT * np.linalg.norm(features._links._weight)
+    return sorted({lever.link for lever, moves in zip(features._levers, pulled, strict=True) if moves})
