@@ -1,8 +1,17 @@
 """Data sets: simulated robots (with Pinocchio) and toys."""
 
 from ..robots import list_robots, load_robot
+from .control import ComputedTorqueController, quintic_reference
 from .dynamics import make_dynamics
 from .simulation import simulate
 from .toy import make_toy
 
-__all__ = ["list_robots", "load_robot", "make_dynamics", "make_toy", "simulate"]
+__all__ = [
+    "ComputedTorqueController",
+    "list_robots",
+    "load_robot",
+    "make_dynamics",
+    "make_toy",
+    "quintic_reference",
+    "simulate",
+]
