@@ -120,8 +120,8 @@ def simulate(
     >>> simulate("pendulum", [0.1, 0.0], lambda step, Z: -2.0 * Z[:, 1:], n_steps=3).round(4)
     array([[ 0.1   ,  0.    ],
            [ 0.0991, -0.0582],
-           [ 0.0969, -0.1013],
-           [ 0.0943, -0.1336]])
+           [ 0.0967, -0.1009],
+           [ 0.0932, -0.1312]])
     """
     plant = Plant(system)
     layout = plant.layout
