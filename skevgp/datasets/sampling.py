@@ -8,6 +8,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from ..robots import SYSTEMS
 from .control import ComputedTorqueController
 from .plant import Plant
 from .simulation import Controller
@@ -95,7 +96,6 @@ _PAPER: Mapping[str, RandomInputs | ControlledMoves] = MappingProxyType(
         ),
     }
 )
-_SIZES = MappingProxyType({"pendulum": (1, 1), "cartpole": (2, 1), "acrobot": (2, 1), "iiwa14": (7, 7)})
 
 
 def sampling_of(plant: Plant) -> RandomInputs | ControlledMoves:
@@ -112,7 +112,7 @@ def sampling_of(plant: Plant) -> RandomInputs | ControlledMoves:
         random inputs if not, with scales from the model.
     """
     layout = plant.layout
-    if _SIZES.get(layout.name) == (layout.n_joints, layout.n_inputs):
+    if layout.name in _PAPER and SYSTEMS[layout.name].layout.driven == layout.driven:
         return _PAPER[layout.name]
     lower, upper = _position_limits(plant)
     with np.errstate(invalid="ignore"):

@@ -60,7 +60,7 @@ def simulate(
     (a model whose limits are all 0 has unknown ones), and its viscous damping acts on the joints; dry friction,
     contacts and the limits of positions and velocities are not simulated. The integrator is SciPy's DOP853 with a
     relative tolerance of 1e-11, started anew at each step, for 64 trajectories together; where damping acts more than
-    a thousand times faster than ``dt``, it is the implicit Radau with 1e-8.
+    a thousand times faster than ``dt``, it is the implicit Radau with 1e-6.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ def simulate(
         Whether to return the inputs that acted, too.
     n_jobs : int, default=None
         Processes that groups of 64 trajectories are spread over (None: 1, -1: all cores). It does not change a bit,
-        and pays for large sets only.
+        and pays for large sets of robots with many joints only.
 
     Returns
     -------

@@ -66,5 +66,10 @@ def test_a_very_strongly_damped_joint_creeps():
 
 
 def test_a_motion_too_fast_for_the_step_ends_in_an_error():
-    with pytest.raises(ValueError, match="integration of 'pendulum' over 1000.0 s failed: it needs more than"):
-        simulate("pendulum", [3.0, 100.0], np.full((1, 1), 50.0), dt=1000.0)
+    with pytest.raises(ValueError, match="integration of 'pendulum' over 0.03 s failed: it needs more than 600 steps"):
+        simulate("pendulum", [3.0, 1e6], np.zeros((1, 1)))
+
+
+def test_a_long_step_may_take_many():
+    Z = simulate("pendulum", [1.0, 0.0], np.zeros((1, 1)), dt=200.0)
+    assert_allclose(Z[1], 0.0, atol=1e-10)
