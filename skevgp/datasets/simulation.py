@@ -6,7 +6,7 @@ from collections.abc import Callable
 from typing import Literal, overload
 
 import numpy as np
-from joblib import Parallel, delayed
+from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import ArrayLike
 
 from .._validation import as_floats, check_integer, check_real
@@ -149,17 +149,27 @@ def simulate(
     Z, inputs = np.empty((len(z), n_steps + 1, 2 * n)), np.empty((len(z), n_steps, n_inputs))
     Z[:, 0] = z
     groups = [slice(first, first + _GROUP) for first in range(0, len(z), _GROUP)]
-    with Parallel(n_jobs=n_jobs) as parallel:
+    n_tasks = min(effective_n_jobs(n_jobs), len(groups))
+    tasks = [groups[len(groups) * task // n_tasks : len(groups) * (task + 1) // n_tasks] for task in range(n_tasks)]
+    with Parallel(n_jobs=n_tasks) as parallel:
         for step in range(n_steps):
             u = _inputs_of(controller, step, Z[:, step].copy(), n_inputs)
             inputs[:, step] = np.clip(u, -plant.limits, plant.limits)
-            after = parallel(delayed(plant.advance)(Z[group, step], inputs[group, step], dt, stiff) for group in groups)
+            after = parallel(
+                delayed(_advance)(plant, [(Z[group, step], inputs[group, step]) for group in task], dt, stiff)
+                for task in tasks
+            )
             Z[:, step + 1] = np.concatenate(after)
     if wrap_angles:
         Z -= turns(Z, layout.revolute)
     if single:
         Z, inputs = Z[0], inputs[0]
     return (Z, inputs) if return_inputs else Z
+
+
+def _advance(plant: Plant, groups: list[tuple[np.ndarray, np.ndarray]], dt: float, stiff: bool) -> np.ndarray:
+    """The next states of some groups of trajectories."""
+    return np.concatenate([plant.advance(z, u, dt, stiff) for z, u in groups])
 
 
 def turns(Z: np.ndarray, revolute: tuple[bool, ...]) -> np.ndarray:
