@@ -1,8 +1,18 @@
 """Data sets: simulated robots (with Pinocchio) and toys."""
 
 from ..robots import list_robots, load_robot, perturb_robot
+from .control import ComputedTorqueController, quintic_reference
 from .dynamics import make_dynamics
 from .simulation import simulate
 from .toy import make_toy
 
-__all__ = ["list_robots", "load_robot", "make_dynamics", "make_toy", "perturb_robot", "simulate"]
+__all__ = [
+    "ComputedTorqueController",
+    "list_robots",
+    "load_robot",
+    "make_dynamics",
+    "make_toy",
+    "perturb_robot",
+    "quintic_reference",
+    "simulate",
+]

@@ -2,39 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Literal, overload
 
 import numpy as np
 from sklearn.utils import Bunch, check_random_state
 
 from .._validation import check_integer, check_real
-from ..robots import layout_of
 from ..robots.loading import Robot
-from .simulation import simulate
+from .plant import Plant
+from .sampling import sampling_of
+from .simulation import simulate, turns
 
 RandomState = int | np.random.RandomState | None
-
-
-@dataclass(frozen=True)
-class _Sampling:
-    """A row of the paper's Table 2: how trajectories of a system are drawn."""
-
-    state_scale: tuple[float, ...]  # alpha: the first state is alpha * U(-1, 1)
-    input_scale: float  # eta: each input is eta * N(0, 1)
-    n_trajectories: int  # H
-    n_steps: int = 100
-
-
-_PAPER: Mapping[str, _Sampling] = MappingProxyType(
-    {
-        "pendulum": _Sampling((np.pi, 0.5), 1.0, 48),
-        "cartpole": _Sampling((1.0, np.pi, 0.5, 0.5), 100.0, 48),
-        "acrobot": _Sampling((np.pi, 1.0, 0.5, 0.5), 0.5, 93),
-    }
-)
 
 
 @overload
@@ -44,8 +23,11 @@ def make_dynamics(
     n_steps: int | None = ...,
     *,
     dt: float = ...,
+    duration: float | None = ...,
     noise: float = ...,
     input_noise: float = ...,
+    wrap_angles: bool = ...,
+    n_jobs: int | None = ...,
     random_state: RandomState = ...,
     return_X_y: Literal[False] = ...,
 ) -> Bunch: ...
@@ -56,8 +38,11 @@ def make_dynamics(
     n_steps: int | None = ...,
     *,
     dt: float = ...,
+    duration: float | None = ...,
     noise: float = ...,
     input_noise: float = ...,
+    wrap_angles: bool = ...,
+    n_jobs: int | None = ...,
     random_state: RandomState = ...,
     return_X_y: Literal[True],
 ) -> tuple[np.ndarray, np.ndarray]: ...
@@ -67,32 +52,55 @@ def make_dynamics(
     n_steps: int | None = None,
     *,
     dt: float = 0.03,
+    duration: float | None = None,
     noise: float = 0.0,
     input_noise: float = 0.0,
+    wrap_angles: bool = False,
+    n_jobs: int | None = None,
     random_state: RandomState = None,
     return_X_y: bool = False,
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Simulate a system from random states under random inputs (section IV-B of the paper).
+    """Simulate a robot: the data sets of section IV-B of the paper, and the like of any robot.
 
-    Each trajectory starts at ``alpha * U(-1, 1)`` and is driven by inputs ``eta * N(0, 1)``, held over each step,
-    with the paper's scales (its Table 2). Angles are not wrapped.
+    The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs
+    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 2).
+
+    The arm iiwa14 starts at rest, its joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each, along a
+    quintic reference and by computed-torque control (gains 100, 20 and 1, held over each step), with noise of standard
+    deviation 0.1 * (3, 15, 3, 2, 2, 2, 0.05) N m on the torques.
+
+    Any other robot whose joints are all driven moves like this arm within its position limits, with noise of a tenth
+    of the torques that it takes to hold it and to give each joint 1 rad/s² (less where that would shake a light link by
+    more than 2 rad/s²). A robot with a joint without motor starts
+    in a random state within its limits and is driven by random inputs of that size, like the acrobot. A robot with the
+    name and the size of one of the four is taken for it. `simulate` says which forces act.
 
     Parameters
     ----------
-    system : str
-        ``"pendulum"``, ``"cartpole"`` or ``"acrobot"``.
+    system : str, path-like, System or pinocchio.Model
+        What `load_robot` takes: ``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"iiwa14"``, another name of
+        `list_robots`, the path of a URDF file, or a model.
     n_trajectories : int, default=None
-        At least 1; None takes the paper's (48, 48 and 93).
+        At least 1; None takes the paper's (48, 48, 93 and 465), and 100 for another robot.
     n_steps : int, default=None
-        Steps per trajectory, at least 1; None takes the paper's 100.
+        Steps per trajectory, at least 1; None takes the paper's (100, and 50 for iiwa14), and 50 for another robot.
     dt : float, default=0.03
-        Length of a step, s.
+        Length of a step, s. Above 0.03 the controller's gains become softer, so that it stays stable.
+    duration : float, default=None
+        How long a controlled move takes, s; the target is held afterwards. None moves until the end. Only for robots
+        that are controlled.
     noise : float, default=0.0
         Standard deviation of the Gaussian noise on each target, as a fraction of that target's standard deviation.
     input_noise : float, default=0.0
         The same for the states in ``data``, as a fraction of each state's standard deviation. Inputs stay exact.
+    wrap_angles : bool, default=False
+        Whether revolute positions in ``data`` lie in [-pi, pi). The row of ``target`` moves by the same multiple of
+        2 pi, so that their difference stays small; it may leave the interval. Noise is added before.
+    n_jobs : int, default=None
+        Processes for the simulation, as in `simulate`; it does not change a bit.
     random_state : int, RandomState instance or None, default=None
-        Draws the initial states, the inputs and the noise, in this order.
+        Draws the initial states, the inputs (or the targets, then the noise on the torques) and the noise on states
+        and targets, in this order.
     return_X_y : bool, default=False
         Whether to return ``(data, target)`` in place of a Bunch.
 
@@ -102,10 +110,12 @@ def make_dynamics(
         With
 
         - ``data`` : ndarray of shape (n_rows, 2 * n_joints + n_inputs): positions (rad or m), velocities (rad/s or
-          m/s), inputs (N m or N), where n_rows = n_trajectories * n_steps, one trajectory after the other;
+          m/s) and the inputs that acted, within the motors' limits (N m or N), where n_rows = n_trajectories *
+          n_steps, one trajectory after the other;
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,): the trajectory of each row, for `GroupKFold`;
-        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): the true states;
+        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): the true states, not
+          wrapped;
         - ``dt`` : float, and ``robot``, as given: what a feature map must be told (``InertiaForce(robot, dt=dt)``);
         - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
@@ -116,7 +126,8 @@ def make_dynamics(
     ImportError
         If Pinocchio is not installed; the message gives the pip command.
     ValueError, TypeError
-        If an argument is out of its range or of the wrong type, or the system is unknown.
+        If an argument is out of its range or of the wrong type, the robot is unknown, or it cannot be simulated (see
+        `simulate`).
 
     Examples
     --------
@@ -126,30 +137,36 @@ def make_dynamics(
     ((10, 3), (10, 2))
     >>> pendulum.feature_names, pendulum.groups.tolist()
     (['q', 'dq/dt', 'u_q'], [0, 0, 0, 0, 0, 1, 1, 1, 1, 1])
+
+    A robot of the package example-robot-data:
+
+    >>> make_dynamics("ur5", n_trajectories=2, n_steps=5, random_state=0).data.shape
+    (10, 18)
     """
-    robot, system = system, layout_of(system)
-    if system.name not in _PAPER or len(_PAPER[system.name].state_scale) != 2 * system.n_joints:
-        raise ValueError(f"No sampling scales are known for {system.name!r}; the known systems are {sorted(_PAPER)}.")
-    sampling = _PAPER[system.name]
+    plant = Plant(system)
+    layout, sampling = plant.layout, sampling_of(plant)
     n_trajectories = sampling.n_trajectories if n_trajectories is None else n_trajectories
     n_steps = sampling.n_steps if n_steps is None else n_steps
     check_integer(n_trajectories, "n_trajectories", minimum=1)
     check_integer(n_steps, "n_steps", minimum=1)
     check_real(dt, "dt", minimum=0.0, strict=True)
+    if duration is not None:
+        check_real(duration, "duration", minimum=0.0, strict=True)
     check_real(noise, "noise", minimum=0.0)
     check_real(input_noise, "input_noise", minimum=0.0)
 
     rng = check_random_state(random_state)
-    n_states = 2 * system.n_joints
-    z0 = np.array(sampling.state_scale) * rng.uniform(-1.0, 1.0, (n_trajectories, n_states))
-    inputs = sampling.input_scale * rng.standard_normal((n_trajectories, n_steps, system.n_inputs))
-    trajectories = simulate(robot, z0, inputs, dt)
+    z0, controller = sampling.draw(plant, (n_trajectories, n_steps), dt, duration, rng)
+    trajectories, inputs = simulate(plant.model, z0, controller, dt, n_steps=n_steps, return_inputs=True, n_jobs=n_jobs)
 
-    states = trajectories[:, :-1].reshape(-1, n_states)
-    target = trajectories[:, 1:].reshape(-1, n_states)
+    states = trajectories[:, :-1].reshape(-1, 2 * layout.n_joints)
+    target = trajectories[:, 1:].reshape(states.shape)
     states = states + input_noise * states.std(axis=0) * rng.standard_normal(states.shape)
     target = target + noise * target.std(axis=0) * rng.standard_normal(target.shape)
-    data = np.hstack([states, inputs.reshape(-1, system.n_inputs)])
+    if wrap_angles:
+        away = turns(states, layout.revolute)
+        states, target = states - away, target - away
+    data = np.hstack([states, inputs.reshape(-1, layout.n_inputs)])
     if return_X_y:
         return data, target
     return Bunch(
@@ -157,12 +174,13 @@ def make_dynamics(
         target=target,
         groups=np.repeat(np.arange(n_trajectories), n_steps),
         trajectories=trajectories,
-        feature_names=system.state_names + system.input_names,
-        target_names=system.state_names,
-        robot=robot,
+        feature_names=layout.column_names,
+        target_names=layout.state_names,
+        robot=system,
         dt=dt,
         DESCR=(
-            f"{n_trajectories} trajectories of {n_steps} steps of {dt} s of the system {system.name!r}; noise {noise} "
-            f"on the targets and {input_noise} on the states, as fractions of their standard deviations."
+            f"{n_trajectories} trajectories of {n_steps} steps of {dt} s of the system {layout.name!r} under "
+            f"{sampling.description}; noise {noise} on the targets and {input_noise} on the states, as fractions of "
+            f"their standard deviations; angles {'' if wrap_angles else 'not '}wrapped."
         ),
     )

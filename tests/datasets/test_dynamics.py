@@ -1,12 +1,11 @@
-from dataclasses import replace
-
 import numpy as np
+import pinocchio
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.utils import check_random_state
 
-from skevgp.datasets import make_dynamics, simulate
-from skevgp.robots import get_system
+from skevgp.datasets import load_robot, make_dynamics, quintic_reference, simulate
+from skevgp.robots import get_system, layout_of
 
 KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "dt", "DESCR"}
 ALPHA = {"pendulum": [np.pi, 0.5], "cartpole": [1.0, np.pi, 0.5, 0.5], "acrobot": [np.pi, 1.0, 0.5, 0.5]}
@@ -160,7 +159,11 @@ def test_a_system_works_in_place_of_its_name():
     [
         ({"system": "robot"}, r"Unknown robot 'robot'.*'acrobot', 'cartpole', 'iiwa14', 'pendulum'"),
         ({"system": "acrobat"}, "Did you mean 'acrobot'"),
-        ({"system": replace(get_system("pendulum"), name="mine")}, "No sampling scales are known for 'mine'.*pendulum"),
+        (
+            {"duration": 1.0},
+            "duration is the time of a controlled move; 'pendulum' is driven by random inputs. Got 1.0",
+        ),
+        ({"system": "iiwa14", "duration": 0.0}, "duration must be finite and above 0.0; got 0.0"),
         ({"n_trajectories": 0}, "n_trajectories must be at least 1; got 0"),
         ({"n_steps": -1}, "n_steps must be at least 1; got -1"),
         ({"dt": 0.0}, "dt must be finite and above 0.0; got 0.0"),
@@ -187,3 +190,116 @@ def test_bad_values_are_named(arguments, message):
 def test_bad_types_are_named(arguments, message):
     with pytest.raises(TypeError, match=message):
         make_dynamics(**{"system": "pendulum"} | arguments)
+
+
+def as_drawn_before_there_was_control(name, n_trajectories, n_steps):
+    rng = check_random_state(5)
+    z0 = np.array(ALPHA[name]) * rng.uniform(-1.0, 1.0, (n_trajectories, len(ALPHA[name])))
+    return z0, ETA[name] * rng.standard_normal((n_trajectories, n_steps, 1))
+
+
+@pytest.mark.parametrize("robot", [str, get_system, load_robot], ids=["name", "System", "model"])
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_states_and_inputs_of_the_planar_systems_are_the_papers(name, robot):
+    z0, U = as_drawn_before_there_was_control(name, 3, 4)
+    dynamics = make_dynamics(robot(name), 3, 4, random_state=5)
+    assert_array_equal(dynamics.trajectories[:, 0], z0)
+    assert_array_equal(dynamics.data[:, -1:], U.reshape(-1, 1))
+
+
+NOISE = 0.1 * np.array([3.0, 15.0, 3.0, 2.0, 2.0, 2.0, 0.05])
+
+
+def test_iiwa14_has_the_size_of_the_paper():
+    assert make_dynamics("iiwa14", n_steps=1, duration=1.5).trajectories.shape == (465, 2, 14)
+    assert make_dynamics("iiwa14", n_trajectories=1).data.shape == (50, 21)
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", load_robot("iiwa14")], ids=["name", "model"])
+def test_iiwa14_starts_at_rest_and_tracks_its_target(robot):
+    dynamics = make_dynamics(robot, 20, random_state=3)
+    rng = check_random_state(3)
+    q0 = 1.5 * rng.uniform(-1.0, 1.0, (20, 7))
+    q1 = q0 + 0.8 * rng.uniform(-1.0, 1.0, (20, 7))
+    first = dynamics.trajectories[:, 0]
+    assert_array_equal(first, np.hstack([q0, np.zeros((20, 7))]))
+    desired = quintic_reference(q0, q1, 1.5, 0.03 * np.arange(51))[0]
+    assert np.abs(dynamics.trajectories[..., :7] - desired).max() < 0.15
+    assert np.abs(dynamics.trajectories[:, -1, :7] - q1).max() < 0.05
+
+
+def test_iiwa14s_torques_scatter_around_computed_torque():
+    dynamics = make_dynamics("iiwa14", 400, 1, duration=1.5, random_state=0)
+    model = load_robot("iiwa14")
+    data = model.createData()
+    held = [pinocchio.computeGeneralizedGravity(model, data, row[:7]) for row in dynamics.data]
+    assert_allclose((dynamics.data[:, 14:] - held).std(axis=0), NOISE, rtol=0.1)
+
+
+def test_a_shorter_move_rests_at_its_target():
+    rest = make_dynamics("iiwa14", 5, 50, duration=0.6, random_state=0).trajectories[:, 30:, :7]
+    assert np.ptp(rest, axis=1).max() < 0.1
+
+
+def test_inputs_are_those_that_acted():
+    dynamics = make_dynamics("iiwa14", 5, 4, duration=0.1, random_state=0)
+    effort = load_robot("iiwa14").upperEffortLimit
+    U = dynamics.data[:, 14:]
+    assert (np.abs(U) <= effort).all()
+    assert (np.abs(U) == effort).any()
+    assert_array_equal(dynamics.trajectories, simulate("iiwa14", dynamics.trajectories[:, 0], U.reshape(5, 4, 7)))
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "kinova", "double_pendulum"])
+def test_any_robot_moves_within_its_limits(name):
+    dynamics = make_dynamics(name, 10, 10, duration=1.0, random_state=0)
+    model, layout = load_robot(name), layout_of(name)
+    assert dynamics.data.shape == (100, layout.n_columns)
+    assert dynamics.feature_names == layout.column_names
+    assert np.isfinite(dynamics.target).all()
+    first = dynamics.trajectories[:, 0, : model.nv]
+    known = model.lowerPositionLimit < model.upperPositionLimit
+    assert (first >= np.where(known, model.lowerPositionLimit, -1.5)).all()
+    assert (first <= np.where(known, model.upperPositionLimit, 1.5)).all()
+    assert (np.ptp(first, axis=0) <= 3.0).all()
+    assert (first.std(axis=0) > 0.005).all()
+    assert not dynamics.trajectories[:, 0, model.nv :].any()
+
+
+def test_a_joint_without_motor_is_swung_at_random():
+    model = load_robot("acrobot")
+    model.name = "mine"
+    model.lowerPositionLimit, model.upperPositionLimit = np.array([2.0, -9.0]), np.array([2.5, 1.0])
+    dynamics = make_dynamics(model, 200, 1, random_state=0)
+    first = dynamics.trajectories[:, 0]
+    assert_allclose(first.min(axis=0), [2.0, -5.5, -0.5, -0.5], atol=0.05)
+    assert_allclose(first.max(axis=0), [2.5, -2.5, 0.5, 0.5], atol=0.05)
+    assert 0.1 < dynamics.data[:, -1].std() < 1.0
+    assert "random inputs from random states" in dynamics.DESCR
+
+
+def test_a_long_step_does_not_shake_the_arm():
+    moves = make_dynamics("ur5", 3, 20, dt=0.1, random_state=0).trajectories
+    assert np.abs(moves[..., 6:]).max() < 5.0
+
+
+def test_the_number_of_jobs_does_not_change_a_bit():
+    one, two = (make_dynamics("iiwa14", 65, 2, random_state=0, n_jobs=jobs) for jobs in (1, 2))
+    assert_array_equal(one.data, two.data)
+    assert_array_equal(one.target, two.target)
+
+
+def test_wrapped_angles_keep_what_changed():
+    turning = {"system": "cartpole", "n_trajectories": 20, "n_steps": 50, "noise": 0.01, "input_noise": 0.01}
+    free, wrapped = (make_dynamics(**turning, wrap_angles=wrap, random_state=0) for wrap in (False, True))
+    assert (np.abs(free.data[:, 1]) > np.pi).any()
+    assert (wrapped.data[:, 1] >= -np.pi).all()
+    assert (wrapped.data[:, 1] < np.pi).all()
+    assert_allclose(wrapped.target - states(wrapped), free.target - states(free), rtol=0, atol=1e-13)
+    assert_array_equal(np.delete(wrapped.data, 1, axis=1), np.delete(free.data, 1, axis=1))
+    assert_array_equal(wrapped.trajectories, free.trajectories)
+    assert "angles wrapped" in wrapped.DESCR
+
+
+def test_the_description_tells_the_controller():
+    assert "computed-torque control" in make_dynamics("iiwa14", 1, 1).DESCR

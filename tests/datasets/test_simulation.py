@@ -1,13 +1,15 @@
 from pathlib import Path
 
 import numpy as np
+import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
 from skevgp.datasets import simulate
-from skevgp.datasets.simulation import Plant
-from skevgp.robots import SYSTEMS, get_system, layout_of
+from skevgp.datasets.plant import Plant
+from skevgp.datasets.simulation import turns
+from skevgp.robots import SYSTEMS, get_system, layout_of, load_robot
 
 G = 9.81
 DT = 0.03
@@ -154,13 +156,26 @@ def test_the_input_is_held_for_dt():
     assert_allclose(coarse, fine[::2], rtol=0, atol=1e-10)
 
 
-def test_the_undriven_cartpole_keeps_its_energy():
-    Z = simulate("cartpole", [0.2, 2.5, 0.3, -0.4], np.zeros((100, 1)))
-    _, theta, dx, dtheta = Z.T
-    kinetic = 0.5 * 11.0 * dx**2 + 0.5 * np.cos(theta) * dx * dtheta + 0.5 * 0.25 * dtheta**2
-    energy = kinetic - G * 0.5 * np.cos(theta)
-    assert np.ptp(kinetic) > 1.0
-    assert_allclose(energy, energy[0], rtol=0, atol=1e-8)
+@pytest.mark.parametrize(
+    ("name", "z0"),
+    [
+        ("pendulum", [2.5, 0.4]),
+        ("cartpole", [0.2, 2.5, 0.3, -0.4]),
+        ("acrobot", [2.5, 0.5, 0.3, -0.4]),
+        ("iiwa14", [0.4, 0.9, -0.3, 1.2, 0.5, -0.7, 0.2] + [0.1] * 7),
+    ],
+)
+def test_without_damping_and_inputs_energy_is_kept(name, z0):
+    model = load_robot(name)
+    model.damping = np.zeros(model.nv)
+    data, n = model.createData(), model.nv
+    Z = simulate(model, z0, np.zeros((100, layout_of(model).n_inputs)))
+    rotors = 0.5 * Z[:, n:] ** 2 @ model.armature  # Pinocchio's energy leaves them out
+    links = [pinocchio.computeKineticEnergy(model, data, z[:n], z[n:]) for z in Z]
+    potential = np.array([pinocchio.computePotentialEnergy(model, data, z[:n]) for z in Z])
+    kinetic = np.array(links) + rotors
+    assert min(np.ptp(kinetic), np.ptp(potential)) > 1.0
+    assert np.ptp(kinetic + potential) < 1e-6 * min(np.ptp(kinetic), np.ptp(potential))
 
 
 def test_damping_slows_the_pendulum_down():
@@ -188,6 +203,7 @@ ZEROS = np.zeros((3, 1))
         (("pendulum", [0.0, 0.0], ZEROS, -0.03), "dt must be .*-0.03"),
         (("pendulum", [0.0, 0.0], ZEROS, np.nan), "dt must be .*nan"),
         (("pendulum", [0.0, 0.0], ZEROS, np.inf), "dt must be .*inf"),
+        (("pendulum", [0.0, 0.0], lambda step, Z: [[0.0]]), "With a controller, n_steps must say how many"),
         (("robot", [0.0, 0.0], ZEROS), r"Unknown robot 'robot'.*'acrobot', 'cartpole', 'iiwa14', 'pendulum'"),
         (("pendulm", [0.0, 0.0], ZEROS), "Did you mean 'pendulum'"),
     ],
@@ -222,3 +238,111 @@ def test_complex_states_are_refused():
 def test_no_trajectory_is_an_error():
     with pytest.raises(ValueError, match="and some rows"):
         simulate("pendulum", np.zeros((0, 2)), np.zeros((0, 3, 1)))
+
+
+def test_a_controller_acts_like_the_inputs_it_gives():
+    z0, U = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 4)), np.random.default_rng(1).standard_normal((3, 5, 1))
+    assert_array_equal(simulate("acrobot", z0, lambda step, Z: U[:, step], n_steps=5), simulate("acrobot", z0, U))
+
+
+def test_a_controller_sees_each_state_once():
+    z0, seen = np.array([[0.3, 0.0], [0.1, 0.2]]), []
+
+    def brake(step, Z):
+        seen.append((step, Z))
+        return -0.5 * Z[:, 1:]
+
+    Z, U = simulate("pendulum", z0, brake, n_steps=4, return_inputs=True)
+    assert [step for step, _ in seen] == [0, 1, 2, 3]
+    assert_array_equal(np.stack([states for _, states in seen], axis=1), Z[:, :-1])
+    assert_array_equal(U, -0.5 * Z[:, :-1, 1:])
+
+
+def test_a_controller_cannot_change_the_states():
+    def careless(_step, Z):
+        Z[:] = 7.0
+        return np.zeros((1, 1))
+
+    assert_array_equal(
+        simulate("pendulum", [0.3, 0.0], careless, n_steps=2), simulate("pendulum", [0.3, 0.0], ZEROS[:2])
+    )
+
+
+def test_one_trajectory_under_a_controller_has_two_dimensions():
+    Z, U = simulate("cartpole", np.zeros(4), lambda step, Z: np.ones((1, 1)), n_steps=3, return_inputs=True)
+    assert (Z.shape, U.shape) == ((4, 4), (3, 1))
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.zeros(2), r"must return finite inputs of shape \(2, 1\); got the shape \(2,\) in step 0"),
+        (np.zeros((1, 1)), r"shape \(2, 1\); got the shape \(1, 1\)"),
+        ([[0.0], [np.nan]], "got NaN or infinity in step 0"),
+        ([[0.0], [1j]], "inputs must be real numbers"),
+    ],
+)
+def test_what_a_controller_returns_is_checked(answer, message):
+    with pytest.raises(ValueError, match=message):
+        simulate("pendulum", np.zeros((2, 2)), lambda step, Z: answer, n_steps=1)
+
+
+def test_a_number_of_steps_is_for_controllers():
+    with pytest.raises(ValueError, match="n_steps is for a controller.*Got 3"):
+        simulate("pendulum", [0.0, 0.0], ZEROS, n_steps=3)
+
+
+def test_motors_give_no_more_than_their_limits():
+    effort = load_robot("iiwa14").upperEffortLimit
+    U = np.random.default_rng(0).uniform(-2.0, 2.0, (2, 3, 7)) * effort
+    clipped = np.clip(U, -effort, effort)
+    z0 = np.zeros((2, 14))
+    Z, acted = simulate("iiwa14", z0, U, return_inputs=True)
+    assert_array_equal(acted, clipped)
+    assert_array_equal(Z, simulate("iiwa14", z0, clipped))
+
+
+def test_limits_that_are_all_zero_are_unknown():
+    U = np.full((2, 2), 30.0)
+    assert not load_robot("double_pendulum").upperEffortLimit.any()
+    assert_array_equal(simulate("double_pendulum", np.zeros(4), U, dt=0.001, return_inputs=True)[1], U)
+
+
+def test_the_number_of_jobs_does_not_change_a_bit():
+    rng = np.random.default_rng(0)
+    z0, U = rng.uniform(-1.0, 1.0, (130, 4)), rng.standard_normal((130, 2, 1))
+    assert_array_equal(simulate("acrobot", z0, U, n_jobs=2), simulate("acrobot", z0, U, n_jobs=1))
+
+
+def test_wrapped_angles_differ_by_whole_turns():
+    z0, U = [0.0, 3.0, 0.0, 8.0], np.zeros((40, 1))
+    Z, wrapped = simulate("cartpole", z0, U), simulate("cartpole", z0, U, wrap_angles=True)
+    assert np.abs(Z[:, 1]).max() > np.pi
+    assert (wrapped[:, 1] >= -np.pi).all()
+    assert (wrapped[:, 1] < np.pi).all()
+    whole = (Z - wrapped)[:, 1] / (2.0 * np.pi)
+    assert_allclose(whole, np.round(whole), rtol=0, atol=1e-12)
+    assert_array_equal(np.delete(wrapped, 1, axis=1), np.delete(Z, 1, axis=1))
+
+
+def test_no_rounding_leaves_an_angle_outside():
+    angles = np.outer(np.arange(-7, 8), [np.pi, np.nextafter(np.pi, 0), np.nextafter(np.pi, 4)]).reshape(-1, 1)
+    states = np.hstack([angles, np.zeros_like(angles)])
+    wrapped = (states - turns(states, (True,)))[:, 0]
+    assert (wrapped >= -np.pi).all()
+    assert (wrapped < np.pi).all()
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "kinova", "double_pendulum"])
+def test_one_step_of_any_robot_equals_plain_pinocchio(name):
+    model = load_robot(name)
+    data, n, rng = model.createData(), model.nv, np.random.default_rng(0)
+    q, v = rng.uniform(-0.5, 0.5, n), rng.uniform(-0.5, 0.5, n)
+    u = np.array(pinocchio.computeGeneralizedGravity(model, data, q))
+
+    def derivative(_t, state):
+        force = u - np.array(model.damping) * state[n:]
+        return np.r_[state[n:], pinocchio.aba(model, data, state[:n], state[n:], force)]
+
+    exact = solve_ivp(derivative, (0.0, DT), np.r_[q, v], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
+    assert_allclose(simulate(name, np.r_[q, v], u[np.newaxis])[1], exact, rtol=0, atol=1e-9)

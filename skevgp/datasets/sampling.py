@@ -1,0 +1,155 @@
+"""How trajectories of a robot are drawn: random inputs, or controlled moves with noise on the torque."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from ..robots import SYSTEMS
+from .control import ComputedTorqueController
+from .plant import Plant
+from .simulation import Controller
+
+_LARGEST_MOVE = 1.5  # half the width of the first positions, rad or m, where limits allow it
+_TRAVEL = 0.8 / 1.5  # how far a target may be from there, as a fraction of that half-width
+_NOISE = 0.1  # of the torques' scale
+_LARGEST_SHAKE = 2.0  # acceleration by noise on one torque, rad/s² or m/s²
+_UNLIMITED = 1e6  # a position limit beyond it is none
+
+
+@dataclass(frozen=True)
+class RandomInputs:
+    """The first state is center + scale * U(-1, 1), each input eta * N(0, 1)."""
+
+    center: np.ndarray  # (2 * n_joints,)
+    scale: np.ndarray  # (2 * n_joints,), alpha in the paper
+    input_scale: np.ndarray  # (n_inputs,), eta
+    n_trajectories: int
+    n_steps: int
+
+    description = "random inputs from random states"
+
+    def draw(
+        self, plant: Plant, shape: tuple[int, int], dt: float, duration: float | None, rng: np.random.RandomState
+    ) -> tuple[np.ndarray, Controller]:
+        if duration is not None:
+            raise ValueError(
+                f"duration is the time of a controlled move; {plant.layout.name!r} is driven by random inputs. "
+                f"Got {duration!r}."
+            )
+        z0 = self.center + self.scale * rng.uniform(-1.0, 1.0, (shape[0], len(self.scale)))
+        inputs = self.input_scale * rng.standard_normal((*shape, len(self.input_scale)))
+        return z0, lambda step, _Z: inputs[:, step]
+
+
+@dataclass(frozen=True)
+class ControlledMoves:
+    """From rest in center + width * U(-1, 1) to a target nearby within the limits, with noise on the torques."""
+
+    center: np.ndarray  # (n_joints,), as all that follow
+    width: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    noise: np.ndarray
+    n_trajectories: int
+    n_steps: int
+
+    description = "computed-torque control along quintic references, with noise on the torques,"
+
+    def draw(
+        self, plant: Plant, shape: tuple[int, int], dt: float, duration: float | None, rng: np.random.RandomState
+    ) -> tuple[np.ndarray, Controller]:
+        n = len(self.center)
+        q0 = self.center + self.width * rng.uniform(-1.0, 1.0, (shape[0], n))
+        q1 = np.clip(q0 + _TRAVEL * self.width * rng.uniform(-1.0, 1.0, (shape[0], n)), self.lower, self.upper)
+        noise = self.noise * rng.standard_normal((*shape, n))
+        kd = min(20.0, 0.6 / dt)  # the paper's gains, softer where a long step would make them unstable
+        controller = ComputedTorqueController(
+            plant.model, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kd**2 / 4, kd=kd
+        )
+        return np.hstack([q0, np.zeros_like(q0)]), lambda step, Z: controller(step, Z) + noise[:, step]
+
+
+def _random_inputs(state_scale: list[float], input_scale: float, n_trajectories: int) -> RandomInputs:
+    return RandomInputs(
+        np.zeros(len(state_scale)), np.array(state_scale), np.array([input_scale]), n_trajectories, n_steps=100
+    )
+
+
+# Table 2 of the paper, and its section IV-B for iiwa14.
+_PAPER: Mapping[str, RandomInputs | ControlledMoves] = MappingProxyType(
+    {
+        "pendulum": _random_inputs([np.pi, 0.5], 1.0, 48),
+        "cartpole": _random_inputs([1.0, np.pi, 0.5, 0.5], 100.0, 48),
+        "acrobot": _random_inputs([np.pi, 1.0, 0.5, 0.5], 0.5, 93),
+        "iiwa14": ControlledMoves(
+            center=np.zeros(7),
+            width=np.full(7, 1.5),
+            lower=np.full(7, -np.inf),
+            upper=np.full(7, np.inf),
+            noise=_NOISE * np.array([3.0, 15.0, 3.0, 2.0, 2.0, 2.0, 0.05]),
+            n_trajectories=465,
+            n_steps=50,
+        ),
+    }
+)
+
+
+def sampling_of(plant: Plant) -> RandomInputs | ControlledMoves:
+    """How a robot's trajectories are drawn.
+
+    Parameters
+    ----------
+    plant : Plant
+
+    Returns
+    -------
+    sampling : RandomInputs or ControlledMoves
+        The paper's for a robot with the name and the size of a named system. Else moves if all joints are driven, and
+        random inputs if not, with scales from the model.
+    """
+    layout = plant.layout
+    if layout.name in _PAPER and SYSTEMS[layout.name].layout.driven == layout.driven:
+        return _PAPER[layout.name]
+    lower, upper = _position_limits(plant)
+    with np.errstate(invalid="ignore"):
+        width = np.minimum(_LARGEST_MOVE, (upper - lower) / 2.0)
+        middle = (lower + upper) / 2.0
+    center = np.clip(np.where(np.isfinite(middle), middle, 0.0), lower + width, upper - width)
+    noise = _noise_scale(plant, center, width)
+    if layout.n_inputs == layout.n_joints:
+        return ControlledMoves(center, width, lower, upper, noise, n_trajectories=100, n_steps=50)
+    fastest = np.array(plant.model.velocityLimit)
+    speed = np.minimum(0.5, np.where(fastest > 0.0, fastest, np.inf))
+    return RandomInputs(
+        np.r_[center, np.zeros_like(center)],
+        np.r_[width, speed],
+        noise[list(layout.driven)],
+        n_trajectories=100,
+        n_steps=50,
+    )
+
+
+def _position_limits(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
+    """Limits of the positions, infinite where the model has none (an empty range is none)."""
+    lower, upper = np.array(plant.model.lowerPositionLimit), np.array(plant.model.upperPositionLimit)
+    known = lower < upper
+    return (
+        np.where(known & (lower > -_UNLIMITED), lower, -np.inf),
+        np.where(known & (upper < _UNLIMITED), upper, np.inf),
+    )
+
+
+def _noise_scale(plant: Plant, center: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """A tenth of what it takes to hold a joint and to give it 1 rad/s²; not more than gives any joint 2 rad/s².
+
+    Root mean squares over configurations; m/s² for prismatic joints.
+    """
+    q = center + width * np.random.RandomState(0).uniform(-1.0, 1.0, (50, len(center)))
+    M = np.array([plant.mass_matrix(row) for row in q])
+    work = np.abs(plant.body.gravity(q)) + np.diagonal(M, axis1=1, axis2=2)
+    answer = np.sqrt(np.mean(np.linalg.inv(M) ** 2, axis=0)).max(axis=0)
+    return np.minimum(_NOISE * np.sqrt(np.mean(work**2, axis=0)), _LARGEST_SHAKE / answer)

@@ -1,0 +1,160 @@
+from pathlib import Path
+
+import numpy as np
+import pinocchio
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from skevgp.datasets import ComputedTorqueController, quintic_reference, simulate
+from skevgp.robots import load_robot
+
+STORED = Path(__file__).parents[3] / "shared" / "reference" / "iiwa14_idc.npz"
+with_reference = pytest.mark.skipif(not STORED.is_file(), reason="the stored reference is not there")
+
+
+@pytest.fixture(scope="module")
+def stored():
+    return np.load(STORED)
+
+
+def test_a_reference_starts_and_ends_at_rest():
+    q, v, a = quintic_reference([0.2, -1.0], [1.0, 2.0], 1.5, [-1.0, 0.0, 1.5, 2.0])
+    assert_allclose(q, [[0.2, -1.0], [0.2, -1.0], [1.0, 2.0], [1.0, 2.0]], rtol=1e-15)
+    assert_array_equal(v, np.zeros((4, 2)))
+    assert_array_equal(a, np.zeros((4, 2)))
+
+
+def test_velocities_and_accelerations_are_derivatives():
+    times, h = np.linspace(0.1, 1.3, 7), 1e-5
+    before, now, after = (quintic_reference([0.2], [1.0], 1.5, times + shift) for shift in (-h, 0.0, h))
+    assert_allclose((after[0] - before[0]) / (2 * h), now[1], rtol=0, atol=1e-8)
+    assert_allclose((after[1] - before[1]) / (2 * h), now[2], rtol=0, atol=1e-8)
+
+
+def test_shapes_of_a_reference():
+    assert quintic_reference(np.zeros(2), np.ones(2), 1.0, 0.5)[0].shape == (2,)
+    assert quintic_reference(np.zeros(2), np.ones(2), 1.0, np.zeros(5))[1].shape == (5, 2)
+    assert quintic_reference(np.zeros((3, 2)), np.ones((3, 2)), 1.0, np.zeros(5))[2].shape == (3, 5, 2)
+
+
+@with_reference
+def test_the_reference_equals_the_stored_one(stored):
+    q, v, a = quintic_reference(stored["q0"], stored["q1"], 1.0, 0.03 * np.arange(50))
+    assert_allclose(np.concatenate([q, v], axis=-1), stored["smooth03_Zd"], rtol=0, atol=1e-12)
+    assert_allclose(a, stored["smooth03_Ad"], rtol=0, atol=1e-11)
+
+
+@with_reference
+def test_commands_equal_the_stored_ones_step_by_step(stored):
+    controller = ComputedTorqueController("iiwa14", stored["q0"], stored["q1"], duration=1.0)
+    for step in range(50):
+        commands = controller(step, stored["smooth03_Z"][:, step]) + stored["noise"][:, step]
+        assert_allclose(commands, stored["smooth03_U"][:, step], rtol=0, atol=1e-8)
+        assert_allclose(controller.integral, stored["smooth03_I"][:, step], rtol=0, atol=1e-9)
+
+
+@with_reference
+def test_the_closed_loop_equals_the_stored_one(stored):
+    controller = ComputedTorqueController("iiwa14", stored["q0"], stored["q1"], duration=1.0)
+    Z, U = simulate(
+        "iiwa14",
+        stored["smooth03_Z"][:, 0],
+        lambda step, Z: controller(step, Z) + stored["noise"][:, step],
+        n_steps=50,
+        return_inputs=True,
+    )
+    assert_allclose(U, stored["smooth03_Uclip"], rtol=0, atol=1e-8)
+    assert_allclose(Z, stored["smooth03_Z"], rtol=0, atol=1e-8)
+
+
+@with_reference
+def test_clamped_commands_equal_the_stored_ones(stored):
+    effort, Z = stored["effort_limit"], stored["step03_Z"]
+    before, after = Z[:, :-1].reshape(-1, 14), Z[:, 1:].reshape(-1, 14)
+    U = stored["step03_U"].reshape(-1, 1, 7)
+    assert (np.abs(U) > effort).any()
+    ends, acted = simulate("iiwa14", before, U, return_inputs=True)
+    assert_array_equal(acted[:, 0], stored["step03_Uclip"].reshape(-1, 7))
+    assert_allclose(ends[:, 1], after, rtol=0, atol=1e-8)
+
+
+def test_the_first_command_is_computed_torque():
+    model = load_robot("panda")
+    n, rng = model.nv, np.random.default_rng(0)
+    q0, q1, q, v = rng.uniform(-0.5, 0.5, (4, n))
+    kp, kd = np.linspace(50.0, 100.0, n), 15.0
+    controller = ComputedTorqueController("panda", q0, q1, duration=1.0, kp=kp, kd=kd)
+    expected = pinocchio.rnea(model, model.createData(), q, v, kp * (q0 - q) - kd * v)
+    assert_allclose(controller(0, np.r_[q, v][np.newaxis]), [expected], rtol=1e-12)
+
+
+def test_the_integral_starts_anew_in_step_0():
+    controller = ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=0.3)
+    z0 = np.r_[np.full(6, 0.1), np.zeros(6)]
+    first, second = (simulate("ur5", z0, controller, n_steps=5) for _ in range(2))
+    assert controller.integral.any()
+    assert_array_equal(first, second)
+
+
+def test_the_integral_is_that_of_the_trajectory():
+    q0, q1 = np.zeros(7), np.full(7, 0.8)
+    controller = ComputedTorqueController("iiwa14", q0, q1, duration=1.0)
+    z0 = np.zeros(14)
+    _, U = simulate("iiwa14", z0, controller, n_steps=10, return_inputs=True)
+    q = simulate("iiwa14", z0, np.repeat(U, 10, axis=0), dt=0.003)[:91, :7]
+    area = 0.003 / 3.0 * (q[0] + 4.0 * q[1:-1:2].sum(axis=0) + 2.0 * q[2:-1:2].sum(axis=0) + q[-1])
+    desired = 0.03 * quintic_reference(q0, q1, 1.0, 0.03 * np.arange(9))[0].sum(axis=0)
+    assert_allclose(controller.integral, [desired - area], rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", "ur5", "panda", "kinova", "double_pendulum", "talos_left_arm"])
+def test_a_robot_arrives_at_its_target(robot):
+    n = load_robot(robot).nv
+    q0, q1 = np.zeros((2, n)), np.array([[0.02], [-0.02]]) * np.ones(n)
+    controller = ComputedTorqueController(robot, q0, q1, duration=0.3)
+    Z = simulate(robot, np.zeros((2, 2 * n)), controller, n_steps=30)
+    assert_allclose(Z[:, -1, :n], q1, rtol=0, atol=0.002)
+
+
+ZERO, ONE = np.zeros(7), np.ones(7)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"robot": "acrobot"}, r"All joints must be driven; those of 'acrobot' without a motor are \['q1'\]"),
+        ({"robot": "robot"}, "Unknown robot 'robot'"),
+        ({"q0": np.zeros(6), "q1": np.ones(6)}, "q0 and q1 must have 7 columns for 'iiwa14'; got 6"),
+        ({"q1": np.ones((2, 7))}, r"same shape.*got \(7,\) and \(2, 7\)"),
+        ({"q0": np.full(7, np.nan)}, "q0 must be finite"),
+        ({"duration": 0.0}, "duration must be finite and above 0.0; got 0.0"),
+        ({"dt": -0.03}, "dt must be finite and above 0.0; got -0.03"),
+        ({"kp": -1.0}, "kp must be a number or 7 numbers, not negative; got -1.0"),
+        ({"ki": np.ones(6)}, "ki must be a number or 7 numbers"),
+        ({"kd": 67.0}, r"kd must be below 2 / dt = 66.6667.*got 67.0"),
+    ],
+)
+def test_bad_arguments_of_a_controller_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        ComputedTorqueController(**{"robot": "iiwa14", "q0": ZERO, "q1": ONE, "duration": 1.0} | arguments)
+
+
+@pytest.mark.parametrize("shape", [(14,), (3, 14), (2, 12)])
+def test_states_of_another_shape_are_refused(shape):
+    controller = ComputedTorqueController("iiwa14", np.zeros((2, 7)), np.ones((2, 7)), duration=1.0)
+    with pytest.raises(ValueError, match=r"must fit q0, of shape \(2, 7\)"):
+        controller(0, np.zeros(shape))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ((0.0, 1.0, 1.0, 0.0), "q0 and q1 must have the same shape"),
+        (([0.0], [1.0], 0.0, 0.0), "duration must be finite and above 0.0"),
+        (([0.0], [1.0], 1.0, [[0.0]]), "times must be a number or one-dimensional"),
+        (([0.0], [1.0], 1.0, np.inf), "times must be finite"),
+    ],
+)
+def test_bad_arguments_of_a_reference_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        quintic_reference(*arguments)

@@ -1,0 +1,75 @@
+import numpy as np
+import pinocchio
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from skevgp.datasets import simulate
+from skevgp.datasets.plant import Plant
+from skevgp.robots import load_robot
+
+
+def strongly_damped(damping):
+    model = load_robot("acrobot")
+    model.damping = np.array([damping, damping])
+    return model
+
+
+def with_a_massless_tip():
+    model = load_robot("pendulum")
+    model.addJoint(1, pinocchio.JointModelRY(), pinocchio.SE3.Identity(), "tip")
+    return model
+
+
+def test_the_mass_matrix_is_that_of_the_inverse_dynamics():
+    plant, q = Plant("iiwa14"), np.linspace(-1.0, 1.0, 7)
+    rows, still = np.tile(q, (7, 1)), np.zeros((7, 7))
+    columns = plant.body.forces(rows, still, np.eye(7)) - plant.body.gravity(rows)
+    assert_allclose(plant.mass_matrix(q), columns, rtol=0, atol=1e-12)
+
+
+def test_limits_are_the_motors():
+    assert_array_equal(Plant("iiwa14").limits, [320, 320, 176, 176, 110, 40, 40])
+    assert_array_equal(Plant("acrobot").limits, [np.inf])
+    assert_array_equal(Plant("double_pendulum").limits, [np.inf, np.inf])
+
+
+def test_a_massless_link_is_named():
+    with pytest.raises(ValueError, match=r"mass matrix of 'pendulum' is singular.*\['tip'\].*inertia"):
+        simulate(with_a_massless_tip(), np.zeros(4), np.zeros((2, 2)))
+
+
+def test_a_robot_without_any_mass_is_refused():
+    model = load_robot("pendulum")
+    model.inertias[1] = pinocchio.Inertia.Zero()
+    with pytest.raises(ValueError, match=r"is singular.*\['q'\]"):
+        simulate(model, [0.1, 0.0], np.zeros((1, 1)))
+
+
+@pytest.mark.parametrize(("damping", "stiff"), [(0.1, False), (1e3, False), (1e6, True)])
+def test_strong_damping_is_stiff(damping, stiff):
+    assert Plant(strongly_damped(damping)).is_stiff(np.zeros(2), 0.03) == stiff
+
+
+def test_the_implicit_method_agrees_with_the_explicit_one():
+    plant, rng = Plant(strongly_damped(50.0)), np.random.default_rng(0)
+    z, u = rng.uniform(-1.0, 1.0, (5, 4)), rng.standard_normal((5, 1))
+    assert_allclose(plant.advance(z, u, 0.03, stiff=True), plant.advance(z, u, 0.03, stiff=False), rtol=0, atol=1e-7)
+
+
+def test_a_very_strongly_damped_joint_creeps():
+    damping, torque = 1e7, 1e5
+    model = load_robot("pendulum")
+    model.damping = np.array([damping])
+    q, v = simulate(model, [0.0, 0.0], np.full((3, 1), torque)).T
+    assert_allclose(v[1:], torque / damping, rtol=1e-4)
+    assert_allclose(np.diff(q), 0.03 * torque / damping, rtol=1e-4)
+
+
+def test_a_motion_too_fast_for_the_step_ends_in_an_error():
+    with pytest.raises(ValueError, match="integration of 'pendulum' over 0.03 s failed: it needs more than 600 steps"):
+        simulate("pendulum", [3.0, 1e6], np.zeros((1, 1)))
+
+
+def test_a_long_step_may_take_many():
+    Z = simulate("pendulum", [1.0, 0.0], np.zeros((1, 1)), dt=200.0)
+    assert_allclose(Z[1], 0.0, atol=1e-10)
