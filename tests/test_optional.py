@@ -67,7 +67,7 @@ def test_simulating_without_pinocchio_gives_the_pip_command(monkeypatch, use):
 
 def test_an_unknown_system_is_told_before_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(ValueError, match="Unknown system"):
+    with pytest.raises(ValueError, match="Unknown robot"):
         make_dynamics("robot")
 
 
