@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self, cast
 
 import numpy as np
 from joblib import effective_n_jobs
@@ -67,10 +67,12 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
         Inducing points; fewer if there are fewer distinct rows.
-    inducing_init : {"k-means", "greedy"} or array-like of shape (m, d), default="k-means"
-        Where inducing points start: at cluster centres of the kernel's inputs; one after the other at the row that the
-        kernel, as it starts, knows least from those before (Burt et al. 2020); or at given points in the space of
-        ``kernel_map``, whose number then replaces ``n_inducing``. With ``max_iter=0`` they stay there.
+    inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
+        Where inducing points start. ``"k-means"``: at cluster centres of the kernel's inputs. ``"greedy"``: one after
+        the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
+        ``"auto"``: at cluster centres, and with L-BFGS after 100 iterations once more, greedily under the kernel
+        learned so far. Or at given points in the space of ``kernel_map``, whose number then replaces ``n_inducing``.
+        With ``max_iter=0`` they stay there.
     sharing : {"all", "kernel", "none"}, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Signal variance, noise and weights are always per output.
@@ -180,7 +182,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "kernel": "no_validation",
         "kernel_map": "no_validation",
         "n_inducing": [Interval(Integral, 1, None, closed="left")],
-        "inducing_init": [StrOptions({"k-means", "greedy"}), "array-like"],
+        "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none"})],
         "posterior": [StrOptions({"full", "diagonal"})],
         "coef_mean": ["array-like", Real, StrOptions({"auto"})],
@@ -210,7 +212,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         *,
         kernel_map: TransformerMixin | None = None,
         n_inducing: int = 100,
-        inducing_init: Literal["k-means", "greedy"] | ArrayLike = "k-means",
+        inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Literal["all", "kernel", "none"] = "all",
         posterior: Literal["full", "diagonal"] = "full",
         coef_mean: ArrayLike | Literal["auto"] = "auto",
@@ -488,12 +490,12 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _placement(self, centre: np.ndarray) -> Placement:
         """How inducing points start, for inputs from which ``centre`` is subtracted."""
         if isinstance(self.inducing_init, str):
-            return Placement("greedy" if self.inducing_init == "greedy" else "k-means", self.n_inducing)
+            return Placement(cast(Literal["auto", "k-means", "greedy"], self.inducing_init), self.n_inducing)
         points = as_floats(self.inducing_init, "inducing_init")
         if points.ndim != 2 or len(points) == 0 or points.shape[1] != len(centre):
             raise ValueError(
-                f"inducing_init must be 'k-means', 'greedy' or an array of shape (m, {len(centre)}): points in the "
-                f"space of kernel_map; got the shape {points.shape}."
+                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {len(centre)}): points in "
+                f"the space of kernel_map; got the shape {points.shape}."
             )
         if not np.isfinite(points).all():
             raise ValueError("inducing_init must be finite; it contains NaN or infinity.")

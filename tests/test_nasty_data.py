@@ -176,7 +176,7 @@ def test_bad_data(X, y, message):
         ({"feature_map": PolynomialFeatures(1), "coef_mean": 1e300}, "coef_mean must not exceed"),
         ({"feature_map": FunctionTransformer(lambda X: 1e200 * X)}, "What feature_map=.* must not exceed"),
         ({"kernel_map": FunctionTransformer(lambda X: X[:, :0])}, "kernel_map=.* returned no columns"),
-        ({"feature_map": InertiaForceGravity("pendulums")}, "Unknown system 'pendulums'.*Did you mean 'pendulum'"),
+        ({"feature_map": InertiaForceGravity("pendulums")}, "Unknown robot 'pendulums'.*Did you mean 'pendulum'"),
         ({"feature_map": InertiaForce("acrobot")}, "X has 3 columns, but .* needs 5"),
         ({"feature_map": InertiaForce("pendulum")}, "y has 1 columns, but .* predicts 2 states"),
     ],

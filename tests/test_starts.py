@@ -26,8 +26,8 @@ def model(**arguments):
 
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_restarts_keep_the_best_bound(sharing):
-    once = model(sharing=sharing).fit(X, Y)
-    often = model(sharing=sharing, n_restarts=3).fit(X, Y)
+    once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
+    often = model(sharing=sharing, inducing_init="k-means", n_restarts=3).fit(X, Y)
     assert often.lower_bound_ >= once.lower_bound_
     # Not all from the same place: the eight points leave several optima, of which the first is not the best.
     assert often.lower_bound_ > once.lower_bound_ + 1e-3
@@ -79,12 +79,36 @@ def test_ctrl_c_ends_the_restarts_with_the_best_so_far(monkeypatch):
 
     monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
     with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(verbose=1, n_restarts=50).fit(X, Y)
-    assert m.lower_bound_ == model().fit(X, Y).lower_bound_
+        m = model(inducing_init="k-means", verbose=1, n_restarts=50).fit(X, Y)
+    assert m.lower_bound_ == model(inducing_init="k-means").fit(X, Y).lower_bound_
     assert calls.count(2) == 2
 
 
 # --- inducing_init -----------------------------------------------------------------------------------------------
+
+
+def test_placing_points_anew_finds_the_columns_that_matter():
+    """Among ten columns the target knows one: clusters spread over all of them, the learned kernel does not."""
+    rng = np.random.RandomState(0)
+    x = rng.uniform(-3.0, 3.0, (400, 10))
+    y = np.sin(3.0 * x[:, 0]) + 0.01 * rng.randn(400)
+    first, auto = (model(n_inducing=16, inducing_init=init).fit(x, y) for init in ("k-means", "auto"))
+    assert auto.lower_bound_ > first.lower_bound_ + 10.0
+    assert auto.n_iter_ == len(auto.loss_curve_)
+    assert auto.lower_bound_ == pytest.approx(-auto.loss_curve_[-1], abs=1e-3)
+
+
+def test_points_are_placed_anew_only_where_the_kernel_can_learn():
+    fixed = ConstantKernel(1.0) * RBF(1.0, "fixed")
+    first, auto = (model(kernel=fixed, inducing_init=init).fit(X, Y) for init in ("k-means", "auto"))
+    assert auto.lower_bound_ == first.lower_bound_
+
+
+def test_max_iter_counts_all_iterations(capsys):
+    with pytest.warns(ConvergenceWarning, match="max_iter=110 iterations"):
+        m = model(max_iter=110, tol=1e-12, verbose=2, n_inducing=20).fit(X, Y)
+    assert m.n_iter_ == 110
+    assert capsys.readouterr().out.splitlines()[-1].startswith("iteration    110")
 
 
 def test_greedy_points_are_rows_and_reproducible():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
@@ -26,14 +26,20 @@ class Placement:
 
     Attributes
     ----------
-    method : {"k-means", "greedy"} or ndarray of shape (m, d)
-        Or the points themselves, in the same units as the inputs.
+    method : {"auto", "k-means", "greedy"} or ndarray of shape (m, d)
+        ``"auto"`` starts as ``"k-means"``; or the points themselves, in the same units as the inputs.
     n_inducing : int
         At most so many points; an array brings its own number.
     """
 
-    method: Literal["k-means", "greedy"] | np.ndarray
+    method: Literal["auto", "k-means", "greedy"] | np.ndarray
     n_inducing: int
+
+    @property
+    def anew(self) -> Placement | None:
+        """How to place them once more, when the kernel has learned something; None if they stay."""
+        by_user = isinstance(self.method, np.ndarray)
+        return replace(self, method="greedy") if not by_user and self.method == "auto" else None
 
     @property
     def sample_size(self) -> int:

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from .adam import adam
+from .advice import far_from_prior, how_it_ended, nothing_learned
 from .bounds import features_alone_bound
 from .elbo import ElboObjective
 from .inducing import Placement
@@ -18,21 +19,19 @@ from .optimize import Minimum, Report, lbfgs
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
-from .start import alike_neighbours
 from .statistics import SufficientStatistics
 from .threads import BlockMap
 
 # An output counts as not learned when this share of what the features alone leave over ends as noise.
 _COLLAPSED = 0.9
-# When no start got below this share, the user should know.
-_NOTHING_LEARNED = 0.99
-# y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
-_FAR, _FAR_WEIGHT = 1e4, 100.0
 # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
 _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0), (1.0, 1e3))
 # With about as many inducing points as rows, a low first noise may lead to a plateau on which the kernel explains every
 # row by itself: such fits, which cost little, start from a noise so many times higher too.
 _INTERPOLATES, _MUCH_NOISE = 1.5, 1e3
+# Iterations after which inducing points are placed anew. By then lengthscales tell which columns matter; with 50 or 300
+# the bounds are about as good.
+_BEFORE_PLACED_ANEW = 100
 # Relative size of the rounding errors in a bound on all rows.
 _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
@@ -58,6 +57,8 @@ class Options:
     natural_gradient : bool
         Of Adam with the full family: q moves by natural gradients.
     threads : BlockMap
+    spent : int
+        Iterations of ``max_iter`` that were used up before.
     """
 
     solver: Literal["lbfgs", "adam"]
@@ -68,6 +69,7 @@ class Options:
     n_restarts: int = 0
     natural_gradient: bool = False
     threads: BlockMap = field(default_factory=BlockMap)
+    spent: int = 0
 
 
 @dataclass(frozen=True)
@@ -147,18 +149,25 @@ def learn(
     -------
     learned : Learned
     """
-    best = _learn_once(model, table, rows, options, rng, report)
+    if cold is not None and not np.array_equal(table["inducing_points"].start, cold["inducing_points"].start):
+        # Inducing points of another fit have found their places.
+        best = _learn_once(model, table, rows, options, rng, report)
+    else:
+        best = _learn_placing(model, table, rows, options, placement, rng, report)
     if cold is not None and not best.interrupted and options.max_iter > 0:
         alone = features_alone_bound(best.statistics[0], model.prior)
         bound = np.inf if best.message else best.bound
         if _stuck(best.values["noise"], bound, rows.scatter(), alone):
-            best = _better(best, _learn_once(model, cold, rows, options, rng, report))
+            best = _better(best, _learn_placing(model, cold, rows, options, placement, rng, report))
     for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
         if best.interrupted:
             break
-        other = _learn_once(model, _other_start(model, table, rows, placement, rng), rows, options, rng, report)
+        start = _other_start(model, table, rows, placement, rng)
+        other = _learn_placing(model, start, rows, options, placement, rng, report)
         best = _better(best, other)
-    advice = [best.message, _far_from_prior(model, rows), _nothing_learned(best, table, rows, options)]
+    advice = [best.message, far_from_prior(model, rows)]
+    if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
+        advice.append(nothing_learned(best.values["noise"], rows))
     return replace(best, message=" ".join(part for part in advice if part))
 
 
@@ -166,37 +175,6 @@ def _better(best: Learned, other: Learned) -> Learned:
     if other.bound > best.bound:
         return other
     return replace(best, interrupted=True, message=other.message) if other.interrupted else best
-
-
-def _far_from_prior(model: SparseModel, rows: Rows) -> str:
-    if (rows.scatter() < _FAR**-2).any():
-        return (
-            f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
-            "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
-        )
-    if (np.abs(model.prior.reference) > _FAR_WEIGHT).any():
-        return (
-            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
-            "raise coef_scale or, if it is an intercept's, set normalize_y=True."
-        )
-    return ""
-
-
-def _nothing_learned(learned: Learned, table: ParameterTable, rows: Rows, options: Options) -> str:
-    if learned.interrupted or options.max_iter == 0 or not table["noise"].free.any():
-        return ""
-    nothing = learned.values["noise"] > _NOTHING_LEARNED * rows.scatter()
-    if nothing.any():
-        # Where residuals look like noise, noise is the answer.
-        nothing &= alike_neighbours(rows)
-    if not nothing.any():
-        return ""
-    return (
-        f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
-        "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
-        "Raise n_inducing or n_restarts, let kernel or noise_variance start elsewhere, or look at the scales of the "
-        "kernel's columns."
-    )
 
 
 def _other_start(
@@ -208,15 +186,59 @@ def _other_start(
         spread = np.log(factor)
         coordinates[name] = coordinates[name] + rng.uniform(-spread, spread, coordinates[name].shape)
     moved = table.values(np.clip(table.flat(coordinates), *table.bounds()))
-    hyperparameters = np.log(moved["hyperparameters"])
-    moved["inducing_points"] = np.array(
-        [
-            placement.points(rows.sample(placement.sample_size, rng).inputs, model.kernel, hyperparameters, rng)
-            for _ in model.groups
-        ]
-    )
-    # Where clusters coincide there are fewer: such a start keeps the first points.
-    return table.started_at(moved)
+    return table.started_at(_placed(moved, model, rows, placement, rng))
+
+
+def _placed(values: Values, model: SparseModel, rows: Rows, placement: Placement, rng: np.random.RandomState) -> Values:
+    """The same values with inducing points placed under their kernel.
+
+    Where clusters coincide there are fewer: the table then keeps those that it has.
+    """
+    hyperparameters = np.log(values["hyperparameters"])
+    points = [
+        placement.points(rows.sample(placement.sample_size, rng).inputs, model.kernel, hyperparameters, rng)
+        for _ in model.groups
+    ]
+    return values | {"inducing_points": np.array(points)}
+
+
+def _learn_placing(
+    model: SparseModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: Options,
+    placement: Placement,
+    rng: np.random.RandomState,
+    report: Report | None = None,
+) -> Learned:
+    """`_learn_once`, with inducing points placed anew under the kernel that the first iterations learned.
+
+    (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
+    columns matter, and L-BFGS moves points a little, not across the data. With Adam, and with about as many points as
+    rows, they stay.
+    """
+    anew, n_inducing = placement.anew, table["inducing_points"].start.shape[1]
+    if (
+        anew is None
+        or options.solver != "lbfgs"
+        or options.max_iter <= _BEFORE_PLACED_ANEW
+        or _INTERPOLATES * n_inducing >= len(rows)
+        or not table["hyperparameters"].free.any()
+    ):
+        return _learn_once(model, table, rows, options, rng, report)
+    first = _learn_once(model, table, rows, replace(options, max_iter=_BEFORE_PLACED_ANEW), rng, report)
+    if first.interrupted:
+        return first
+    spent = len(first.loss_curve)
+    rest = replace(options, spent=spent)
+    later = None if report is None else lambda iteration, loss: report(spent + iteration, loss)
+
+    def go_on(values: Values) -> Learned:
+        learned = _learn_once(model, table.started_at(values), rows, rest, rng, later)
+        return replace(learned, loss_curve=first.loss_curve + learned.loss_curve)
+
+    best = go_on(_placed(first.values, model, rows, anew, rng))
+    return best if best.bound > first.bound or best.interrupted else _better(best, go_on(first.values))
 
 
 def _learn_once(
@@ -287,7 +309,7 @@ def _by_adam(
         reached = max(reached, solution[0])
         if solution[0] >= bound:
             x, (bound, posterior, statistics) = other, solution
-    message = _message(minimum, options)
+    message = how_it_ended(minimum, options.max_iter, options.spent, options.tol)
     fell = not reached >= first - max(options.tol, _ROUNDING * abs(first))
     if fell and minimum.converged:
         message = (
@@ -321,7 +343,8 @@ def _by_lbfgs(
     bound, posterior = model.at_optimum(values, statistics)
     bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
     curve = [n_rows * loss for loss in minimum.loss_curve]
-    return Learned(model, values, bound, posterior, statistics, curve, _message(minimum, options), minimum.interrupted)
+    message = how_it_ended(minimum, options.max_iter, options.spent, options.tol)
+    return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
 
 
 def _lbfgs_unless_stuck(
@@ -334,7 +357,7 @@ def _lbfgs_unless_stuck(
 ) -> Minimum:
     """L-BFGS from the table's start; from other starts too where that may have ended in a bad optimum."""
     linear = objective.blocks.linear
-    alone = features_alone_bound(linear, model.prior)
+    alone, left = features_alone_bound(linear, model.prior), options.max_iter - options.spent
     best: Minimum | None = None
 
     def descend(length_factor: float, noise_factor: float) -> Minimum:
@@ -342,7 +365,7 @@ def _lbfgs_unless_stuck(
         start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
         start["noise"] = start["noise"] + np.log(noise_factor)
         first = np.clip(table.flat(start), *table.bounds())
-        minimum = lbfgs(objective, first, table.bounds(), options.max_iter, options.tol / linear.n_rows, report)
+        minimum = lbfgs(objective, first, table.bounds(), left, options.tol / linear.n_rows, report)
         return minimum if best is None or minimum.loss < best.loss else replace(best, interrupted=minimum.interrupted)
 
     best = descend(1.0, 1.0)
@@ -362,20 +385,3 @@ def _lbfgs_unless_stuck(
 def _stuck(noise: np.ndarray, bound: float, scatter: np.ndarray, alone: float) -> bool:
     """Whether noise came to explain everything, or the kernel explains less than nothing would."""
     return bool((noise > _COLLAPSED * scatter).any()) or bound < alone
-
-
-def _message(minimum: Minimum, options: Options) -> str:
-    if minimum.interrupted:
-        return f"The fit was interrupted after {minimum.n_iter} iterations; the best parameters so far are kept."
-    if minimum.converged:
-        return ""
-    if minimum.n_iter < options.max_iter:
-        return (
-            f"L-BFGS stopped after {minimum.n_iter} iterations: rounding errors keep hiding the way up, as in data "
-            "without noise. The best parameters are kept; a larger tol, fewer inducing points or a WhiteKernel with a "
-            "lower bound on the noise end sooner."
-        )
-    return (
-        f"The bound was still rising after max_iter={options.max_iter} iterations. Raise max_iter, or stop earlier on "
-        f"purpose with a larger tol (now {options.tol})."
-    )

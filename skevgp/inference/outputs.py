@@ -157,14 +157,13 @@ class FittedOutputs:
                 table = table.started_at(values)
             tables.append(table)
             colds.append(None if table is cold else cold)
-        seeds = rng.randint(np.iinfo(np.int32).max, size=len(models))
+        # The same for all, so that outputs that share nothing are fitted as they would be alone.
+        seed = rng.randint(np.iinfo(np.int32).max)
         threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
         options = replace(options, threads=threads)
         at_once = min(n_threads, len(models))
 
-        def one(
-            outputs: slice, model: SparseModel, table: ParameterTable, cold: ParameterTable | None, seed: int
-        ) -> Learned:
+        def one(outputs: slice, model: SparseModel, table: ParameterTable, cold: ParameterTable | None) -> Learned:
             inner = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
 
             def report(iteration: int, loss: float) -> None:
@@ -179,7 +178,7 @@ class FittedOutputs:
                 stop.set()
             return learned
 
-        jobs = [(*model, *start, seed) for model, *start, seed in zip(models, tables, colds, seeds, strict=True)]
+        jobs = [(*model, *start) for model, *start in zip(models, tables, colds, strict=True)]
         try:
             learned = _side_by_side(one, jobs, at_once, stop)
         finally:
