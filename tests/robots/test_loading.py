@@ -1,0 +1,243 @@
+import importlib.metadata
+import pickle
+from collections import Counter
+
+import numpy as np
+import pinocchio
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+
+from skevgp.robots import SYSTEMS, get_system, layout_of, list_robots, load_robot, loading
+
+JOINT = """
+  <joint name="{name}" type="{kind}">
+    <parent link="{parent}"/><child link="{child}"/><origin xyz="0 0 0.3" rpy="0.1 0.2 0.3"/><axis xyz="{axis}"/>
+    {limit}
+  </joint>
+  <link name="{child}">
+    <inertial><origin xyz="0.1 0 0.2"/><mass value="2"/>
+      <inertia ixx="0.1" iyy="0.2" izz="0.15" ixy="0.01" ixz="0" iyz="0"/></inertial>
+  </link>"""
+
+
+def urdf(path, joints):
+    """A chain of (name, kind, axis, effort)."""
+    parts = ['<robot name="chain"><link name="base"/>']
+    parent = "base"
+    for name, kind, axis, effort in joints:
+        limit = f'<limit lower="-1" upper="2" effort="{effort}" velocity="3"/>' if effort is not None else ""
+        parts.append(JOINT.format(name=name, kind=kind, parent=parent, child=f"of_{name}", axis=axis, limit=limit))
+        parent = f"of_{name}"
+    path.write_text("".join(parts) + "</robot>")
+    return path
+
+
+@pytest.fixture
+def chain(tmp_path):
+    joints = [
+        ("slide", "prismatic", "0 0 1", 5),
+        ("turn", "continuous", "0 0.6 0.8", 7),
+        ("loose", "revolute", "1 0 0", 0),
+    ]
+    return urdf(tmp_path / "chain.urdf", joints)
+
+
+# --- names -------------------------------------------------------------------------------------------------------
+
+
+def test_the_systems_of_the_paper_come_first():
+    assert list_robots()[:4] == sorted(SYSTEMS)
+
+
+@pytest.mark.parametrize("name", ["panda", "ur5", "kinova", "talos_left_arm", "double_pendulum", "z1"])
+def test_robots_of_the_collection_are_found_by_their_names(name):
+    assert name in list_robots()
+    assert load_robot(name).nv == layout_of(name).n_joints
+
+
+def test_names_are_unique_and_each_is_a_file_or_a_system():
+    assert [name for name, count in Counter(list_robots()).items() if count > 1] == []
+    assert set(list_robots()) == set(SYSTEMS) | set(loading._collection())
+    assert all(path.is_file() for path in loading._collection().values())
+
+
+def test_robots_of_the_same_name_are_told_apart_by_their_folders():
+    assert {"anymal_b_simple_description/anymal", "anymal_c_simple_description/anymal"} <= set(list_robots())
+    assert "anymal" not in list_robots()
+
+
+def test_bodies_without_joints_are_not_listed():
+    assert not {"iris_simple", "quadrotor_base"} & set(list_robots())
+
+
+@pytest.mark.parametrize(("name", "close"), [("pnda", "panda"), ("ur_5", "ur5"), ("iiwa", "iiwa14")])
+def test_an_unknown_name_gets_close_ones_and_all(name, close):
+    message = rf"Unknown robot '{name}'; the known ones are \['acrobot'.*'z1'\].*Did you mean .*'{close}'"
+    with pytest.raises(ValueError, match=message):
+        load_robot(name)
+
+
+@pytest.fixture
+def without_collection(monkeypatch):
+    def missing(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "files", missing)
+    monkeypatch.setattr(loading.sys, "prefix", "/nowhere")
+    loading._collection.cache_clear()
+    yield
+    loading._collection.cache_clear()
+
+
+def test_without_the_collection_the_systems_are_left_and_the_error_says_how_to_get_more(without_collection):
+    assert list_robots() == sorted(SYSTEMS)
+    assert load_robot("acrobot").nv == 2
+    with pytest.raises(ValueError, match=r"pip install example-robot-data brings more"):
+        load_robot("panda")
+
+
+def test_a_collection_without_a_list_of_files_is_found_by_its_place(monkeypatch, tmp_path, chain):
+    folder = tmp_path / "share" / "example-robot-data" / "robots" / "chain_description"
+    folder.mkdir(parents=True)
+    chain.rename(folder / "mine_robot.urdf")
+    (folder / "broken.urdf").write_text("<robot")
+    monkeypatch.setattr(importlib.metadata, "files", lambda name: None)
+    monkeypatch.setattr(loading.sys, "prefix", str(tmp_path))
+    loading._collection.cache_clear()
+    try:
+        assert list_robots() == [*sorted(SYSTEMS), "mine"]
+        assert load_robot("mine").nv == 3
+    finally:
+        loading._collection.cache_clear()
+
+
+# --- what can be loaded --------------------------------------------------------------------------------------------
+
+
+def test_a_path_is_loaded(chain):
+    by_path, by_text = load_robot(chain), load_robot(str(chain))
+    assert by_path == by_text
+    assert list(by_path.names)[1:] == ["slide", "turn", "loose"]
+
+
+def test_a_model_comes_back_as_it_is():
+    model = load_robot("ur5")
+    assert load_robot(model) is model
+    assert load_robot(get_system("acrobot")) == load_robot("acrobot")
+
+
+def test_iiwa14_has_its_rotors_and_limits():
+    model = load_robot("iiwa14")
+    assert_allclose(model.armature, [3.38176, 3.38176, 3.38176, 3.38176, 1.321, 1.16224, 1.16224], rtol=1e-12)
+    assert_array_equal(model.upperEffortLimit, [320, 320, 176, 176, 110, 40, 40])
+    assert_array_equal(model.lowerEffortLimit, -model.upperEffortLimit)
+    assert not model.damping.any()
+
+
+def test_a_continuous_joint_has_an_angle(chain):
+    plain, model = pinocchio.buildModelFromUrdf(str(chain)), load_robot(chain)
+    assert (plain.nq, plain.nv, model.nq, model.nv) == (4, 3, 3, 3)
+    rng = np.random.default_rng(0)
+    for q, v, force in rng.uniform(-2, 2, (5, 3, 3)):
+        of_plain = np.r_[q[0], np.cos(q[1]), np.sin(q[1]), q[2]]
+        expected = pinocchio.aba(plain, plain.createData(), of_plain, v, force)
+        assert_allclose(pinocchio.aba(model, model.createData(), q, v, force), expected, rtol=1e-10)
+    assert_array_equal(model.lowerPositionLimit, [-1.0, -np.inf, -1.0])
+    assert_array_equal(model.upperPositionLimit, [2.0, np.inf, 2.0])
+    assert_array_equal(model.upperEffortLimit, [5.0, 7.0, 0.0])
+
+
+def test_kinova_moves_as_its_own_file_says():
+    path = loading._collection()["kinova"]
+    plain, model = pinocchio.buildModelFromUrdf(str(path)), load_robot("kinova")
+    assert plain.nq > plain.nv == model.nq
+    q = np.random.default_rng(0).uniform(-2, 2, 6)
+    of_plain = np.concatenate(
+        [[np.cos(x), np.sin(x)] if joint.nq == 2 else [x] for joint, x in zip(list(plain.joints)[1:], q, strict=True)]
+    )
+    expected = pinocchio.computeGeneralizedGravity(plain, plain.createData(), of_plain)
+    assert_allclose(pinocchio.computeGeneralizedGravity(model, model.createData(), q), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("robot", ["iiwa14", "kinova", "panda"])
+def test_a_model_can_be_pickled(robot):
+    model = load_robot(robot)
+    assert pickle.loads(pickle.dumps(model)) == model
+
+
+# --- layouts -------------------------------------------------------------------------------------------------------
+
+
+def test_a_joint_of_effort_zero_has_no_motor(chain):
+    layout = layout_of(chain)
+    assert layout.driven == (0, 1)
+    assert layout.revolute == (False, True, True)
+    assert layout.column_names == [
+        *("slide", "turn", "loose", "dslide/dt", "dturn/dt", "dloose/dt"),
+        *("u_slide", "u_turn"),
+    ]
+    assert layout.n_columns == 8
+
+
+def test_where_no_effort_is_known_all_joints_are_driven(tmp_path):
+    path = urdf(tmp_path / "free.urdf", [("a", "revolute", "1 0 0", 0), ("b", "revolute", "0 1 0", 0)])
+    assert layout_of(path).driven == (0, 1)
+
+
+def test_a_joint_without_limits_is_driven(tmp_path):
+    path = urdf(tmp_path / "free.urdf", [("a", "continuous", "1 0 0", None), ("b", "revolute", "0 1 0", 0)])
+    assert layout_of(path).driven == (0,)
+
+
+@pytest.mark.parametrize("name", sorted(SYSTEMS))
+def test_a_model_of_a_system_has_the_layout_of_its_table(name):
+    assert layout_of(load_robot(name)) == layout_of(name) == layout_of(get_system(name))
+
+
+# --- what cannot ---------------------------------------------------------------------------------------------------
+
+
+def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
+    path = tmp_path / "bad.urdf"
+    path.write_text("<robot><link></robot>")
+    with pytest.raises(ValueError, match=r"bad.urdf' is not a URDF that Pinocchio can read"):
+        load_robot(path)
+
+
+@pytest.mark.parametrize("path", ["nothing.urdf", "some/where", "~"])
+def test_a_file_that_is_not_there_is_an_error(path):
+    with pytest.raises(ValueError, match=r"(There is no file|Unknown robot) '"):
+        load_robot(path)
+
+
+def test_a_floating_base_is_refused():
+    with pytest.raises(ValueError, match=r"joint 'root_joint' of the type JointModelFreeFlyer.*base fixed"):
+        load_robot(pinocchio.buildSampleModelHumanoidRandom())
+
+
+@pytest.mark.parametrize(
+    "joint", [pinocchio.JointModelSpherical(), pinocchio.JointModelPlanar(), pinocchio.JointModelTranslation()]
+)
+def test_joints_of_several_velocities_are_refused(joint):
+    model = pinocchio.Model()
+    model.addJoint(0, joint, pinocchio.SE3.Identity(), "ball")
+    with pytest.raises(ValueError, match=rf"joint 'ball' of the type {joint.shortname()}"):
+        load_robot(model)
+
+
+def test_a_screw_joint_is_refused():
+    model = pinocchio.Model()
+    model.addJoint(0, pinocchio.JointModelHX(0.1), pinocchio.SE3.Identity(), "screw")
+    with pytest.raises(ValueError, match=r"joint 'screw'.*revolute or prismatic"):
+        load_robot(model)
+
+
+def test_a_model_without_joints_is_refused():
+    with pytest.raises(ValueError, match="has no joint that moves"):
+        load_robot(pinocchio.Model())
+
+
+@pytest.mark.parametrize("robot", [3, None, ["ur5"], object()])
+def test_what_is_no_robot_is_a_type_error(robot):
+    with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF file"):
+        load_robot(robot)
