@@ -82,8 +82,8 @@ def of(rows: list[Row], column: str) -> np.ndarray:
 
 
 def figure_of(value: float) -> str:
-    """Three digits, without an exponent."""
-    return np.format_float_positional(value, precision=3, unique=False, fractional=False, trim="-")
+    """Three digits."""
+    return f"{value:#.3g}".rstrip(".")
 
 
 def table(header: list[str], lines: list[list[str]]) -> str:
@@ -150,8 +150,8 @@ def markdown(rows: list[Row]) -> str:
     ]
     if "skevgp-angles" in settings:
         parts.append(
-            "A kernel of sines and cosines cannot tell an angle from the same after a full turn: VGP, whose targets are "
-            "angles, has no chance in the setting skevgp-angles. Other models know that an angle starts where it is."
+            "A kernel of sines and cosines cannot tell an angle from the same after a turn. VGP, whose targets are "
+            "angles, has no chance in the setting skevgp-angles; other models know that an angle starts where it is."
         )
     if limited:
         parts.append(f"Iterations were limited by `--max-iter` in: {', '.join(limited)}.")
