@@ -207,9 +207,9 @@ def run_all(cells: Sequence[Cell], jobs: int, output: Path) -> int:
                     paper = table3_report.PAPER[cell.system][cell.model].error
                     said += f"Error {row['error_mean']:.6f} (paper {paper:g}), {row['fit_seconds']:.1f} s"
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
-        except BaseException:
+        except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
-            raise
+            raise SystemExit(f"Interrupted. What is finished is in {output}; run again to go on.") from None
     return failures
 
 
