@@ -233,6 +233,11 @@ def plot(rows: list[Row], path: Path) -> None:
             label = "paper's setting" if setting == "paper" else setting
             grid[0, 0].plot([], [], marker, color=colour, markersize=7, label=f"ours: {label}")
     handles, labels = grid[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3 if n_columns > 1 else 2, frameon=False)
+    notes = ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
+    notes += [f"noise {rows[0]['noise']}"] if float(rows[0]["noise"]) else []
+    columns = 3 if n_columns > 1 else 2
+    figure.legend(
+        handles, labels, loc="outside upper center", ncols=columns, frameon=False, title=", ".join(notes) or None
+    )
     figure.savefig(path, dpi=110)
     plt.close(figure)
