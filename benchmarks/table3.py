@@ -14,7 +14,7 @@ kernel sees sines and cosines of angles) and, for iiwa14's EVGP, "skevgp-nominal
 centres of mass and inertias are wrong by up to 20 % as further features).
 
 In the paper's setting a fit takes 1 to 4 minutes of one core for the pendulum and the cartpole, 10 to 30 for the
-acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes.
+acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.
 """
 
 from __future__ import annotations
