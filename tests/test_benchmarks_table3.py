@@ -1,0 +1,151 @@
+"""The benchmark of the paper's Table 3 in short mode."""
+
+import csv
+import runpy
+import sys
+from contextlib import nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity
+from skevgp.metrics import prediction_error, std_norm
+
+BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+COLUMNS = (
+    "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,n_parameters,fit_seconds"
+)
+PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
+
+
+@pytest.fixture(autouse=True)
+def as_a_script(monkeypatch):
+    """Scripts find the modules beside them."""
+    monkeypatch.syspath_prepend(str(BENCHMARKS))
+    monkeypatch.setenv("MPLBACKEND", "Agg")
+
+
+@pytest.fixture
+def run(monkeypatch, capsys, tmp_path):
+    """Tiny fits of the pendulum's models."""
+
+    def run(*arguments, max_iter=2):
+        options = ("--quick", "--systems", "pendulum", "--max-iter", max_iter, "--jobs", 1)
+        options += ("--output", tmp_path / "table.csv")
+        monkeypatch.setattr(sys, "argv", ["table3.py", *map(str, (*options, *arguments))])
+        runpy.run_path(str(BENCHMARKS / "table3.py"), run_name="__main__")
+        return capsys.readouterr().out
+
+    return run
+
+
+def read(path):
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
+    table, page, picture = (tmp_path / f"table.{suffix}" for suffix in ("csv", "md", "png"))
+    both = ("--models", "RES-VGP", "EVGP-IFG", "--settings")
+    said = run(*both, "paper")
+    assert "[2/2] pendulum" in said
+    assert table.read_text().startswith(COLUMNS + ",noise,")
+    before = table.read_text()
+    said = run(*both, "paper", "skevgp")
+    assert "2 of 4 cells" in said
+    assert "[2/2] pendulum" in said
+    assert table.read_text().startswith(before)
+
+    train, test = (make_dynamics("pendulum", 12, random_state=state) for state in (0, 1000))
+    X, y = train.data, train.target
+    models = {
+        ("RES-VGP", "skevgp"): EVGPRegressor(n_inducing=40),
+        ("EVGP-IFG", "skevgp"): EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10),
+        ("EVGP-IFG", "paper"): EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, **PAPER),
+    }
+    rows = {(row["model"], row["setting"]): row for row in read(table)}
+    for key, model in models.items():
+        row, residual = rows[key], float(key[0] == "RES-VGP")
+        with pytest.warns(ConvergenceWarning, match="max_iter") if key[1] == "skevgp" else nullcontext():
+            model.set_params(max_iter=2, random_state=0).fit(X, y - residual * X[:, :2])
+        mean, std = model.predict(test.data, return_std=True)
+        mean += residual * test.data[:, :2]
+        assert float(row["error_mean"]) == pytest.approx(prediction_error(test.target, mean), rel=1e-6)
+        assert float(row["std_norm"]) == pytest.approx(std_norm(std), rel=1e-6)
+        assert row["converged"] == str(key[1] == "paper")
+    assert "| 123 / 123 |" in page.read_text()  # parameters, ours and the paper's
+    assert "/ 0.005 |" in page.read_text()
+    assert picture.stat().st_size > 10_000
+
+    # Of another noise, the file has one row, by hand: nothing is left to do, and the page is of this noise alone.
+    with table.open("a", newline="") as file:
+        csv.DictWriter(file, rows["RES-VGP", "paper"]).writerow({**rows["RES-VGP", "paper"], "noise": "0.5"})
+    assert "1 of 1 cells" in run("--models", "RES-VGP", "--settings", "paper", "--noise", "0.5")
+    assert "Noise: 0.5 " in page.read_text()
+    assert "RES-VGP | 1 |" in page.read_text()
+    assert "EVGP-IFG | 1 |" not in page.read_text()
+
+
+def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
+    with pytest.raises(SystemExit, match="1 cells failed"):
+        run("--models", "EVGP-IF", "--settings", "skevgp", max_iter=-1)
+    assert not (tmp_path / "table.csv").exists()
+
+
+def test_noise_is_on_the_targets():
+    import table3
+
+    cells = [table3.Cell("pendulum", "EVGP-IFG", "skevgp", 0, noise, "quick", 0) for noise in (0.0, 0.01)]
+    exact, noisy = (table3.data("pendulum", 1000, cell.noise, cell.size) for cell in cells)
+    share = (noisy.target - exact.target).std(axis=0) / exact.target.std(axis=0)
+    np.testing.assert_allclose(share, 0.01, rtol=0.1)
+    row = table3.run(cells[1])
+    assert (row["noise"], row["seed"], row["size"]) == (0.01, 0, "quick")
+    assert row["error_mean"] >= 0.9 * np.linalg.norm(noisy.target - exact.target, axis=1).mean()
+
+
+def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():
+    """Per output m inducing inputs, 2 m for their values, 2 p for weights, signal and noise; and D lengthscales."""
+    import table3
+    from table3_report import PAPER
+
+    widths = {"pendulum": (2, 3, 4), "cartpole": (4, 5, 6), "acrobot": (4, 5, 7), "iiwa14": (14, 21, 33)}
+    for place, (system, (n_outputs, d, with_gravity)) in enumerate(widths.items()):
+        assert table3.SYSTEMS[place] == system
+        for name, p in {"VGP": 0, "RES-VGP": 0, "EVGP-IF": d, "EVGP-IFG": with_gravity}.items():
+            m = table3.MODELS[name].sizes[place]
+            assert PAPER[system][name].n_parameters == n_outputs * (m * d + 2 * m + 2 * p + 2) + d, (system, name)
+
+
+def test_settings_are_what_they_say():
+    import table3
+
+    def built(system, model, setting, seed=0, size="full", max_iter=None):
+        cell = table3.Cell(system, model, setting, seed, 0.0, size, max_iter)
+        return table3.MODELS[model].build(cell, 5)
+
+    paper = built("acrobot", "VGP", "paper")
+    assert (paper.feature_map, paper.kernel_map, paper.max_iter) == (None, None, None)
+    assert {name: paper.get_params()[name] for name in PAPER} == PAPER
+    plain, defaults = built("acrobot", "EVGP-IF", "skevgp").get_params(deep=False), EVGPRegressor().get_params()
+    assert {name for name, value in plain.items() if value != defaults[name]} == {
+        *("feature_map", "n_inducing", "random_state")
+    }
+    angles = built("iiwa14", "EVGP-IFG", "skevgp-angles")
+    assert isinstance(angles.kernel_map, AngleEncoder)
+    assert angles.kernel_map.robot == "iiwa14"
+    assert (
+        built("iiwa14", "VGP", "paper", size="quick").max_iter < built("iiwa14", "VGP", "skevgp", size="quick").max_iter
+    )
+    assert built("iiwa14", "VGP", "paper", size="quick", max_iter=7).max_iter == 7
+
+    X = np.random.RandomState(0).uniform(-1, 1, (3, 21))
+    physics, nominal = (step for _, step in built("iiwa14", "EVGP-IF", "skevgp-nominal").feature_map.transformer_list)
+    assert isinstance(physics, InertiaForce)
+    _, other = (step for _, step in built("iiwa14", "EVGP-IF", "skevgp-nominal", seed=1).feature_map.transformer_list)
+    assert not np.allclose(nominal.fit_transform(X), other.fit_transform(X))
