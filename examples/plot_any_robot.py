@@ -43,8 +43,8 @@ parser.add_argument(
 )
 options = parser.parse_args()
 quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
-n_trajectories = (12 if quick else 60) if options.trajectories is None else options.trajectories
-n_folds, n_inducing, sharing = (2, 20, "all") if quick else (3, 30, "none")
+n_trajectories = (30 if quick else 60) if options.trajectories is None else options.trajectories
+n_folds, n_inducing, sharing = (2, 15, "all") if quick else (3, 30, "none")
 
 # %%
 # The robot, and its moves under computed-torque control
@@ -107,7 +107,7 @@ for name, model in models.items():
     errors, ratio = -folds["test_score"], containing_ratios(moves.target, mean, std, k=2)[0]
     around = f"{errors.min():.5f} to {errors.max():.5f}"
     print(f"{name:20s}{errors.mean():9.5f}{around:>20s}{ratio:8.3f}{seconds:9.2f}", flush=True)
-    for message in {str(warning.message) for warning in caught}:
+    for message in sorted({str(warning.message).partition(". ")[0] for warning in caught}):
         print(f"    a fit warned: {message}")
 
 # %%
