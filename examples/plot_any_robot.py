@@ -5,7 +5,7 @@ Learn any robot's dynamics
 A robot's name, or the path of its URDF file, is all that simulation and features need. Here it is the arm UR5 of the
 package example-robot-data. Four models are compared by cross-validation over its moves: a sparse Gaussian process
 alone, with inertia and force (IF), with gravity on the links too (IFG), and with a URDF file whose masses are wrong.
-Run ``python examples/plot_any_robot.py --robot z1`` for another robot, and ``--help`` for options.
+Run ``python examples/plot_any_robot.py --robot acrobot`` for another robot, and ``--help`` for options.
 """
 
 # %%
@@ -30,6 +30,7 @@ from skevgp.datasets import list_robots, load_robot, make_dynamics, perturb_robo
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, NominalDynamics
 from skevgp.metrics import containing_ratios, prediction_error
 from skevgp.plotting import PosteriorDisplay
+from skevgp.robots import layout_of
 
 parser = argparse.ArgumentParser(description="Learn a robot's dynamics from its URDF file and simulated moves.")
 parser.add_argument("--robot", default="ur5", help="a name of list_robots() or the path of a URDF file; default: ur5")
@@ -119,15 +120,19 @@ rows = moves.groups == 0
 seconds = moves.dt * (1 + np.arange(rows.sum()))
 change = (moves.target - constant)[:, n_joints:]
 joints = np.sort(np.argsort(change[rows].std(axis=0))[-2:])
-figure, axes = plt.subplots(len(joints), 2, figsize=(9, 3.2 * len(joints)), layout="constrained", sharex=True)
-for row, joint in zip(np.atleast_2d(axes), n_joints + joints, strict=True):
+figure, axes = plt.subplots(
+    len(joints), 2, figsize=(9, 3.2 * len(joints)), layout="constrained", sharex=True, squeeze=False
+)
+for row, joint in zip(axes, joints.tolist(), strict=True):
+    velocity = n_joints + joint
     for ax, name in zip(row, ("IFG", "IF + wrong URDF"), strict=True):
-        mean, std = (part[rows, joint] for part in predictions[name])
-        now = moves.data[rows, joint]
-        PosteriorDisplay(seconds, mean - now, std, moves.target[rows, joint] - now).plot(ax, label="predicted")
-        ax.set_title(f"{robot.names[int(joint) - n_joints + 1]}: {name}", fontsize=10)
+        mean, std = (part[rows, velocity] for part in predictions[name])
+        now, after = moves.data[rows, velocity], moves.target[rows, velocity]
+        PosteriorDisplay(seconds, mean - now, std, after - now).plot(ax, label="predicted")
+        ax.set_title(f"{robot.names[joint + 1]}: {name}", fontsize=10)
     row[1].sharey(row[0])
-    row[0].set_ylabel(f"change of velocity in {moves.dt} s (rad/s)")
+    unit = "rad/s" if layout_of(robot).revolute[joint] else "m/s"
+    row[0].set_ylabel(f"change of velocity in {moves.dt} s ({unit})")
 axes[0, 0].legend(fontsize=8)
 for ax in axes[-1]:
     ax.set_xlabel("time (s)")

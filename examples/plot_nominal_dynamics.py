@@ -107,8 +107,8 @@ print("weights of the nominal accelerations, as multiples of Δt:", *(f"{weight:
 # %%
 # Pictures
 # --------
-# Few moves are few independent facts, however many rows they have: both models promise too much at first, and learn to
-# promise what they keep with more moves. The weights stay as near to Δt as the model is to the truth.
+# Few moves are few independent facts, however many rows they have: both models promise too much, and less so
+# with many moves. The weights stay within about 20 % of Δt.
 
 colours = dict(zip(names, ("#D55E00", "#0072B2"), strict=True))
 figure, axes = plt.subplots(2, 2, figsize=(9, 6.8), layout="constrained")
