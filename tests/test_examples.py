@@ -7,7 +7,10 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
+import numpy as np
 import pytest
+
+from skevgp.metrics import prediction_error
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LEARN = EXAMPLES / "plot_learn_dynamics.py"
@@ -46,11 +49,39 @@ def test_learn_dynamics(monkeypatch, capsys, tmp_path, system):
     assert (tmp_path / f"learn_dynamics_{system}.png").stat().st_size > 10_000
 
 
-def command_line(*arguments, code=""):
+def test_link_gravity(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_link_gravity.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    assert "shoulder_lift_joint" in capsys.readouterr().out
+    for case, label in ((("iiwa14", "q6"), "u_x and u_y"), (("ur5", "shoulder_lift_joint"), "u_x")):
+        curves = names["curves"][case]
+        np.testing.assert_allclose(curves[label], curves["gravity's torque"], rtol=0, atol=1e-9)
+    assert names["weights"][1] == pytest.approx(-names["moment"][1])
+    assert (tmp_path / "link_gravity.png").stat().st_size > 10_000
+
+
+def test_nominal_dynamics(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_nominal_dynamics.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    errors = names["results"]
+    assert errors["IF + nominal"][-1] < names["untrained_error"] < errors["IFG"][-1]
+    np.testing.assert_allclose(names["weights"], names["test"].dt, rtol=0.3)
+    assert "the wrong model without data" in capsys.readouterr().out
+    assert (tmp_path / "nominal_dynamics.png").stat().st_size > 10_000
+
+
+def test_any_robot(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_any_robot.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    truth = names["moves"].target
+    errors = {name: prediction_error(truth, mean) for name, (mean, _) in names["predictions"].items()}
+    assert errors["IF + wrong URDF"] < min(errors["IF"], prediction_error(truth, names["constant"]))
+    assert "constant velocity" in capsys.readouterr().out
+    assert (tmp_path / "any_robot_ur5.png").stat().st_size > 10_000
+
+
+def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
         f"import runpy, sys; {code or 'pass'}; sys.argv = sys.argv[1:]; runpy.run_path(sys.argv[0])",
-        str(LEARN),
+        str(script),
     ]
     environment = os.environ | {"MPLBACKEND": "Agg"}
     return subprocess.run(
@@ -71,6 +102,13 @@ def test_a_wrong_system_lists_the_right_ones():
     assert "cartpole" in result.stderr
 
 
+def test_an_unknown_robot_is_a_line_not_a_traceback():
+    result = command_line("--robot", "urr5", script=EXAMPLES / "plot_any_robot.py")
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: Unknown robot 'urr5'")
+    assert "Traceback" not in result.stderr
+
+
 def test_a_wrong_size_is_a_line_not_a_traceback():
     result = command_line("--trajectories", "0")
     assert result.returncode == 1
@@ -84,4 +122,12 @@ def test_without_an_optional_package(package, pip):
     result = command_line(code=f"sys.modules[{package!r}] = None")
     assert result.returncode == 1
     assert pip in result.stderr
+    assert "Traceback" not in result.stderr
+
+
+@pytest.mark.parametrize("script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py"])
+def test_the_stories_of_robots_without_pinocchio(script):
+    result = command_line(script=EXAMPLES / script, code="sys.modules['pinocchio'] = None")
+    assert result.returncode == 1
+    assert "pip install pin" in result.stderr
     assert "Traceback" not in result.stderr

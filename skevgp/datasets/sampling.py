@@ -57,7 +57,7 @@ class ControlledMoves:
     n_trajectories: int
     n_steps: int
 
-    description = "computed-torque control along quintic references, with noise on the torques,"
+    description = "computed-torque control along quintic references, with noise on the torques"
 
     def draw(
         self, plant: Plant, shape: tuple[int, int], dt: float, duration: float | None, rng: np.random.RandomState
