@@ -71,8 +71,10 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Where inducing points start. ``"k-means"``: at cluster centres of the kernel's inputs. ``"greedy"``: one after
         the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
         ``"auto"``: at cluster centres, and with L-BFGS after 100 iterations once more, greedily under the kernel
-        learned so far. Or at given points in the space of ``kernel_map``, whose number then replaces ``n_inducing``.
-        With ``max_iter=0`` they stay there.
+        learned so far; 100 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
+        placed). They are not placed anew with ``max_iter`` up to 100, a kernel that is fixed, a warm start, or as many
+        points as two thirds of the rows. Or at given points in the space of ``kernel_map``, whose number then replaces
+        ``n_inducing``. With ``max_iter=0`` they stay there.
     sharing : {"all", "kernel", "none"}, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Signal variance, noise and weights are always per output.

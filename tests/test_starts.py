@@ -10,6 +10,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
+from skevgp.inference import learning
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (120, 2))
@@ -102,6 +103,81 @@ def test_points_are_placed_anew_only_where_the_kernel_can_learn():
     fixed = ConstantKernel(1.0) * RBF(1.0, "fixed")
     first, auto = (model(kernel=fixed, inducing_init=init).fit(X, Y) for init in ("k-means", "auto"))
     assert auto.lower_bound_ == first.lower_bound_
+
+
+def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
+    """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
+    monkeypatch.setattr("skevgp.inference.learning._STAGE", 20)
+    placed, calls = learning._placed, []
+
+    def all_at_one_place(values, *arguments):
+        moved = placed(values, *arguments)
+        calls.append(1)
+        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
+
+    class Interrupt:
+        def __init__(self, verbose, shift):
+            pass
+
+        def __call__(self, iteration, loss):
+            if calls:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr("skevgp.inference.learning._placed", all_at_one_place)
+    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
+    with pytest.warns(ConvergenceWarning, match="interrupted"):
+        m = model(verbose=1, tol=1e-9).fit(X, Y)
+    with pytest.warns(ConvergenceWarning, match="still rising"):
+        before = model(max_iter=20, tol=1e-9).fit(X, Y)
+    assert m.lower_bound_ == pytest.approx(before.lower_bound_, abs=1e-6)
+    assert m.n_iter_ == 20
+
+
+def test_ctrl_c_while_points_are_placed_keeps_the_fit(monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("skevgp.inference.learning._placed", interrupted)
+    with pytest.warns(ConvergenceWarning, match="interrupted after"):
+        m = model().fit(X, Y)
+    assert m.lower_bound_ > 0.0
+
+
+def test_bad_places_do_not_cost_the_bound(monkeypatch):
+    placed = learning._placed
+
+    def all_at_one_place(values, *arguments):
+        moved = placed(values, *arguments)
+        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
+
+    monkeypatch.setattr("skevgp.inference.learning._placed", all_at_one_place)
+    monkeypatch.setattr("skevgp.inference.learning._STAGE", 15)
+    m = model().fit(X, Y)
+    assert m.lower_bound_ > model(inducing_init="k-means").fit(X, Y).lower_bound_ - 1.0
+
+
+@pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
+def test_points_stay_where_they_have_a_reason_to(monkeypatch, why):
+    warm = model(warm_start=True, inducing_init="k-means").fit(X, Y)
+
+    def never(*arguments):
+        raise AssertionError("placed anew")
+
+    monkeypatch.setattr("skevgp.inference.learning._placed", never)
+    fits = {
+        "warm start": lambda: warm.set_params(inducing_init="auto").fit(X, Y),
+        "as many points as rows": lambda: model(n_inducing=80, tol=1.0).fit(X, Y),
+        "few iterations": lambda: model(max_iter=100, tol=1.0).fit(X, Y),
+        "Adam": lambda: model(solver="adam", max_iter=150).fit(X, Y),
+        "own points": lambda: model(inducing_init=Z).fit(X, Y),
+    }
+    fits[why]()
+
+
+def test_random_state_draws_mini_batches():
+    arguments = {"solver": "adam", "max_iter": 120, "batch_size": 10, "inducing_init": Z}
+    bounds = {model(random_state=seed, **arguments).fit(X, Y).lower_bound_ for seed in (0, 1)}
+    assert len(bounds) == 2
 
 
 def test_max_iter_counts_all_iterations(capsys):

@@ -196,7 +196,7 @@ class LinkGravity(GravityMap):
 
     def _prepare(self) -> None:
         if self.robot is not None:
-            model = load_robot(self.robot)
+            model = load_robot(self._robot)
             self._levers = self._levers_of(model)
             self._links = _Links(model)
             components = [_COMPONENTS[lever.name] for lever in self._levers]

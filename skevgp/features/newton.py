@@ -13,7 +13,7 @@ from sklearn.utils._param_validation import Interval
 
 from .._validation import as_floats
 from ..robots import SYSTEMS, Layout, System, get_system
-from ..robots.loading import Robot
+from ..robots.loading import Robot, owned
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
 from .robot_map import RobotMap
 
@@ -247,20 +247,24 @@ class InertiaForceGravity(_NewtonFeatures):
     }
 
     def _prepare(self) -> None:
-        self._gravity = self._gravity_map(self.n_features_in_)
+        self._gravity = self._gravity_map(None if self.robot is None else self._robot, self.n_features_in_)
 
-    def _gravity_map(self, n_columns: int) -> GravityMap:
+    def _gravity_map(self, robot: Robot | None, n_columns: int) -> GravityMap:
         """The fitted features of gravity."""
         if self.gravity is not None:
             features = clone(self.gravity)
+            if features.outputs is not None:
+                raise ValueError(
+                    f"gravity={self.gravity!r} must leave outputs to {type(self).__name__}, which knows all of them."
+                )
             if features.robot is None:
-                features.robot = self.robot
-        elif self.robot is None or _has_sines(self.robot):
-            features = SineGravity(self.robot, self.unknown_scale, self.free_scale)
+                features.robot = robot
+        elif robot is None or _has_sines(robot):
+            features = SineGravity(robot, self.unknown_scale, self.free_scale)
         else:
             features = LinkGravity(
-                self.robot,
-                links=links_under_gravity(self.robot),
+                robot,
+                links=links_under_gravity(robot),
                 unknown_scale=self.unknown_scale,
                 free_scale=self.free_scale,
             )
@@ -273,7 +277,8 @@ class InertiaForceGravity(_NewtonFeatures):
         return [*columns, *self._gravity._names(columns)]
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        features = self._gravity if hasattr(self, "_gravity") else self._gravity_map(layout.n_columns)
+        fitted = hasattr(self, "_gravity")
+        features = self._gravity if fitted else self._gravity_map(owned(self.robot), layout.n_columns)
         mean, scale = features._prior(layout)
         acts_on, gain = features._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
         if gain.shape != acts_on.shape or not np.isfinite(gain).all():

@@ -125,9 +125,10 @@ class NominalDynamics(RobotMap):
 
     def _prepare(self) -> None:
         self._check_terms()
+        self._terms = tuple(self.terms)
         if self.robot is None:
             return
-        model = load_robot(self.robot)
+        model = load_robot(self._robot)
         self._body = RigidBody(model)
         self._damping = np.array(model.damping)
         self._driven = np.array(self._layout.driven)
@@ -153,7 +154,7 @@ class NominalDynamics(RobotMap):
             "bias": lambda: body.forces(q, v, np.zeros_like(v)),
             "input": lambda: body.accelerations_by_force(q, force),
         }
-        features = np.hstack([columns[term]() for term in self.terms])
+        features = np.hstack([columns[term]() for term in self._terms])
         if not np.isfinite(features).all():
             raise ValueError(self._why_not_finite(q[~np.isfinite(features).all(axis=1)][0]))
         return features
@@ -171,7 +172,7 @@ class NominalDynamics(RobotMap):
     def _names(self, columns: np.ndarray) -> list[str]:
         if self.robot is None:
             return columns.tolist()
-        return [_NAMES[term].format(name) for term in self.terms for name in columns[: self._layout.n_joints]]
+        return [_NAMES[term].format(name) for term in self._terms for name in columns[: self._layout.n_joints]]
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         """Blocks (2 * n_joints, n_joints) of the terms, side by side."""

@@ -13,7 +13,7 @@ from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, v
 
 from .._validation import is_plain
 from ..robots import Layout, layout_of
-from ..robots.loading import Robot
+from ..robots.loading import Robot, owned
 
 
 def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
@@ -59,14 +59,22 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         """
         validate_data(self, X, dtype=np.float64)
         if self.robot is not None:
-            self._layout = layout_of(self.robot)
+            self._robot = owned(self.robot)
+            self._layout = layout_of(self._robot)
             if self.n_features_in_ != self._layout.n_columns:
                 raise ValueError(
                     f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
                     f"{self._layout.name!r} needs {self._layout.n_columns}: {self._layout.column_names}."
                 )
+            self._check_order()
         self._prepare()
         return self
+
+    def _check_order(self) -> None:
+        """Columns that bear the robot's own names must be in its order."""
+        names = list(getattr(self, "feature_names_in_", []))
+        if names != self._layout.column_names and set(names) == set(self._layout.column_names):
+            raise ValueError(f"The columns of X must be in the robot's order {self._layout.column_names}; got {names}.")
 
     def transform(self, X: ArrayLike) -> np.ndarray:
         """Evaluate the features.

@@ -29,7 +29,7 @@ def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float) -> str
     """
     n_iter = spent + minimum.n_iter
     if minimum.interrupted:
-        return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
+        return interrupted(n_iter)
     if minimum.converged:
         return ""
     if n_iter < max_iter:
@@ -42,6 +42,11 @@ def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float) -> str
         f"The bound was still rising after max_iter={max_iter} iterations. Raise max_iter, or stop earlier on "
         f"purpose with a larger tol (now {tol})."
     )
+
+
+def interrupted(n_iter: int) -> str:
+    """That Ctrl-C ended the fit."""
+    return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
 
 
 def far_from_prior(model: SparseModel, rows: Rows) -> str:

@@ -16,6 +16,8 @@ from .statistics import Kernel
 
 # On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
+# The greedy search keeps so many numbers at most, 80 MB.
+LARGEST_SEARCH = 10_000_000
 # Below this share of the prior variance, what is left is rounding: it no longer tells which row is the least known.
 _EXHAUSTED = 1e-10
 
@@ -44,6 +46,8 @@ class Placement:
     @property
     def sample_size(self) -> int:
         """How many rows are enough to choose from."""
+        if isinstance(self.method, str) and self.method == "greedy":
+            return max(2 * self.n_inducing, min(MAX_SAMPLE, LARGEST_SEARCH // self.n_inducing))
         return max(MAX_SAMPLE, 10 * self.n_inducing)
 
     def points(

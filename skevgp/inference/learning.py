@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from .adam import adam
-from .advice import far_from_prior, how_it_ended, nothing_learned
+from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
 from .bounds import features_alone_bound
 from .elbo import ElboObjective
 from .inducing import Placement
@@ -29,9 +29,9 @@ _OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0), (1.0, 1e3))
 # With about as many inducing points as rows, a low first noise may lead to a plateau on which the kernel explains every
 # row by itself: such fits, which cost little, start from a noise so many times higher too.
 _INTERPOLATES, _MUCH_NOISE = 1.5, 1e3
-# Iterations after which inducing points are placed anew. By then lengthscales tell which columns matter; with 50 or 300
-# the bounds are about as good.
-_BEFORE_PLACED_ANEW = 100
+# Iterations after which inducing points are placed anew, and so many again until it shows whether that was better. By
+# then lengthscales tell which columns matter; with 50 or 300 the bounds are about as good.
+_STAGE = 100
 # Relative size of the rounding errors in a bound on all rows.
 _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
@@ -190,16 +190,13 @@ def _other_start(
 
 
 def _placed(values: Values, model: SparseModel, rows: Rows, placement: Placement, rng: np.random.RandomState) -> Values:
-    """The same values with inducing points placed under their kernel.
+    """The same values with inducing points placed under their kernel, alike for all groups.
 
     Where clusters coincide there are fewer: the table then keeps those that it has.
     """
-    hyperparameters = np.log(values["hyperparameters"])
-    points = [
-        placement.points(rows.sample(placement.sample_size, rng).inputs, model.kernel, hyperparameters, rng)
-        for _ in model.groups
-    ]
-    return values | {"inducing_points": np.array(points)}
+    inputs = rows.sample(placement.sample_size, rng).inputs
+    points = placement.points(inputs, model.kernel, np.log(values["hyperparameters"]), rng)
+    return values | {"inducing_points": np.repeat(points[np.newaxis], len(model.groups), axis=0)}
 
 
 def _learn_placing(
@@ -214,31 +211,40 @@ def _learn_placing(
     """`_learn_once`, with inducing points placed anew under the kernel that the first iterations learned.
 
     (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
-    columns matter, and L-BFGS moves points a little, not across the data. With Adam, and with about as many points as
-    rows, they stay.
+    columns matter, and L-BFGS moves points a little, not across the data. A stage later the better of the two, the
+    fit from the new places and that which went on from the old ones, goes on. With Adam, and with about as many points
+    as rows, points stay.
     """
     anew, n_inducing = placement.anew, table["inducing_points"].start.shape[1]
     if (
         anew is None
         or options.solver != "lbfgs"
-        or options.max_iter <= _BEFORE_PLACED_ANEW
+        or options.max_iter <= _STAGE
         or _INTERPOLATES * n_inducing >= len(rows)
         or not table["hyperparameters"].free.any()
     ):
         return _learn_once(model, table, rows, options, rng, report)
-    first = _learn_once(model, table, rows, replace(options, max_iter=_BEFORE_PLACED_ANEW), rng, report)
+
+    def go_on(learned: Learned, values: Values, until: int) -> Learned:
+        spent = len(learned.loss_curve)
+        part = replace(options, max_iter=min(until, options.max_iter), spent=spent)
+        later = None if report is None else lambda iteration, loss: report(spent + iteration, loss)
+        more = _learn_once(model, table.started_at(values), rows, part, rng, later)
+        return replace(more, loss_curve=learned.loss_curve + more.loss_curve)
+
+    first = _learn_once(model, table, rows, replace(options, max_iter=_STAGE), rng, report)
     if first.interrupted:
         return first
-    spent = len(first.loss_curve)
-    rest = replace(options, spent=spent)
-    later = None if report is None else lambda iteration, loss: report(spent + iteration, loss)
-
-    def go_on(values: Values) -> Learned:
-        learned = _learn_once(model, table.started_at(values), rows, rest, rng, later)
-        return replace(learned, loss_curve=first.loss_curve + learned.loss_curve)
-
-    best = go_on(_placed(first.values, model, rows, anew, rng))
-    return best if best.bound > first.bound or best.interrupted else _better(best, go_on(first.values))
+    try:
+        values = _placed(first.values, model, rows, anew, rng)
+    except KeyboardInterrupt:
+        return replace(first, interrupted=True, message=interrupted(len(first.loss_curve)))
+    best = _better(first, go_on(first, values, 2 * _STAGE))
+    # Without a message it has converged.
+    if first.message and not best.interrupted:
+        best = _better(best, go_on(first, first.values, 2 * _STAGE))
+    unfinished = best.message and not best.interrupted and len(best.loss_curve) < options.max_iter
+    return go_on(best, best.values, options.max_iter) if unfinished else best
 
 
 def _learn_once(
@@ -369,7 +375,7 @@ def _lbfgs_unless_stuck(
         return minimum if best is None or minimum.loss < best.loss else replace(best, interrupted=minimum.interrupted)
 
     best = descend(1.0, 1.0)
-    if options.max_iter == 0 or not table["noise"].free.any():
+    if options.max_iter == 0 or options.spent > 0 or not table["noise"].free.any():
         return best
     if _INTERPOLATES * table["inducing_points"].start.shape[1] >= linear.n_rows and not best.interrupted:
         best = descend(1.0, _MUCH_NOISE)

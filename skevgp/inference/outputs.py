@@ -157,7 +157,7 @@ class FittedOutputs:
                 table = table.started_at(values)
             tables.append(table)
             colds.append(None if table is cold else cold)
-        # The same for all, so that outputs that share nothing are fitted as they would be alone.
+        # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
         seed = rng.randint(np.iinfo(np.int32).max)
         threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
         options = replace(options, threads=threads)

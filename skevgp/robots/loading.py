@@ -133,6 +133,16 @@ def layout_of(robot: Robot) -> Layout:
     )
 
 
+def owned(robot: Robot) -> Robot:
+    """A robot as a fitted object keeps it: a named system as it is, any other as a model of its own.
+
+    Files are read once, and what the user does to a model later changes nothing.
+    """
+    if isinstance(robot, System) or (isinstance(robot, str) and robot in SYSTEMS):
+        return robot
+    return load_robot(robot).copy()
+
+
 def joint_axes(model: Any) -> np.ndarray:
     """Motion of each joint per unit of its velocity, in its own frame.
 

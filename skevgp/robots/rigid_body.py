@@ -24,7 +24,7 @@ class RigidBody:
     """
 
     def __init__(self, model: Any, n_threads: int = 1):
-        self.model = model
+        self.model = model.copy()  # what the user does to it later changes nothing
         self.n_threads = n_threads
 
     def __getstate__(self) -> dict[str, Any]:
