@@ -85,6 +85,14 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ``normalize_y=True``.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
+    noise_cv : int, default=None
+        None: the noise variance is where the bound is highest. For rows of trajectories that is too low, and ``std``
+        too small on new ones: rows that are alike count as new knowledge each. A number of folds, 2 or more (10 is
+        good): after the fit each fold of consecutive rows (as of KFold, so leave them in their order) is predicted from
+        the others, with kernel and inducing points as they are, and the noise variance is set so that the squared
+        errors are as large as the predicted variances, on average (Rasmussen & Williams 2006, section 5.4.2). It stays
+        within its bounds, and what is ``"fixed"`` stays. Where rows are independent, little changes. Takes two
+        passes over the rows, memory for as many matrices (m, m), and Ctrl-C leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, default="lbfgs"
@@ -188,6 +196,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "coef_mean": ["array-like", Real, StrOptions({"auto"})],
         "coef_scale": ["array-like", Real, StrOptions({"auto"})],
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
+        "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "normalize_y": ["boolean"],
         "solver": [StrOptions({"lbfgs", "adam"})],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -218,6 +227,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         coef_mean: ArrayLike | Literal["auto"] = "auto",
         coef_scale: ArrayLike | Literal["auto"] = "auto",
         noise_variance: float | None = None,
+        noise_cv: int | None = None,
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] = "lbfgs",
         max_iter: int | None = None,
@@ -242,6 +252,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.coef_mean = coef_mean
         self.coef_scale = coef_scale
         self.noise_variance = noise_variance
+        self.noise_cv = noise_cv
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
@@ -432,6 +443,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"got solver={self.solver!r} and posterior={self.posterior!r}."
             )
         given, X, y = self._validated(X, y, reset=True)
+        if self.noise_cv is not None and self.noise_cv > len(X):
+            raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={len(X)}.")
         fit_to = fit_map_to_chunks if is_dask(X) else fit_map
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
@@ -460,6 +473,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.learning_rate,
             self.n_restarts,
             self.natural_gradient,
+            self.noise_cv,
         )
         self._fitted = FittedOutputs.fit(
             frame,
