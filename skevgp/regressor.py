@@ -86,13 +86,13 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=None
-        None: the noise variance is where the bound is highest. For rows of trajectories that is too low, and ``std``
-        too small on new ones: rows that are alike count as new knowledge each. A number of folds, 2 or more (10 is
-        good): after the fit each fold of consecutive rows (as of KFold, so leave them in their order) is predicted from
-        the others, with kernel and inducing points as they are, and the noise variance is set so that the squared
-        errors are as large as the predicted variances, on average (Rasmussen & Williams 2006, section 5.4.2). It stays
-        within its bounds, and what is ``"fixed"`` stays. Where rows are independent, little changes. Takes two
-        passes over the rows, memory for as many matrices (m, m), and Ctrl-C leaves it out.
+        None: the noise variance is where the bound is highest. On rows of trajectories, each like the one before, that
+        is too low: the bound takes them for independent, and ``std`` is too small on new trajectories. A number of
+        folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
+        from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
+        are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
+        Put one trajectory after the other; in random order, or where rows are independent, hardly anything changes. It
+        takes two passes over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, default="lbfgs"
@@ -149,7 +149,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
     lower_bound_ : float
-        On the log marginal likelihood; nats, summed over outputs.
+        On the log marginal likelihood; nats, summed over outputs. With ``noise_cv`` it is below that of the last
+        iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration (of Adam: a mini-batch's estimate).
     n_iter_ : int

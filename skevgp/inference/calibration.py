@@ -114,8 +114,9 @@ def calibrated_noise(
 ) -> np.ndarray:
     """The noise variance of each output at which φ first falls to 1, from the lowest that is allowed.
 
-    The lowest is the mean square of what the model leaves over of its own rows: a block that has nothing like it among
-    the others is uncertain anyway, and says little of the noise. Where φ is 1 or less there, it is the answer.
+    The lowest is what the model's own rows show, the square of what it leaves over per degree of freedom: blocks that
+    have nothing like them among the others are uncertain anyway, and say little of the noise. Where φ is 1 or less
+    there, it is the answer.
 
     Parameters
     ----------
@@ -142,7 +143,9 @@ def calibrated_noise(
     noise = np.empty(len(bounds))
     for own, outputs, (at, L, L_inv) in zip(statistics, model.groups, model.factors(values), strict=True):
         bound = model.bound(own, outputs, values["signal"], values["noise"], L, L_inv)
-        left_over = bound.residuals().squares / own.n_rows
+        # Rows less the trace of I - B⁻¹, the weights that they determine.
+        freedom = [own.n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
+        left_over = bound.residuals().squares / np.maximum(freedom, 1e-6 * own.n_rows)
         lowest = np.maximum(np.clip(left_over, *bounds[outputs].T), _LOWEST)
         highest = np.maximum(np.minimum(bounds[outputs, 1], _HIGHEST), lowest)
         grid = np.geomspace(lowest, highest, _GRID, axis=1)
