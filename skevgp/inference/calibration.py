@@ -9,6 +9,7 @@ as they are, and each output's noise variance is set so that
     φ(σ²) = mean over all rows of r² / (latent variance + σ²) = 1,
 
 where the error r and the latent variance of a row are those of the optimal q without the row's block, for that σ².
+(It may fall as well: what inducing points cannot represent is noise to the bound, while predictions count it twice.)
 
 Without a block the sufficient statistics are sums over the other blocks. (They are summed, not subtracted: what only
 one block knows is then exactly unknown without it.) With B₀ = I + σ₀⁻² PᵀP = L Lᵀ of these (see `bounds`), and the
