@@ -98,8 +98,8 @@ class DaskSource:
         dask = _dask()
         maps = dask.delayed((feature_map, kernel_map), traverse=False)
         chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
-        self._partitions = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
-        self._ends = np.cumsum(X.chunks[0])
+        self._partitions: Sequence[Any] = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
+        self._ends: np.ndarray = np.cumsum(X.chunks[0])
         self.n_rows = len(X)
 
     def sum(self, function: Callable[[RawRows], Any]) -> Any:
@@ -117,6 +117,16 @@ class DaskSource:
         found = dask.compute(*parts)
         back = np.argsort(order)
         return RawRows(*(np.concatenate(columns)[back] for columns in zip(*found, strict=True)))
+
+    def part(self, first: int, end: int) -> DaskSource:
+        delayed, part = _dask().delayed, copy(self)
+        starts = np.append(0, self._ends[:-1])
+        cuts = np.column_stack([np.maximum(first - starts, 0), np.minimum(end, self._ends) - starts]).tolist()
+        owners = [owner for owner, (begin, stop) in enumerate(cuts) if begin < stop]
+        part._partitions = [delayed(_cut)(self._partitions[owner], *cuts[owner]) for owner in owners]
+        part._ends = np.cumsum([cuts[owner][1] - cuts[owner][0] for owner in owners])
+        part.n_rows = end - first
+        return part
 
     def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return DaskBlocks(self._partitions, make, n_inducing)
@@ -201,6 +211,10 @@ def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any]) -> LocalSour
     check_magnitude(X, "X")
     check_magnitude(y, "y")
     return LocalSource(MappedRows(X, X, y, *maps), len(X))
+
+
+def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
+    return partition.part(first, end)
 
 
 def _blocks(partition: LocalSource, make: Callable[[RawRows], Block], n_inducing: int) -> Blocks:

@@ -87,6 +87,14 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ``normalize_y=True``.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
+    noise_cv : int, default=None
+        None: the noise variance is where the bound is highest. On rows of trajectories, each like the one before, that
+        is too low: the bound takes them for independent, and ``std`` is too small on new trajectories. A number of
+        folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
+        from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
+        are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
+        Put one trajectory after the other; in random order, or where rows are independent, hardly anything changes. It
+        takes two passes over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, default="lbfgs"
@@ -143,7 +151,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
     lower_bound_ : float
-        On the log marginal likelihood; nats, summed over outputs.
+        On the log marginal likelihood; nats, summed over outputs. With ``noise_cv`` it is below that of the last
+        iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration (of Adam: a mini-batch's estimate).
     n_iter_ : int
@@ -190,6 +199,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "coef_mean": ["array-like", Real, StrOptions({"auto"})],
         "coef_scale": ["array-like", Real, StrOptions({"auto"})],
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
+        "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "normalize_y": ["boolean"],
         "solver": [StrOptions({"lbfgs", "adam"})],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -220,6 +230,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         coef_mean: ArrayLike | Literal["auto"] = "auto",
         coef_scale: ArrayLike | Literal["auto"] = "auto",
         noise_variance: float | None = None,
+        noise_cv: int | None = None,
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] = "lbfgs",
         max_iter: int | None = None,
@@ -244,6 +255,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.coef_mean = coef_mean
         self.coef_scale = coef_scale
         self.noise_variance = noise_variance
+        self.noise_cv = noise_cv
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
@@ -434,6 +446,8 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"got solver={self.solver!r} and posterior={self.posterior!r}."
             )
         given, X, y = self._validated(X, y, reset=True)
+        if self.noise_cv is not None and self.noise_cv > len(X):
+            raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={len(X)}.")
         fit_to = fit_map_to_chunks if is_dask(X) else fit_map
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
@@ -462,6 +476,7 @@ class EVGPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.learning_rate,
             self.n_restarts,
             self.natural_gradient,
+            self.noise_cv,
         )
         self._fitted = FittedOutputs.fit(
             frame,

@@ -66,6 +66,20 @@ def test_fit_to_chunks_on_two_workers_is_fit_to_arrays(cluster):
     assert_same_model(model(max_iter=5).fit(*chunked(X, Y)), model(max_iter=5).fit(X, Y))
 
 
+@pytest.mark.parametrize("rows", [(150, 250, 200), (600,)])
+def test_folds_may_cut_chunks(rows):
+    parameters = {"noise_cv": 4, "max_iter": 1, "feature_map": PolynomialFeatures(1)}
+    expected, actual = model(**parameters).fit(X, Y), model(**parameters).fit(*chunked(X, Y, rows=rows))
+    np.testing.assert_allclose(actual.noise_variance_, expected.noise_variance_, rtol=1e-6)
+    assert (actual.noise_variance_ != model(**{**parameters, "noise_cv": None}).fit(X, Y).noise_variance_).all()
+    assert_same_model(actual, expected)
+
+
+def test_folds_on_two_workers_are_folds_of_arrays(cluster):
+    parameters = {"noise_cv": 4, "max_iter": 1}
+    assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))
+
+
 def test_adam_takes_its_batches_from_the_chunks():
     parameters = {"solver": "adam", "max_iter": 5, "batch_size": 100}
     assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))

@@ -6,7 +6,7 @@ from skevgp import EVGPRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
-ESTIMATORS = [EVGPRegressor(), *MAPS]
+ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)

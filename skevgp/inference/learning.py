@@ -10,6 +10,7 @@ import numpy as np
 from .adam import adam
 from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
 from .bounds import features_alone_bound
+from .calibration import calibrated_noise
 from .elbo import ElboObjective
 from .inducing import Placement
 from .linalg import NotPositiveDefiniteError
@@ -56,6 +57,8 @@ class Options:
         Further fits from other starts.
     natural_gradient : bool
         Of Adam with the full family: q moves by natural gradients.
+    noise_cv : int, optional
+        Folds of consecutive rows by which the noise is calibrated.
     threads : BlockMap
     spent : int
         Iterations of ``max_iter`` that were used up before.
@@ -68,6 +71,7 @@ class Options:
     learning_rate: float
     n_restarts: int = 0
     natural_gradient: bool = False
+    noise_cv: int | None = None
     threads: BlockMap = field(default_factory=BlockMap)
     spent: int = 0
 
@@ -112,8 +116,21 @@ class Learned:
         n_inducing = self.values["inducing_points"].shape[1]
         new = self.model.statistics(self.values, rows.blocks(self.model.kernel, n_inducing))
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        bound, posterior = self.model.at_optimum(self.values, statistics)
-        return replace(self, bound=bound, posterior=posterior, statistics=statistics)
+        return replace(self, statistics=statistics).at_optimum()
+
+    def calibrated(self, table: ParameterTable, rows: Rows, n_folds: int, threads: BlockMap) -> Learned:
+        """The noise that is free from cross-validation, and q at its optimum for it."""
+        free = table["noise"].free
+        if not free.any():
+            return self
+        bounds = table["noise"].value_bounds()
+        noise = calibrated_noise(self.model, self.values, self.statistics, rows, bounds, n_folds, threads)
+        return replace(self, values=self.values | {"noise": np.where(free, noise, self.values["noise"])}).at_optimum()
+
+    def at_optimum(self) -> Learned:
+        """With q at its optimum for values and statistics, and the bound there."""
+        bound, posterior = self.model.at_optimum(self.values, self.statistics)
+        return replace(self, bound=bound, posterior=posterior)
 
 
 def learn(
@@ -168,7 +185,10 @@ def learn(
     advice = [best.message, far_from_prior(model, rows)]
     if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
         advice.append(nothing_learned(best.values["noise"], rows))
-    return replace(best, message=" ".join(part for part in advice if part))
+    best = replace(best, message=" ".join(part for part in advice if part))
+    if options.noise_cv is None or best.interrupted:
+        return best
+    return best.calibrated(table, rows, options.noise_cv, options.threads)
 
 
 def _better(best: Learned, other: Learned) -> Learned:

@@ -130,6 +130,10 @@ class Rows:
                 for begin in range(0, len(order) - size + 1, size):
                     yield Batch(make(self.source.take(order[begin : begin + size])))
 
+    def part(self, first: int, end: int, share: float) -> Rows:
+        """Consecutive rows, with a share of the memory."""
+        return replace(self, source=self.source.part(first, end), share=self.share * share)
+
     def outputs(self, columns: slice, share: float = 1.0) -> Rows:
         """The same rows with some of the outputs."""
         return replace(self, columns=columns, share=share)

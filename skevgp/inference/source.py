@@ -46,6 +46,9 @@ class Source(Protocol):
     def take(self, rows: np.ndarray) -> RawRows:
         """Some rows, by index."""
 
+    def part(self, first: int, end: int) -> Source:
+        """Consecutive rows, at least one."""
+
     def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
 
@@ -130,12 +133,27 @@ class LocalSource:
     def take(self, rows: np.ndarray) -> RawRows:
         return self.load(rows)
 
+    def part(self, first: int, end: int) -> LocalSource:
+        return LocalSource(_Part(self.load, first, end), end - first)
+
     def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return LocalBlocks(self.through(make), self.n_rows, n_inducing, threads, share)
 
     def through(self, make: Callable[[RawRows], Block]) -> Callable[[slice], Block]:
         """Load, then make."""
         return _Through(self.load, make)
+
+
+@dataclass(frozen=True)
+class _Part:
+    load: Callable[[slice | np.ndarray], RawRows]
+    first: int
+    end: int
+
+    def __call__(self, rows: slice | np.ndarray) -> RawRows:
+        if isinstance(rows, slice):
+            return self.load(slice(self.first + rows.start, min(self.first + rows.stop, self.end)))
+        return self.load(self.first + rows)
 
 
 @dataclass(frozen=True)
