@@ -89,7 +89,7 @@ class AngleEncoder(RobotTransformer):
         original[:, self._angles] = np.where(angles <= -np.pi, np.pi, angles)
         return original
 
-    def _prepare(self) -> None:
+    def _prepare(self, robot: Robot | None) -> None:
         self._angles = np.array(self._columns_of_angles(), dtype=int)
         copies = np.ones(self.n_features_in_, dtype=int)
         copies[self._angles] = 2

@@ -194,9 +194,9 @@ class LinkGravity(GravityMap):
         "links": ["array-like", None],
     }
 
-    def _prepare(self) -> None:
-        if self.robot is not None:
-            model = load_robot(self._robot)
+    def _prepare(self, robot: Robot | None) -> None:
+        if robot is not None:
+            model = load_robot(robot)
             self._levers = self._levers_of(model)
             self._links = _Links(model)
             components = [_COMPONENTS[lever.name] for lever in self._levers]

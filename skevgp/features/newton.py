@@ -246,8 +246,8 @@ class InertiaForceGravity(_NewtonFeatures):
         "gravity_gain": [Real, "array-like"],
     }
 
-    def _prepare(self) -> None:
-        self._gravity = self._gravity_map(None if self.robot is None else self._robot, self.n_features_in_)
+    def _prepare(self, robot: Robot | None) -> None:
+        self._gravity = self._gravity_map(robot, self.n_features_in_)
 
     def _gravity_map(self, robot: Robot | None, n_columns: int) -> GravityMap:
         """The fitted features of gravity."""

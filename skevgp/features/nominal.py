@@ -123,12 +123,12 @@ class NominalDynamics(RobotMap):
         "free_scale": [Interval(Real, 0, None, closed="left")],
     }
 
-    def _prepare(self) -> None:
+    def _prepare(self, robot: Robot | None) -> None:
         self._check_terms()
         self._terms = tuple(self.terms)
-        if self.robot is None:
+        if robot is None:
             return
-        model = load_robot(self._robot)
+        model = load_robot(robot)
         self._body = RigidBody(model)
         self._damping = np.array(model.damping)
         self._driven = np.array(self._layout.driven)

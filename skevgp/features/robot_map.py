@@ -58,16 +58,16 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
             If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
         """
         validate_data(self, X, dtype=np.float64)
-        if self.robot is not None:
-            self._robot = owned(self.robot)
-            self._layout = layout_of(self._robot)
+        robot = None if self.robot is None else owned(self.robot)
+        if robot is not None:
+            self._layout = layout_of(robot)
             if self.n_features_in_ != self._layout.n_columns:
                 raise ValueError(
                     f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
                     f"{self._layout.name!r} needs {self._layout.n_columns}: {self._layout.column_names}."
                 )
             self._check_order()
-        self._prepare()
+        self._prepare(robot)
         return self
 
     def _check_order(self) -> None:
@@ -110,8 +110,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
             input_features = np.array(self._layout.column_names, dtype=object)
         return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
 
-    def _prepare(self) -> None:
-        """What `fit` keeps of the robot besides its layout; nothing here."""
+    def _prepare(self, robot: Robot | None) -> None:
+        """What `fit` keeps of the robot (its own, loaded) besides the layout; nothing here."""
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         """h(x) of rows (n, n_features_in_); without a robot too."""
