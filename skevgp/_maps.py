@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 from sklearn.base import clone
+from sklearn.pipeline import FeatureUnion
 from sklearn.utils import _safe_indexing
 
 from ._validation import LARGEST, as_floats, check_magnitude
@@ -69,7 +70,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
         rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
-        values = fitted_map.transform(rows)
+        values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
         if blocks and values.shape[1] != blocks[0].shape[1]:
@@ -79,6 +80,17 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
             )
         blocks.append(values)
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+
+
+def _transform(fitted_map: Any, rows: Any) -> Any:
+    """What the map returns; for a row of a union, its own bookkeeping would take longer than all its parts."""
+    if type(fitted_map) is FeatureUnion and type(rows) is np.ndarray and fitted_map.transformer_weights is None:
+        maps = [part for _, part in fitted_map.transformer_list]
+        if not any(isinstance(part, str) for part in maps):
+            parts = [part.transform(rows) for part in maps]
+            if all(type(part) is np.ndarray and part.shape[:1] == rows.shape[:1] for part in parts):
+                return np.hstack(parts)
+    return fitted_map.transform(rows)
 
 
 def _is_good(values: Any, n_rows: int) -> bool:

@@ -6,6 +6,7 @@ from scipy.sparse import csr_array, issparse
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import LinearRegression
+from sklearn.pipeline import FeatureUnion, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 from sklearn.utils.validation import check_is_fitted
 
@@ -165,3 +166,13 @@ def test_a_map_that_cannot_be_cloned_is_named():
 
     with pytest.raises(TypeError, match="kernel_map=.* cannot be cloned"):
         fit_map(Plain(), np.ones((2, 2)), np.ones(2), "kernel_map")
+
+
+def test_a_union_of_arrays_gives_what_it_gives_by_itself():
+    for union in (
+        make_union(PolynomialFeatures(2), StandardScaler()),
+        FeatureUnion([("a", StandardScaler()), ("b", "passthrough")]),
+        FeatureUnion([("a", StandardScaler()), ("b", "drop")]),
+        FeatureUnion([("a", StandardScaler()), ("b", PolynomialFeatures(1))], transformer_weights={"a": 2.0}),
+    ):
+        assert_array_equal(apply_map(union.fit(X), X, "feature_map"), union.transform(X))

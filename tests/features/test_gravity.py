@@ -295,3 +295,8 @@ def test_a_union_is_inertia_force_gravity_in_two_parts():
     of_union, of_whole = (EVGPRegressor(features, n_inducing=5, max_iter=0).fit(X, y) for features in (union, whole))
     assert_array_equal(of_union.coef_prior_mean_, of_whole.coef_prior_mean_)
     assert_array_equal(of_union.coef_prior_scale_, of_whole.coef_prior_scale_)
+
+
+def test_gravity_inside_ifg_leaves_the_outputs_to_it():
+    with pytest.raises(ValueError, match=r"must leave outputs to InertiaForceGravity"):
+        InertiaForceGravity("acrobot", gravity=LinkGravity(outputs=["q1"])).coef_prior(4)

@@ -12,7 +12,7 @@ from sklearn.pipeline import FeatureUnion
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics, perturb_robot, simulate
-from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, NominalDynamics
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 from skevgp.features.prior import resolve_coef_prior
 from skevgp.metrics import prediction_error
 from skevgp.robots import System, get_system, layout_of, load_robot
@@ -352,3 +352,34 @@ def test_a_wrong_model_and_encoded_angles_help_the_regressor():
     with_both = error(EVGPRegressor(nominal, kernel_map=AngleEncoder("acrobot"), **settings), data)
     assert with_model < 0.7 * plain
     assert with_both < with_model
+
+
+# --- what a fitted map knows of the robot --------------------------------------------------------------------------
+
+
+def test_a_fitted_map_does_not_follow_the_users_model():
+    model = load_robot("acrobot")
+    X = np.random.default_rng(0).normal(size=(3, 5))
+    fitted = NominalDynamics(model, terms=["acceleration", "gravity", "input"]).fit(X)
+    before = fitted.transform(X)
+    model.inertias[1].mass = 9.0
+    model.damping = np.full(2, 5.0)
+    assert_array_equal(fitted.transform(X), before)
+    assert_array_equal(pickle.loads(pickle.dumps(fitted)).transform(X), before)
+
+
+def test_terms_are_those_of_the_fit():
+    X = np.random.default_rng(0).normal(size=(3, 5))
+    fitted = NominalDynamics("acrobot").fit(X).set_params(terms=["gravity"])
+    assert fitted.get_feature_names_out().tolist() == ["acc(q1)", "acc(q2)"]
+    assert_array_equal(fitted.transform(X), NominalDynamics("acrobot").fit_transform(X))
+
+
+@pytest.mark.parametrize("feature_map", [InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics, AngleEncoder])
+def test_columns_with_the_robots_names_must_be_in_its_order(feature_map):
+    names = layout_of("acrobot").column_names
+    rows = np.random.default_rng(0).normal(size=(3, 5))
+    with pytest.raises(ValueError, match=r"robot's order \['q1', 'q2', 'dq1/dt'.*got \['u_q2'"):
+        feature_map("acrobot").fit(pd.DataFrame(rows, columns=names[::-1]))
+    for columns in (names, list("abcde")):
+        assert len(feature_map("acrobot").fit_transform(pd.DataFrame(rows, columns=columns))) == 3
