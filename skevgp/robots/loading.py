@@ -279,12 +279,12 @@ def _plain(model: Any, called: str) -> Any:
                 f"{called} has the joint {name!r} that mimics another; load the URDF with mimic=False, which lets it "
                 "move on its own."
             )
-        if joint.nv != 1 or joint.nq > 2 or np.count_nonzero(_axis(joint).reshape(2, 3).any(axis=1)) > 1:
+        if joint.nv != 1 or joint.nq > 2 or ((axis := _axis(joint))[:3].any() and axis[3:].any()):
             raise ValueError(
                 f"{called} has the joint {name!r} of the type {joint.shortname()}; joints must be revolute or "
                 "prismatic and the base fixed (load the URDF without a free-flyer)."
             )
-        length = np.linalg.norm(_axis(joint))
+        length = np.linalg.norm(axis)
         if not abs(length - 1.0) <= _AXIS_TOLERANCE:
             raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
     _check_numbers(model, called)
