@@ -179,6 +179,16 @@ def test_a_refused_call_changes_nothing(ur5):
     assert_array_equal(ur5(1, Z[1]), torque)
 
 
+def test_states_may_be_overwritten_after_a_call(ur5):
+    Z = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 1, 12))
+    reused = Z[0].copy()
+    ur5(0, reused)
+    reused[:] = 7.0
+    torque = ur5(1, Z[1])
+    ur5(0, Z[0])
+    assert_array_equal(ur5(1, Z[1]), torque)
+
+
 def test_states_may_be_a_list(ur5):
     z = np.linspace(-0.1, 0.1, 12)
     assert_array_equal(ur5(0, [z.tolist()]), ur5(0, z[np.newaxis]))
