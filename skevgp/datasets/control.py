@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validation import as_floats, check_real
+from .._validation import as_floats, check_integer, check_real
 from ..robots.loading import Robot
 from .plant import Plant
 
@@ -90,6 +90,8 @@ class ComputedTorqueController:
 
     Attributes
     ----------
+    dt : float
+        As given.
     integral : ndarray of shape (n_trajectories, n_joints)
         The integral of q_d - q up to the last call, rad s or m s; 0 in step 0.
 
@@ -133,7 +135,7 @@ class ComputedTorqueController:
         if layout.n_inputs != n:
             free = [name for joint, name in enumerate(layout.position_names) if joint not in layout.driven]
             raise ValueError(f"All joints must be driven; those of {layout.name!r} without a motor are {free}.")
-        self._dt = check_real(dt, "dt", minimum=0.0, strict=True)
+        self.dt = check_real(dt, "dt", minimum=0.0, strict=True)
         self._duration = check_real(duration, "duration", minimum=0.0, strict=True)
         quintic_reference(q0, q1, duration, 0.0)
         self._q0, self._q1 = np.atleast_2d(as_floats(q0, "q0")), np.atleast_2d(as_floats(q1, "q1"))
@@ -143,18 +145,24 @@ class ComputedTorqueController:
         if (self._kd * dt >= 2.0).any():
             raise ValueError(f"kd must be below 2 / dt = {2.0 / dt:g}, or the held loop is unstable; got {kd!r}.")
         self.integral = np.zeros_like(self._q0)
+        self._next = 0
 
-    def __call__(self, step: int, Z: np.ndarray) -> np.ndarray:
+    def __call__(self, step: int, Z: ArrayLike) -> np.ndarray:
         """The torques of a step, of shape (n_trajectories, n_joints); steps follow one another from 0."""
-        if Z.ndim != 2 or Z.shape[1] != 2 * self._q0.shape[1] or len(self._q0) not in (1, len(Z)):
-            raise ValueError(f"The states must fit q0, of shape {self._q0.shape}; got the shape {Z.shape}.")
-        q, v = np.hsplit(np.array(Z, dtype=np.float64), 2)
+        if check_integer(step, "step", minimum=0) not in (0, self._next):
+            raise ValueError(f"Steps must follow one another from 0; got {step}, expected 0 or {self._next}.")
+        states = np.array(_finite(Z, "Z"))
+        if states.ndim != 2 or states.shape[1] != 2 * self._q0.shape[1] or len(self._q0) not in (1, len(states)):
+            raise ValueError(f"The states must fit q0, of shape {self._q0.shape}; got the shape {states.shape}.")
+        if step and len(states) != len(self.integral):
+            raise ValueError(f"There were {len(self.integral)} trajectories in step 0; got {len(states)}.")
+        q, v = np.hsplit(states, 2)
         self.integral = self.integral + self._change(q, v) if step else np.zeros_like(q)
-        q_d, v_d, a_d = quintic_reference(self._q0, self._q1, self._duration, step * self._dt)
+        q_d, v_d, a_d = quintic_reference(self._q0, self._q1, self._duration, step * self.dt)
         a = a_d + self._kp * (q_d - q) + self._kd * (v_d - v) + self._ki * self.integral
         # Damping at the desired velocity: at the measured one, held, it would stop a strongly damped joint's motion.
         torque = self._plant.body.forces(q, v, a) + np.array(self._plant.model.damping) * v_d
-        self._before = q, v, q_d, torque
+        self._before, self._next = (q, v, q_d, torque), step + 1
         return torque
 
     def _change(self, q1: np.ndarray, v1: np.ndarray) -> np.ndarray:
@@ -163,7 +171,7 @@ class ComputedTorqueController:
         The cubic through the ends leaves h³/180 of the second difference of the accelerations; the model's serves,
         and what torque acted hardly matters in it.
         """
-        h = self._dt
+        h = self.dt
         q0, v0, q_d, torque = self._before
         middle = (q0 + q1) / 2.0 + h / 8.0 * (v0 - v1), 1.5 * (q1 - q0) / h - (v0 + v1) / 4.0
         ends = self._plant.accelerations(q0, v0, torque) + self._plant.accelerations(q1, v1, torque)

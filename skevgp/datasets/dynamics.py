@@ -73,7 +73,7 @@ def make_dynamics(
     of the torques that it takes to hold it and to give each joint 1 rad/s² (less where that would shake a light link by
     more than 2 rad/s²). A robot with a joint without motor starts
     in a random state within its limits and is driven by random inputs of that size, like the acrobot. A robot with the
-    name and the size of one of the four is taken for it. `simulate` says which forces act.
+    name and the size of one of the four is taken for it. `simulate` says which forces act, and which robots are slow.
 
     Parameters
     ----------
@@ -85,7 +85,8 @@ def make_dynamics(
     n_steps : int, default=None
         Steps per trajectory, at least 1; None takes the paper's (100, and 50 for iiwa14), and 50 for another robot.
     dt : float, default=0.03
-        Length of a step, s. Above 0.03 the controller's gains become softer, so that it stays stable.
+        Length of a step, s. Above 0.03 the controller's gains become softer. Robots with light links need a short step
+        all the same: where a held controller makes them run away, there is an error.
     duration : float, default=None
         How long a controlled move takes, s; the target is held afterwards. None moves until the end. Only for robots
         that are controlled.
@@ -126,8 +127,8 @@ def make_dynamics(
     ImportError
         If Pinocchio is not installed; the message gives the pip command.
     ValueError, TypeError
-        If an argument is out of its range or of the wrong type, the robot is unknown, or it cannot be simulated (see
-        `simulate`).
+        If an argument is out of its range or of the wrong type, the robot is unknown, it cannot be simulated (see
+        `simulate`), or controlled moves run away because ``dt`` is too long or ``duration`` too short.
 
     Examples
     --------

@@ -17,6 +17,7 @@ _LARGEST_MOVE = 1.5  # half the width of the first positions, rad or m, where li
 _TRAVEL = 0.8 / 1.5  # how far a target may be from there, as a fraction of that half-width
 _NOISE = 0.1  # of the torques' scale
 _LARGEST_SHAKE = 2.0  # acceleration by noise on one torque, rad/s² or m/s²
+_LOST = 5.0  # a joint faster than so many of its largest moves per step is no longer controlled
 _UNLIMITED = 1e6  # a position limit beyond it is none
 
 
@@ -67,10 +68,24 @@ class ControlledMoves:
         q1 = np.clip(q0 + _TRAVEL * self.width * rng.uniform(-1.0, 1.0, (shape[0], n)), self.lower, self.upper)
         noise = self.noise * rng.standard_normal((*shape, n))
         kd = min(20.0, 0.6 / dt)  # the paper's gains, softer where a long step would make them unstable
+        kp = kd**2 / 4.0
         controller = ComputedTorqueController(
-            plant.model, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kd**2 / 4, kd=kd
+            plant.model, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kp, kd=kd
         )
-        return np.hstack([q0, np.zeros_like(q0)]), lambda step, Z: controller(step, Z) + noise[:, step]
+        # Positions tell less: a motor that is too weak lets its joint fall as far.
+        fastest = _LOST * (_TRAVEL * self.width + _LARGEST_SHAKE / kp) / dt
+
+        def noisy(step: int, Z: np.ndarray) -> np.ndarray:
+            lost = (np.abs(Z[:, n:]) > fastest).any(axis=0)
+            if lost.any():
+                raise ValueError(
+                    f"The controlled moves of {plant.layout.name!r} run away in step {step}, at the joints "
+                    f"{[plant.layout.position_names[joint] for joint in np.flatnonzero(lost)]}: the held controller is "
+                    f"unstable at this dt of {dt} s. Lower dt, or give a longer duration."
+                )
+            return controller(step, Z) + noise[:, step]
+
+        return np.hstack([q0, np.zeros_like(q0)]), noisy
 
 
 def _random_inputs(state_scale: list[float], input_scale: float, n_trajectories: int) -> RandomInputs:

@@ -20,6 +20,8 @@ from .systems import GRAVITY, SYSTEMS, Layout, System
 
 _COLLECTION = "example-robot-data"
 _MOVABLE = ("revolute", "continuous", "prismatic")
+_LIMITS = ("upperEffortLimit", "lowerEffortLimit", "velocityLimit")
+_AXIS_TOLERANCE = 1e-6
 
 Robot = Any  # str | os.PathLike | System | pinocchio.Model: Pinocchio may not be there to name its type
 
@@ -38,9 +40,10 @@ def load_robot(robot: Robot) -> Any:
     -------
     model : pinocchio.Model
         With a fixed base and ``nq == nv``: a continuous joint's position is its angle (where Pinocchio's own loader
-        has its cosine and sine). Reflected rotor inertias are in ``armature``. `skevgp.datasets.simulate` also heeds
-        viscous ``damping`` and ``effortLimit``; a joint of limit 0 has no motor, unless all limits are 0 (then none is
-        known).
+        has its cosine and sine). A joint of a URDF file that mimics another moves on its own, with its own motor.
+        Reflected rotor inertias are in ``armature``. `skevgp.datasets.simulate` also heeds viscous ``damping`` and the
+        limits of effort; a joint whose both limits are 0 has no motor, unless all are 0 (then none is known). A lower
+        limit that was never set is the upper one's opposite.
 
     Raises
     ------
@@ -48,7 +51,8 @@ def load_robot(robot: Robot) -> Any:
         If Pinocchio is not installed; the message gives the pip command.
     ValueError
         If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
-        joint moves, or a joint is neither revolute nor prismatic (a floating base, a ball joint).
+        joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
+        number of the model makes no sense (not finite, a negative mass or damping, an axis that is not of length 1).
     TypeError
         If ``robot`` is none of the above.
 
@@ -66,7 +70,7 @@ def load_robot(robot: Robot) -> Any:
     array([0.1, 0.1])
     """
     if isinstance(robot, System):
-        return _model_of_table(robot)
+        return _plain(_model_of_table(robot), f"The system {robot.name!r}")
     if isinstance(robot, str) and robot in SYSTEMS:
         return _model_of_table(SYSTEMS[robot])
     if isinstance(robot, (str, os.PathLike)):
@@ -94,6 +98,9 @@ def list_robots() -> list[str]:
     names : list of str
         The systems of the paper, then what the installed package example-robot-data brings, sorted: each URDF file
         with a joint that moves, by its name without ``_robot``; where two have the same, with its folder in front.
+        Legged robots and drones come with the trunk welded to the world. ``"icub"``, ``"romeo"`` and
+        ``"romeo_laas_small"`` have massless links and cannot be simulated (``"icub_reduced"`` and ``"romeo_small"``
+        can).
 
     Examples
     --------
@@ -124,11 +131,10 @@ def layout_of(robot: Robot) -> Layout:
     if isinstance(robot, str) and robot in SYSTEMS:
         return SYSTEMS[robot].layout
     model = load_robot(robot)
-    motors = np.flatnonzero(model.upperEffortLimit > 0.0)
     return Layout(
         model.name,
         position_names=tuple(model.names)[1:],
-        driven=tuple(motors.tolist()) if len(motors) else tuple(range(model.nv)),
+        driven=tuple(np.flatnonzero(effort_limits(model).any(axis=0)).tolist()),
         revolute=tuple(bool(np.any(axis[3:])) for axis in joint_axes(model)),
     )
 
@@ -141,6 +147,25 @@ def owned(robot: Robot) -> Robot:
     if isinstance(robot, System) or (isinstance(robot, str) and robot in SYSTEMS):
         return robot
     return load_robot(robot).copy()
+
+
+def effort_limits(model: Any) -> np.ndarray:
+    """What the motors of a model can give.
+
+    Parameters
+    ----------
+    model : pinocchio.Model
+
+    Returns
+    -------
+    limits : ndarray of shape (2, n_joints)
+        The least and the largest torque or force on each joint: 0 and 0 without a motor, infinite on all joints if the
+        model knows none (all are 0).
+    """
+    lower, upper = np.array(model.lowerEffortLimit), np.array(model.upperEffortLimit)
+    lower = np.where(lower == np.finfo(np.float64).min, -upper, lower)  # Pinocchio's value where it was never set
+    limits = np.array([lower, upper])
+    return limits if limits.any() else np.array([[-np.inf], [np.inf]]) * np.ones(model.nv)
 
 
 def joint_axes(model: Any) -> np.ndarray:
@@ -170,15 +195,20 @@ def _path_of(robot: str | os.PathLike[str]) -> Path:
     names = _collection()
     if isinstance(robot, str) and robot in names:
         return names[robot]
-    path = Path(robot)
+    path = Path(os.path.expanduser(robot))
     if path.is_file():
         return path
-    if not isinstance(robot, str) or path.suffix or len(path.parts) > 1:
+    if robot and path.is_dir():
+        raise ValueError(f"{str(path)!r} is a folder; a robot is one URDF file.")
+    if not isinstance(robot, str):
+        raise ValueError(f"There is no file {str(path)!r}; a robot's name must be a string, not a path.")
+    if path.suffix or len(path.parts) > 1:
         raise ValueError(f"There is no file {str(path)!r}; the names that are known are {list_robots()}.")
-    close = get_close_matches(robot, list_robots(), n=3)
-    hint = f" Did you mean {' or '.join(map(repr, close))}?" if close else ""
+    known = {name.lower(): name for name in list_robots()}
+    close = [repr(known[name]) for name in get_close_matches(robot.lower(), known, n=3)]
+    hint = f" Did you mean {' or '.join(close)}?" if close else ""
     more = "" if names else f" (pip install {_COLLECTION} brings more)"
-    raise ValueError(f"Unknown robot {robot!r}; the known ones are {list_robots()}{more}, and any URDF path.{hint}")
+    raise ValueError(f"Unknown robot {robot!r}.{hint} The known ones are {list_robots()}{more}, and any URDF path.")
 
 
 @lru_cache(maxsize=1)
@@ -254,12 +284,47 @@ def _plain(model: Any, called: str) -> Any:
     if not joints:
         raise ValueError(f"{called} has no joint that moves.")
     for joint, name in zip(joints, list(model.names)[1:], strict=True):
-        if joint.nv != 1 or joint.nq > 2 or np.count_nonzero(_axis(joint).reshape(2, 3).any(axis=1)) != 1:
+        if "Mimic" in joint.shortname():
+            raise ValueError(
+                f"{called} has the joint {name!r} that mimics another; load the URDF with mimic=False, which lets it "
+                "move on its own."
+            )
+        if joint.nv != 1 or joint.nq > 2 or ((axis := _axis(joint))[:3].any() and axis[3:].any()):
             raise ValueError(
                 f"{called} has the joint {name!r} of the type {joint.shortname()}; joints must be revolute or "
                 "prismatic and the base fixed (load the URDF without a free-flyer)."
             )
+        length = np.linalg.norm(axis)
+        if not abs(length - 1.0) <= _AXIS_TOLERANCE:
+            raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
+    _check_numbers(model, called)
     return model if model.nq == model.nv else _with_angles(model)
+
+
+def _check_numbers(model: Any, called: str) -> None:
+    """Refuse what no robot can have; Pinocchio would compute with it."""
+    links = list(model.inertias)[1:]
+    numbers = {
+        "gravity": model.gravity.vector,
+        "jointPlacements": [placement.homogeneous for placement in model.jointPlacements],
+        "inertias": [link.toDynamicParameters() for link in links],
+        "armature": model.armature,
+        "damping": model.damping,
+    }
+    for name, values in numbers.items():
+        if not np.isfinite(values).all():
+            raise ValueError(f"{called} has NaN or infinity in its {name}; they must be finite.")
+    for name, values in (("masses", [link.mass for link in links]), ("damping", model.damping)):
+        if min(values) < 0.0:
+            raise ValueError(f"{called} has a negative value among its {name}: {min(values):g}.")
+    for name in (*_LIMITS, "lowerPositionLimit", "upperPositionLimit"):
+        if np.isnan(getattr(model, name)).any():
+            raise ValueError(f"{called} has NaN in its {name}.")
+    least, largest = effort_limits(model)
+    if (least > 0.0).any() or (largest < 0.0).any():
+        raise ValueError(
+            f"{called} has motors that cannot give 0: their least effort is above it or the largest below."
+        )
 
 
 def _with_angles(model: Any) -> Any:
@@ -275,7 +340,7 @@ def _with_angles(model: Any) -> Any:
             joint = pin.JointModelRevoluteUnaligned(_axis(joint)[3:])
         copy.addJoint(model.parents[index], joint, model.jointPlacements[index], model.names[index])
         copy.inertias[index] = model.inertias[index]
-    for name in ("armature", "damping", "friction", "upperEffortLimit", "lowerEffortLimit", "velocityLimit"):
+    for name in ("armature", "damping", "friction", *_LIMITS):
         setattr(copy, name, getattr(model, name))
     positions = np.array([joint.idx_q for joint in list(model.joints)[1:]])
     copy.lowerPositionLimit = np.where(bounded, model.lowerPositionLimit[positions], -np.inf)

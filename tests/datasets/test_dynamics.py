@@ -283,6 +283,31 @@ def test_a_long_step_does_not_shake_the_arm():
     assert np.abs(moves[..., 6:]).max() < 5.0
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments", "joint"),
+    [("panda", {"dt": 0.1}, "finger"), ("so100", {"dt": 0.1}, "gripper"), ("panda", {"duration": 0.2}, "finger")],
+)
+def test_moves_that_run_away_are_an_error(name, arguments, joint):
+    with pytest.raises(ValueError, match=rf"run away in step \d+, at .*{joint}.*unstable at this dt of .*Lower dt"):
+        make_dynamics(name, 10, 50, random_state=0, **arguments)
+
+
+@pytest.mark.parametrize("name", ["panda", "so100"])
+def test_moves_at_the_default_step_stay_near_their_targets(name):
+    moves = make_dynamics(name, 10, 50, random_state=0).trajectories
+    half = moves.shape[2] // 2
+    assert np.abs(moves[..., half:]).max() < 3.0
+    assert np.abs(moves[..., :half] - moves[:, :1, :half]).max() < 1.2
+
+
+def test_a_motor_too_weak_to_hold_its_joint_is_no_unstable_controller():
+    model = load_robot("pendulum")
+    model.name = "weak"
+    model.upperEffortLimit, model.lowerEffortLimit = np.array([0.5]), np.array([-0.5])
+    dynamics = make_dynamics(model, 10, 50, random_state=0)
+    assert np.abs(dynamics.trajectories[..., 0] - dynamics.trajectories[:, :1, 0]).max() > 1.0
+
+
 def test_the_number_of_jobs_does_not_change_a_bit():
     one, two = (make_dynamics("iiwa14", 65, 2, random_state=0, n_jobs=jobs) for jobs in (1, 2))
     assert_array_equal(one.data, two.data)

@@ -6,7 +6,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import solve_ivp
 
-from skevgp.datasets import simulate
+from skevgp.datasets import ComputedTorqueController, simulate
 from skevgp.datasets.plant import Plant
 from skevgp.datasets.simulation import turns
 from skevgp.robots import SYSTEMS, get_system, layout_of, load_robot
@@ -346,3 +346,23 @@ def test_one_step_of_any_robot_equals_plain_pinocchio(name):
 
     exact = solve_ivp(derivative, (0.0, DT), np.r_[q, v], method="DOP853", rtol=1e-12, atol=1e-13).y[:, -1]
     assert_allclose(simulate(name, np.r_[q, v], u[np.newaxis])[1], exact, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("dt", [0.01, 0.06])
+def test_a_controller_of_another_step_is_refused(dt):
+    controller = ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=1.0, dt=0.03)
+    with pytest.raises(ValueError, match=rf"dt must be that of the controller, 0.03; got {dt}"):
+        simulate("ur5", np.zeros(12), controller, dt, n_steps=2)
+
+
+def test_a_step_that_differs_by_rounding_is_the_controllers():
+    controller = ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=1.0, dt=0.1 + 0.2, kp=4.0, kd=4.0)
+    assert simulate("ur5", np.zeros(12), controller, 0.3, n_steps=1).shape == (2, 12)
+
+
+def test_stiffness_is_decided_per_group_whatever_the_jobs():
+    model = load_robot("acrobot")
+    model.damping = np.full(2, 1e5)
+    rng = np.random.default_rng(0)
+    z0, U = rng.uniform(-1.0, 1.0, (65, 4)), rng.standard_normal((65, 2, 1))
+    assert_array_equal(simulate(model, z0, U, n_jobs=2), simulate(model, z0, U, n_jobs=1))

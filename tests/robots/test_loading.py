@@ -1,13 +1,16 @@
+import dataclasses
 import importlib.metadata
 import pickle
+import re
 from collections import Counter
+from pathlib import Path
 
 import numpy as np
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from skevgp.robots import SYSTEMS, get_system, layout_of, list_robots, load_robot, loading
+from skevgp.robots import SYSTEMS, System, get_system, layout_of, list_robots, load_robot, loading
 
 JOINT = """
   <joint name="{name}" type="{kind}">
@@ -70,9 +73,11 @@ def test_bodies_without_joints_are_not_listed():
     assert not {"iris_simple", "quadrotor_base"} & set(list_robots())
 
 
-@pytest.mark.parametrize(("name", "close"), [("pnda", "panda"), ("ur_5", "ur5"), ("iiwa", "iiwa14")])
+@pytest.mark.parametrize(
+    ("name", "close"), [("pnda", "panda"), ("UR5", "ur5"), ("twodofs", "TwoDofs"), ("iiwa", "iiwa14")]
+)
 def test_an_unknown_name_gets_close_ones_and_all(name, close):
-    message = rf"Unknown robot '{name}'; the known ones are \['acrobot'.*'z1'\].*Did you mean .*'{close}'"
+    message = rf"Unknown robot '{name}'. Did you mean .*'{close}'.*The known ones are \['acrobot'.*'z1'\]"
     with pytest.raises(ValueError, match=message):
         load_robot(name)
 
@@ -189,6 +194,27 @@ def test_a_joint_without_limits_is_driven(tmp_path):
     assert layout_of(path).driven == (0,)
 
 
+@pytest.mark.parametrize(
+    ("lower", "upper", "driven", "limits"),
+    [
+        ([-2.0, 0.0], [0.0, 3.0], (0, 1), [[-2.0, 0.0], [0.0, 3.0]]),
+        ([0.0, -1.0], [0.0, 0.0], (1,), [[0.0, -1.0], [0.0, 0.0]]),
+        ([0.0, 0.0], [0.0, 0.0], (0, 1), [[-np.inf, -np.inf], [np.inf, np.inf]]),
+        (None, [4.0, 0.0], (0,), [[-4.0, 0.0], [4.0, 0.0]]),
+    ],
+    ids=["one way each", "backwards only", "unknown", "lower never set"],
+)
+def test_a_motor_works_between_both_limits(lower, upper, driven, limits):
+    model = pinocchio.Model()
+    for parent, name in enumerate(("a", "b")):
+        model.addJoint(parent, pinocchio.JointModelRX(), pinocchio.SE3.Identity(), name)
+    model.upperEffortLimit = np.array(upper)
+    if lower is not None:
+        model.lowerEffortLimit = np.array(lower)
+    assert layout_of(model).driven == driven
+    assert_array_equal(loading.effort_limits(model), limits)
+
+
 @pytest.mark.parametrize("name", sorted(SYSTEMS))
 def test_a_model_of_a_system_has_the_layout_of_its_table(name):
     assert layout_of(load_robot(name)) == layout_of(name) == layout_of(get_system(name))
@@ -204,10 +230,32 @@ def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
         load_robot(path)
 
 
-@pytest.mark.parametrize("path", ["nothing.urdf", "some/where", "~"])
+@pytest.mark.parametrize("path", ["nothing.urdf", "some/where", "~/nothing.urdf", "~nobody-of-this-name/a.urdf"])
 def test_a_file_that_is_not_there_is_an_error(path):
-    with pytest.raises(ValueError, match=r"(There is no file|Unknown robot) '"):
+    with pytest.raises(ValueError, match=r"There is no file '.*the names that are known"):
         load_robot(path)
+
+
+def test_a_path_may_start_at_home(monkeypatch, chain):
+    monkeypatch.setenv("HOME", str(chain.parent))
+    monkeypatch.setenv("USERPROFILE", str(chain.parent))
+    assert load_robot("~/chain.urdf") == load_robot(Path("~/chain.urdf")) == load_robot(chain)
+
+
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_folder_is_told_apart(tmp_path, kind):
+    with pytest.raises(ValueError, match=r"is a folder; a robot is one URDF file"):
+        load_robot(kind(tmp_path))
+
+
+def test_no_name_is_no_folder():
+    with pytest.raises(ValueError, match="Unknown robot ''"):
+        load_robot("")
+
+
+def test_a_name_as_a_path_gets_a_hint():
+    with pytest.raises(ValueError, match=r"no file 'panda'; a robot's name must be a string, not a path"):
+        load_robot(Path("panda"))
 
 
 def test_a_floating_base_is_refused():
@@ -241,3 +289,102 @@ def test_a_model_without_joints_is_refused():
 def test_what_is_no_robot_is_a_type_error(robot):
     with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF file"):
         load_robot(robot)
+
+
+@pytest.mark.parametrize("axis", [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.6, 0.80001], [0.0, 0.0, np.nan]])
+@pytest.mark.parametrize("joint", [pinocchio.JointModelRevoluteUnaligned, pinocchio.JointModelPrismaticUnaligned])
+def test_an_axis_of_another_length_is_refused(joint, axis):
+    model = pinocchio.Model()
+    model.addJoint(0, joint(np.array(axis)), pinocchio.SE3.Identity(), "long")
+    with pytest.raises(
+        ValueError, match=rf"joint 'long' with an axis of length {np.linalg.norm(axis):g}; it must be 1"
+    ):
+        load_robot(model)
+
+
+def test_an_axis_of_a_table_is_checked():
+    link = dataclasses.replace(get_system("pendulum").links[0], axis=(0.0, 2.0, 0.0))
+    with pytest.raises(ValueError, match="The system 'mine' has the joint 'q' with an axis of length 2"):
+        load_robot(System("mine", (link,)))
+
+
+def test_a_file_may_have_an_axis_of_any_length(tmp_path):
+    model = load_robot(urdf(tmp_path / "long.urdf", [("turn", "revolute", "0 3 4", 5)]))
+    assert_allclose(loading.joint_axes(model), [[0, 0, 0, 0, 0.6, 0.8]], rtol=1e-12)
+
+
+MIMIC = '<mimic joint="first" multiplier="2"/></joint><link name="of_second">'
+
+
+@pytest.fixture
+def mimicking(tmp_path):
+    path = urdf(tmp_path / "mimic.urdf", [("first", "revolute", "1 0 0", 5), ("second", "revolute", "0 1 0", 5)])
+    path.write_text(
+        MIMIC.join(part.strip() for part in re.split(r'</joint>\s*<link name="of_second">', path.read_text()))
+    )
+    return path
+
+
+def test_a_mimic_joint_of_a_file_moves_on_its_own(mimicking):
+    assert "<mimic" in mimicking.read_text()
+    assert layout_of(mimicking).driven == (0, 1)
+
+
+def test_a_model_with_mimic_joints_is_refused(mimicking):
+    model = pinocchio.buildModelFromUrdf(str(mimicking), mimic=True)
+    with pytest.raises(ValueError, match=r"joint 'second' that mimics another; load the URDF with mimic=False"):
+        load_robot(model)
+
+
+def set_mass(model, mass):
+    link = model.inertias[1]
+    link.mass = mass
+
+
+def set_placement(model, x):
+    model.jointPlacements[1] = pinocchio.SE3(np.eye(3), np.array([x, 0.0, 0.0]))
+
+
+def set_array(name):
+    def change(model, value):
+        array = np.array(getattr(model, name))
+        array[0] = value
+        setattr(model, name, array)
+
+    return change
+
+
+def set_gravity(model, value):
+    model.gravity.linear = np.array([0.0, 0.0, value])
+
+
+@pytest.mark.parametrize(
+    ("change", "value", "message"),
+    [
+        (set_gravity, np.nan, "NaN or infinity in its gravity"),
+        (set_gravity, -np.inf, "NaN or infinity in its gravity"),
+        (set_mass, np.nan, "NaN or infinity in its inertias"),
+        (set_mass, -1.0, "negative value among its masses: -1"),
+        (set_placement, np.inf, "NaN or infinity in its jointPlacements"),
+        (set_array("damping"), np.nan, "NaN or infinity in its damping"),
+        (set_array("damping"), -0.1, "negative value among its damping: -0.1"),
+        (set_array("armature"), np.inf, "NaN or infinity in its armature"),
+        (set_array("upperEffortLimit"), np.nan, "NaN in its upperEffortLimit"),
+        (set_array("lowerEffortLimit"), np.nan, "NaN in its lowerEffortLimit"),
+        (set_array("velocityLimit"), np.nan, "NaN in its velocityLimit"),
+        (set_array("lowerPositionLimit"), np.nan, "NaN in its lowerPositionLimit"),
+        (set_array("upperPositionLimit"), np.nan, "NaN in its upperPositionLimit"),
+        (set_array("lowerEffortLimit"), 1.0, "motors that cannot give 0"),
+        (set_array("upperEffortLimit"), -1.0, "motors that cannot give 0"),
+    ],
+)
+@pytest.mark.parametrize("name", ["acrobot", "kinova"])
+def test_numbers_that_make_no_sense_are_named(name, change, value, message):
+    model = load_robot(name).copy()
+    change(model, value)
+    with pytest.raises(ValueError, match=rf"The model '{model.name}' has .*{message}"):
+        load_robot(model)
+
+
+def test_every_robot_of_the_list_passes_the_checks():
+    assert all(load_robot(name).nv > 0 for name in list_robots())
