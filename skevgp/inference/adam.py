@@ -113,6 +113,8 @@ class _Typical:
 def is_flat(losses: np.ndarray, tol: float) -> bool:
     """Whether the last third of the losses is like the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
+    if n == 0:
+        return False
     before, after = _Typical.of(losses[-2 * n : -n]), _Typical.of(losses[-n:])
     return abs(before.value - after.value) < max(tol, 2.0 * np.sqrt(before.variance + after.variance))
 
