@@ -16,7 +16,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._progress import Progress
-from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain
+from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .inference.network import VariationalNetwork
 from .inference.threads import single_threaded_libraries
 from .inference.training import Scaling, Training, train
@@ -201,42 +201,10 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the loss still fell when the epochs were used up, or Ctrl-C ended them (the best parameters so far are
             kept). It says what to change.
         """
-        inputs, targets = self._intake(X, y)
-        scaling = Scaling.of(inputs, targets)
-        network = self._network_of(inputs.shape[1], targets.shape[1])
-        n_held_back = max(1, round(self.validation_fraction * len(inputs))) if self.early_stopping else 0
-        n_kept = len(inputs) - n_held_back
-        if n_kept == 0:
-            raise ValueError(
-                f"validation_fraction={self.validation_fraction!r} of {len(inputs)} rows leaves none to learn from."
-            )
-        batch_size = min(_BATCH_SIZE if isinstance(self.batch_size, str) else self.batch_size, n_kept)
-        max_iter = self.max_iter or max(_EPOCHS, -(-_STEPS // -(-n_kept // batch_size)))
-        rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
-        start = network.start(rng)
-        if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
-            scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
-        with single_threaded_libraries():
-            training = train(
-                network,
-                start,
-                scaling.inputs(inputs),
-                scaling.targets(targets),
-                rng,
-                n_held_back=n_held_back,
-                max_iter=max_iter,
-                batch_size=batch_size,
-                learning_rate=self.learning_rate_init,
-                tol=self.tol,
-                patience=self.n_iter_no_change,
-                report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
-            )
-        self._warn(training, max_iter)
-        self._network, self._scaling, self._theta = network, scaling, training.theta
-        self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
-        self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
-        self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
-        self._set_attributes()
+        with unchanged_if_it_fails(self), single_threaded_libraries():
+            message = self._fit(X, y)
+        if message:
+            warnings.warn(message, ConvergenceWarning, stacklevel=3)
         return self
 
     def predict(
@@ -315,6 +283,44 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         samples = np.moveaxis(samples * self._scaling.y_scale + self._scaling.y_mean, 0, 2)
         return samples[:, 0] if samples.shape[1] == 1 else samples
 
+    def _fit(self, X: Any, y: Any) -> str:
+        """Fit, and say what the user should know of how it went."""
+        inputs, targets = self._intake(X, y)
+        scaling = Scaling.of(inputs, targets)
+        network = self._network_of(inputs.shape[1], targets.shape[1])
+        n_held_back = max(1, round(self.validation_fraction * len(inputs))) if self.early_stopping else 0
+        n_kept = len(inputs) - n_held_back
+        if n_kept == 0:
+            raise ValueError(
+                f"validation_fraction={self.validation_fraction!r} of {len(inputs)} rows leaves none to learn from."
+            )
+        batch_size = min(_BATCH_SIZE if isinstance(self.batch_size, str) else self.batch_size, n_kept)
+        max_iter = self.max_iter or max(_EPOCHS, -(-_STEPS // -(-n_kept // batch_size)))
+        rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
+        start = network.start(rng)
+        if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
+            scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
+        training = train(
+            network,
+            start,
+            scaling.inputs(inputs),
+            scaling.targets(targets),
+            rng,
+            n_held_back=n_held_back,
+            max_iter=max_iter,
+            batch_size=batch_size,
+            learning_rate=self.learning_rate_init,
+            tol=self.tol,
+            patience=self.n_iter_no_change,
+            report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
+        )
+        self._network, self._scaling, self._theta = network, scaling, training.theta
+        self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
+        self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
+        self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
+        self._set_attributes()
+        return self._how_it_ended(training, max_iter)
+
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
         X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
@@ -338,23 +344,21 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 f"prior_scale must be a number or one for each of the {len(sizes) - 1} layers of weights; "
                 f"got {self.prior_scale!r}."
             )
-        if not (np.isfinite(scales) & (scales > 0.0)).all():
-            raise ValueError(f"prior_scale must be finite and above 0; got {self.prior_scale!r}.")
+        if not ((scales >= 1e-30) & (scales <= 1e30)).all():
+            raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
 
-    def _warn(self, training: Training, max_iter: int) -> None:
+    def _how_it_ended(self, training: Training, max_iter: int) -> str:
         if training.minimum.interrupted:
-            message = "The fit was interrupted; the best parameters so far are kept."
-        elif not training.minimum.converged:
-            message = "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
-        elif training.still_falling:
-            message = (
+            return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
+        if not training.minimum.converged:
+            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
+        if training.still_falling:
+            return (
                 f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
                 f"purpose with a larger tol (now {self.tol})."
             )
-        else:
-            return
-        warnings.warn(message, ConvergenceWarning, stacklevel=3)
+        return ""
 
     def _set_attributes(self) -> None:
         layers, log_noise = self._scaling.to_users(*self._network.split(self._theta))

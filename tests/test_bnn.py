@@ -273,6 +273,13 @@ def test_steps_that_are_much_too_large_stay_finite(rate):
     assert np.isfinite(m.predict(X_NEW, return_std=True)).all()
 
 
+@pytest.mark.parametrize("unit", [1e-130, 1.0, 1e99])
+def test_predictions_stay_finite_however_far_away(unit):
+    m = model().fit(unit * X, Y)
+    assert np.isfinite(m.predict(np.full((3, 2), 1e100), return_std=True)).all()
+    assert np.isfinite(m.predict(np.full((3, 2), -1e100), return_cov=True)[1]).all()
+
+
 def test_targets_without_noise_and_rows_on_top_of_each_other():
     x = np.repeat(X[:20], 5, axis=0)
     m = model((), max_iter=2000, learning_rate_init=0.05).fit(x, x @ [[1.0], [2.0]])
@@ -289,9 +296,10 @@ def test_targets_without_noise_and_rows_on_top_of_each_other():
         ({"hidden_layer_sizes": 0}, "hidden_layer_sizes"),
         ({"prior_scale": 0.0}, "prior_scale"),
         ({"prior_scale": [1.0]}, "each of the 2 layers"),
-        ({"prior_scale": [1.0, -1.0]}, "finite and above 0"),
-        ({"prior_scale": [1.0, np.nan]}, "finite and above 0"),
+        ({"prior_scale": [1.0, -1.0]}, "from 1e-30 to 1e30"),
+        ({"prior_scale": [1.0, np.nan]}, "from 1e-30 to 1e30"),
         ({"prior_scale": np.inf}, "prior_scale"),
+        ({"prior_scale": 1e-200}, "from 1e-30 to 1e30"),
         ({"negative_slope": 2.0}, "negative_slope"),
         ({"batch_size": 0}, "batch_size"),
         ({"max_iter": 0}, "max_iter"),
@@ -335,5 +343,5 @@ def test_a_fit_that_fails_leaves_the_model_as_it_was():
     m = model().fit(X, Y)
     before = m.predict(X_NEW)
     with pytest.raises(ValueError, match="prior_scale"):
-        m.set_params(prior_scale=-1.0).fit(X[:, :1], Y[:, 0])
+        m.set_params(prior_scale=[1.0]).fit(X[:, :1], Y[:, 0])
     np.testing.assert_array_equal(m.predict(X_NEW), before)

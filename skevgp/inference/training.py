@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._validation import LARGEST
 from .adam import adam, is_flat
 from .network import Layer, VariationalNetwork
 from .optimize import Minimum, Report
@@ -41,8 +42,8 @@ class Scaling:
         return float(np.log(self.y_scale).sum())
 
     def inputs(self, X: np.ndarray) -> np.ndarray:
-        """Standardised inputs."""
-        return (X - self.x_mean) / self.x_scale
+        """Standardised inputs; so far out that their squares would overflow, they get no farther."""
+        return np.clip((X - self.x_mean) / self.x_scale, -LARGEST, LARGEST)
 
     def targets(self, Y: np.ndarray) -> np.ndarray:
         """Standardised targets."""
