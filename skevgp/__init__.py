@@ -7,14 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import datasets, features, metrics, plotting
+    from .bnn import BayesianMLPRegressor
     from .regressor import EVGPRegressor
 
 __version__ = "0.1.0"
 
-__all__ = ["EVGPRegressor", "__version__", "datasets", "features", "metrics", "plotting"]
+__all__ = ["BayesianMLPRegressor", "EVGPRegressor", "__version__", "datasets", "features", "metrics", "plotting"]
 
 _SUBMODULES = ("datasets", "features", "metrics", "plotting")
-_HOME = {"EVGPRegressor": "regressor"}
+_HOME = {"BayesianMLPRegressor": "bnn", "EVGPRegressor": "regressor"}
 
 
 def __getattr__(name: str) -> Any:

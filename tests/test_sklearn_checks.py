@@ -2,11 +2,13 @@ import pytest
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from skevgp import EVGPRegressor
+from skevgp import BayesianMLPRegressor, EVGPRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
-ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), *MAPS]
+# Its defaults take seconds per fit.
+QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=500, tol=1e9)
+ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), QUICK_NETWORK, *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)

@@ -24,6 +24,7 @@ def adam(
     tol: float = 0.0,
     report: Report | None = None,
     pace: Callable[[float], None] | None = None,
+    stop: Callable[[np.ndarray], bool] | None = None,
 ) -> Minimum:
     """Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine.
 
@@ -49,6 +50,8 @@ def adam(
         report(iteration, loss), once per step.
     pace : callable, default=None
         pace(share), before each step: its size as a share of the first.
+    stop : callable, default=None
+        stop(x), after each step: whether it was the last.
 
     Returns
     -------
@@ -78,9 +81,11 @@ def adam(
             if report is not None:
                 report(t, loss)
             if t % _WINDOW == 0 and t >= 3 * _WINDOW:
-                flat_from = (flat_from or t) if _is_flat(np.array(minimum.loss_curve), tol) else 0
+                flat_from = (flat_from or t) if is_flat(np.array(minimum.loss_curve), tol) else 0
                 if flat_from > 0 and t >= _FEWEST and t - flat_from >= t // 3 and 2 * t < until:
                     since, until, highest = t, 2 * t, share
+            if stop is not None and stop(x):
+                until = t
         minimum.converged = minimum.n_iter == until
     except NotPositiveDefiniteError:
         pass
@@ -105,9 +110,11 @@ class _Typical:
         return cls(float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses))
 
 
-def _is_flat(losses: np.ndarray, tol: float) -> bool:
+def is_flat(losses: np.ndarray, tol: float) -> bool:
     """Whether the last third of the losses is like the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
+    if n == 0:
+        return False
     before, after = _Typical.of(losses[-2 * n : -n]), _Typical.of(losses[-n:])
     return abs(before.value - after.value) < max(tol, 2.0 * np.sqrt(before.variance + after.variance))
 
