@@ -3,12 +3,12 @@ from sklearn.linear_model import LinearRegression
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
-ESTIMATORS = [EVGPRegressor(), *RESIDUALS, *MAPS]
+ESTIMATORS = [EVGPRegressor(), EGPRegressor(), *RESIDUALS, *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)
