@@ -28,6 +28,8 @@ from .kernels import KernelSpec, parse_kernel
 
 # float32 is not copied as a whole: pieces of it become float64.
 _DTYPES = [np.float64, np.float32]
+# In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
+_VAGUE = 1e3
 
 
 @dataclass(frozen=True)
@@ -42,7 +44,7 @@ class Problem:
     spec : KernelSpec
         With the start of the noise.
     vague : ndarray of shape (o, p)
-        Which weights have an infinite prior scale; in ``frame.prior`` theirs is wide.
+        Which weights have an infinite prior scale; in ``frame.prior`` theirs is very wide.
     """
 
     source: Source
@@ -213,8 +215,9 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             self.coef_mean, self.coef_scale, self.feature_map_, given, wide, allow_vague=allow_vague
         )
         vague = np.isinf(scale)
+        unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
-        frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, wide, scale))
+        frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
         self._spec, self._single_output = spec, y.ndim == 1
         return Problem(source, frame, spec, vague)
 
