@@ -18,6 +18,7 @@ from ._dask import is_dask
 from ._explicit_gp import ExplicitGaussianProcess
 from ._progress import Progress
 from .inference.exact import ExactFit, ExactOptions
+from .inference.threads import single_threaded_libraries
 
 
 class EGPRegressor(ExplicitGaussianProcess):
@@ -171,7 +172,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
-        with self._unchanged_if_it_fails():
+        with self._unchanged_if_it_fails(), single_threaded_libraries():
             problem = self._problem(X, y, allow_vague=True)
             frame, spec = problem.frame, problem.spec
             self._fitted = ExactFit.fit(

@@ -143,7 +143,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
 
     See Also
     --------
-    sklearn.gaussian_process.GaussianProcessRegressor : The exact GP, for a few thousand rows.
+    EGPRegressor : The same model without inducing points, exact, for a few thousand rows.
+    sklearn.gaussian_process.GaussianProcessRegressor : The exact GP without features.
 
     References
     ----------
