@@ -7,14 +7,25 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from . import datasets, features, metrics, plotting
+    from .exact import EGPRegressor
     from .regressor import EVGPRegressor
+    from .residual import ResidualRegressor
 
 __version__ = "0.1.0"
 
-__all__ = ["EVGPRegressor", "__version__", "datasets", "features", "metrics", "plotting"]
+__all__ = [
+    "EGPRegressor",
+    "EVGPRegressor",
+    "ResidualRegressor",
+    "__version__",
+    "datasets",
+    "features",
+    "metrics",
+    "plotting",
+]
 
 _SUBMODULES = ("datasets", "features", "metrics", "plotting")
-_HOME = {"EVGPRegressor": "regressor"}
+_HOME = {"EGPRegressor": "exact", "EVGPRegressor": "regressor", "ResidualRegressor": "residual"}
 
 
 def __getattr__(name: str) -> Any:

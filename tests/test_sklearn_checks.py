@@ -1,12 +1,14 @@
 import pytest
+from sklearn.linear_model import LinearRegression
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from skevgp import EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
-ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), *MAPS]
+RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
+ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), EGPRegressor(), *RESIDUALS, *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)
