@@ -8,14 +8,31 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from . import datasets, features, metrics, plotting
     from .bnn import BayesianMLPRegressor
+    from .exact import EGPRegressor
     from .regressor import EVGPRegressor
+    from .residual import ResidualRegressor
 
 __version__ = "0.1.0"
 
-__all__ = ["BayesianMLPRegressor", "EVGPRegressor", "__version__", "datasets", "features", "metrics", "plotting"]
+__all__ = [
+    "BayesianMLPRegressor",
+    "EGPRegressor",
+    "EVGPRegressor",
+    "ResidualRegressor",
+    "__version__",
+    "datasets",
+    "features",
+    "metrics",
+    "plotting",
+]
 
 _SUBMODULES = ("datasets", "features", "metrics", "plotting")
-_HOME = {"BayesianMLPRegressor": "bnn", "EVGPRegressor": "regressor"}
+_HOME = {
+    "BayesianMLPRegressor": "bnn",
+    "EGPRegressor": "exact",
+    "EVGPRegressor": "regressor",
+    "ResidualRegressor": "residual",
+}
 
 
 def __getattr__(name: str) -> Any:

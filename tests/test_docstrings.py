@@ -37,7 +37,7 @@ def section(docstring, title):
 
 def documented(text):
     """Names at the left margin: ``a : type`` or ``a, b : type``."""
-    heads = re.findall(r"^(\w+(?:, \w+)*)(?= : |$)", text, re.MULTILINE)
+    heads = re.findall(r"^\**(\w+(?:, \w+)*)(?= : |$)", text, re.MULTILINE)
     return [name for head in heads for name in head.split(", ")]
 
 

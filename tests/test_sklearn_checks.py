@@ -1,14 +1,16 @@
 import pytest
+from sklearn.linear_model import LinearRegression
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from skevgp import BayesianMLPRegressor, EVGPRegressor
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
+RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.
 QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=500, tol=1e9)
-ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), QUICK_NETWORK, *MAPS]
+ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), EGPRegressor(), QUICK_NETWORK, *RESIDUALS, *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)

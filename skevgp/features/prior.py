@@ -23,6 +23,8 @@ def resolve_coef_prior(
     feature_map: Any,
     X: Any,
     wide: np.ndarray,
+    *,
+    allow_vague: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Prior mean and standard deviation of the weights.
 
@@ -37,6 +39,8 @@ def resolve_coef_prior(
         What the map takes; only its first row is used, to learn the widths of the parts of a union.
     wide : ndarray of shape (o, p)
         `wide_scale`.
+    allow_vague : bool, default=False
+        Whether a scale may be infinite.
 
     Returns
     -------
@@ -55,7 +59,8 @@ def resolve_coef_prior(
         auto_mean, auto_scale = mean, np.where(np.isnan(scale), auto_scale, scale)
     mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)
     scale = auto_scale if _word(coef_scale) == "auto" else _as_table(coef_scale, "coef_scale", shape)
-    for name, values in (("coef_mean", mean), ("coef_scale", scale)):
+    finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
+    for name, values in (("coef_mean", mean), ("coef_scale", finite)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
         check_magnitude(values, name)

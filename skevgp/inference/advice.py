@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .model import SparseModel
+from .bounds import CoefficientPrior
 from .optimize import Minimum
 from .rows import Rows
 from .start import alike_neighbours
@@ -15,7 +15,7 @@ _NOTHING_LEARNED = 0.99
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 
-def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float) -> str:
+def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float, sparse: bool = True) -> str:
     """Whether the optimiser ended before it converged, and why.
 
     Parameters
@@ -26,6 +26,8 @@ def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float) -> str
         Iterations of ``max_iter`` before those of ``minimum``.
     tol : float
         In nats.
+    sparse : bool, default=True
+        Whether there are inducing points.
     """
     n_iter = spent + minimum.n_iter
     if minimum.interrupted:
@@ -35,12 +37,12 @@ def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float) -> str
     if n_iter < max_iter:
         return (
             f"L-BFGS stopped after {n_iter} iterations: rounding errors keep hiding the way up, as in data without "
-            "noise. The best parameters are kept; a larger tol, fewer inducing points or a WhiteKernel with a lower "
-            "bound on the noise end sooner."
+            f"noise. The best parameters are kept; a larger tol{', fewer inducing points' if sparse else ''} or a "
+            "WhiteKernel with a lower bound on the noise end sooner."
         )
     return (
-        f"The bound was still rising after max_iter={max_iter} iterations. Raise max_iter, or stop earlier on "
-        f"purpose with a larger tol (now {tol})."
+        f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
+        f"max_iter, or stop earlier on purpose with a larger tol (now {tol})."
     )
 
 
@@ -49,14 +51,14 @@ def interrupted(n_iter: int) -> str:
     return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
 
 
-def far_from_prior(model: SparseModel, rows: Rows) -> str:
+def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     """Whether y, or a weight, is so far from its prior mean that the fit suffers."""
     if (rows.scatter() < _FAR**-2).any():
         return (
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
             "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
         )
-    if (np.abs(model.prior.reference) > _FAR_WEIGHT).any():
+    if (np.abs(prior.reference) > _FAR_WEIGHT).any():
         return (
             f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
             "raise coef_scale or, if it is an intercept's, set normalize_y=True."
@@ -64,7 +66,7 @@ def far_from_prior(model: SparseModel, rows: Rows) -> str:
     return ""
 
 
-def nothing_learned(noise: np.ndarray, rows: Rows) -> str:
+def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
     """Whether noise variances (o,) explain everything of targets whose neighbouring rows are alike."""
     nothing = noise > _NOTHING_LEARNED * rows.scatter()
     if nothing.any():
@@ -75,6 +77,6 @@ def nothing_learned(noise: np.ndarray, rows: Rows) -> str:
     return (
         f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
         "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
-        "Raise n_inducing or n_restarts, let kernel or noise_variance start elsewhere, or look at the scales of the "
-        "kernel's columns."
+        f"Raise {'n_inducing or ' if sparse else ''}n_restarts, let kernel or noise_variance start elsewhere, or look "
+        "at the scales of the kernel's columns."
     )

@@ -11,25 +11,19 @@ from .adam import adam
 from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
 from .bounds import features_alone_bound
 from .calibration import calibrated_noise
+from .descent import interpolates, lbfgs_unless_stuck, moved_start, stuck
 from .elbo import ElboObjective
 from .inducing import Placement
 from .linalg import NotPositiveDefiniteError
 from .model import SparseModel, Values
 from .objectives import BoundObjective
-from .optimize import Minimum, Report, lbfgs
+from .optimize import Report
 from .parameters import ParameterTable
 from .posterior import Posterior
 from .rows import Rows
 from .statistics import SufficientStatistics
 from .threads import BlockMap
 
-# An output counts as not learned when this share of what the features alone leave over ends as noise.
-_COLLAPSED = 0.9
-# Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
-_OTHER_STARTS = ((0.5, 1.0), (2.0, 100.0), (1.0, 1e3))
-# With about as many inducing points as rows, a low first noise may lead to a plateau on which the kernel explains every
-# row by itself: such fits, which cost little, start from a noise so many times higher too.
-_INTERPOLATES, _MUCH_NOISE = 1.5, 1e3
 # Iterations after which inducing points are placed anew, and so many again until it shows whether that was better. By
 # then lengthscales tell which columns matter; with 50 or 300 the bounds are about as good.
 _STAGE = 100
@@ -37,8 +31,6 @@ _STAGE = 100
 _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
-# A restart multiplies the first values by a number between 1 / factor and the factor, drawn log-uniformly.
-_RESTART_FACTORS = {"hyperparameters": 3.0, "noise": 30.0}
 
 
 @dataclass(frozen=True)
@@ -174,7 +166,7 @@ def learn(
     if cold is not None and not best.interrupted and options.max_iter > 0:
         alone = features_alone_bound(best.statistics[0], model.prior)
         bound = np.inf if best.message else best.bound
-        if _stuck(best.values["noise"], bound, rows.scatter(), alone):
+        if stuck(best.values["noise"], bound, rows.scatter(), alone):
             best = _better(best, _learn_placing(model, cold, rows, options, placement, rng, report))
     for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
         if best.interrupted:
@@ -182,7 +174,7 @@ def learn(
         start = _other_start(model, table, rows, placement, rng)
         other = _learn_placing(model, start, rows, options, placement, rng, report)
         best = _better(best, other)
-    advice = [best.message, far_from_prior(model, rows)]
+    advice = [best.message, far_from_prior(model.prior, rows)]
     if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
         advice.append(nothing_learned(best.values["noise"], rows))
     best = replace(best, message=" ".join(part for part in advice if part))
@@ -201,12 +193,7 @@ def _other_start(
     model: SparseModel, table: ParameterTable, rows: Rows, placement: Placement, rng: np.random.RandomState
 ) -> ParameterTable:
     """The same table with kernel, noise and inducing points elsewhere, within their bounds."""
-    coordinates = table.coordinates(table.start())
-    for name, factor in _RESTART_FACTORS.items():
-        spread = np.log(factor)
-        coordinates[name] = coordinates[name] + rng.uniform(-spread, spread, coordinates[name].shape)
-    moved = table.values(np.clip(table.flat(coordinates), *table.bounds()))
-    return table.started_at(_placed(moved, model, rows, placement, rng))
+    return table.started_at(_placed(moved_start(table, rng), model, rows, placement, rng))
 
 
 def _placed(values: Values, model: SparseModel, rows: Rows, placement: Placement, rng: np.random.RandomState) -> Values:
@@ -240,7 +227,7 @@ def _learn_placing(
         anew is None
         or options.solver != "lbfgs"
         or options.max_iter <= _STAGE
-        or _INTERPOLATES * n_inducing >= len(rows)
+        or interpolates(n_inducing, len(rows))
         or not table["hyperparameters"].free.any()
     ):
         return _learn_once(model, table, rows, options, rng, report)
@@ -363,7 +350,17 @@ def _by_lbfgs(
     """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""
     n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
     objective = BoundObjective(model, table, rows.blocks(model.kernel, n_inducing, options.threads))
-    minimum = _lbfgs_unless_stuck(model, objective, table, rows.scatter(), options, report)
+    minimum = lbfgs_unless_stuck(
+        objective,
+        table,
+        rows.scatter(),
+        options.max_iter - options.spent,
+        options.tol / n_rows,
+        alone=features_alone_bound(objective.blocks.linear, model.prior) / n_rows,
+        one_start=options.spent > 0,
+        may_interpolate=interpolates(n_inducing, n_rows),
+        report=report,
+    )
     values = table.values(minimum.x)
     statistics = model.statistics(values, objective.blocks)
     bound, posterior = model.at_optimum(values, statistics)
@@ -371,43 +368,3 @@ def _by_lbfgs(
     curve = [n_rows * loss for loss in minimum.loss_curve]
     message = how_it_ended(minimum, options.max_iter, options.spent, options.tol)
     return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
-
-
-def _lbfgs_unless_stuck(
-    model: SparseModel,
-    objective: BoundObjective,
-    table: ParameterTable,
-    scatter: np.ndarray,
-    options: Options,
-    report: Report | None,
-) -> Minimum:
-    """L-BFGS from the table's start; from other starts too where that may have ended in a bad optimum."""
-    linear = objective.blocks.linear
-    alone, left = features_alone_bound(linear, model.prior), options.max_iter - options.spent
-    best: Minimum | None = None
-
-    def descend(length_factor: float, noise_factor: float) -> Minimum:
-        start = table.coordinates(table.start())
-        start["hyperparameters"] = start["hyperparameters"] + np.log(length_factor)
-        start["noise"] = start["noise"] + np.log(noise_factor)
-        first = np.clip(table.flat(start), *table.bounds())
-        minimum = lbfgs(objective, first, table.bounds(), left, options.tol / linear.n_rows, report)
-        return minimum if best is None or minimum.loss < best.loss else replace(best, interrupted=minimum.interrupted)
-
-    best = descend(1.0, 1.0)
-    if options.max_iter == 0 or options.spent > 0 or not table["noise"].free.any():
-        return best
-    if _INTERPOLATES * table["inducing_points"].start.shape[1] >= linear.n_rows and not best.interrupted:
-        best = descend(1.0, _MUCH_NOISE)
-    for factors in _OTHER_STARTS:
-        # A fit that has not ended yet may still be below.
-        bound = -best.loss * linear.n_rows if best.converged else np.inf
-        if best.interrupted or not _stuck(table.values(best.x)["noise"], bound, scatter, alone):
-            break
-        best = descend(*factors)
-    return best
-
-
-def _stuck(noise: np.ndarray, bound: float, scatter: np.ndarray, alone: float) -> bool:
-    """Whether noise came to explain everything, or the kernel explains less than nothing would."""
-    return bool((noise > _COLLAPSED * scatter).any()) or bound < alone

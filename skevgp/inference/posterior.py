@@ -51,7 +51,7 @@ class Posterior:
     mean : tuple of o ndarrays of shape (m + p,)
         E[ω].
     root : tuple of o ndarrays of shape (m + p, m + p)
-        R with Cov[ω] = Rᵀ R.
+        R with Cov[ω] = Rᵀ R; of lower rank in the exact model.
     """
 
     kernel: Kernel
@@ -93,7 +93,7 @@ class Posterior:
             if return_variance:
                 spread = group.root @ P
                 np.multiply(spread, spread, out=spread)
-                squares = spread.reshape(len(group.mean), -1, len(inputs)).sum(axis=1)
+                squares = spread.reshape(len(group.mean), group.rank, len(inputs)).sum(axis=1)
                 variances.append((np.outer(group.signal, np.maximum(unexplained, 0.0)) + squares).T)
         mean = _side_by_side(means)
         mean += features @ self.prior.offset.T
@@ -163,6 +163,11 @@ class _Group:
     signal: np.ndarray
     mean: np.ndarray
     root: np.ndarray
+
+    @property
+    def rank(self) -> int:
+        """Rows of ``root`` per output."""
+        return len(self.root) // len(self.mean)
 
     def project(self, prepared: Any, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""

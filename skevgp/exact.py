@@ -1,0 +1,195 @@
+"""EGPRegressor: explicit physics features plus an exact Gaussian process."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any, Literal, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import TransformerMixin, _fit_context
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process.kernels import Kernel
+from sklearn.utils import check_random_state
+
+from ._dask import is_dask
+from ._explicit_gp import ExplicitGaussianProcess
+from ._progress import Progress
+from .inference.exact import ExactFit, ExactOptions
+from .inference.threads import single_threaded_libraries
+
+
+class EGPRegressor(ExplicitGaussianProcess):
+    r"""Exact Gaussian process with explicit features (EGP).
+
+    The model of each output is that of `EVGPRegressor`,
+
+    .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
+              f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
+
+    but nothing is approximated: kernel and noise maximise the log marginal likelihood with the weights integrated out.
+    Time is cubic in the number of rows and memory quadratic: for a few thousand rows, and as the reference.
+
+    Parameters
+    ----------
+    feature_map : transformer, default=None
+        x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
+        it. None has no explicit features.
+    kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
+        Covariance of f, as of `EVGPRegressor`; outputs share its shape, and have signal variances of their own.
+    kernel_map : transformer, default=None
+        x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
+    coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
+        Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
+        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean; with the scale
+        ``np.inf`` nothing is known of it (Rasmussen & Williams 2006, eq. 2.42 to 2.45): its estimate is that of
+        generalised least squares.
+    noise_variance : float, default=None
+        Where the noise variance starts; None takes it from the data.
+    normalize_y : bool, default=False
+        Whether the prior mean is the training mean of y, in place of 0.
+    max_iter : int, default=1000
+        The most iterations of L-BFGS from each start. With 0 kernel and noise stay where they start.
+    n_restarts : int, default=0
+        Further fits with kernel and noise drawn log-uniformly around the first start, within their bounds; the
+        likeliest is kept.
+    tol : float, default=0.01
+        In nats. L-BFGS starts anew when each of three iterations in a row raises the log marginal likelihood by less
+        than this, and stops when that no longer gains a hundred times as much.
+    random_state : int, RandomState instance or None, default=None
+        Draws the restarts.
+    verbose : int, default=0
+        1 prints iteration, log marginal likelihood and time about once a second, 2 at each iteration.
+
+    Attributes
+    ----------
+    coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Posterior mean of the weights.
+    coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Their posterior standard deviations.
+    coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
+        Their posterior covariances.
+    coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
+        The prior that was used.
+    feature_map_, kernel_map_ : transformer or None
+        Fitted clones of the maps.
+    kernel_ : Kernel, or list of Kernel for a y with columns
+        Fitted, without the noise.
+    noise_variance_ : float or ndarray of shape (n_outputs,)
+        σ², in squared units of y.
+    log_marginal_likelihood_value_ : float
+        In nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts (eq. 2.45 there).
+    loss_curve_ : ndarray of shape (n_iter_,)
+        Minus the log marginal likelihood per iteration.
+    n_iter_ : int
+        Iterations of the start that was kept.
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    EVGPRegressor : The same model with inducing points, for any number of rows.
+
+    References
+    ----------
+    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
+
+    Examples
+    --------
+    A wave on a linear trend of which nothing is known; the explicit features are x and 1:
+
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EGPRegressor(PolynomialFeatures(1), coef_scale=np.inf).fit(X, y)
+    >>> mean, std = model.predict(X, return_std=True)
+    >>> round(model.score(X, y), 2)
+    0.96
+    """
+
+    _fitted: ExactFit
+
+    def __init__(
+        self,
+        feature_map: TransformerMixin | None = None,
+        kernel: Kernel | Callable[..., Any] | None = None,
+        *,
+        kernel_map: TransformerMixin | None = None,
+        coef_mean: ArrayLike | Literal["auto"] = "auto",
+        coef_scale: ArrayLike | Literal["auto"] = "auto",
+        noise_variance: float | None = None,
+        normalize_y: bool = False,
+        max_iter: int = 1000,
+        n_restarts: int = 0,
+        tol: float = 0.01,
+        random_state: int | np.random.RandomState | None = None,
+        verbose: int = 0,
+    ):
+        self.feature_map = feature_map
+        self.kernel = kernel
+        self.kernel_map = kernel_map
+        self.coef_mean = coef_mean
+        self.coef_scale = coef_scale
+        self.noise_variance = noise_variance
+        self.normalize_y = normalize_y
+        self.max_iter = max_iter
+        self.n_restarts = n_restarts
+        self.tol = tol
+        self.random_state = random_state
+        self.verbose = verbose
+
+    @_fit_context(prefer_skip_nested_validation=False)
+    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fit kernel and noise; the posterior is exact.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ValueError, TypeError
+            If an argument is out of its range, the data are not finite, shapes do not fit, or features with vague
+            weights depend on each other; the message names the argument, the value and what is allowed.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
+            kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
+        """
+        if is_dask(X):
+            raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
+        with self._unchanged_if_it_fails(), single_threaded_libraries():
+            problem = self._problem(X, y, allow_vague=True)
+            frame, spec = problem.frame, problem.spec
+            self._fitted = ExactFit.fit(
+                frame,
+                frame.rows(problem.source),
+                spec.covariance.seen_from(frame.centre),
+                spec.starts,
+                problem.vague,
+                ExactOptions(self.max_iter, self.tol, self.n_restarts),
+                check_random_state(self.random_state),
+                partial(Progress, self.verbose) if self.verbose else None,
+            )
+            self._set_common_attributes()
+            self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
+            self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
+            self.loss_curve_ = self._fitted.loss_curve
+            self.n_iter_ = len(self.loss_curve_)
+        if self._fitted.message:
+            warnings.warn(self._fitted.message, ConvergenceWarning, stacklevel=2)
+        return self

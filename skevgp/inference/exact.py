@@ -1,0 +1,364 @@
+"""The exact model with explicit features: likelihood, gradient and posterior (Rasmussen & Williams 2006, section 2.7).
+
+Per output, with ρ = σ²/s², L Lᵀ = K̃ + ρ I and the columns of c as prior scales, the whitened rows are z = L⁻¹ r / s
+and W = L⁻¹ H diag(c) / s; β = μ_β + c (w₀ + w) and r = y - H (μ_β + c w₀) as in `bounds`. Integrating β out leaves
+
+    -2 log p(y) = (n - k) log 2π + log |s² L Lᵀ| + log |B| + |z - W w|² + |D (w + w₀)|² - 2 Σ_vague log c,
+    B = D + WᵀW,   w = B⁻¹ (Wᵀz - D w₀),   posterior of the weights: N(w, B⁻¹),
+
+where D = I, but 0 for the k weights whose prior is vague, Σ_β → ∞: for them c is a unit, and the likelihood that of
+n - k contrasts (eq. 2.45 there; the infinite log |Σ_β| left out). A QR factorisation of [W; D] gives B without squaring
+its condition.
+
+Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
+2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (c h(x) - s Wᵀ V)|², with
+V = L⁻¹ k̃(X, x) and B = RᵀR.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import lapack
+
+from .advice import far_from_prior, how_it_ended, nothing_learned
+from .bounds import LOG_2PI, CoefficientPrior
+from .descent import lbfgs_unless_stuck, moved_start
+from .frame import Frame
+from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from .model import Values
+from .optimize import Minimum, Report
+from .parameters import ParameterTable
+from .posterior import InducingSet, Posterior
+from .rows import Rows
+from .source import RawRows
+from .start import FIRST_NOISE, Starts, checked_variance, spread_of, starting_table
+from .statistics import Kernel
+
+# On so many rows it is seen whether a user's kernel works.
+_CHECKED_ROWS = 500
+
+
+class OutputGivenKernel:
+    """Likelihood and posterior of one output, given K̃.
+
+    Parameters
+    ----------
+    K : ndarray of shape (n, n)
+        k̃(X, X).
+    H : ndarray of shape (n, p)
+    r : ndarray of shape (n,)
+        Residuals.
+    signal, noise : float
+        s² and σ².
+    prior : CoefficientPrior
+        Of this output.
+    vague : ndarray of shape (p,)
+        Weights with Σ_β → ∞; their prior scale is a unit.
+    """
+
+    def __init__(
+        self,
+        K: np.ndarray,
+        H: np.ndarray,
+        r: np.ndarray,
+        signal: float,
+        noise: float,
+        prior: CoefficientPrior,
+        vague: np.ndarray,
+    ):
+        self.signal, self.noise, self.ratio = signal, noise, noise / signal
+        shifted = K.copy()
+        diagonal_of(shifted)[...] += self.ratio
+        self.L = jittered_cholesky(shifted)
+        self.L_inv = triangular_inverse(self.L)
+        s, scale, reference = np.sqrt(signal), prior.scale[0], prior.reference[0]
+        proper = ~vague
+        self.vague, self.scale = vague, scale
+        self.W = self.L_inv @ (H * (scale / s))
+        z = self.L_inv @ (r / s)
+        # [W; D] w = [z; -D w₀] by least squares.
+        Q, self.R = np.linalg.qr(np.vstack([self.W, np.diag(proper.astype(float))]))
+        self.R_inv = lapack.dtrtri(self.R)[0] if len(self.R) else self.R
+        self.w = self.R_inv @ (Q.T @ np.concatenate([z, np.where(proper, -reference, 0.0)]))
+        self.left_over = z - self.W @ self.w
+        self.from_prior = proper * (self.w + reference)
+
+    @property
+    def log_likelihood(self) -> float:
+        """Of the residuals, in nats."""
+        n_contrasts = len(self.L) - self.vague.sum()
+        log_det = len(self.L) * np.log(self.signal) + 2.0 * np.log(np.diagonal(self.L)).sum()
+        log_det += 2.0 * (np.log(np.abs(np.diagonal(self.R))).sum() - np.log(self.scale[self.vague]).sum())
+        squares = self.left_over @ self.left_over + self.from_prior @ self.from_prior
+        return float(-0.5 * (n_contrasts * LOG_2PI + log_det + squares))
+
+    def gradient(self) -> tuple[np.ndarray, float, float]:
+        """Of the log likelihood in K̃ (symmetric), log s² and log σ²: ½ (α αᵀ - P) pulled back to each.
+
+        (α = (s² L Lᵀ)⁻¹ (r - H c w); P is the inverse of y's covariance, or for vague weights its limit.)
+        """
+        n, s = len(self.L), np.sqrt(self.signal)
+        alpha = self.L_inv.T @ self.left_over / s
+        spread = self.L_inv.T @ (self.W @ self.R_inv)
+        P = (symmetric_inverse(self.L_inv) - spread @ spread.T) / self.signal
+        trace = float(np.trace(P))
+        squares = float(self.left_over @ self.left_over)
+        explained = len(self.R) - float(np.sum(self.R_inv[~self.vague] ** 2))
+        noise_bar = 0.5 * self.noise * (float(alpha @ alpha) - trace)
+        P *= -1.0
+        P += np.multiply.outer(alpha, alpha)
+        P *= 0.5 * self.signal
+        return P, 0.5 * (squares - n + explained) - noise_bar, noise_bar
+
+    def posterior(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """L⁻¹ (n, n), and of ω = (v, w): its mean (n + p,) and a root (max(p, 1), n + p) of its covariance."""
+        root = np.zeros((1, len(self.L)))
+        if len(self.R):
+            root = np.hstack([-(self.W @ self.R_inv).T, self.R_inv.T])
+        return self.L_inv, np.concatenate([self.left_over, self.w]), root
+
+
+@dataclass(frozen=True)
+class ExactModel:
+    """Covariance, prior and rows: θ -> likelihood, gradient and posterior.
+
+    Attributes
+    ----------
+    kernel : Kernel
+        k̃, common to all outputs.
+    prior : CoefficientPrior
+    vague : ndarray of shape (o, p)
+        Weights with an infinite prior scale; in ``prior`` theirs is a unit.
+    rows : RawRows
+        All of them, in internal units.
+    """
+
+    kernel: Kernel
+    prior: CoefficientPrior
+    vague: np.ndarray
+    rows: RawRows
+
+    def outputs(self, values: Values) -> tuple[Any, list[OutputGivenKernel]]:
+        """The covariance of the rows, and each output given it."""
+        at = self.kernel.at(np.log(values["hyperparameters"]), self.rows.inputs)
+        K = at.matrix()
+        return at, [
+            OutputGivenKernel(
+                K,
+                self.rows.features,
+                self.rows.targets[:, o],
+                values["signal"][o],
+                values["noise"][o],
+                self.prior.outputs(slice(o, o + 1)),
+                self.vague[o],
+            )
+            for o in range(len(self.vague))
+        ]
+
+    def log_likelihood(self, values: Values) -> tuple[float, Values]:
+        """Summed over outputs, and its gradient in the logarithms of the values."""
+        at, outputs = self.outputs(values)
+        total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
+        K_bar = np.zeros((len(self.rows.inputs),) * 2)
+        for o, output in enumerate(outputs):
+            total += output.log_likelihood
+            own, gradient["signal"][o], gradient["noise"][o] = output.gradient()
+            K_bar += own
+        gradient["hyperparameters"], _ = at.finish_pullback(at.start_pullback(), K_bar)
+        return total, gradient
+
+    def posterior(self, values: Values) -> Posterior:
+        """In internal units; the rows are its inducing points."""
+        _, outputs = self.outputs(values)
+        L_inv, mean, root = zip(*(output.posterior() for output in outputs), strict=True)
+        hyperparameters = np.log(values["hyperparameters"])
+        sets = tuple(
+            InducingSet(hyperparameters, self.rows.inputs, own, slice(o, o + 1)) for o, own in enumerate(L_inv)
+        )
+        return Posterior(self.kernel, sets, values["signal"], values["noise"], self.prior, mean, root)
+
+
+@dataclass(frozen=True)
+class ExactOptions:
+    """How to optimise.
+
+    Attributes
+    ----------
+    max_iter : int
+    tol : float
+        In nats.
+    n_restarts : int
+    """
+
+    max_iter: int
+    tol: float
+    n_restarts: int = 0
+
+
+@dataclass(frozen=True)
+class ExactFit:
+    """The exact model of some outputs, fitted.
+
+    Attributes
+    ----------
+    frame : Frame
+    model : ExactModel
+    table : ParameterTable
+        Where it started, and its bounds.
+    minimum : Minimum
+        In internal units, per row.
+    message : str
+        What the user should know of how it ended; empty if it converged.
+    """
+
+    frame: Frame
+    model: ExactModel
+    table: ParameterTable
+    minimum: Minimum
+    message: str
+
+    @classmethod
+    def fit(
+        cls,
+        frame: Frame,
+        rows: Rows,
+        kernel: Kernel,
+        starts: Starts,
+        vague: np.ndarray,
+        options: ExactOptions,
+        rng: np.random.RandomState,
+        reporter: Callable[[float], Report] | None = None,
+    ) -> ExactFit:
+        """Maximise the log marginal likelihood.
+
+        Parameters
+        ----------
+        frame : Frame
+        rows : Rows
+            In internal units.
+        kernel : Kernel
+        starts : Starts
+            What the user says of kernel and noise.
+        vague : ndarray of shape (o, p)
+            Weights with an infinite prior scale.
+        options : ExactOptions
+        rng : RandomState
+            Draws the restarts.
+        reporter : callable, default=None
+            reporter(what to subtract from a loss in internal units) returns the fit's report.
+
+        Returns
+        -------
+        fitted : ExactFit
+
+        Raises
+        ------
+        ValueError
+            If features with vague weights depend on each other, or the kernel does not work.
+        """
+        n = len(rows)
+        everything = rows.some(np.arange(n))
+        _check_independent(everything.features, vague)
+        first, variance = starts.hyperparameters.value, 1.0
+        if first is not None:
+            some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
+            variance = checked_variance(kernel, first, everything.inputs[some])
+        spread = spread_of(rows.inputs)
+        table = starting_table(
+            spread,
+            np.empty((1, 0, len(spread))),
+            frame.target_unit,
+            starts,
+            rows.scatter(),
+            FIRST_NOISE["lbfgs"],
+            kernel.n_hyperparameters,
+            variance,
+        )
+        model = ExactModel(kernel, frame.internal_prior(), vague, everything)
+        shown = None if reporter is None else reporter(_shift(frame, vague, n))
+        report = None if shown is None else lambda iteration, loss: shown(iteration, n * loss)
+        best = _maximise(model, table, rows, options, rng, report)
+        proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
+        advice = [how_it_ended(best, options.max_iter, 0, options.tol, sparse=False), far_from_prior(proper, rows)]
+        if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
+            advice.append(nothing_learned(table.values(best.x)["noise"], rows, sparse=False))
+        return cls(frame, model, table, best, " ".join(part for part in advice if part))
+
+    def posterior(self) -> Posterior:
+        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+        return self.frame.posterior([self.model.posterior(self.table.values(self.minimum.x))])
+
+    @property
+    def log_marginal_likelihood(self) -> float:
+        """In nats, summed over outputs."""
+        outputs = self.model.outputs(self.table.values(self.minimum.x))[1]
+        return sum(output.log_likelihood for output in outputs) - self._shift
+
+    @property
+    def loss_curve(self) -> np.ndarray:
+        """Minus the log marginal likelihood per iteration."""
+        return self._n_rows * np.array(self.minimum.loss_curve) + self._shift
+
+    def bounds(self, name: str, output: int) -> np.ndarray:
+        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+        bounds = self.table[name].value_bounds()
+        return bounds[[output]] * self.frame.target_unit[output] ** 2 if name == "signal" else bounds
+
+    @property
+    def _n_rows(self) -> int:
+        return len(self.model.rows.inputs)
+
+    @property
+    def _shift(self) -> float:
+        return _shift(self.frame, self.model.vague, self._n_rows)
+
+
+def _maximise(
+    model: ExactModel,
+    table: ParameterTable,
+    rows: Rows,
+    options: ExactOptions,
+    rng: np.random.RandomState,
+    report: Report | None,
+) -> Minimum:
+    """L-BFGS on the log marginal likelihood from the table's start, then from others; the best is kept."""
+    n = len(rows)
+
+    def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
+        likelihood, gradient = model.log_likelihood(table.values(flat))
+        return -likelihood / n, -table.flat(gradient) / n
+
+    def descend(start: ParameterTable) -> Minimum:
+        return lbfgs_unless_stuck(
+            loss, start, rows.scatter(), options.max_iter, options.tol / n, may_interpolate=True, report=report
+        )
+
+    best = descend(table)
+    for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
+        if best.interrupted:
+            break
+        other = descend(table.started_at(moved_start(table, rng)))
+        best = other if other.loss < best.loss else replace(best, interrupted=other.interrupted)
+    return best
+
+
+def _shift(frame: Frame, vague: np.ndarray, n_rows: int) -> float:
+    """From internal units to the user's, for a loss of all rows: each contrast has a unit."""
+    return float(((n_rows - vague.sum(axis=1)) * np.log(frame.target_unit)).sum())
+
+
+def _check_independent(features: np.ndarray, vague: np.ndarray) -> None:
+    """Refuse features whose vague weights the rows cannot tell apart."""
+    size = np.sqrt(np.sum(features**2, axis=0))
+    scaled = features / np.where(size > 0.0, size, 1.0)
+    for mask in np.unique(vague, axis=0):
+        rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
+        if rank < mask.sum():
+            raise ValueError(
+                f"coef_scale=inf needs features that are linearly independent on the rows of X: {mask.sum()} features "
+                f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
+            )

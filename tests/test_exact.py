@@ -1,0 +1,401 @@
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning, NotFittedError
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern, WhiteKernel
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+from skevgp import EGPRegressor, EVGPRegressor
+from skevgp.datasets import make_dynamics, make_toy
+from skevgp.features import InertiaForceGravity
+
+RNG = np.random.RandomState(0)
+X = RNG.uniform(-2, 2, (50, 2))
+Y = np.column_stack([np.sin(2 * X[:, 0]) + X[:, 1], 3 * np.cos(X[:, 1]) * X[:, 0]]) + 0.05 * RNG.randn(50, 2)
+X_NEW = RNG.uniform(-2.5, 2.5, (30, 2))
+TREND = PolynomialFeatures(1)
+FIXED = ConstantKernel(1.4, "fixed") * RBF([0.9, 1.6], "fixed")
+TARGETS = [(Y[:, 0], (), 1), (Y[:, :1], (1,), 1), (Y, (2,), 2)]
+IDS = ["one output", "one column", "two outputs"]
+
+
+def fixed(noise=0.01, **arguments):
+    """A model whose kernel and noise stay."""
+    return EGPRegressor(**{"kernel": FIXED, "noise_variance": noise, "max_iter": 0} | arguments)
+
+
+# --- agreement with other models ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("y", "outputs", "n_outputs"), TARGETS, ids=IDS)
+@pytest.mark.parametrize("feature_map", [None, TREND], ids=str)
+@pytest.mark.parametrize("normalize_y", [False, True])
+def test_it_is_the_sparse_model_whose_inducing_points_are_the_rows(y, outputs, n_outputs, feature_map, normalize_y):
+    common = {"feature_map": feature_map, "normalize_y": normalize_y, "max_iter": 0}
+    common |= {"kernel": FIXED, "noise_variance": 0.01}
+    if feature_map is not None:
+        common |= {"coef_mean": 0.3, "coef_scale": np.tile([0.5, 2.0, 0.0], (n_outputs, 1))}
+    exact = EGPRegressor(**common).fit(X, y)
+    sparse = EVGPRegressor(inducing_init=X, **common).fit(X, y)
+    assert exact.log_marginal_likelihood_value_ == pytest.approx(sparse.lower_bound_, abs=1e-6)
+    for options in ({"return_std": True}, {"return_cov": True}, {"return_std": True, "include_noise": False}):
+        for actual, expected in zip(exact.predict(X_NEW, **options), sparse.predict(X_NEW, **options), strict=True):
+            assert actual.shape == expected.shape
+            np.testing.assert_allclose(actual, expected, atol=1e-6)
+    for name in ("coef_", "coef_std_", "coef_cov_", "coef_prior_mean_", "coef_prior_scale_", "noise_variance_"):
+        actual, expected = getattr(exact, name), getattr(sparse, name)
+        assert np.shape(actual) == np.shape(expected)
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
+    assert str(exact.kernel_) == str(sparse.kernel_)
+
+
+def test_it_ends_where_the_sparse_model_whose_inducing_points_are_the_rows_ends():
+    exact = EGPRegressor(TREND, tol=1e-4).fit(X, Y[:, 0])
+    sparse = EVGPRegressor(TREND, inducing_init=X, tol=1e-4).fit(X, Y[:, 0])
+    assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=0.01)
+    np.testing.assert_allclose(sparse.predict(X_NEW), exact.predict(X_NEW), atol=0.01)
+
+
+@pytest.mark.parametrize(
+    "kernel", [FIXED, ConstantKernel(2.0) * Matern(1.2, nu=1.5), 0.5**2 * RBF() + DotProduct()], ids=str
+)
+def test_without_features_it_is_scikit_learns(kernel):
+    m = fixed(0.02, kernel=kernel).fit(X, Y[:, 0])
+    g = GaussianProcessRegressor(m.kernel_, alpha=m.noise_variance_, optimizer=None).fit(X, Y[:, 0])
+    assert m.log_marginal_likelihood_value_ == pytest.approx(g.log_marginal_likelihood_value_, rel=1e-10)
+    for option in ("return_std", "return_cov"):
+        actual, expected = (model.predict(X_NEW, **{option: True}) for model in (m, g))
+        np.testing.assert_allclose(actual[0], expected[0], rtol=1e-8)
+        noise = 0.02 * np.eye(30) if option == "return_cov" else 0.02
+        second = actual[1] - noise if option == "return_cov" else np.sqrt(actual[1] ** 2 - noise)
+        np.testing.assert_allclose(second, expected[1], atol=1e-8)
+
+
+def test_what_it_learns_is_as_likely_as_what_scikit_learn_learns():
+    kernel = ConstantKernel(1.0, (1e-3, 1e4)) * RBF([1.0, 1.0], (1e-2, 1e3)) + WhiteKernel(1e-2, (1e-6, 1e1))
+    m = EGPRegressor(kernel=kernel).fit(X, Y[:, 0])
+    g = GaussianProcessRegressor(kernel, n_restarts_optimizer=2, random_state=0).fit(X, Y[:, 0])
+    assert m.log_marginal_likelihood_value_ == pytest.approx(g.log_marginal_likelihood_value_, abs=0.02)
+    np.testing.assert_allclose(m.kernel_.theta, g.kernel_.k1.theta, atol=0.1)
+
+
+def test_with_features_it_is_a_gaussian_process_with_their_covariance():
+    kernel, c = 1.4 * RBF([0.9, 1.6]), 2.5
+    m = EGPRegressor(TREND, kernel, noise_variance=0.01, coef_mean=0.4, coef_scale=c, max_iter=0).fit(X, Y[:, 0])
+    # h = (1, x): h Σ hᵀ = c² (1 + xᵀx').
+    g = GaussianProcessRegressor(kernel + c**2 * DotProduct(1.0), alpha=0.01, optimizer=None)
+    g.fit(X, Y[:, 0] - 0.4 * (1 + X.sum(axis=1)))
+    assert m.log_marginal_likelihood_value_ == pytest.approx(g.log_marginal_likelihood_value_, rel=1e-10)
+    mean, cov = g.predict(X_NEW, return_cov=True)
+    actual, actual_cov = m.predict(X_NEW, return_cov=True, include_noise=False)
+    np.testing.assert_allclose(actual, mean + 0.4 * (1 + X_NEW.sum(axis=1)), atol=1e-9)
+    np.testing.assert_allclose(actual_cov, cov, atol=1e-9)
+
+
+def test_the_likelihood_bounds_every_sparse_models_bound():
+    exact = EGPRegressor(TREND).fit(X, Y)
+    for m in (5, 20, 50):
+        sparse = EVGPRegressor(TREND, n_inducing=m, random_state=0).fit(X, Y)
+        assert sparse.lower_bound_ < exact.log_marginal_likelihood_value_ + 0.05
+
+
+# --- vague weights ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("which", [[True, True, True], [False, True, False]], ids=["all", "one"])
+def test_vague_weights_are_the_limit_of_wide_ones(which):
+    def at(scale):
+        return fixed(feature_map=TREND, coef_mean=0.2, coef_scale=np.where(which, scale, 0.7)).fit(X, Y[:, 0])
+
+    def limit(of):
+        """Extrapolated in 1 / scale²."""
+        first, second = of(at(200.0), 200.0), of(at(400.0), 400.0)
+        return (4.0 * second - first) / 3.0
+
+    vague, k = at(np.inf), np.sum(which)
+    likelihood = limit(lambda m, c: m.log_marginal_likelihood_value_ + k * np.log(c * np.sqrt(2 * np.pi)))
+    assert vague.log_marginal_likelihood_value_ == pytest.approx(likelihood, abs=1e-6)
+    np.testing.assert_allclose(vague.coef_, limit(lambda m, _: m.coef_), atol=1e-7)
+    np.testing.assert_allclose(vague.coef_cov_, limit(lambda m, _: m.coef_cov_), atol=1e-7)
+    for i in (0, 1):
+        wide = limit(lambda m, _, i=i: m.predict(X_NEW, return_std=True)[i])
+        np.testing.assert_allclose(vague.predict(X_NEW, return_std=True)[i], wide, atol=1e-7)
+    np.testing.assert_array_equal(vague.coef_prior_scale_, np.where(which, np.inf, 0.7))
+
+
+def test_vague_weights_are_estimated_by_generalised_least_squares():
+    m = fixed(feature_map=TREND, coef_scale=np.inf, noise=0.05).fit(X, Y)
+    H, K = TREND.fit_transform(X), FIXED(X) + 0.05 * np.eye(50)
+    A = H.T @ np.linalg.solve(K, H)
+    np.testing.assert_allclose(m.coef_, np.linalg.solve(A, H.T @ np.linalg.solve(K, Y)).T, rtol=1e-9)
+    np.testing.assert_allclose(m.coef_cov_, np.array([np.linalg.inv(A)] * 2), rtol=1e-8)
+    # Rasmussen & Williams, eq. 2.45.
+    C = np.linalg.solve(K, H) @ np.linalg.solve(A, np.linalg.solve(K, H).T)
+    squares = np.sum(Y * (np.linalg.solve(K, Y) - C @ Y))
+    log_dets = np.linalg.slogdet(K)[1] + np.linalg.slogdet(A)[1] + 47 * np.log(2 * np.pi)
+    assert m.log_marginal_likelihood_value_ == pytest.approx(-0.5 * squares - log_dets, rel=1e-10)
+
+
+def test_a_vague_intercept_makes_the_level_of_y_irrelevant():
+    m, raised = (EGPRegressor(TREND, coef_scale=np.inf).fit(X, Y[:, 0] + level) for level in (0.0, 1e6))
+    np.testing.assert_allclose(raised.predict(X_NEW) - 1e6, m.predict(X_NEW), atol=1e-4)
+    assert raised.log_marginal_likelihood_value_ == pytest.approx(m.log_marginal_likelihood_value_, abs=1e-2)
+
+
+def test_vague_weights_do_not_depend_on_the_units_of_features():
+    scaled = PolynomialFeatures(1).fit(X)
+    m = EGPRegressor(scaled, coef_scale=np.inf, kernel_map=StandardScaler()).fit(X, Y[:, 0])
+    other = EGPRegressor(scaled, coef_scale=np.inf, kernel_map=StandardScaler()).fit(1e-3 * X, Y[:, 0])
+    np.testing.assert_allclose(other.coef_, m.coef_ * [1, 1e3, 1e3], rtol=1e-4)
+    shift = 2 * np.log(1e-3)
+    assert other.log_marginal_likelihood_value_ + shift == pytest.approx(m.log_marginal_likelihood_value_, abs=1e-3)
+
+
+@pytest.mark.parametrize("columns", [[0, 0], [0, None]], ids=["twice the same", "a column of zeros"])
+def test_vague_weights_need_independent_features(columns):
+    given = np.column_stack([np.zeros(50) if column is None else X[:, column] for column in columns])
+    with pytest.raises(ValueError, match=r"coef_scale=inf needs .* independent .* 3 features .* only 2"):
+        EGPRegressor(TREND, coef_scale=np.inf).fit(given, Y)
+    EGPRegressor(TREND, coef_scale=[[np.inf, np.inf, 1.0]], max_iter=0).fit(given, Y[:, 0])
+
+
+def test_vague_weights_need_as_many_rows():
+    with pytest.raises(ValueError, match="only 2 of them are independent"):
+        EGPRegressor(TREND, coef_scale=np.inf).fit(X[:2], Y[:2])
+    assert np.isfinite(EGPRegressor(TREND, coef_scale=np.inf, max_iter=0).fit(X[:3], Y[:3]).predict(X_NEW)).all()
+
+
+@pytest.mark.parametrize("scale", [np.nan, -np.inf, -1.0])
+def test_other_scales_are_refused(scale):
+    with pytest.raises(ValueError, match="coef_scale must"):
+        EGPRegressor(TREND, coef_scale=scale).fit(X, Y)
+
+
+def test_the_sparse_model_refuses_vague_weights():
+    with pytest.raises(ValueError, match="coef_scale must be finite"):
+        EVGPRegressor(TREND, coef_scale=np.inf).fit(X, Y)
+
+
+# --- learning -----------------------------------------------------------------------------------------------------
+
+
+def test_it_learns_and_its_likelihood_ends_at_minus_the_loss():
+    m = EGPRegressor(TREND).fit(X, Y)
+    assert (
+        m.score(X_NEW, np.column_stack([np.sin(2 * X_NEW[:, 0]) + X_NEW[:, 1], 3 * np.cos(X_NEW[:, 1]) * X_NEW[:, 0]]))
+        > 0.97
+    )
+    assert m.loss_curve_.shape == (m.n_iter_,)
+    assert -m.loss_curve_.min() == pytest.approx(m.log_marginal_likelihood_value_, abs=0.05)
+    assert m.loss_curve_[0] > m.loss_curve_[-1]
+    np.testing.assert_allclose(m.noise_variance_, 0.05**2, rtol=0.6)
+
+
+def test_it_knows_physics():
+    train, test = (make_dynamics("pendulum", 3, n_steps=30, random_state=s) for s in (0, 1))
+    m = EGPRegressor(InertiaForceGravity("pendulum")).fit(train.data, train.target)
+    assert m.score(test.data, test.target) > 0.999
+    assert m.coef_.shape == (2, 4)
+
+
+def test_units_do_not_matter():
+    m = EGPRegressor(TREND).fit(X, Y[:, 0])
+    other = EGPRegressor(TREND).fit(1e3 * X, 1e-5 * Y[:, 0])
+    np.testing.assert_allclose(1e5 * other.predict(1e3 * X_NEW), m.predict(X_NEW), atol=1e-3)
+    expected = m.log_marginal_likelihood_value_ - 50 * np.log(1e-5)
+    assert other.log_marginal_likelihood_value_ == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_restarts_keep_the_likeliest_and_repeat():
+    def fit(n_restarts, seed):
+        # So few iterations end where they began.
+        return EGPRegressor(max_iter=1, n_restarts=n_restarts, random_state=seed).fit(X, Y)
+
+    one = fit(0, None).log_marginal_likelihood_value_
+    several = [fit(1, seed) for seed in range(6)]
+    likelihoods = {m.log_marginal_likelihood_value_ for m in several}
+    assert min(likelihoods) == one < max(likelihoods)
+    for seed, m in enumerate(several):
+        np.testing.assert_array_equal(fit(1, seed).predict(X_NEW), m.predict(X_NEW))
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-9])
+def test_nearly_noise_free_data_are_fitted(noise):
+    x = np.linspace(-2, 2, 80)[:, np.newaxis]
+    y = np.sin(3 * x[:, 0]) + noise * np.random.RandomState(0).randn(80)
+    m = EGPRegressor().fit(x, y)
+    mean, std = m.predict(x, return_std=True)
+    np.testing.assert_allclose(mean, y, atol=1e-4)
+    assert (std < 1e-3).all()
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize(
+    "nasty",
+    [
+        (np.vstack([X[:20]] * 3), np.vstack([Y[:20]] * 3)),
+        (np.repeat(X[:1], 10, axis=0), Y[:10]),
+        (X, np.zeros((50, 2))),
+        (X, np.ones((50, 2))),
+        (1e12 * X, 1e-12 * Y),
+        (np.column_stack([X, X[:, 0], np.ones(50)]), Y),
+        (X[:1], Y[:1]),
+        (X[:2], Y[:2]),
+    ],
+    ids=["rows thrice", "one row", "zeros", "ones", "scales", "columns", "a single row", "two rows"],
+)
+@pytest.mark.parametrize("feature_map", [None, TREND], ids=str)
+def test_nasty_data_are_fitted(nasty, feature_map):
+    x, y = nasty
+    mean, std = EGPRegressor(feature_map, max_iter=100).fit(x, y).predict(x, return_std=True)
+    assert np.isfinite(mean).all()
+    assert (std > 0).all()
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_a_fixed_noise_that_vanishes_does_not_raise():
+    kernel = RBF(5.0) + WhiteKernel(1e-30, "fixed")
+    m = EGPRegressor(kernel=kernel, max_iter=20).fit(np.vstack([X, X]), np.vstack([Y, Y]))
+    assert np.isfinite(m.predict(X_NEW)).all()
+
+
+# --- scikit-learn's conventions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("y", "outputs", "n_outputs"), TARGETS, ids=IDS)
+def test_shapes_are_those_of_the_sparse_model(y, outputs, n_outputs):
+    m = fixed(feature_map=TREND).fit(X, y)
+    shape = (30, 2) if outputs == (2,) else (30,)
+    mean, cov = m.predict(X_NEW, return_cov=True)
+    assert mean.shape == shape
+    assert cov.shape == (30, *shape)
+    assert m.sample_y(X_NEW, 3).shape == (*shape, 3)
+    assert m.coef_.shape == (*outputs, 3)
+    assert m.coef_cov_.shape == (*outputs, 3, 3)
+    assert np.shape(m.noise_variance_) == outputs
+    assert m.n_features_in_ == 2
+
+
+def test_samples_have_the_predicted_moments():
+    m = fixed(feature_map=TREND, noise=0.1).fit(X, Y)
+    mean, std = m.predict(X_NEW, return_std=True, include_noise=False)
+    samples = m.sample_y(X_NEW, 3000, random_state=1, include_noise=False)
+    np.testing.assert_allclose(samples.mean(axis=-1), mean, atol=0.1)
+    np.testing.assert_allclose(samples.std(axis=-1), std, rtol=0.1)
+
+
+def test_normalize_y_is_centring_by_hand():
+    level = Y.mean(axis=0)
+    m, centred = EGPRegressor(normalize_y=True).fit(X, Y), EGPRegressor().fit(X, Y - level)
+    np.testing.assert_allclose(m.predict(X_NEW), centred.predict(X_NEW) + level, atol=1e-8)
+
+
+def test_only_the_kernel_sees_kernel_map_and_a_data_frame_stays_one():
+    seen = []
+
+    class Trend(PolynomialFeatures):
+        def transform(self, X):
+            seen.append(type(X))
+            return super().transform(X)
+
+    frame = pd.DataFrame(100.0 * X, columns=["a", "b"])
+    m = EGPRegressor(Trend(1), kernel_map=StandardScaler(), max_iter=0).fit(frame, Y)
+    m.predict(frame)
+    assert set(seen) == {pd.DataFrame}
+    np.testing.assert_array_equal(m.feature_names_in_, ["a", "b"])
+    direct = EGPRegressor(TREND, kernel_map=StandardScaler(), max_iter=0).fit(100.0 * X, Y)
+    np.testing.assert_allclose(direct.predict(100.0 * X), m.predict(frame), rtol=1e-8)
+
+
+def test_the_noise_starts_in_one_place():
+    with pytest.raises(ValueError, match="either from noise_variance=0.1 or from the WhiteKernel"):
+        EGPRegressor(kernel=RBF() + WhiteKernel(), noise_variance=0.1).fit(X, Y)
+
+
+def test_bounds_and_fixed_values_are_respected():
+    kernel = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], (0.5, 0.7)) + WhiteKernel(0.03, "fixed")
+    m = EGPRegressor(kernel=kernel).fit(X, Y[:, 0])
+    assert m.kernel_.k1.constant_value == 2.0
+    assert ((m.kernel_.k2.length_scale >= 0.5) & (m.kernel_.k2.length_scale <= 0.7)).all()
+    assert m.noise_variance_ == pytest.approx(0.03)
+
+
+def test_dask_arrays_are_refused():
+    da = pytest.importorskip("dask.array")
+    with pytest.raises(TypeError, match="use EVGPRegressor"):
+        EGPRegressor().fit(da.from_array(X), Y)
+
+
+def test_dask_arrays_are_predicted():
+    da = pytest.importorskip("dask.array")
+    m = fixed(feature_map=TREND).fit(X, Y)
+    mean, std = m.predict(da.from_array(X_NEW, chunks=(10, 2)), return_std=True)
+    expected = m.predict(X_NEW, return_std=True)
+    np.testing.assert_allclose(mean.compute(scheduler="sync"), expected[0], rtol=1e-12)
+    np.testing.assert_allclose(std.compute(scheduler="sync"), expected[1], rtol=1e-12)
+
+
+def test_too_few_iterations_warn_and_say_what_to_change():
+    with pytest.warns(ConvergenceWarning, match="likelihood was still rising after max_iter=2 .* Raise max_iter"):
+        EGPRegressor(max_iter=2).fit(X, Y)
+
+
+def test_noise_that_explains_everything_warns():
+    x = np.linspace(0, 1, 200)[:, np.newaxis]
+    kernel = RBF(1e3, "fixed")
+    with pytest.warns(ConvergenceWarning, match=r"noise explains everything.*Raise n_restarts"):
+        EGPRegressor(kernel=kernel).fit(x, np.sin(20 * x[:, 0]))
+
+
+def test_ctrl_c_keeps_the_best_parameters_and_warns(monkeypatch):
+    class Interrupt:
+        def __init__(self, verbose, shift):
+            pass
+
+        def __call__(self, iteration, loss):
+            if iteration == 3:
+                raise KeyboardInterrupt
+
+    monkeypatch.setattr("skevgp.exact.Progress", Interrupt)
+    with pytest.warns(ConvergenceWarning, match="interrupted after 3 iterations"):
+        m = EGPRegressor(verbose=1, n_restarts=2).fit(X, Y)
+    assert m.n_iter_ == 3
+    assert np.isfinite(m.predict(X_NEW)).all()
+
+
+def test_verbose_prints_the_likelihood_in_the_users_units(capsys):
+    m = EGPRegressor(TREND, coef_scale=np.inf, verbose=2).fit(X, 1e3 * Y)
+    printed = [float(line.split()[3]) for line in capsys.readouterr().out.splitlines()]
+    assert max(printed) == pytest.approx(-m.loss_curve_.min(), abs=1e-3)
+
+
+def test_a_failed_refit_leaves_the_model_as_it_was():
+    m = fixed().fit(X, Y)
+    before = m.predict(X_NEW)
+    with pytest.raises(ValueError, match="kernel"):
+        m.set_params(kernel=RBF([1.0, 1.0, 1.0])).fit(X, Y)
+    np.testing.assert_array_equal(m.predict(X_NEW), before)
+
+
+def test_fitted_models_pickle_and_clone():
+    m = fixed(feature_map=TREND, coef_scale=np.inf).fit(X, Y)
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(m)).predict(X_NEW), m.predict(X_NEW))
+    with pytest.raises(NotFittedError):
+        clone(m).predict(X_NEW)
+
+
+def test_the_readme_toy():
+    x, y = make_toy(random_state=0, return_X_y=True)
+    m = EGPRegressor(TREND).fit(x, y)
+    # Far away the line is left, and what is not known of it.
+    far = np.array([[50.0]])
+    mean, std = m.predict(far, return_std=True)
+    assert mean[0] == pytest.approx(m.coef_ @ [1.0, 50.0], rel=1e-9)
+    h = np.array([1.0, 50.0])
+    variance = h @ m.coef_cov_ @ h + m.kernel_.k1.constant_value + m.noise_variance_
+    assert std[0] == pytest.approx(np.sqrt(variance), rel=1e-6)

@@ -1,0 +1,261 @@
+import pickle
+
+import numpy as np
+import pandas as pd
+import pytest
+import sklearn
+from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.linear_model import LinearRegression, Ridge, SGDRegressor
+from sklearn.metrics import r2_score
+from sklearn.model_selection import cross_validate
+from sklearn.svm import SVR
+from sklearn.utils import get_tags
+
+from skevgp import EVGPRegressor, ResidualRegressor
+
+RNG = np.random.RandomState(0)
+X = RNG.uniform(-2, 2, (60, 3))
+CHANGE = np.column_stack([np.sin(2 * X[:, 2]), X[:, 0] * X[:, 1]])
+Y = X[:, :2] + 0.1 * CHANGE
+X_NEW = RNG.uniform(-2, 2, (20, 3))
+NAMES = ["angle", "speed", "force"]
+TARGETS = [(Y[:, 0], [0]), (Y[:, :1], [0]), (Y, [0, 1])]
+
+
+def evgp(**arguments):
+    return EVGPRegressor(**{"n_inducing": 8, "max_iter": 0, "random_state": 0} | arguments)
+
+
+@pytest.fixture
+def routing():
+    with sklearn.config_context(enable_metadata_routing=True):
+        yield
+
+
+class Recorder(RegressorMixin, BaseEstimator):
+    """Keeps what it is given."""
+
+    def fit(self, X, y, sample_weight=None):
+        self.fit_given_ = X, y, sample_weight
+        return self
+
+    def partial_fit(self, X, y, sample_weight=None):
+        return self.fit(X, y, sample_weight)
+
+    def predict(self, X, **given):
+        self.predict_given_ = X, given
+        return np.zeros(len(X))
+
+
+# --- what it learns and predicts ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
+@pytest.mark.parametrize("regressor", [LinearRegression(), evgp(), GaussianProcessRegressor(optimizer=None)], ids=str)
+def test_it_is_the_regressor_of_the_change_plus_the_base(regressor, y, base):
+    change = clone(regressor).fit(X, y - X[:, base].reshape(y.shape)).predict(X_NEW)
+    m = ResidualRegressor(regressor).fit(X, y)
+    np.testing.assert_array_equal(m.predict(X_NEW), change + X_NEW[:, base].reshape(change.shape))
+    np.testing.assert_array_equal(m.base_, base)
+
+
+@pytest.mark.parametrize("base", [[2, 0], np.array([2, 0]), [-1, -3], ["force", "angle"], np.array(["force", "angle"])])
+def test_the_base_columns_are_chosen_by_index_or_name(base):
+    frame = pd.DataFrame(X, columns=NAMES)
+    m = ResidualRegressor(LinearRegression(), base=base).fit(frame, Y)
+    np.testing.assert_array_equal(m.base_, [2, 0])
+    np.testing.assert_allclose(m.regressor_.coef_, LinearRegression().fit(X, Y - X[:, [2, 0]]).coef_, atol=1e-12)
+    # A linear regression learns the same sum whatever is taken away before.
+    direct = LinearRegression().fit(X, Y).predict(X_NEW)
+    np.testing.assert_allclose(m.predict(pd.DataFrame(X_NEW, columns=NAMES)), direct, atol=1e-12)
+
+
+@pytest.mark.parametrize("base", [1, "speed", [1], ["speed"]])
+def test_one_output_needs_one_column(base):
+    m = ResidualRegressor(Recorder(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y[:, 1])
+    np.testing.assert_array_equal(m.regressor_.fit_given_[1], Y[:, 1] - X[:, 1])
+    np.testing.assert_array_equal(m.predict(pd.DataFrame(X_NEW, columns=NAMES)), X_NEW[:, 1])
+
+
+def test_a_data_frame_stays_one_for_the_regressor():
+    frame = pd.DataFrame(X, columns=NAMES)
+    m = ResidualRegressor(Recorder()).fit(frame, Y[:, 0])
+    m.predict(frame)
+    assert m.regressor_.fit_given_[0] is frame
+    assert m.regressor_.predict_given_[0] is frame
+    assert m.feature_names_in_.tolist() == NAMES
+    assert m.n_features_in_ == 3
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
+def test_numbers_of_other_types_do_not_wrap_around(dtype):
+    states = np.array([[3, 1], [5, 2], [9, 3]], dtype=dtype)
+    target = np.array([1, 2, 3], dtype=dtype)
+    m = ResidualRegressor(Recorder()).fit(states, target)
+    np.testing.assert_array_equal(m.regressor_.fit_given_[1], [-2.0, -3.0, -6.0])
+
+
+def test_the_regressor_itself_is_left_alone():
+    inner = LinearRegression()
+    m = ResidualRegressor(inner).fit(X, Y)
+    assert not hasattr(inner, "coef_")
+    assert m.regressor is inner
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(m)).predict(X_NEW), m.predict(X_NEW))
+
+
+# --- uncertainty passes through -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
+@pytest.mark.parametrize("include_noise", [True, False])
+@pytest.mark.parametrize("asked", ["return_std", "return_cov"])
+def test_the_spread_is_the_regressors(y, base, asked, include_noise):
+    options = {asked: True, "include_noise": include_noise}
+    mean, spread = evgp().fit(X, y - X[:, base].reshape(y.shape)).predict(X_NEW, **options)
+    shifted, same = ResidualRegressor(evgp()).fit(X, y).predict(X_NEW, **options)
+    np.testing.assert_array_equal(same, spread)
+    np.testing.assert_array_equal(shifted, mean + X_NEW[:, base].reshape(mean.shape))
+
+
+@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
+def test_samples_are_the_regressors_plus_the_base(y, base):
+    samples = evgp().fit(X, y - X[:, base].reshape(y.shape)).sample_y(X_NEW, 4, 7, include_noise=False)
+    shifted = ResidualRegressor(evgp()).fit(X, y).sample_y(X_NEW, 4, 7, include_noise=False)
+    np.testing.assert_array_equal(shifted, samples + X_NEW[:, base].reshape(*samples.shape[:-1], 1))
+
+
+def test_samples_work_for_scikit_learns_gaussian_process_too():
+    m = ResidualRegressor(GaussianProcessRegressor(random_state=0, optimizer=None, alpha=0.1)).fit(X, Y)
+    samples, mean = m.sample_y(X_NEW, 2000), m.predict(X_NEW)
+    np.testing.assert_allclose(samples.mean(axis=-1), mean, atol=0.15)
+
+
+@pytest.mark.parametrize("method", ["sample_y", "partial_fit"])
+def test_methods_are_there_if_the_regressor_has_them(method):
+    assert hasattr(ResidualRegressor(evgp()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()).fit(X, Y), method)
+
+
+# --- going on -----------------------------------------------------------------------------------------------------
+
+
+def test_partial_fit_is_the_regressors():
+    m, direct = ResidualRegressor(evgp()), evgp()
+    for rows in (slice(0, 40), slice(40, 60)):
+        m.partial_fit(X[rows], Y[rows])
+        direct.partial_fit(X[rows], Y[rows] - X[rows, :2])
+    np.testing.assert_array_equal(m.predict(X_NEW), direct.predict(X_NEW) + X_NEW[:, :2])
+
+
+def test_partial_fit_goes_on_and_fit_starts_anew():
+    m = ResidualRegressor(SGDRegressor(random_state=0)).partial_fit(X, Y[:, 0])
+    first = m.regressor_
+    assert m.partial_fit(X, Y[:, 0]).regressor_ is first
+    assert m.fit(X, Y[:, 0]).regressor_ is not first
+
+
+def test_partial_fit_refuses_other_outputs():
+    m = ResidualRegressor(evgp()).partial_fit(X, Y)
+    with pytest.raises(ValueError, match="y has 1 outputs, but the model has 2"):
+        m.partial_fit(X, Y[:, 0])
+
+
+# --- scikit-learn's conventions -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("regressor", [SVR(), LinearRegression(), evgp()], ids=str)
+def test_outputs_are_as_many_as_the_regressor_takes(regressor):
+    tags, own = get_tags(ResidualRegressor(regressor)), get_tags(regressor)
+    assert tags.target_tags == own.target_tags
+    assert not tags.input_tags.sparse
+    assert tags.estimator_type == "regressor"
+
+
+@pytest.mark.parametrize("method", ["fit", "partial_fit"])
+def test_weights_reach_the_regressor(method):
+    weight = RNG.uniform(size=60)
+    m = getattr(ResidualRegressor(Recorder()), method)(X, Y[:, 0], sample_weight=weight)
+    assert m.regressor_.fit_given_[2] is weight
+
+
+def test_weighted_regressions_are_those_of_the_change():
+    weight = RNG.uniform(size=60)
+    m = ResidualRegressor(Ridge()).fit(X, Y, sample_weight=weight)
+    np.testing.assert_array_equal(m.regressor_.coef_, Ridge().fit(X, Y - X[:, :2], sample_weight=weight).coef_)
+
+
+@pytest.mark.parametrize("method", ["fit", "partial_fit"])
+def test_routed_weights_reach_the_regressor_if_it_requests_them(routing, method):
+    weight = RNG.uniform(size=60)
+    request = {f"set_{method}_request": {"sample_weight": True}}
+    inner = Recorder()
+    for setter, wanted in request.items():
+        inner = getattr(inner, setter)(**wanted)
+    m = getattr(ResidualRegressor(inner), method)(X, Y[:, 0], sample_weight=weight)
+    assert m.regressor_.fit_given_[2] is weight
+
+
+def test_weights_that_are_not_requested_are_refused_with_routing(routing):
+    with pytest.raises(sklearn.exceptions.UnsetMetadataPassedError, match="sample_weight"):
+        ResidualRegressor(Recorder()).fit(X, Y[:, 0], sample_weight=np.ones(60))
+
+
+def test_weights_are_routed_through_a_cross_validation(routing):
+    weight = np.where(np.arange(60) % 3 == 0, 1e-9, 1.0)
+    m = ResidualRegressor(Ridge().set_fit_request(sample_weight=True)).set_score_request(sample_weight=True)
+    found = cross_validate(m, X, Y, params={"sample_weight": weight}, cv=2, return_estimator=True)
+    half = slice(30, 60)
+    direct = Ridge().fit(X[half], Y[half] - X[half, :2], sample_weight=weight[half])
+    np.testing.assert_array_equal(found["estimator"][0].regressor_.coef_, direct.coef_)
+    score = r2_score(Y[:30], direct.predict(X[:30]) + X[:30, :2], sample_weight=weight[:30])
+    assert found["test_score"][0] == pytest.approx(score, rel=1e-12)
+
+
+def test_keywords_of_predict_pass_with_routing_too(routing):
+    m = ResidualRegressor(evgp()).fit(X, Y)
+    assert len(m.predict(X_NEW, return_std=True)) == 2
+
+
+# --- errors -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("base", "message"),
+    [
+        ([0], r"base=\[0\] must be one index or name .* n_outputs=2"),
+        ([0.0, 1.0], "must be one index or name"),
+        ([[0, 1]], "must be one index or name"),
+        ([0, 3], r"base=\[0, 3\] must be below the 3 columns"),
+        ([0, -4], r"base=\[0, -4\] must be below the 3 columns"),
+        (["angle", "torque"], r"base=\['angle', 'torque'\] must name columns of X; .*\['angle', 'speed', 'force'\]"),
+        ([True, False], "must be one index or name"),
+    ],
+)
+def test_a_base_that_is_not_in_x_is_refused(base, message):
+    with pytest.raises(ValueError, match=message):
+        ResidualRegressor(LinearRegression(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y)
+
+
+def test_names_need_a_data_frame():
+    with pytest.raises(ValueError, match=r"must name columns of X; its columns' names are \[\]"):
+        ResidualRegressor(LinearRegression(), base=["angle", "speed"]).fit(X, Y)
+
+
+def test_more_outputs_than_columns_are_refused():
+    with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
+        ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
+    assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
+
+
+def test_it_predicts_after_a_fit_only():
+    m = ResidualRegressor(evgp(n_inducing=0))
+    for method in (m.predict, m.sample_y):
+        with pytest.raises(NotFittedError):
+            method(X)
+    with pytest.raises(ValueError, match="n_inducing"):
+        m.fit(X, Y)
+    with pytest.raises(NotFittedError):
+        m.predict(X)
