@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral, Real
 from typing import Any, ClassVar, Protocol
@@ -220,15 +219,6 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
         self._spec, self._single_output = spec, y.ndim == 1
         return Problem(source, frame, spec, vague)
-
-    @contextmanager
-    def _unchanged_if_it_fails(self) -> Iterator[None]:
-        before = dict(vars(self))
-        try:
-            yield
-        except BaseException:
-            self.__dict__ = before
-            raise
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_posterior")

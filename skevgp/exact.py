@@ -17,6 +17,7 @@ from sklearn.utils import check_random_state
 from ._dask import is_dask
 from ._explicit_gp import ExplicitGaussianProcess
 from ._progress import Progress
+from ._validation import unchanged_if_it_fails
 from .inference.exact import ExactFit, ExactOptions
 from .inference.threads import single_threaded_libraries
 
@@ -172,7 +173,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
-        with self._unchanged_if_it_fails(), single_threaded_libraries():
+        with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y, allow_vague=True)
             frame, spec = problem.frame, problem.spec
             self._fitted = ExactFit.fit(

@@ -19,7 +19,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 
 from ._explicit_gp import ExplicitGaussianProcess
 from ._progress import Progress
-from ._validation import as_floats, check_magnitude
+from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
 from .inference.inducing import Placement
 from .inference.learning import Options
 from .inference.outputs import FittedOutputs
@@ -280,7 +280,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
             If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
             kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
         """
-        with self._unchanged_if_it_fails(), single_threaded_libraries():
+        with unchanged_if_it_fails(self), single_threaded_libraries():
             self._fit(X, y)
         for message in self._fitted.messages:
             warnings.warn(message, ConvergenceWarning, stacklevel=2)
@@ -313,7 +313,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         if not hasattr(self, "_fitted"):
             return self.fit(X, y)
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
-        with self._unchanged_if_it_fails(), single_threaded_libraries():
+        with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
             frame, n_outputs = self._fitted.frame, 1 if y.ndim == 1 else y.shape[1]
             if n_outputs != self._n_outputs:
