@@ -18,6 +18,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ._dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from ._data import MappedRows, map_rows
 from ._maps import fit_map
+from ._shapes import like_y
 from ._validation import check_magnitude, check_not_vanishing, is_plain
 from .features.prior import resolve_coef_prior, wide_scale
 from .inference.frame import Frame
@@ -144,7 +145,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if return_cov:
             mean, cov = self._posterior.covariance(*self._inputs_and_features(given, array, slice(None)))
             cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
-            return self._like_y(mean + self._fitted.frame.target_mean), self._like_y(cov)
+            return like_y(mean + self._fitted.frame.target_mean), like_y(cov)
         means, deviations = [], []
         size = self._posterior.rows_at_once
         for first in range(0, len(array), size):
@@ -153,8 +154,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             means.append(mean + self._fitted.frame.target_mean)
             if variance is not None:
                 deviations.append(np.sqrt(variance + noise))
-        mean = self._like_y(np.concatenate(means))
-        return (mean, self._like_y(np.concatenate(deviations))) if return_std else mean
+        mean = like_y(np.concatenate(means))
+        return (mean, like_y(np.concatenate(deviations))) if return_std else mean
 
     def sample_y(
         self,
@@ -277,7 +278,3 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def _n_outputs(self) -> int:
         return len(self._posterior.noise)
-
-    def _like_y(self, values: np.ndarray) -> np.ndarray:
-        """Drop the axis of outputs if there is one output, as GaussianProcessRegressor does."""
-        return values[..., 0] if values.shape[-1] == 1 else values

@@ -16,6 +16,7 @@ from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._progress import Progress
+from ._shapes import like_y
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .inference.network import VariationalNetwork
 from .inference.threads import single_threaded_libraries
@@ -246,11 +247,11 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             deviations = np.moveaxis(functions - mean, 2, 0)  # (n_outputs, n_samples, rows)
             cov = np.moveaxis(deviations.transpose(0, 2, 1) @ deviations, 0, 2) / len(functions)
             cov = (cov + np.eye(len(X))[:, :, np.newaxis] * noise) * scale**2
-            return self._like_y(mean * scale + offset), self._like_y(cov)
+            return like_y(mean * scale + offset), like_y(cov)
         moments = [self._moments(X[rows]) for rows in self._blocks(len(X))]
         mean, variance = (np.concatenate(parts) for parts in zip(*moments, strict=True))
-        mean = self._like_y(mean * scale + offset)
-        return (mean, self._like_y(np.sqrt(variance + noise) * scale)) if return_std else mean
+        mean = like_y(mean * scale + offset)
+        return (mean, like_y(np.sqrt(variance + noise) * scale)) if return_std else mean
 
     def sample_y(
         self,
@@ -397,7 +398,3 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _moments(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         functions = self._network.functions(self._theta, self._weights, self._scaling.inputs(X))
         return functions.mean(axis=0), functions.var(axis=0)
-
-    def _like_y(self, values: np.ndarray) -> np.ndarray:
-        """Drop the axis of outputs if there is one output, as GaussianProcessRegressor does."""
-        return values[..., 0] if values.shape[-1] == 1 else values

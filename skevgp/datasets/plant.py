@@ -8,7 +8,6 @@ import numpy as np
 from scipy.integrate import DOP853, OdeSolver, Radau
 from scipy.sparse import eye_array, kron
 
-from .._optional import require
 from ..robots import RigidBody, layout_of, load_robot
 from ..robots.loading import Robot, effort_limits
 
@@ -46,20 +45,15 @@ class Plant:
         self.layout = layout_of(self.model)
         self.body = RigidBody(self.model)
         self._damping = np.array(self.model.damping)
-        self._driven = np.array(self.layout.driven)
-        self.limits = effort_limits(self.model)[:, self._driven]
+        self.limits = effort_limits(self.model)[:, list(self.layout.driven)]
 
     def accelerations(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
         """Joint accelerations under inputs u, of shape (n, n_inputs)."""
-        force = -self._damping * v
-        force[:, self._driven] += u
-        return self.body.accelerations(q, v, force)
+        return self.body.accelerations_under(q, v, u)
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """M(q) of one configuration, of shape (n_joints, n_joints), or an error if it is singular."""
-        pin = require("pinocchio", "Rigid-body dynamics")
-        upper = np.triu(pin.crba(self.model, self.model.createData(), q))
-        M = upper + np.triu(upper, 1).T
+        M = self.body.mass_matrix(q)
         eigenvalues, eigenvectors = np.linalg.eigh(M)
         null = eigenvectors[:, eigenvalues <= _SINGULAR * eigenvalues[-1]]
         if null.size:

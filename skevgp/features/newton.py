@@ -12,8 +12,8 @@ from sklearn.base import clone
 from sklearn.utils._param_validation import Interval
 
 from .._validation import as_floats
-from ..robots import SYSTEMS, Layout, System, get_system
-from ..robots.loading import Robot, owned
+from ..robots import Layout
+from ..robots.loading import Robot, named_system, read_once
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
 from .robot_map import RobotMap
 
@@ -259,7 +259,7 @@ class InertiaForceGravity(_NewtonFeatures):
                 )
             if features.robot is None:
                 features.robot = robot
-        elif robot is None or _has_sines(robot):
+        elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
             features = SineGravity(robot, self.unknown_scale, self.free_scale)
         else:
             features = LinkGravity(
@@ -278,7 +278,7 @@ class InertiaForceGravity(_NewtonFeatures):
 
     def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
         fitted = hasattr(self, "_gravity")
-        features = self._gravity if fitted else self._gravity_map(owned(self.robot), layout.n_columns)
+        features = self._gravity if fitted else self._gravity_map(read_once(self.robot), layout.n_columns)
         mean, scale = features._prior(layout)
         acts_on, gain = features._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
         if gain.shape != acts_on.shape or not np.isfinite(gain).all():
@@ -286,8 +286,3 @@ class InertiaForceGravity(_NewtonFeatures):
         mean[layout.n_joints :] = np.where(acts_on, 0.0 - self.dt * gain, 0.0)
         of_inertia, scale_of_inertia = super()._prior(layout)
         return np.hstack([of_inertia, mean]), np.hstack([scale_of_inertia, scale])
-
-
-def _has_sines(robot: Robot) -> bool:
-    named = isinstance(robot, System) or (isinstance(robot, str) and robot in SYSTEMS)
-    return named and bool(get_system(robot).gravity)

@@ -128,10 +128,7 @@ class NominalDynamics(RobotMap):
         self._terms = tuple(self.terms)
         if robot is None:
             return
-        model = load_robot(robot)
-        self._body = RigidBody(model)
-        self._damping = np.array(model.damping)
-        self._driven = np.array(self._layout.driven)
+        self._body = RigidBody(load_robot(robot))
         # A massless tip makes the mass matrix singular in nearly every configuration: say so before the data are seen.
         self._features(np.random.RandomState(0).uniform(-1.0, 1.0, (1, self._layout.n_columns)))
 
@@ -144,15 +141,13 @@ class NominalDynamics(RobotMap):
         if self.robot is None:
             return X.copy()
         n = self._layout.n_joints
-        q, v = X[:, :n], X[:, n : 2 * n]
-        force = np.zeros_like(q)
-        force[:, self._driven] = X[:, 2 * n :]
+        q, v, u = X[:, :n], X[:, n : 2 * n], X[:, 2 * n :]
         body = self._body
         columns = {
-            "acceleration": lambda: body.accelerations(q, v, force - self._damping * v),
+            "acceleration": lambda: body.accelerations_under(q, v, u),
             "gravity": lambda: body.gravity(q),
             "bias": lambda: body.forces(q, v, np.zeros_like(v)),
-            "input": lambda: body.accelerations_by_force(q, force),
+            "input": lambda: body.accelerations_by_force(q, body.joint_forces(u)),
         }
         features = np.hstack([columns[term]() for term in self._terms])
         if not np.isfinite(features).all():

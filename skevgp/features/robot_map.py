@@ -13,7 +13,7 @@ from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, v
 
 from .._validation import is_plain
 from ..robots import Layout, layout_of
-from ..robots.loading import Robot, owned
+from ..robots.loading import Robot, read_once
 
 
 def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
@@ -58,7 +58,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
             If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
         """
         validate_data(self, X, dtype=np.float64)
-        robot = None if self.robot is None else owned(self.robot)
+        robot = None if self.robot is None else read_once(self.robot)
         if robot is not None:
             self._layout = layout_of(robot)
             if self.n_features_in_ != self._layout.n_columns:
@@ -111,7 +111,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
 
     def _prepare(self, robot: Robot | None) -> None:
-        """What `fit` keeps of the robot (its own, loaded) besides the layout; nothing here."""
+        """What `fit` keeps of the robot (read) besides the layout; nothing here."""
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         """h(x) of rows (n, n_features_in_); without a robot too."""

@@ -69,10 +69,9 @@ def load_robot(robot: Robot) -> Any:
     >>> model.damping
     array([0.1, 0.1])
     """
-    if isinstance(robot, System):
-        return _plain(_model_of_table(robot), f"The system {robot.name!r}")
-    if isinstance(robot, str) and robot in SYSTEMS:
-        return _model_of_table(SYSTEMS[robot])
+    system = named_system(robot)
+    if system is not None:
+        return _plain(_model_of_table(system), f"The system {system.name!r}")
     if isinstance(robot, (str, os.PathLike)):
         path = _path_of(robot)
         pin = require("pinocchio", "Loading a robot")
@@ -126,10 +125,9 @@ def layout_of(robot: Robot) -> Layout:
     -------
     layout : Layout
     """
-    if isinstance(robot, System):
-        return robot.layout
-    if isinstance(robot, str) and robot in SYSTEMS:
-        return SYSTEMS[robot].layout
+    system = named_system(robot)
+    if system is not None:
+        return system.layout
     model = load_robot(robot)
     return Layout(
         model.name,
@@ -139,14 +137,16 @@ def layout_of(robot: Robot) -> Layout:
     )
 
 
-def owned(robot: Robot) -> Robot:
-    """A robot as a fitted object keeps it: a named system as it is, any other as a model of its own.
+def named_system(robot: Robot) -> System | None:
+    """The table of a robot, if it has one: it needs no Pinocchio then."""
+    if isinstance(robot, str):
+        return SYSTEMS.get(robot)
+    return robot if isinstance(robot, System) else None
 
-    Files are read once, and what the user does to a model later changes nothing.
-    """
-    if isinstance(robot, System) or (isinstance(robot, str) and robot in SYSTEMS):
-        return robot
-    return load_robot(robot).copy()
+
+def read_once(robot: Robot) -> Robot:
+    """A named system as it is, any other robot as its model, so that a file is read once."""
+    return load_robot(robot) if named_system(robot) is None else robot
 
 
 def effort_limits(model: Any) -> np.ndarray:
@@ -263,19 +263,9 @@ def _model_of_table(system: System) -> Any:
         )
     model.armature = np.array([link.armature for link in system.links])
     model.damping = np.array([link.damping for link in system.links])
-    set_effort_limits(model, np.array([link.effort for link in system.links]))
+    efforts = np.array([link.effort for link in system.links])
+    model.upperEffortLimit, model.lowerEffortLimit = efforts, -efforts
     return model
-
-
-def set_effort_limits(model: Any, limits: np.ndarray) -> None:
-    """Symmetric limits of a model's torques and forces.
-
-    Parameters
-    ----------
-    model : pinocchio.Model
-    limits : ndarray of shape (n_joints,)
-    """
-    model.upperEffortLimit, model.lowerEffortLimit = limits, -limits
 
 
 def _plain(model: Any, called: str) -> Any:
