@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-
-Row = dict[str, str]
+from harness import Row, figure_of, provenance_text, table
+from harness import column as of
 
 
 class Result(NamedTuple):
@@ -77,21 +77,7 @@ def group(rows: list[Row]) -> dict[tuple[str, str, str], list[Row]]:
     return {key: own for key, own in groups.items() if own}
 
 
-def of(rows: list[Row], column: str) -> np.ndarray:
-    return np.array([float(row[column]) for row in rows])
-
-
-def figure_of(value: float) -> str:
-    """Three digits."""
-    return f"{value:#.3g}".rstrip(".")
-
-
-def table(header: list[str], lines: list[list[str]]) -> str:
-    rows = [header, ["---"] * len(header), *lines]
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
-
-
-def markdown(rows: list[Row]) -> str:
+def paragraphs(rows: list[Row]) -> list[str]:
     """A page: the mean Errors of all settings at a glance, then a table of everything for each setting.
 
     Parameters
@@ -101,7 +87,7 @@ def markdown(rows: list[Row]) -> str:
 
     Returns
     -------
-    text : str
+    parts : list of str
     """
     groups = group(rows)
     settings = [setting for setting in STYLES if any(key[2] == setting for key in groups)]
@@ -115,14 +101,12 @@ def markdown(rows: list[Row]) -> str:
         for system in systems
         for model in MODELS
     ]
-    seeds, dates = sorted({int(row["seed"]) for row in rows}), sorted({row["date"] for row in rows})
+    seeds = sorted({int(row["seed"]) for row in rows})
     parts = [
         "# Table 3 of the paper, and ours",
         "Written by `benchmarks/table3.py`. Error is the mean over test rows of the norm of the error, in SI units. "
         f"Noise: {rows[0]['noise']} of each target's standard deviation. Seeds: {', '.join(map(str, seeds))}. "
-        f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}; "
-        f"{'; '.join(sorted({row['versions'] for row in rows}))}; "
-        f"{', '.join(sorted({row['machine'] for row in rows}))}.",
+        f"{provenance_text(rows)}",
     ]
     if rows[0]["size"] == "quick":
         parts.append(
@@ -134,7 +118,7 @@ def markdown(rows: list[Row]) -> str:
         *(part for setting in settings for part in (f"## Setting: {setting}", details(groups, setting))),
         "Each pair is *ours / the paper's*; ours are means over seeds, but for the spread of the Error over seeds "
         "(median and largest). Median and 99 % of rows: quantiles of the error over test rows. NLPD: negative log "
-        "predictive density, nats per row. Seconds: of the fit, on one core.",
+        "predictive density, nats per row. Seconds: processor time of the fit, one thread.",
     ]
     stopped = [
         f"{system} {model} {setting} ({sum(row['converged'] == 'False' for row in own)} of {len(own)})"
@@ -155,7 +139,7 @@ def markdown(rows: list[Row]) -> str:
         )
     if limited:
         parts.append(f"Iterations were limited by `--max-iter` in: {', '.join(limited)}.")
-    return "\n\n".join(part.rstrip("\n") for part in parts) + "\n"
+    return parts
 
 
 def details(groups: dict[tuple[str, str, str], list[Row]], setting: str) -> str:

@@ -4,13 +4,14 @@ import csv
 import runpy
 import sys
 from contextlib import nullcontext
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
 
-from skevgp import EVGPRegressor
+from skevgp import BayesianMLPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity
 from skevgp.metrics import prediction_error, std_norm
@@ -97,6 +98,16 @@ def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
     assert not (tmp_path / "table.csv").exists()
 
 
+def test_a_network_has_a_row_like_the_others():
+    import table3
+
+    row = table3.run(table3.Cell("pendulum", "RES-DBNN", "skevgp-angles", 0, 0.0, "quick", 3))
+    assert (row["n_parameters"], row["max_iter"]) == (634 + 2 * 15, "")
+    assert 1 <= row["n_iter"] <= 400
+    assert np.isnan(row["bound_per_row"])
+    assert 0 < row["error_mean"] < 1
+
+
 def test_noise_is_on_the_targets():
     import table3
 
@@ -111,23 +122,26 @@ def test_noise_is_on_the_targets():
 
 def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():
     """Per output m inducing inputs, 2 m for their values, 2 p for weights, signal and noise; and D lengthscales."""
-    import table3
+    from paper_models import MODELS, SYSTEMS
     from table3_report import PAPER
 
     widths = {"pendulum": (2, 3, 4), "cartpole": (4, 5, 6), "acrobot": (4, 5, 7), "iiwa14": (14, 21, 33)}
     for place, (system, (n_outputs, d, with_gravity)) in enumerate(widths.items()):
-        assert table3.SYSTEMS[place] == system
+        assert SYSTEMS[place] == system
         for name, p in {"VGP": 0, "RES-VGP": 0, "EVGP-IF": d, "EVGP-IFG": with_gravity}.items():
-            m = table3.MODELS[name].sizes[place]
+            m = MODELS[name].sizes[place]
             assert PAPER[system][name].n_parameters == n_outputs * (m * d + 2 * m + 2 * p + 2) + d, (system, name)
+        # Of the network two per weight, one per bias, one noise per output.
+        layers = (d, *MODELS["RES-DBNN"].sizes[place], n_outputs)
+        weights = sum(a * b for a, b in pairwise(layers))
+        assert PAPER[system]["RES-DBNN"].n_parameters == 2 * weights + sum(layers[1:]) + n_outputs
 
 
 def test_settings_are_what_they_say():
-    import table3
+    from paper_models import Fit, build
 
     def built(system, model, setting, seed=0, size="full", max_iter=None):
-        cell = table3.Cell(system, model, setting, seed, 0.0, size, max_iter)
-        return table3.MODELS[model].build(cell, 5)
+        return build(Fit(system, model, setting, seed, size, max_iter))
 
     paper = built("acrobot", "VGP", "paper")
     assert (paper.feature_map, paper.kernel_map, paper.max_iter) == (None, None, None)
@@ -143,6 +157,13 @@ def test_settings_are_what_they_say():
         built("iiwa14", "VGP", "paper", size="quick").max_iter < built("iiwa14", "VGP", "skevgp", size="quick").max_iter
     )
     assert built("iiwa14", "VGP", "paper", size="quick", max_iter=7).max_iter == 7
+
+    standard, narrow = (built("iiwa14", "RES-DBNN", setting).regressor for setting in ("paper", "skevgp"))
+    assert (standard.hidden_layer_sizes, standard.prior_scale) == ((250, 250), 1.0)
+    assert narrow.get_params() == BayesianMLPRegressor((250, 250), random_state=0).get_params()
+    encoder, network = built("pendulum", "RES-DBNN", "skevgp-angles", size="quick").regressor
+    assert isinstance(encoder, AngleEncoder)
+    assert network.max_iter == 400
 
     X = np.random.RandomState(0).uniform(-1, 1, (3, 21))
     physics, nominal = (step for _, step in built("iiwa14", "EVGP-IF", "skevgp-nominal").feature_map.transformer_list)

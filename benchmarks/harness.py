@@ -1,0 +1,188 @@
+"""What the benchmarks share: their options, cells run in processes, and a CSV in which what is finished stays."""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import dataclasses
+import platform
+import signal
+import time
+from collections.abc import Callable, Collection, Iterable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from datetime import UTC, datetime
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import joblib
+import numpy as np
+import scipy
+import sklearn
+
+import skevgp
+
+RESULTS = Path(__file__).parent / "results"
+
+Row = dict[str, str]  # of a CSV
+
+
+def argument_parser(
+    description: str | None, *, quick: str, seeds: str | None = None, systems: Collection[str] = ()
+) -> argparse.ArgumentParser:
+    """With the options of every benchmark.
+
+    Parameters
+    ----------
+    description : str
+        The script's docstring.
+    quick : str
+        What --quick means.
+    seeds : str, default=None
+        What --seeds counts and its default; None is a benchmark without seeds.
+    systems : collection of str, default=()
+        What --systems chooses from; empty is a benchmark of no system.
+
+    Returns
+    -------
+    parser : ArgumentParser
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help=quick)
+    if seeds:
+        parser.add_argument("--seeds", type=int, help=seeds)
+    if systems:
+        parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: all")
+    parser.add_argument(
+        "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: all"
+    )
+    parser.add_argument(
+        "--output", type=Path, help="the CSV; Markdown and PNG are written beside it; default: in benchmarks/results"
+    )
+    return parser
+
+
+def output_path(options: argparse.Namespace, name: str) -> Path:
+    """``--output``, or ``name``.csv in the folder of results, with "_quick" for a quick run."""
+    path = options.output or RESULTS / f"{name}{'_quick' if options.quick else ''}.csv"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def provenance() -> dict[str, str]:
+    """Columns that say when, with what and where a row was measured."""
+    return {
+        "date": datetime.now(UTC).date().isoformat(),
+        "versions": " ".join(f"{package.__name__} {package.__version__}" for package in (skevgp, np, scipy, sklearn)),
+        "machine": platform.processor() or platform.machine(),
+    }
+
+
+def provenance_text(rows: Iterable[Row]) -> str:
+    """The same of many rows, as a sentence of a report."""
+    columns = ({row[name] for row in rows} for name in ("date", "versions", "machine"))
+    dates, versions, machines = (sorted(values) for values in columns)
+    return f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}; {'; '.join(versions)}; {', '.join(machines)}."
+
+
+def read(path: Path) -> list[Row]:
+    """The rows that are there."""
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def append(row: dict[str, Any], path: Path) -> None:
+    """Add a row, below a header of its keys if the file is new."""
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, list(row))
+        if file.tell() == 0:
+            writer.writeheader()
+        writer.writerow(row)
+
+
+def key(cell: Any) -> tuple[str, ...]:
+    """What tells a cell from all others, as a CSV holds it: the fields by which it is compared."""
+    return tuple(str(getattr(cell, field.name)) for field in dataclasses.fields(cell) if field.compare)
+
+
+def run_missing(
+    cells: Sequence[Any],
+    run: Callable[[Any], dict[str, Any]],
+    output: Path,
+    jobs: int,
+    say: Callable[[dict[str, Any]], str],
+) -> int:
+    """Run the cells of which the CSV has no row, in processes, and write each row as it comes.
+
+    Parameters
+    ----------
+    cells : sequence of dataclass
+        Their fields that are compared are columns of the CSV.
+    run : callable
+        cell -> its row; a function of the top level of a module.
+    output : Path
+        The CSV.
+    jobs : int
+        Cells at a time.
+    say : callable
+        row -> what to print of it.
+
+    Returns
+    -------
+    n_failures : int
+        Cells that raised; the others are in the CSV.
+    """
+    names = [field.name for field in dataclasses.fields(cells[0]) if field.compare] if cells else []
+    done = {tuple(row[name] for name in names) for row in read(output)}
+    missing = [cell for cell in cells if key(cell) not in done]
+    print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
+    if not missing:
+        return 0
+    start, n_failures = time.perf_counter(), 0
+    # Fresh processes, since a copy of this one could hold locks of its threads. Ctrl-C ends them: a fit would take it
+    # for the end of its iterations, and go on to the next.
+    with ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_DFL)) as pool:
+        pending = {pool.submit(run, cell): cell for cell in missing}
+        try:
+            for count, future in enumerate(as_completed(pending), start=1):
+                said = f"[{count}/{len(missing)}] {' '.join(key(pending[future]))}: "
+                try:
+                    row = future.result()
+                except Exception as problem:  # hours of other cells are not lost with this one
+                    n_failures += 1
+                    said += f"failed: {type(problem).__name__}: {problem}"
+                else:
+                    append(row, output)
+                    said += say(row)
+                print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
+        except KeyboardInterrupt:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise SystemExit(f"Interrupted. What is finished is in {output}; run again to go on.") from None
+    return n_failures
+
+
+def figure_of(value: float) -> str:
+    """Three digits."""
+    return f"{value:#.3g}".rstrip(".")
+
+
+def table(header: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
+    """In Markdown."""
+    rows = [header, ["---"] * len(header), *lines]
+    return "\n".join(f"| {' | '.join(cells)} |" for cells in rows) + "\n"
+
+
+def column(rows: Iterable[Row], name: str) -> np.ndarray:
+    """Of numbers."""
+    return np.array([float(row[name]) for row in rows])
+
+
+def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> None:
+    """Write paragraphs to the Markdown beside the CSV and print them; say in the exit code if cells failed."""
+    text = "\n\n".join(part.strip("\n") for part in parts) + "\n"
+    output.with_suffix(".md").write_text(text)
+    print(f"\n{text}\n{output.with_suffix('.md')}, {output.with_suffix('.png')}")
+    if n_failures:
+        raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
