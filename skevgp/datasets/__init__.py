@@ -4,10 +4,12 @@ from ..robots import list_robots, load_robot, perturb_robot
 from .control import ComputedTorqueController, quintic_reference
 from .dynamics import make_dynamics
 from .simulation import simulate
+from .snelson import fetch_snelson
 from .toy import make_toy
 
 __all__ = [
     "ComputedTorqueController",
+    "fetch_snelson",
     "list_robots",
     "load_robot",
     "make_dynamics",
