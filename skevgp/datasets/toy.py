@@ -12,9 +12,13 @@ from .._validation import check_integer, check_real
 RandomState = int | np.random.RandomState | None
 
 
+# Height, centre and width of the waves: a broad dip and then faster ups and downs, where Snelson's data have them.
+_WAVES = ((-1.8, 1.45, 0.9), (0.8, 2.6, 0.45), (0.9, 4.4, 0.4), (-0.85, 5.3, 0.45))
+
+
 def _toy_mean(x: np.ndarray) -> np.ndarray:
-    """The noise-free target: waves of uneven height on a line of slope 3, as in the paper's toy figure."""
-    waves = 0.8 * np.cos(3.8 * (x - 2.7)) - 1.6 * np.exp(-2.0 * (x - 1.2) ** 2)
+    """The noise-free target: waves on a line of slope 3, as in the paper's toy figure."""
+    waves = sum(height * np.exp(-(((x - centre) / width) ** 2)) for height, centre, width in _WAVES)
     return 6.0 * waves + 3.0 * x
 
 
@@ -31,8 +35,9 @@ def make_toy(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Generate a wave on a linear trend, the shape of the paper's toy data.
 
-    The paper's figure uses Snelson's 200 points, x in (0, 6), with (y, x) <- (6 y + 3 x, x). These are points of
-    the same shape drawn afresh: a wiggle that a kernel must learn on a trend that ``h(x) = (1, x)`` explains.
+    The paper's figure uses Snelson's 200 points, x in (0, 6), with (y, x) <- (6 y + 3 x, x): see `fetch_snelson`. These
+    are points of the same shape drawn afresh: dips and humps of like places, heights and noise, which a kernel must
+    learn, on a trend that ``h(x) = (1, x)`` explains.
 
     Parameters
     ----------
@@ -57,6 +62,10 @@ def make_toy(
     ------
     ValueError, TypeError
         If an argument is out of its range or of the wrong type.
+
+    See Also
+    --------
+    fetch_snelson : The points of the paper's figure.
 
     Examples
     --------

@@ -1,8 +1,12 @@
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from skevgp.datasets import make_toy
+from skevgp.datasets import fetch_snelson, make_toy
+
+SNELSON = Path(__file__).parents[3] / "shared" / "data" / "snelson"
 
 
 def test_the_default_is_as_large_as_snelsons_data():
@@ -33,20 +37,23 @@ def test_the_noise_has_the_standard_deviation_asked_for():
     assert residual.mean() == pytest.approx(0.0, abs=0.02)
 
 
-def test_the_trend_has_slope_three():
-    """Away from the dip at 1.2 the mean repeats itself on the line."""
+def test_the_mean_is_waves_on_a_line_of_slope_three():
+    """Between the waves, and at both ends, the line is left."""
     toy = make_toy(n_samples=20_000, noise=0.0, random_state=0)
-    x, period = np.linspace(3.6, 4.3, 20), 2.0 * np.pi / 3.8
-    before, after = (np.interp(at, toy.data[:, 0], toy.target) for at in (x, x + period))
-    assert (after - before) / period == pytest.approx(3.0, abs=0.01)
+    x, waves = toy.data[:, 0], toy.target - 3.0 * toy.data[:, 0]
+    assert np.interp([0.0, 3.5, 6.0], x, waves) == pytest.approx(0.0, abs=1.0)
+    extrema = waves[1:-1][np.diff(np.sign(np.diff(waves))) != 0]
+    np.testing.assert_allclose(extrema[np.abs(extrema) > 2.0], [-11.0, 3.2, 5.3, -5.0], atol=0.5)
 
 
-def test_waves_stand_out_from_the_trend():
-    toy = make_toy(n_samples=500, noise=0.0, random_state=0)
-    x = toy.data[:, 0]
-    waves = toy.target - np.polyval(np.polyfit(x, toy.target, 1), x)
-    assert waves.std() > 2.0
-    assert np.count_nonzero(np.diff(np.sign(waves))) >= 5
+@pytest.mark.skipif(not SNELSON.exists(), reason="the real files are not part of the package")
+def test_it_looks_like_snelsons_data():
+    real, toy = fetch_snelson(SNELSON, download_if_missing=False), make_toy(n_samples=20_000, noise=0.0, random_state=0)
+    order = np.argsort(real.data[:, 0])
+    residual = real.target - np.interp(real.data[:, 0], toy.data[:, 0], toy.mean)
+    assert residual.std() == pytest.approx(1.7, rel=0.1)
+    assert np.abs(np.convolve(residual[order], np.ones(15) / 15, "valid")).max() < 1.7
+    assert (toy.data.min(), toy.data.max()) == pytest.approx((real.data.min(), real.data.max()), abs=0.1)
 
 
 def test_the_same_random_state_gives_the_same_bits():
