@@ -29,6 +29,11 @@ def _check_output(output: int, n_outputs: int) -> None:
         raise ValueError(f"output={output!r} must be the index of one of {n_outputs} outputs.")
 
 
+def _one_output(y: ArrayLike, output: int) -> np.ndarray:
+    values = np.asarray(y, dtype=float)
+    return values.reshape(len(values), -1)[:, output]
+
+
 class PosteriorDisplay:
     """Predicted mean with a band of standard deviations, along one axis.
 
@@ -41,6 +46,8 @@ class PosteriorDisplay:
         Observations at the same places.
     inducing_points : ndarray of shape (m,), default=None
         Drawn as crosses along the lower edge.
+    x_train, y_train : ndarray of shape (n_train,), default=None
+        Observations at places of their own, drawn as dots.
 
     Attributes
     ----------
@@ -59,7 +66,8 @@ class PosteriorDisplay:
     >>> from skevgp.plotting import PosteriorDisplay
     >>> X, y = make_toy(random_state=0, return_X_y=True)
     >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, y)
-    >>> display = PosteriorDisplay.from_estimator(model, np.linspace(-1, 7, 50)[:, np.newaxis])
+    >>> X_grid = np.linspace(-1, 7, 50)[:, np.newaxis]
+    >>> display = PosteriorDisplay.from_estimator(model, X_grid, x_train=X[:, 0], y_train=y)
     """
 
     def __init__(
@@ -69,12 +77,16 @@ class PosteriorDisplay:
         std: np.ndarray,
         y: np.ndarray | None = None,
         inducing_points: np.ndarray | None = None,
+        x_train: np.ndarray | None = None,
+        y_train: np.ndarray | None = None,
     ):
         self.x = x
         self.mean = mean
         self.std = std
         self.y = y
         self.inducing_points = inducing_points
+        self.x_train = x_train
+        self.y_train = y_train
 
     @classmethod
     def from_estimator(
@@ -85,6 +97,8 @@ class PosteriorDisplay:
         *,
         output: int = 0,
         x: ArrayLike | None = None,
+        x_train: ArrayLike | None = None,
+        y_train: ArrayLike | None = None,
         ax: Any = None,
         n_std: float = 2.0,
         label: str = "mean",
@@ -102,6 +116,10 @@ class PosteriorDisplay:
             Which output to draw.
         x : array-like of shape (n_samples,), default=None
             Values along the horizontal axis, for example times; by default the only column of X, or the row numbers.
+        x_train : array-like of shape (n_train,), default=None
+            Where on that axis further observations are, for example those of the fit.
+        y_train : array-like of shape (n_train,) or (n_train, n_outputs), default=None
+            These observations.
         ax : matplotlib Axes, default=None
             Where to draw; by default on new axes.
         n_std : float, default=2.0
@@ -116,7 +134,8 @@ class PosteriorDisplay:
         Raises
         ------
         ValueError
-            If y or x does not have a value per row of X, or there is no such output.
+            If y or x does not have a value per row of X, x_train and y_train are not both given or of different
+            lengths, or there is no such output.
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
@@ -135,8 +154,14 @@ class PosteriorDisplay:
             points = None
         places = np.asarray(x, dtype=float)
         check_consistent_length(mean, places, y)
-        observed = None if y is None else np.asarray(y, dtype=float).reshape(len(mean), -1)[:, output]
-        return cls(places, mean, std, observed, points).plot(ax=ax, n_std=n_std, label=label)
+        observed = None if y is None else _one_output(y, output)
+        if (x_train is None) != (y_train is None):
+            raise ValueError(f"x_train and y_train go together; {'x' if x_train is None else 'y'}_train is None.")
+        training: tuple[np.ndarray, ...] = ()
+        if x_train is not None and y_train is not None:
+            check_consistent_length(x_train, y_train)
+            training = np.ravel(np.asarray(x_train, dtype=float)), _one_output(y_train, output)
+        return cls(places, mean, std, observed, points, *training).plot(ax=ax, n_std=n_std, label=label)
 
     def plot(self, ax: Any = None, *, n_std: float = 2.0, label: str = "mean") -> Self:
         """Draw.
@@ -167,6 +192,8 @@ class PosteriorDisplay:
         ax.plot(x, mean, color=_MODEL, label=label)
         if self.y is not None:
             ax.plot(x, self.y[order], color=_TRUTH, linestyle="--", label="observed")
+        if self.x_train is not None:
+            ax.plot(self.x_train, self.y_train, ".", color="0.35", markersize=3, zorder=1, label="training data")
         if self.inducing_points is not None:
             # On the lower edge, whatever the limits: x in data, y in axes units.
             ax.plot(

@@ -121,6 +121,29 @@ def test_the_horizontal_axis_can_be_given():
     assert_array_equal(lines(PosteriorDisplay.from_estimator(fitted(), X, x=times))["mean"].get_xdata(), times)
 
 
+@pytest.mark.parametrize(("targets", "output"), [(y, 0), (Y, 0), (Y, 1)])
+def test_training_data_are_dots_at_places_of_their_own(targets, output):
+    display = PosteriorDisplay.from_estimator(fitted(targets), X[:7], output=output, x_train=X[:, 0], y_train=targets)
+    dots = lines(display)["training data"]
+    assert_array_equal(dots.get_xdata(), X[:, 0])
+    assert_array_equal(dots.get_ydata(), Y[:, output])
+    assert (dots.get_marker(), dots.get_linestyle()) == (".", "None")
+    assert_array_equal(lines(display)["mean"].get_xdata(), X[:7, 0])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"x_train": X[:, 0]}, "x_train and y_train go together; y_train is None"),
+        ({"y_train": y}, "x_train and y_train go together; x_train is None"),
+        ({"x_train": X[:4, 0], "y_train": y}, "inconsistent numbers of samples"),
+    ],
+)
+def test_training_data_that_do_not_fit_are_named(arguments, message):
+    with pytest.raises(ValueError, match=message):
+        PosteriorDisplay.from_estimator(fitted(), X, **arguments)
+
+
 def test_any_regressor_with_a_standard_deviation_works():
     model = GaussianProcessRegressor(alpha=1.0, optimizer=None).fit(X, y)
     display = PosteriorDisplay.from_estimator(model, X)
