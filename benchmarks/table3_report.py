@@ -105,7 +105,7 @@ def paragraphs(rows: list[Row]) -> list[str]:
     parts = [
         "# Table 3 of the paper, and ours",
         "Written by `benchmarks/table3.py`. Error is the mean over test rows of the norm of the error, in SI units. "
-        f"Noise: {rows[0]['noise']} of each target's standard deviation. Seeds: {', '.join(map(str, seeds))}. "
+        f"Noise: {rows[0]['noise']} of each training target's standard deviation. Seeds: {', '.join(map(str, seeds))}. "
         f"{provenance_text(rows)}",
     ]
     if rows[0]["size"] == "quick":
