@@ -305,7 +305,7 @@ def main() -> None:
         __doc__, quick="no restarts, three folds and one seed", seeds="seeds 0, 1, ...; default: 4, of a quick run 1"
     )
     parser.add_argument(
-        "--data", choices=SOURCES, help="default: Snelson's points, or make_toy's if they cannot be had"
+        "--data", "--systems", choices=SOURCES, help="default: Snelson's points, or make_toy's if they cannot be had"
     )
     parser.add_argument("--data-home", type=Path, help="a folder with Snelson's files; default: scikit-learn's")
     options = parser.parse_args()
