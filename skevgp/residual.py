@@ -234,7 +234,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
             return np.arange(n_outputs)
         columns = np.atleast_1d(np.asarray(self.base, dtype=object))
         given = columns.ravel().tolist()
-        if columns.shape != (n_outputs,) or not all(type(c) is not bool and isinstance(c, Integral | str) for c in given):
+        if columns.shape != (n_outputs,) or not all(
+            type(c) is not bool and isinstance(c, Integral | str) for c in given
+        ):
             raise ValueError(
                 f"base={self.base!r} must be one index or name of a column of X for each of n_outputs={n_outputs}."
             )
