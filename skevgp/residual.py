@@ -38,7 +38,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     regressor : estimator
-        A clone of it is fitted. It sees all of X.
+        A clone of it is fitted. It sees all of X. Scaling of columns and encoding of angles belong in here,
+        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``: in front of the whole they would change the
+        base columns too.
     base : int, str or array-like of shape (n_outputs,), default=None
         The column of X from which each output starts: its index, or its name if X is a data frame. None are the first
         ``n_outputs`` columns.

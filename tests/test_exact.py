@@ -323,6 +323,11 @@ def test_only_the_kernel_sees_kernel_map_and_a_data_frame_stays_one():
     np.testing.assert_allclose(direct.predict(100.0 * X), m.predict(frame), rtol=1e-8)
 
 
+def test_a_kernel_that_is_none_is_named():
+    with pytest.raises(ValueError, match=r"kernel: k\(X, X\) must be positive semi-definite"):
+        EGPRegressor(kernel=lambda A, B: A @ B.T - 10.0).fit(X, Y)
+
+
 def test_the_noise_starts_in_one_place():
     with pytest.raises(ValueError, match="either from noise_variance=0.1 or from the WhiteKernel"):
         EGPRegressor(kernel=RBF() + WhiteKernel(), noise_variance=0.1).fit(X, Y)

@@ -16,6 +16,7 @@ from sklearn.svm import SVR
 from sklearn.utils import get_tags
 
 from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp.features import AngleEncoder
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (60, 3))
@@ -143,6 +144,13 @@ def test_the_spread_passes_through_pipelines_around_and_inside(asked, routed):
     np.testing.assert_array_equal(actual, mean + Z_new[:, :2])
     np.testing.assert_array_equal(same, spread)
     np.testing.assert_array_equal(other, evgp().fit(Z, Y - X[:, :2]).predict(Z_new, **{asked: True})[1])
+
+
+def test_angles_are_encoded_for_the_regressor_alone():
+    change = np.sin(X[:, 0]) - 0.3 * np.cos(X[:, 0])
+    m = ResidualRegressor(make_pipeline(AngleEncoder(angles=[0]), LinearRegression())).fit(X, X[:, 0] + change)
+    turned = X + [20.0 * np.pi, 0.0, 0.0]
+    np.testing.assert_allclose(m.predict(turned), turned[:, 0] + change, atol=1e-9)
 
 
 def test_samples_work_for_scikit_learns_gaussian_process_too():
