@@ -19,7 +19,7 @@ from ._dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, pre
 from ._data import MappedRows, map_rows
 from ._maps import fit_map
 from ._shapes import like_y
-from ._validation import check_magnitude, check_not_vanishing, is_plain
+from ._validation import check_integer, check_magnitude, check_not_vanishing, is_plain
 from .features.prior import resolve_coef_prior, wide_scale
 from .inference.frame import Frame
 from .inference.posterior import Posterior
@@ -179,6 +179,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
         """
+        check_integer(n_samples, "n_samples", minimum=1)
         rng = check_random_state(random_state)
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1

@@ -192,5 +192,5 @@ class EGPRegressor(ExplicitGaussianProcess):
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
         if self._fitted.message:
-            warnings.warn(self._fitted.message, ConvergenceWarning, stacklevel=2)
+            warnings.warn(self._fitted.message, ConvergenceWarning, stacklevel=3)
         return self

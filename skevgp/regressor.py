@@ -283,7 +283,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries():
             self._fit(X, y)
         for message in self._fitted.messages:
-            warnings.warn(message, ConvergenceWarning, stacklevel=2)
+            warnings.warn(message, ConvergenceWarning, stacklevel=3)
         return self
 
     @_fit_context(prefer_skip_nested_validation=False)

@@ -16,6 +16,8 @@ from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, proces
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ._validation import as_floats, unchanged_if_it_fails
+
 _DTYPES = [np.float64, np.float32]
 
 
@@ -36,7 +38,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
     Parameters
     ----------
     regressor : estimator
-        A clone of it is fitted. It sees all of X.
+        A clone of it is fitted. It sees all of X. Scaling of columns and encoding of angles belong in here,
+        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``: in front of the whole they would change the
+        base columns too.
     base : int, str or array-like of shape (n_outputs,), default=None
         The column of X from which each output starts: its index, or its name if X is a data frame. None are the first
         ``n_outputs`` columns.
@@ -100,7 +104,8 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         ValueError
             If X has fewer columns than y, or ``base`` does not name a column of X for each output.
         """
-        return self._fit("fit", X, y, params)
+        with unchanged_if_it_fails(self):
+            return self._fit("fit", X, y, params)
 
     @available_if(_regressor_has("partial_fit"))
     @_fit_context(prefer_skip_nested_validation=False)
@@ -123,7 +128,8 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         ValueError
             As `fit`, and if y does not have the outputs of the first call.
         """
-        return self._fit("partial_fit", X, y, params)
+        with unchanged_if_it_fails(self):
+            return self._fit("partial_fit", X, y, params)
 
     def predict(self, X: ArrayLike, **params: Any) -> Any:
         """Predict y: the base columns plus what the regressor predicts.
@@ -199,6 +205,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         first = method == "fit" or not hasattr(self, "regressor_")
         given = X
         X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=_DTYPES)
+        y = y if y.dtype.kind == "f" else as_floats(y, "y")
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         if not first and n_outputs != len(self.base_):
             raise ValueError(f"y has {n_outputs} outputs, but the model has {len(self.base_)}.")
@@ -227,16 +234,18 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
                     "give base the column from which each output starts."
                 )
             return np.arange(n_outputs)
-        base = np.atleast_1d(np.asarray(self.base))
-        if base.dtype.kind in "UO":
-            names = getattr(self, "feature_names_in_", np.empty(0, dtype=object)).tolist()
-            if not set(base.ravel().tolist()) <= set(names):
-                raise ValueError(f"base={self.base!r} must name columns of X; its columns' names are {names}.")
-            base = np.vectorize(names.index, otypes=[np.intp])(base)
-        if base.shape != (n_outputs,) or base.dtype.kind not in "iu":
+        columns = np.atleast_1d(np.asarray(self.base, dtype=object))
+        given = columns.ravel().tolist()
+        if columns.shape != (n_outputs,) or not all(
+            type(c) is not bool and isinstance(c, Integral | str) for c in given
+        ):
             raise ValueError(
                 f"base={self.base!r} must be one index or name of a column of X for each of n_outputs={n_outputs}."
             )
+        names = getattr(self, "feature_names_in_", np.empty(0, dtype=object)).tolist()
+        if not {c for c in given if isinstance(c, str)} <= set(names):
+            raise ValueError(f"base={self.base!r} must name columns of X; its columns' names are {names}.")
+        base = np.array([names.index(c) if isinstance(c, str) else c for c in given])
         if (base < -self.n_features_in_).any() or (base >= self.n_features_in_).any():
             raise ValueError(f"base={self.base!r} must be below the {self.n_features_in_} columns of X.")
         return base.astype(np.intp) % self.n_features_in_

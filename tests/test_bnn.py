@@ -5,6 +5,7 @@ from itertools import pairwise
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.stats import norm
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.metrics import r2_score
@@ -135,6 +136,26 @@ def test_attributes_are_of_a_network_in_the_users_units():
         values = values @ weights + bias
         values = np.where(values > 0.0, values, 0.01 * values) if k < 2 else values
     np.testing.assert_allclose(values, m.predict(1e3 * X_NEW + 7.0), rtol=1e-9)
+
+
+def test_loss_and_predictions_are_those_of_weights_drawn_from_the_attributes():
+    """In the users' units, with the prior's, and nothing of the implementation."""
+    x, y = 1e3 * X[:50] + 7.0, Y[:50] * [1e-3, 10.0]
+    m = model((6,), prior_scale=[0.7, 0.4], max_iter=400, batch_size=50, n_samples=4000).fit(x, y)
+    means, stds, rng, n = m.coefs_, m.coefs_std_, np.random.RandomState(0), 4000
+    first, second = (mean + std * rng.randn(n, *mean.shape) for mean, std in zip(means, stds, strict=True))
+    hidden = (x - m.X_mean_) @ first + m.intercepts_[0]
+    functions = np.where(hidden > 0.0, hidden, 0.01 * hidden) @ second + m.intercepts_[1]
+    likelihood = norm.logpdf(y, functions, np.sqrt(m.noise_variance_)).sum(axis=2).mean()
+    priors = 0.7 / x.std(axis=0)[:, np.newaxis], 0.4 * y.std(axis=0)
+    divergence = sum(
+        np.sum(np.log(prior / std) + (mean**2 + std**2) / (2.0 * prior**2) - 0.5)
+        for prior, mean, std in zip(priors, means, stds, strict=True)
+    )
+    assert np.mean(m.loss_curve_[-50:]) == pytest.approx(divergence / 50 - likelihood, abs=0.02)
+    predicted, std = m.predict(x, return_std=True)
+    np.testing.assert_allclose(predicted / y.std(axis=0), functions.mean(axis=0) / y.std(axis=0), atol=0.01)
+    np.testing.assert_allclose(std**2, functions.var(axis=0) + m.noise_variance_, rtol=0.05)
 
 
 def test_samples_have_the_predicted_moments():

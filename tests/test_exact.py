@@ -58,6 +58,11 @@ def test_it_ends_where_the_sparse_model_whose_inducing_points_are_the_rows_ends(
     sparse = EVGPRegressor(TREND, inducing_init=X, tol=1e-4).fit(X, Y[:, 0])
     assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=0.01)
     np.testing.assert_allclose(sparse.predict(X_NEW), exact.predict(X_NEW), atol=0.01)
+    # At the same kernel and noise they are the same but for the jitter of the sparse model.
+    kernel, noise = exact.kernel_, exact.noise_variance_
+    same = EVGPRegressor(TREND, kernel, inducing_init=X, noise_variance=noise, max_iter=0).fit(X, Y[:, 0])
+    for actual, expected in zip(same.predict(X, return_std=True), exact.predict(X, return_std=True), strict=True):
+        np.testing.assert_allclose(actual, expected, atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -281,6 +286,12 @@ def test_shapes_are_those_of_the_sparse_model(y, outputs, n_outputs):
     assert m.n_features_in_ == 2
 
 
+@pytest.mark.parametrize(("n_samples", "error"), [(0, ValueError), (2.5, TypeError)])
+def test_as_many_samples_as_one_can_draw(n_samples, error):
+    with pytest.raises(error, match=f"n_samples must be .*{n_samples}"):
+        fixed().fit(X, Y).sample_y(X_NEW, n_samples)
+
+
 def test_samples_have_the_predicted_moments():
     m = fixed(feature_map=TREND, noise=0.1).fit(X, Y)
     mean, std = m.predict(X_NEW, return_std=True, include_noise=False)
@@ -310,6 +321,11 @@ def test_only_the_kernel_sees_kernel_map_and_a_data_frame_stays_one():
     np.testing.assert_array_equal(m.feature_names_in_, ["a", "b"])
     direct = EGPRegressor(TREND, kernel_map=StandardScaler(), max_iter=0).fit(100.0 * X, Y)
     np.testing.assert_allclose(direct.predict(100.0 * X), m.predict(frame), rtol=1e-8)
+
+
+def test_a_kernel_that_is_none_is_named():
+    with pytest.raises(ValueError, match=r"kernel: k\(X, X\) must be positive semi-definite"):
+        EGPRegressor(kernel=lambda A, B: A @ B.T - 10.0).fit(X, Y)
 
 
 def test_the_noise_starts_in_one_place():
@@ -343,6 +359,13 @@ def test_dask_arrays_are_predicted():
 def test_too_few_iterations_warn_and_say_what_to_change():
     with pytest.warns(ConvergenceWarning, match="likelihood was still rising after max_iter=2 .* Raise max_iter"):
         EGPRegressor(max_iter=2).fit(X, Y)
+
+
+def test_warnings_point_at_the_line_that_fits():
+    for model in (EGPRegressor(max_iter=2), EVGPRegressor(n_inducing=5, max_iter=2)):
+        with pytest.warns(ConvergenceWarning) as warned:
+            model.fit(X, Y)
+        assert {warning.filename for warning in warned} == {__file__}
 
 
 def test_noise_that_explains_everything_warns():

@@ -10,10 +10,13 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.linear_model import LinearRegression, Ridge, SGDRegressor
 from sklearn.metrics import r2_score
 from sklearn.model_selection import cross_validate
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import StandardScaler
 from sklearn.svm import SVR
 from sklearn.utils import get_tags
 
 from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp.features import AngleEncoder
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (60, 3))
@@ -126,6 +129,30 @@ def test_samples_are_the_regressors_plus_the_base(y, base):
     np.testing.assert_array_equal(shifted, samples + X_NEW[:, base].reshape(*samples.shape[:-1], 1))
 
 
+@pytest.mark.parametrize("asked", ["return_std", "return_cov"])
+@pytest.mark.parametrize("routed", [False, True])
+def test_the_spread_passes_through_pipelines_around_and_inside(asked, routed):
+    scale, shift = StandardScaler().fit(X), evgp()
+    Z, Z_new = scale.transform(X), scale.transform(X_NEW)
+    mean, spread = shift.fit(Z, Y - Z[:, :2]).predict(Z_new, **{asked: True})
+    with sklearn.config_context(enable_metadata_routing=routed):
+        inner = evgp().set_predict_request(**{asked: True}) if routed else evgp()
+        around = make_pipeline(StandardScaler(), ResidualRegressor(inner)).fit(X, Y)
+        inside = ResidualRegressor(make_pipeline(StandardScaler(), inner)).fit(X, Y)
+        actual, same = around.predict(X_NEW, **{asked: True})
+        _, other = inside.predict(X_NEW, **{asked: True})
+    np.testing.assert_array_equal(actual, mean + Z_new[:, :2])
+    np.testing.assert_array_equal(same, spread)
+    np.testing.assert_array_equal(other, evgp().fit(Z, Y - X[:, :2]).predict(Z_new, **{asked: True})[1])
+
+
+def test_angles_are_encoded_for_the_regressor_alone():
+    change = np.sin(X[:, 0]) - 0.3 * np.cos(X[:, 0])
+    m = ResidualRegressor(make_pipeline(AngleEncoder(angles=[0]), LinearRegression())).fit(X, X[:, 0] + change)
+    turned = X + [20.0 * np.pi, 0.0, 0.0]
+    np.testing.assert_allclose(m.predict(turned), turned[:, 0] + change, atol=1e-9)
+
+
 def test_samples_work_for_scikit_learns_gaussian_process_too():
     m = ResidualRegressor(GaussianProcessRegressor(random_state=0, optimizer=None, alpha=0.1)).fit(X, Y)
     samples, mean = m.sample_y(X_NEW, 2000), m.predict(X_NEW)
@@ -232,6 +259,8 @@ def test_keywords_of_predict_pass_with_routing_too(routing):
         ([0, -4], r"base=\[0, -4\] must be below the 3 columns"),
         (["angle", "torque"], r"base=\['angle', 'torque'\] must name columns of X; .*\['angle', 'speed', 'force'\]"),
         ([True, False], "must be one index or name"),
+        ([[0], [1, 2]], r"base=\[\[0\], \[1, 2\]\] must be one index or name"),
+        ({}, "base={} must be one index or name"),
     ],
 )
 def test_a_base_that_is_not_in_x_is_refused(base, message):
@@ -248,6 +277,21 @@ def test_more_outputs_than_columns_are_refused():
     with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
         ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
     assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
+
+
+def test_targets_that_are_not_numbers_are_refused():
+    with pytest.raises(ValueError, match="y must be real numbers"):
+        ResidualRegressor(LinearRegression()).fit(X, np.array(["1.0"] * 60))
+
+
+@pytest.mark.parametrize("method", ["fit", "partial_fit"])
+def test_a_fit_that_fails_leaves_the_model_as_it_was(method):
+    m = ResidualRegressor(evgp()).fit(X, Y)
+    before = m.predict(X_NEW)
+    with pytest.raises(ValueError, match="features|columns|base"):
+        getattr(m, method)(X[:, :1], Y)
+    np.testing.assert_array_equal(m.predict(X_NEW), before)
+    assert m.n_features_in_ == 3
 
 
 def test_it_predicts_after_a_fit_only():

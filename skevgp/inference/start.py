@@ -159,7 +159,7 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
     at = kernel.at(np.log(hyperparameters), inducing_points)
     K = at.matrix()
     if not np.isfinite(K).all():
-        raise ValueError("kernel: it is not finite on the inducing points, with its hyperparameters where they start.")
+        raise ValueError("kernel: k(X, X) is not finite, with its hyperparameters where they start.")
     variance = float(np.mean(np.diagonal(K)))
     if np.abs(K - K.T).max() > 1e-8 * np.abs(K).max():
         raise ValueError("kernel: k(X, X) must be symmetric.")
@@ -169,8 +169,8 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
         jittered_cholesky(K)
     except NotPositiveDefiniteError:
         raise ValueError(
-            "kernel: k(X_m, X_m) must be positive semi-definite and not 0; on the inducing points it is not, with its "
-            "hyperparameters where they start. (ExpSineSquared is one of a single column, times others.)"
+            "kernel: k(X, X) must be positive semi-definite and not 0; with its hyperparameters where they start it is "
+            "not. (ExpSineSquared is one of a single column, times others.)"
         ) from None
     difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
     if not difference <= 1e-6 * np.diagonal(K).max():

@@ -96,13 +96,15 @@ def test_the_loss_is_what_brute_force_over_weights_gives(network):
     assert error < 0.1 * abs(brute.mean())
 
 
-def test_local_reparameterisation_gives_the_variance_of_pre_activations():
+def test_local_reparameterisation_gives_the_variance_of_pre_activations_and_outputs():
     network = NETWORKS[2]
     theta, X, _, draws = case(network)
     layers, _ = network.split(theta)
     passed = network._forward(layers, [np.exp(2.0 * layer.log_std) for layer in layers], X, draws)
-    for k, weights in enumerate(network.draw(theta, 40_000, np.random.default_rng(0))[:-1]):
-        np.testing.assert_allclose((passed.inputs[k] @ weights).var(axis=0), passed.spreads[k] ** 2, rtol=0.04)
+    variances = [*(spread**2 for spread in passed.spreads), passed.variance]
+    drawn = network.draw(theta, 40_000, np.random.default_rng(0))
+    for inputs, weights, variance in zip(passed.inputs, drawn, variances, strict=True):
+        np.testing.assert_allclose((inputs @ weights).var(axis=0), variance, rtol=0.04)
 
 
 @pytest.mark.parametrize("network", NETWORKS, ids=lambda network: str(network.sizes))
