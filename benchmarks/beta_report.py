@@ -165,7 +165,7 @@ def explanation(rows: list[Row]) -> str:
     )
     said = (
         "The data determine what b and the Gaussian process say together: in all fits the sum of *b* and *GP* is the "
-        f"least squares weight, to {np.abs(apart).max():.0e}. How it is divided depends on prior and start."
+        f"least squares weight, to {np.abs(apart).max():.0e}. How it is divided differs between settings and seeds."
     )
     stds = {(setting, model): matrix(own, "std").mean(axis=0) for setting, model, own in groups(rows)}
     models = sorted({model for _, model in stds if {("paper", model), ("skevgp", model)} <= stds.keys()})
@@ -174,7 +174,7 @@ def explanation(rows: list[Row]) -> str:
         said += (
             " The paper's diagonal posterior has the standard deviation of a weight with all others and the Gaussian "
             f"process given; the full posterior's, which knows that they can stand in for each other, is {ratio:.0f} "
-            "times as large (median over weights)."
+            "times as large (median over weights; kernels and noise of the fits differ too)."
         )
     return said
 

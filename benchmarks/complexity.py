@@ -4,7 +4,7 @@ Measures evaluations of the bound with its gradient, steps of Adam in the paper'
 size of fitted models; writes one row per measurement to a CSV, and from the CSV exponents of power laws: a Markdown
 page and a picture.
 
-    python benchmarks/complexity.py          # five minutes of one core
+    python benchmarks/complexity.py          # two minutes of an idle core
     python benchmarks/complexity.py --quick  # few sizes, seconds
 
 Times are processor time of one thread, the fastest of several repeats, on random rows of 5 columns. With --jobs above 1

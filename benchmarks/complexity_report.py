@@ -240,10 +240,12 @@ def explanations(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
         f"- **m³ is the smaller part while rows are many.** An evaluation takes O(N m²) for the rows and O(m³) for the "
         f"matrices. What is left with {FEW} rows is, with points per output, {few[hundred] / many[hundred]:.0%} "
         f"of the time with {MANY} rows at m = {m[hundred]:g}, and {few[-1] / many[-1]:.0%} at m = {last} (shared "
-        f"points: {shared_few[-1] / shared[-1]:.0%}). Both parts are as large with "
+        f"points: {shared_few[-1] / shared[-1]:.0%}). The two parts take as long as each other with "
         f"{equal[large].min():.1f} m to {equal[large].max():.1f} m rows at m from {m[large][0]:g} (shared points: "
         f"{shared_equal[large].min():.1f} m to {shared_equal[large].max():.1f} m). There are usually more rows than "
-        "that, and time grows like m², not m³.",
+        f"that, and time grows like m², not m³. With {FEW} rows, too, it grows more slowly than m³ (from m = "
+        f"{m[-2]:g} to {last} with the power {np.log(few[-1] / few[-2]) / np.log(m[-1] / m[-2]):.2f}): large products "
+        "run at a higher rate than small ones.",
         f"- **A step of Adam** sees {BATCH} rows only: what {FEW} rows take is {adam_few[hundred] / adam[hundred]:.0%} "
         f"of its time at m = {m[hundred]:g} and {adam_few[-1] / adam[-1]:.0%} at m = {last}. From m = {m[-2]:g} to "
         f"{last} its time grows with the power {np.log(adam[-1] / adam[-2]) / np.log(m[-1] / m[-2]):.2f} of m.",
