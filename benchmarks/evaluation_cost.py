@@ -18,16 +18,18 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from threadpoolctl import threadpool_limits
 
 import skevgp
+from skevgp.inference.bounds import PosteriorFamily
 from skevgp.inference.frame import Frame
-from skevgp.inference.inducing import Placement
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
-from skevgp.inference.parameters import Start
+from skevgp.inference.parameters import ParameterTable, Start
+from skevgp.inference.rows import Rows
 from skevgp.inference.source import LocalSource, moments_of_rows
 from skevgp.inference.start import FIRST_NOISE, Starts, spread_of, starting_table
 from skevgp.inference.threads import BlockMap, single_threaded_libraries
@@ -47,9 +49,19 @@ COLUMNS = ["sweep", "name", "n", "m", "d", "outputs", "cores", "evaluation_ms", 
 COLUMNS += ["evaluation_fastest_ms", "floor_fastest_ms", "repeats", "versions", "machine"]
 
 
-@contextmanager
-def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[Callable[[], object]]:
-    """What is measured: () -> bound and gradient in all parameters, of all outputs, with shared inducing points."""
+def problem(
+    n: int,
+    m: int,
+    d: int,
+    n_outputs: int,
+    sharing: Literal["all", "kernel"] = "all",
+    posterior: PosteriorFamily = "full",
+    solver: Literal["lbfgs", "adam"] = "lbfgs",
+) -> tuple[SparseModel, ParameterTable, Rows]:
+    """What a fit minimises over, where it starts.
+
+    Inducing points are drawn as the rows are, however few these may be: the cost does not depend on where they lie.
+    """
     rng = np.random.RandomState(0)
     X = rng.randn(n, d)
     Y = np.sin(X @ rng.randn(d, n_outputs)) + 0.01 * rng.randn(n, n_outputs)
@@ -57,15 +69,23 @@ def evaluation(n: int, m: int, d: int, n_outputs: int, cores: int) -> Iterator[C
     inputs, _, targets = source.sum(moments_of_rows)
     nothing = np.zeros((n_outputs, 0))
     frame = Frame.of(source, inputs, targets, np.zeros(n_outputs), nothing, nothing)
-    rows, kernel = frame.rows(source), SquaredExponential(d)
-    model = SparseModel(kernel, frame.internal_prior(), "full", (slice(0, n_outputs),))
-    points = Placement("k-means", m).points(rows.sample(20 * m, rng).inputs, kernel, np.zeros(d), rng)
+    each = tuple(slice(o, o + 1) for o in range(n_outputs))
+    groups = (slice(0, n_outputs),) if sharing == "all" else each
+    model, rows = SparseModel(SquaredExponential(d), frame.internal_prior(), posterior, groups), frame.rows(source)
+    points = np.repeat(rng.randn(1, m, d), len(groups), axis=0)
     starts, spread = Starts(Start(), Start(), Start()), spread_of(rows.inputs)
-    table = starting_table(
-        spread, points[np.newaxis], frame.target_unit, starts, rows.scatter(), FIRST_NOISE["lbfgs"], d
-    )
+    table = starting_table(spread, points, frame.target_unit, starts, rows.scatter(), FIRST_NOISE[solver], d)
+    return model, table, rows
+
+
+@contextmanager
+def evaluation(
+    n: int, m: int, d: int, n_outputs: int, cores: int, sharing: Literal["all", "kernel"] = "all"
+) -> Iterator[Callable[[], object]]:
+    """What is measured: () -> bound and gradient in all parameters, of all outputs."""
+    model, table, rows = problem(n, m, d, n_outputs, sharing)
     threads = BlockMap(cores)
-    objective = BoundObjective(model, table, rows.blocks(kernel, m, threads))
+    objective = BoundObjective(model, table, rows.blocks(model.kernel, m, threads))
     start = table.start()
 
     def evaluate() -> object:

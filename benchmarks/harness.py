@@ -52,9 +52,9 @@ def argument_parser(
     if seeds:
         parser.add_argument("--seeds", type=int, help=seeds)
     if systems:
-        parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: all")
+        parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: %(default)s")
     parser.add_argument(
-        "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: all"
+        "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: %(default)s"
     )
     parser.add_argument(
         "--output", type=Path, help="the CSV; Markdown and PNG are written beside it; default: in benchmarks/results"
@@ -93,13 +93,13 @@ def read(path: Path) -> list[Row]:
         return list(csv.DictReader(file))
 
 
-def append(row: dict[str, Any], path: Path) -> None:
-    """Add a row, below a header of its keys if the file is new."""
+def append(rows: Sequence[dict[str, Any]], path: Path) -> None:
+    """Add rows, below a header of their keys if the file is new."""
     with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(row))
+        writer = csv.DictWriter(file, list(rows[0]))
         if file.tell() == 0:
             writer.writeheader()
-        writer.writerow(row)
+        writer.writerows(rows)
 
 
 def key(cell: Any) -> tuple[str, ...]:
@@ -109,25 +109,25 @@ def key(cell: Any) -> tuple[str, ...]:
 
 def run_missing(
     cells: Sequence[Any],
-    run: Callable[[Any], dict[str, Any]],
+    run: Callable[[Any], Any],
     output: Path,
     jobs: int,
-    say: Callable[[dict[str, Any]], str],
+    say: Callable[[Any], str],
 ) -> int:
-    """Run the cells of which the CSV has no row, in processes, and write each row as it comes.
+    """Run the cells of which the CSV has no row, in processes, and write what each gives as it comes.
 
     Parameters
     ----------
     cells : sequence of dataclass
         Their fields that are compared are columns of the CSV.
     run : callable
-        cell -> its row; a function of the top level of a module.
+        cell -> its row, or a list of its rows; a function of the top level of a module.
     output : Path
         The CSV.
     jobs : int
         Cells at a time.
     say : callable
-        row -> what to print of it.
+        What ``run`` returned -> what to print of it.
 
     Returns
     -------
@@ -149,13 +149,13 @@ def run_missing(
             for count, future in enumerate(as_completed(pending), start=1):
                 said = f"[{count}/{len(missing)}] {' '.join(key(pending[future]))}: "
                 try:
-                    row = future.result()
+                    result = future.result()
                 except Exception as problem:  # hours of other cells are not lost with this one
                     n_failures += 1
                     said += f"failed: {type(problem).__name__}: {problem}"
                 else:
-                    append(row, output)
-                    said += say(row)
+                    append(result if isinstance(result, list) else [result], output)
+                    said += say(result)
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
@@ -186,3 +186,13 @@ def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> Non
     print(f"\n{text}\n{output.with_suffix('.md')}, {output.with_suffix('.png')}")
     if n_failures:
         raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
+
+
+def save_picture(figure: Any, path: Path) -> None:
+    """Write a figure as a PNG of at most 128 colours, a third of the usual size."""
+    from PIL import Image
+
+    figure.set_dpi(110)
+    figure.canvas.draw()
+    image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)

@@ -1,0 +1,164 @@
+"""Time and space against inducing points, rows, outputs and units, beside the paper's table of complexities.
+
+Measures evaluations of the bound with its gradient, steps of Adam in the paper's setting, steps of the network, and the
+size of fitted models; writes one row per measurement to a CSV, and from the CSV exponents of power laws: a Markdown
+page and a picture.
+
+    python benchmarks/complexity.py          # two minutes of an idle core
+    python benchmarks/complexity.py --quick  # few sizes, seconds
+
+Times are processor time of one thread, the fastest of several repeats, on random rows of 5 columns. With --jobs above 1
+cells share caches, and times are less even.
+"""
+
+from __future__ import annotations
+
+import pickle
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import complexity_report
+import harness
+import numpy as np
+from complexity_report import BATCH, CURVES, NETWORK_BATCH, QUICK
+from evaluation_cost import evaluation, problem
+from sklearn.exceptions import ConvergenceWarning
+from threadpoolctl import threadpool_limits
+
+from skevgp import BayesianMLPRegressor, EVGPRegressor
+from skevgp.inference.adam import adam
+from skevgp.inference.elbo import ElboObjective
+
+N_COLUMNS = 5
+PAPER: dict[str, Any] = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
+# Seconds and number of repeats of a cell: at least, at most.
+PATIENCE, REPEATS = 1.0, (3, 30)
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One measurement; the sizes that a model does not have are 0.
+
+    Attributes
+    ----------
+    what : {"bound", "adam step", "network step", "model", "network"}
+        What is timed, or (the last two) weighed.
+    setting : str
+        Of a bound what the outputs share, of a model "paper" or "skevgp"; else empty.
+    n_rows, n_inducing, n_outputs, n_layers, n_units : int
+    """
+
+    what: str
+    setting: str
+    n_rows: int
+    n_inducing: int
+    n_outputs: int
+    n_layers: int
+    n_units: int
+
+
+def data(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and targets."""
+    rng = np.random.RandomState(0)
+    X = rng.randn(cell.n_rows, N_COLUMNS)
+    return X, np.sin(X @ rng.randn(N_COLUMNS, cell.n_outputs)) + 0.01 * rng.randn(cell.n_rows, cell.n_outputs)
+
+
+@contextmanager
+def bound(cell: Cell) -> Iterator[Callable[[], object]]:
+    """() -> bound and gradient of all outputs; those that share nothing are models of one output, one after another."""
+    alone = cell.setting == "none"
+    n_models, n_outputs = (cell.n_outputs, 1) if alone else (1, cell.n_outputs)
+    with ExitStack() as stack:
+        size = (cell.n_rows, cell.n_inducing, N_COLUMNS, n_outputs)
+        models = [
+            stack.enter_context(evaluation(*size, cores=1, sharing="all" if alone else cell.setting))
+            for _ in range(n_models)
+        ]
+        yield lambda: [evaluate() for evaluate in models]
+
+
+@contextmanager
+def adam_step(cell: Cell) -> Iterator[Callable[[], object]]:
+    """() -> one step in the paper's setting, over all parameters."""
+    size = (cell.n_rows, cell.n_inducing, N_COLUMNS, cell.n_outputs)
+    model, table, rows = problem(*size, PAPER["sharing"], PAPER["posterior"], PAPER["solver"])
+    elbo = ElboObjective(model, table, rows.blocks(model.kernel, cell.n_inducing))
+    objective = elbo.minibatch(rows.batches(model.kernel, BATCH, np.random.RandomState(0)))
+    start, bounds = elbo.table.start(), elbo.table.bounds()
+    yield lambda: adam(objective, start, bounds, max_iter=1, learning_rate=0.1)
+
+
+@contextmanager
+def network_step(cell: Cell) -> Iterator[Callable[[], object]]:
+    """() -> a fit of as many steps as there are batches."""
+    X, Y = data(cell)
+    layers = (cell.n_units,) * cell.n_layers
+    network = BayesianMLPRegressor(layers, batch_size=NETWORK_BATCH, max_iter=1, n_samples=1, random_state=0)
+    yield lambda: network.fit(X, Y)
+
+
+TIMED = {"bound": bound, "adam step": adam_step, "network step": network_step}
+
+
+def timed(cell: Cell) -> dict[str, Any]:
+    """Seconds of each repeat, after a first that does not count."""
+    seconds: list[float] = []
+    with TIMED[cell.what](cell) as work:
+        work()
+        while len(seconds) < REPEATS[0] or (sum(seconds) < PATIENCE and len(seconds) < REPEATS[1]):
+            start = time.process_time()
+            work()
+            seconds.append(time.process_time() - start)
+    n_steps = -(-cell.n_rows // NETWORK_BATCH) if cell.what == "network step" else 1
+    return {"seconds": min(seconds) / n_steps, "seconds_median": np.median(seconds) / n_steps, "repeats": len(seconds)}
+
+
+def weighed(cell: Cell) -> dict[str, Any]:
+    """Parameters of a fitted model, and its bytes in a file."""
+    X, Y = data(cell)
+    if cell.what == "network":
+        regressor = BayesianMLPRegressor((cell.n_units,) * cell.n_layers, max_iter=1, random_state=0)
+    else:
+        points = np.random.RandomState(1).randn(cell.n_inducing, N_COLUMNS)
+        setting = PAPER if cell.setting == "paper" else {}
+        regressor = EVGPRegressor(inducing_init=points, max_iter=0, random_state=0, **setting)
+    regressor.fit(X, Y)
+    # The starting places are an argument, not part of what was learned.
+    fitted = len(pickle.dumps(regressor)) - (0 if cell.what == "network" else len(pickle.dumps(points)))
+    return {"n_parameters": regressor.n_parameters_, "n_bytes": fitted}
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Time or weigh."""
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        measured = timed(cell) if cell.what in TIMED else weighed(cell)
+    names = ("seconds", "seconds_median", "repeats", "n_parameters", "n_bytes")
+    return {**vars(cell), **{name: measured.get(name, "") for name in names}, **harness.provenance()}
+
+
+def say(row: dict[str, Any]) -> str:
+    return f"{1e3 * row['seconds']:.2f} ms" if row["seconds"] else f"{row['n_bytes'] / 1e6:.3f} MB"
+
+
+def main() -> None:
+    parser = harness.argument_parser(__doc__, quick="few sizes")
+    parser.set_defaults(jobs=1)
+    options = parser.parse_args()
+    output = harness.output_path(options, "complexity")
+    curves = QUICK if options.quick else CURVES
+    cells = list(dict.fromkeys(Cell(**sizes) for curve in curves for sizes in curve.cells()))
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    rows = harness.read(output)
+    if not n_failures:
+        complexity_report.plot(curves, rows, output.with_suffix(".png"))
+    harness.write_report([] if n_failures else complexity_report.paragraphs(curves, rows), output, n_failures)
+
+
+if __name__ == "__main__":
+    main()
