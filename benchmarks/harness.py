@@ -6,14 +6,17 @@ import argparse
 import csv
 import dataclasses
 import platform
+import resource
 import signal
+import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from datetime import UTC, datetime
 from multiprocessing import get_context
 from pathlib import Path
-from typing import Any
+from types import TracebackType
+from typing import Any, Self
 
 import joblib
 import numpy as np
@@ -28,7 +31,12 @@ Row = dict[str, str]  # of a CSV
 
 
 def argument_parser(
-    description: str | None, *, quick: str, seeds: str | None = None, systems: Collection[str] = ()
+    description: str | None,
+    *,
+    quick: str,
+    seeds: str | None = None,
+    systems: Collection[str] = (),
+    in_processes: bool = True,
 ) -> argparse.ArgumentParser:
     """With the options of every benchmark.
 
@@ -42,6 +50,8 @@ def argument_parser(
         What --seeds counts and its default; None is a benchmark without seeds.
     systems : collection of str, default=()
         What --systems chooses from; empty is a benchmark of no system.
+    in_processes : bool, default=True
+        Whether there is --jobs; a benchmark of the time on the wall runs one cell after the other.
 
     Returns
     -------
@@ -53,11 +63,12 @@ def argument_parser(
         parser.add_argument("--seeds", type=int, help=seeds)
     if systems:
         parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: all")
+    if in_processes:
+        parser.add_argument(
+            "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: all"
+        )
     parser.add_argument(
-        "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: all"
-    )
-    parser.add_argument(
-        "--output", type=Path, help="the CSV; Markdown and PNG are written beside it; default: in benchmarks/results"
+        "--output", type=Path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
     )
     return parser
 
@@ -102,6 +113,16 @@ def append(row: dict[str, Any], path: Path) -> None:
         writer.writerow(row)
 
 
+def write(rows: Iterable[dict[str, Any]], columns: Sequence[str], path: Path) -> None:
+    """Write rows anew; interrupted, it leaves the file as it was."""
+    new = path.with_suffix(".new")
+    with new.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+    new.replace(path)
+
+
 def key(cell: Any) -> tuple[str, ...]:
     """What tells a cell from all others, as a CSV holds it: the fields by which it is compared."""
     return tuple(str(getattr(cell, field.name)) for field in dataclasses.fields(cell) if field.compare)
@@ -113,6 +134,7 @@ def run_missing(
     output: Path,
     jobs: int,
     say: Callable[[dict[str, Any]], str],
+    fresh: bool = False,
 ) -> int:
     """Run the cells of which the CSV has no row, in processes, and write each row as it comes.
 
@@ -128,6 +150,8 @@ def run_missing(
         Cells at a time.
     say : callable
         row -> what to print of it.
+    fresh : bool, default=False
+        Whether each cell has a process of its own, where memory is measured.
 
     Returns
     -------
@@ -143,7 +167,13 @@ def run_missing(
     start, n_failures = time.perf_counter(), 0
     # Fresh processes, since a copy of this one could hold locks of its threads. Ctrl-C ends them: a fit would take it
     # for the end of its iterations, and go on to the next.
-    with ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_DFL)) as pool:
+    context = get_context("forkserver" if fresh else "spawn")
+    if fresh:  # imported once; a process has no memory of another's fits
+        context.set_forkserver_preload(["skevgp", "skevgp.datasets", "sklearn.gaussian_process", "pinocchio"])
+    with ProcessPoolExecutor(
+        *(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_DFL)),
+        max_tasks_per_child=1 if fresh else None,
+    ) as pool:
         pending = {pool.submit(run, cell): cell for cell in missing}
         try:
             for count, future in enumerate(as_completed(pending), start=1):
@@ -186,3 +216,54 @@ def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> Non
     print(f"\n{text}\n{output.with_suffix('.md')}, {output.with_suffix('.png')}")
     if n_failures:
         raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
+
+
+class PeakMemory(threading.Thread):
+    """How far the anonymous memory of this process (its mapped files are data) rises inside a ``with``.
+
+    Attributes
+    ----------
+    megabytes : float
+        Above what there was before.
+    """
+
+    def __init__(self) -> None:
+        super().__init__(daemon=True)
+        self.before = self.now()
+        self.megabytes = 0.0
+        self._done = threading.Event()
+
+    @staticmethod
+    def now() -> float:
+        try:
+            status = Path("/proc/self/status").read_text()
+            return float(status.split("RssAnon:")[1].split()[0]) / 1024
+        except (OSError, IndexError):
+            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+    def run(self) -> None:
+        while not self._done.wait(0.005):
+            self.megabytes = max(self.megabytes, self.now() - self.before)
+
+    def __enter__(self) -> Self:
+        self.start()
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self._done.set()
+        self.join()
+
+
+def noisy_waves(n_rows: int, n_columns: int, rng: np.random.RandomState) -> Iterator[tuple[np.ndarray, ...]]:
+    """Endless pieces of rows of a smooth function of all columns in [-2, 2], with noise of standard deviation 0.1.
+
+    Yields
+    ------
+    X, y, truth : ndarray of shape (n_rows, n_columns), (n_rows,), (n_rows,)
+        The truth is y without noise.
+    """
+    directions = rng.randn(n_columns, 3) / np.sqrt(n_columns)
+    while True:
+        X = rng.uniform(-2.0, 2.0, (n_rows, n_columns))
+        truth = np.sin(X @ directions).sum(axis=1)
+        yield X, truth + 0.1 * rng.randn(n_rows), truth

@@ -1,0 +1,234 @@
+"""What the rows of against_gpr.py say: a Markdown page and a picture."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from harness import Row, column, figure_of, provenance_text, table
+
+# Colour (Okabe & Ito's palette, safe for colour-blind readers), marker and line of each model.
+STYLES = {
+    "GPR": ("#D55E00", "s", "-"),
+    "EGP": ("#E69F00", "D", "--"),
+    "EVGP": ("#0072B2", "o", "-"),
+    "EGP-IFG": ("#CC79A7", "v", "--"),
+    "EVGP-IFG": ("#009E73", "^", "-"),
+}
+LABELS = {
+    "GPR": "scikit-learn GPR",
+    "EGP": "EGP: exact, as GPR",
+    "EVGP": "EVGP, 100 inducing points",
+    "EGP-IFG": "EGP with gravity's features",
+    "EVGP-IFG": "EVGP with them, 10 or 60 points",
+}
+SYSTEMS = {"pendulum": "pendulum", "cartpole": "cartpole", "smooth": "smooth function with noise, 8 columns"}
+MEASURES = {
+    "fit_seconds": "seconds to fit",
+    "memory_mb": "MB while fitting",
+    "error": "test error",
+    "nlpd": "NLPD, nats per row",
+}
+# Sizes, the largest, over which exponents are fitted.
+N_EXPONENT = 4
+
+Lines = dict[str, dict[int, list[Row]]]
+
+
+def lines_of(rows: list[Row], system: str) -> Lines:
+    """Rows by model and N, seeds together."""
+    own = [row for row in rows if row["system"] == system]
+    return {
+        model: {n: [row for row in of if int(row["n_rows"]) == n] for n in sorted({int(row["n_rows"]) for row in of})}
+        for model in STYLES
+        if (of := [row for row in own if row["model"] == model])
+    }
+
+
+def curve(line: dict[int, list[Row]], name: str) -> tuple[np.ndarray, np.ndarray]:
+    """N and the mean over seeds."""
+    return np.array(list(line), float), np.array([column(own, name).mean() for own in line.values()])
+
+
+def exponent(line: dict[int, list[Row]], name: str) -> float:
+    """Of the power of N, over the largest sizes."""
+    n, values = (values[-N_EXPONENT:] for values in curve(line, name))
+    return float(np.polyfit(np.log(n), np.log(np.maximum(values, 1e-9)), 1)[0]) if len(n) > 1 else np.nan
+
+
+def crossing(one: dict[int, list[Row]], other: dict[int, list[Row]], name: str) -> str:
+    """From which N on the other is below the one, between sizes by the straight line of the picture."""
+    common = [n for n in one if n in other]
+    of = [np.log(np.maximum(curve({n: line[n] for n in common}, name)[1], 1e-9)) for line in (one, other)]
+    ahead, x = of[0] - of[1], np.log(common)
+    if ahead[-1] <= 0.0:
+        return f"not up to {common[-1]}"
+    behind = np.flatnonzero(ahead <= 0.0)
+    if not len(behind):
+        return f"from {common[0]} or fewer"
+    i = behind[-1]
+    return f"from about {figure_of(np.exp(x[i] - ahead[i] * (x[i + 1] - x[i]) / (ahead[i + 1] - ahead[i])))}"
+
+
+def details(lines: Lines) -> str:
+    """Every measure of every model, N from left to right."""
+    sizes = sorted({n for line in lines.values() for n in line})
+    measures = {
+        "fit_seconds": ("fit, s", ""),
+        "predict_seconds": ("predict 1000 rows, s", ""),
+        "memory_mb": ("memory, MB", ""),
+        "error": ("error", ""),
+        "counterpart_error": ("error", ", made exact"),
+        "nlpd": ("NLPD", ""),
+        "counterpart_nlpd": ("NLPD", ", made exact"),
+        "log_likelihood": ("log likelihood / N", ""),
+        "counterpart_log_likelihood": ("log likelihood / N", ", made exact"),
+    }
+    parts = []
+    for name, (measure, suffix) in measures.items():
+        for model, line in lines.items():
+            if suffix and model != "EVGP":
+                continue
+            cells = []
+            for n in sizes:
+                value = column(line[n], name).mean() / (n if "likelihood" in name else 1) if n in line else np.nan
+                cells.append("" if np.isnan(value) else figure_of(value))
+            parts.append([measure, model + suffix, *cells])
+    return table(["", "model", *map(str, sizes)], parts)
+
+
+def verdict(lines: Lines) -> str:
+    """Both regressors without features at the largest N that both were fitted to, and where their lines cross."""
+    gpr, evgp = lines.get("GPR", {}), lines.get("EVGP", {})
+    common = [n for n in gpr if n in evgp]
+    if not common:
+        return ""
+    largest = common[-1]
+    gpr_row, evgp_row = ({name: column(line[largest], name).mean() for name in MEASURES} for line in (gpr, evgp))
+    said = (
+        f"At {largest} rows, the most that GPR was fitted to, it took {figure_of(gpr_row['fit_seconds'])} s and "
+        f"{figure_of(gpr_row['memory_mb'])} MB; EVGP {figure_of(evgp_row['fit_seconds'])} s and "
+        f"{figure_of(evgp_row['memory_mb'])} MB. "
+    )
+    if max(evgp) > largest:
+        n_next = min(n for n in evgp if n > largest)
+        expected = gpr_row["fit_seconds"] * (n_next / largest) ** 3
+        said += (
+            f"At {n_next} rows GPR was expected to take {figure_of(expected)} s (growing with N³) and was left out; "
+            f"EVGP went on to {max(evgp)} rows in {figure_of(column(evgp[max(evgp)], 'fit_seconds').mean())} s and "
+            f"{figure_of(column(evgp[max(evgp)], 'memory_mb').mean())} MB. "
+        )
+    said += (
+        f"EVGP takes less time {crossing(gpr, evgp, 'fit_seconds')} rows and less memory "
+        f"{crossing(gpr, evgp, 'memory_mb')} rows.\n"
+    )
+    for name, what in (("error", "error"), ("nlpd", "NLPD")):
+        better, unknown = [], []
+        for n in common:
+            ours, theirs = column(evgp[n], name).mean(), column(gpr[n], name).mean()
+            if np.isnan(theirs):
+                unknown.append(str(n))
+            elif theirs < ours:
+                difference = (
+                    f"{figure_of(ours / theirs)} times" if name == "error" else f"{figure_of(ours - theirs)} nats"
+                )
+                better.append(f"{n} ({difference})")
+        said += f"\n* {what}: GPR is better than EVGP at {', '.join(better) + ' rows' if better else 'no size'}."
+        if unknown:
+            said += f" It has no NLPD at {', '.join(unknown)} rows: negative variances, rounded up to 0."
+    gaps = [
+        (n, np.mean(column(own, "counterpart_log_likelihood") - column(own, "log_likelihood")) / n)
+        for n, own in evgp.items()
+        if not np.isnan(column(own, "counterpart_log_likelihood")).any()
+    ]
+    if gaps:
+        said += "\n* What sparsity costs (log marginal likelihood of the exact counterpart less EVGP's bound, nats per "
+        said += f"row): {', '.join(f'{figure_of(gap)} at {n}' for n, gap in gaps)}."
+    for model, line in lines.items():
+        warned = {n: own[0]["warning"] for n, own in line.items() if own[0]["warning"]}
+        if warned:
+            said += f"\n* {model} warned at {', '.join(map(str, warned))} rows; at {max(warned)}: {warned[max(warned)]}"
+    return said
+
+
+def paragraphs(rows: list[Row]) -> list[str]:
+    """A page: what is compared, exponents, then what each data set shows and its figures.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV.
+
+    Returns
+    -------
+    parts : list of str
+    """
+    found = {system: lines for system in SYSTEMS if (lines := lines_of(rows, system))}
+    seeds = sorted({int(row["seed"]) for row in rows})
+    exponents = [
+        [system, model, str(max(line)), *(f"{exponent(line, name):.2f}" for name in ("fit_seconds", "memory_mb"))]
+        for system, lines in found.items()
+        for model, line in lines.items()
+    ]
+    parts = [
+        "# EVGPRegressor and GaussianProcessRegressor as N grows",
+        "Written by `benchmarks/against_gpr.py`; its docstring says what the models are. Seconds: of the processor, "
+        "one thread. MB: peak while fitting, above what there was before. Error: mean norm of the error on 4800 test "
+        "rows (of the smooth function against itself without noise), in units of y. NLPD: nats per row. Of the systems "
+        "GPR has one kernel and one noise for all outputs, EVGP and EGP a signal variance and a noise for each. "
+        f"*EVGP, made exact* is GPR with the EVGP's kernel and noise. Seeds: {', '.join(map(str, seeds))}. "
+        f"{provenance_text(rows)}",
+        "## Exponents",
+        f"Time and memory grow with these powers of N, fitted over the {N_EXPONENT} largest sizes of each model; "
+        "memory of a few MB is not fitted well.",
+        table(["data", "model", "largest N", "time", "memory"], exponents),
+    ]
+    for system, lines in found.items():
+        parts += [f"## {SYSTEMS[system].capitalize()}", verdict(lines), details(lines)]
+    return parts
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """Time, memory, error and NLPD over N; a column of panels per data set.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV.
+    path : Path
+        Of the PNG.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot as plt
+
+    found = {system: lines for system in SYSTEMS if (lines := lines_of(rows, system))}
+    figure, grid = plt.subplots(
+        *(len(MEASURES), len(found)),
+        figsize=(0.9 + 2.5 * len(found), 9.0),
+        squeeze=False,
+        sharex="col",
+        layout="constrained",
+    )
+    for panels, (system, lines) in zip(grid.T, found.items(), strict=True):
+        panels[0].set_title(SYSTEMS[system].replace(", ", "\n"), fontsize=10)
+        for axes, name in zip(panels, MEASURES, strict=True):
+            for model, line in lines.items():
+                colour, marker, style = STYLES[model]
+                n, values = curve(line, name)
+                axes.plot(n, values, marker + style, color=colour, markersize=4.5, linewidth=1.4, label=LABELS[model])
+            axes.set_xscale("log")
+            if name != "nlpd":
+                axes.set_yscale("log")
+            axes.grid(alpha=0.25)
+            axes.spines[["top", "right"]].set_visible(False)
+        panels[-1].set_xlabel("rows, N")
+    for axes, label in zip(grid[:, 0], MEASURES.values(), strict=True):
+        axes.set_ylabel(label)
+    handles = {
+        label: handle for axes in grid[0] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(handles.values(), handles, loc="outside upper center", ncols=min(3, 1 + len(found)), frameon=False)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
