@@ -187,7 +187,7 @@ def run(cell: Cell) -> dict[str, Any]:
         warnings.simplefilter("ignore")
         # What is imported and allocated once is not the fit's.
         model.build(cell, train.X).fit(train.X[:10], train.y[:10]).predict(test.X[:10], return_std=True)
-        with warnings.catch_warnings(record=True) as caught, harness.PeakMemory() as memory:
+        with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")
             start = time.process_time()
             regressor.fit(train.X, train.y)
@@ -206,7 +206,7 @@ def run(cell: Cell) -> dict[str, Any]:
         "m": len(regressor.inducing_points_) if isinstance(regressor, EVGPRegressor) else "",
         "fit_seconds": fit_seconds,
         "predict_seconds": 1000.0 * predict_seconds / len(test.X),
-        "memory_mb": memory.megabytes,
+        "memory_mb": memory(),
         "error": prediction_error(test.truth, mean),
         "nlpd": density(test, mean, std),
         "zero_std": np.mean(std <= 0.0),

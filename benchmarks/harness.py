@@ -12,11 +12,11 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from multiprocessing import get_context
 from pathlib import Path
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 import joblib
 import numpy as np
@@ -218,50 +218,36 @@ def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> Non
         raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
 
 
-class PeakMemory(threading.Thread):
-    """How far the anonymous memory of this process (its mapped files are data) rises inside a ``with``.
+def anonymous_memory() -> float:
+    """Of this process, in MB; its mapped files, which are data, are not counted where the system tells them apart."""
+    try:
+        return float(Path("/proc/self/status").read_text().split("RssAnon:")[1].split()[0]) / 1024
+    except (OSError, IndexError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
-    Attributes
-    ----------
-    megabytes : float
-        Above what there was before.
-    """
 
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.before = self.now()
-        self.megabytes = 0.0
-        self._done = threading.Event()
+@contextmanager
+def peak_memory() -> Iterator[Callable[[], float]]:
+    """Gives a function that tells how far memory rose inside the ``with``, in MB."""
+    before = peak = anonymous_memory()
+    done = threading.Event()
 
-    @staticmethod
-    def now() -> float:
-        try:
-            status = Path("/proc/self/status").read_text()
-            return float(status.split("RssAnon:")[1].split()[0]) / 1024
-        except (OSError, IndexError):
-            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    def watch() -> None:
+        nonlocal peak
+        while not done.wait(0.005):
+            peak = max(peak, anonymous_memory())
 
-    def run(self) -> None:
-        while not self._done.wait(0.005):
-            self.megabytes = max(self.megabytes, self.now() - self.before)
-
-    def __enter__(self) -> Self:
-        self.start()
-        return self
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self._done.set()
-        self.join()
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield lambda: peak - before
+    finally:
+        done.set()
+        thread.join()
 
 
 def noisy_waves(n_rows: int, n_columns: int, rng: np.random.RandomState) -> Iterator[tuple[np.ndarray, ...]]:
-    """Endless pieces of rows of a smooth function of all columns in [-2, 2], with noise of standard deviation 0.1.
-
-    Yields
-    ------
-    X, y, truth : ndarray of shape (n_rows, n_columns), (n_rows,), (n_rows,)
-        The truth is y without noise.
-    """
+    """Endless pieces (X, y, y without noise) of a smooth function of columns in [-2, 2], with noise of std 0.1."""
     directions = rng.randn(n_columns, 3) / np.sqrt(n_columns)
     while True:
         X = rng.uniform(-2.0, 2.0, (n_rows, n_columns))

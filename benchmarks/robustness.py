@@ -32,22 +32,8 @@ from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.inference import model as sparse_model
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
-COLUMNS = [
-    *(
-        "part",
-        "case",
-        "variant",
-        "seed",
-        "outcome",
-        "bound_per_row",
-        "gain_per_row",
-        "error",
-        "noise_share",
-        "n_iter",
-        "seconds",
-    ),
-    *("versions", "machine"),
-]
+COLUMNS = ["part", "case", "variant", "seed", "outcome", "bound_per_row", "gain_per_row", "error", "noise_share"]
+COLUMNS += ["n_iter", "seconds", "versions", "machine"]
 FIXED_JITTERS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 # Errors below this share of the target's standard deviation count as equal.
 ERROR_FLOOR = 1e-9

@@ -25,8 +25,6 @@ from skevgp import EVGPRegressor
 from skevgp.inference.objectives import BoundObjective
 
 ENGINES = ("1 thread", "2 threads", "Dask, 2 workers")
-COLUMNS = ["n_rows", "n_columns", "n_inducing", "engine", "max_iter", "evaluation_seconds", "n_evaluations"]
-COLUMNS += ["fit_seconds", "memory_mb", "data_mb", "r2", "noise_sd", "converged", "versions", "machine"]
 N_COLUMNS, N_INDUCING, CHUNK = 8, 100, 50_000
 
 
@@ -107,7 +105,7 @@ def run(cell: Cell) -> dict[str, Any]:
     BoundObjective.__call__ = timed  # type: ignore[method-assign]
     n_jobs = 2 if engine.startswith("2") else 1
     model = EVGPRegressor(n_inducing=N_INDUCING, max_iter=max_iter, n_jobs=n_jobs, random_state=0)
-    with warnings.catch_warnings(record=True) as caught, harness.PeakMemory() as memory:
+    with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
         warnings.simplefilter("always")
         start = time.perf_counter()
         model.fit(X, y)
@@ -117,11 +115,19 @@ def run(cell: Cell) -> dict[str, Any]:
     if client is not None:
         client.close()
         cluster.close()
-    values = (n_rows, N_COLUMNS, N_INDUCING, engine, max_iter, np.median(seconds), len(seconds), fit_seconds)
-    values += (memory.megabytes, 8e-6 * n_rows * (N_COLUMNS + 1), model.score(X, y))
-    values += (np.sqrt(model.noise_variance_), not caught)
     where = harness.provenance()
-    return dict(zip(COLUMNS, (*values, where["versions"], where["machine"]), strict=True))
+    return {
+        **{"n_rows": n_rows, "n_columns": N_COLUMNS, "n_inducing": N_INDUCING, "engine": engine, "max_iter": max_iter},
+        "evaluation_seconds": np.median(seconds),
+        "n_evaluations": len(seconds),
+        "fit_seconds": fit_seconds,
+        "memory_mb": memory(),
+        "data_mb": 8e-6 * n_rows * (N_COLUMNS + 1),
+        "r2": model.score(X, y),
+        "noise_sd": np.sqrt(model.noise_variance_),
+        "converged": not caught,
+        **{name: where[name] for name in ("versions", "machine")},
+    }
 
 
 def say(row: dict[str, Any]) -> str:
@@ -139,14 +145,11 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     for engine, colour, marker in zip(ENGINES, ("#0072B2", "#D55E00", "#009E73"), "os^", strict=True):
-        of = sorted(
-            (float(r["n_rows"]), float(r["evaluation_seconds"]), float(r["memory_mb"]))
-            for r in rows
-            if r["engine"] == engine and int(r["max_iter"]) < 1000
-        )
+        of = [row for row in rows if row["engine"] == engine and int(row["max_iter"]) < 1000]
         if not of:
             continue
-        n, seconds, memory = np.array(of).T
+        of.sort(key=lambda row: int(row["n_rows"]))
+        n, seconds, memory = (harness.column(of, name) for name in ("n_rows", "evaluation_seconds", "memory_mb"))
         left.loglog(n, seconds, marker + "-", color=colour, label=engine)
         right.semilogx(
             n, memory, marker + "-", color=colour, label=engine + (": the client" if "Dask" in engine else "")
@@ -176,11 +179,10 @@ def main() -> None:
         cells = [Cell(n, engine, 8, folder) for n in sizes for engine in options.engines]
         if options.full_fit:
             cells.append(Cell(sizes[-1], "2 threads", 1000, folder))
-        if options.redo and output.exists():
+        if options.redo and (rows := harness.read(output)):
             again = set(map(harness.key, cells))
-            rows = harness.read(output)
             kept = [row for row in rows if (row["n_rows"], row["engine"], row["max_iter"]) not in again]
-            harness.write(kept, COLUMNS, output)
+            harness.write(kept, list(rows[0]), output)
         n_failures = harness.run_missing(cells, run, output, 1, say, fresh=True)
     rows = harness.read(output)
     for engine in ENGINES:
