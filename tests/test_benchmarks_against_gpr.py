@@ -127,6 +127,6 @@ def test_exponents_and_crossings_of_power_laws():
 
     cubic, linear = line(3, 1e-6), line(1, 0.09)
     assert exponent(cubic, "fit_seconds") == pytest.approx(3.0)
-    assert crossing(cubic, linear, "fit_seconds") == "from about 300"
-    assert crossing(cubic, line(1, 1e-6), "fit_seconds") == "from 100 or fewer"
-    assert crossing(linear, line(1, 0.1), "fit_seconds") == "not up to 1600"
+    assert crossing(cubic, linear, "fit_seconds") == "from about 300 rows on"
+    assert crossing(cubic, line(1, 1e-6), "fit_seconds") == "at all of these sizes"
+    assert crossing(linear, line(1, 0.1), "fit_seconds") == "not at 1600 rows"
