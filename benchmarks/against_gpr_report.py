@@ -67,7 +67,7 @@ def crossing(one: dict[int, list[Row]], other: dict[int, list[Row]], name: str) 
     if not len(behind):
         return "at all of these sizes"
     i = behind[-1]
-    return f"from about {figure_of(np.exp(x[i] - ahead[i] * (x[i + 1] - x[i]) / (ahead[i + 1] - ahead[i])))} rows on"
+    return f"from about {np.exp(x[i] - ahead[i] * (x[i + 1] - x[i]) / (ahead[i + 1] - ahead[i])):.0f} rows on"
 
 
 def details(lines: Lines) -> str:
