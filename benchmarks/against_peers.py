@@ -15,7 +15,6 @@ each output, or with sharing="all" what the peer makes of it: skevgp keeps them 
 from __future__ import annotations
 
 import argparse
-import csv
 import os
 import platform
 import subprocess
@@ -26,7 +25,9 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
 
+import harness
 import numpy as np
+from harness import Row
 from peer_jobs import Job, Result
 from peer_models import PEERS
 
@@ -40,7 +41,6 @@ REFERENCE = ("GPflow SGPR", "none")
 QUICK_PEERS = ("skevgp", "scikit-learn GPR", "scikit-learn BayesianRidge")
 # Rows of an exact GP.
 SUBSET = 600
-RESULTS = Path(__file__).parent / "results"
 KEY = ("peer", "dataset", "model", "sharing", "m", "n_train", "seed")
 COLUMNS = (
     *KEY,
@@ -49,8 +49,6 @@ COLUMNS = (
 )
 CURVE_COLUMNS = (*KEY, "seconds_so_far", "cpu_seconds_so_far", "bound_so_far")
 _CURVE_POINTS = 150
-
-Row = dict[str, str]
 
 
 @dataclass(frozen=True)
@@ -224,11 +222,7 @@ class Table:
     """A CSV of rows by key; written anew at each change, so that an interrupted run loses one fit at most."""
 
     def __init__(self, path: Path, columns: tuple[str, ...]):
-        self.path, self.columns = path, columns
-        self.rows: list[Row] = []
-        if path.exists():
-            with path.open(newline="") as file:
-                self.rows = list(csv.DictReader(file))
+        self.path, self.columns, self.rows = path, columns, harness.read(path)
 
     def of(self, key: Row) -> list[Row]:
         return [row for row in self.rows if all(row[name] == value for name, value in key.items())]
@@ -236,13 +230,7 @@ class Table:
     def replace(self, key: Row, rows: list[Row]) -> None:
         """Put rows in place of those of the same key."""
         self.rows = [row for row in self.rows if any(row[name] != key[name] for name in KEY)] + rows
-        self.path.parent.mkdir(parents=True, exist_ok=True)
-        new = self.path.with_suffix(".new")
-        with new.open("w", newline="") as file:
-            writer = csv.DictWriter(file, self.columns)
-            writer.writeheader()
-            writer.writerows(self.rows)
-        new.replace(self.path)
+        harness.write(self.rows, self.columns, self.path)
 
 
 def time_to_reach(curve: list[Row], bound: float, clock: str) -> float:
@@ -299,20 +287,22 @@ def summarise(table: Table, curves: Table) -> None:
 
 
 def arguments() -> argparse.Namespace:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--systems", nargs="+", choices=SYSTEMS, default=list(SYSTEMS), help="default: all")
+    parser = harness.argument_parser(
+        __doc__,
+        quick="a small pendulum in seconds",
+        seeds="seeds 0, 1, ...; default: 1",
+        systems=SYSTEMS,
+        in_processes=False,
+    )
+    parser.set_defaults(seeds=1)
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
     parser.add_argument("--peers", nargs="+", choices=PEERS, metavar="PEER", help=f"of {', '.join(PEERS)}")
     parser.add_argument("--sharing", nargs="+", choices=("none", "all"), default=["none", "all"], help="default: both")
-    parser.add_argument("--seeds", type=int, default=1, help="seeds 0, 1, ...; default: %(default)s")
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch")
     parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
-    parser.add_argument("--quick", action="store_true", help="a small pendulum in seconds")
-    parser.add_argument("--output", type=Path, help="CSV; the curves and the picture go beside it")
     options = parser.parse_args()
-    if options.output is None:
-        options.output = RESULTS / ("against_peers_quick.csv" if options.quick else "against_peers.csv")
+    options.output = harness.output_path(options, "against_peers")
     if options.peers is None:
         options.peers = list(QUICK_PEERS if options.quick else PEERS)
     return options

@@ -10,8 +10,6 @@ threads of its own, the floor in those of BLAS.
 
 from __future__ import annotations
 
-import argparse
-import csv
 import os
 import platform
 import time
@@ -20,6 +18,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Literal
 
+import harness
 import numpy as np
 from threadpoolctl import threadpool_limits
 
@@ -182,12 +181,11 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="a few small sizes")
+    parser = harness.argument_parser(__doc__, quick="a few small sizes", in_processes=False)
     parser.add_argument("--repeats", type=int, default=20, help="default: %(default)s")
     parser.add_argument("--cores", type=int, nargs="+", default=sorted({1, os.cpu_count() or 1}))
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "evaluation_cost.csv")
     options = parser.parse_args()
+    output = harness.output_path(options, "evaluation_cost")
 
     sweeps = QUICK if options.quick else {"data": NAMED, "rows": ROWS, "points": POINTS}
     sizes = [("data", name, size) for name, size in sweeps["data"].items()]
@@ -195,7 +193,6 @@ def main() -> None:
     versions = f"skevgp {skevgp.__version__} numpy {np.__version__}"
     machine = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
     rows = []
-    options.output.parent.mkdir(parents=True, exist_ok=True)
     titles = ("", "rows", "points", "columns", "outputs", "cores", "ms", "floor", "ratio", "of fastest")
     print("".join(f"{title:>11s}" for title in titles))
     for sweep, name, size in sizes:
@@ -206,11 +203,8 @@ def main() -> None:
             rows.append(dict(zip(COLUMNS, map(str, values), strict=True)))
             numbers = "".join(f"{value:11d}" for value in (*size, cores))
             print(f"{name:>11s}{numbers}{median[0]:11.2f}{median[1]:11.2f}{ratio:11.2f}{of_fastest:11.2f}", flush=True)
-            with options.output.open("w", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                writer.writerows(rows)
-    draw(rows, options.output.with_suffix(".png"))
+            harness.write(rows, COLUMNS, output)
+    draw(rows, output.with_suffix(".png"))
 
 
 if __name__ == "__main__":

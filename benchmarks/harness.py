@@ -6,10 +6,13 @@ import argparse
 import csv
 import dataclasses
 import platform
+import resource
 import signal
+import threading
 import time
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from contextlib import contextmanager
 from datetime import UTC, datetime
 from multiprocessing import get_context
 from pathlib import Path
@@ -28,7 +31,12 @@ Row = dict[str, str]  # of a CSV
 
 
 def argument_parser(
-    description: str | None, *, quick: str, seeds: str | None = None, systems: Collection[str] = ()
+    description: str | None,
+    *,
+    quick: str,
+    seeds: str | None = None,
+    systems: Collection[str] = (),
+    in_processes: bool = True,
 ) -> argparse.ArgumentParser:
     """With the options of every benchmark.
 
@@ -42,6 +50,8 @@ def argument_parser(
         What --seeds counts and its default; None is a benchmark without seeds.
     systems : collection of str, default=()
         What --systems chooses from; empty is a benchmark of no system.
+    in_processes : bool, default=True
+        Whether there is --jobs; a benchmark of the time on the wall runs one cell after the other.
 
     Returns
     -------
@@ -53,11 +63,12 @@ def argument_parser(
         parser.add_argument("--seeds", type=int, help=seeds)
     if systems:
         parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: %(default)s")
+    if in_processes:
+        parser.add_argument(
+            "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: %(default)s"
+        )
     parser.add_argument(
-        "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: %(default)s"
-    )
-    parser.add_argument(
-        "--output", type=Path, help="the CSV; Markdown and PNG are written beside it; default: in benchmarks/results"
+        "--output", type=Path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
     )
     return parser
 
@@ -102,6 +113,16 @@ def append(rows: Sequence[dict[str, Any]], path: Path) -> None:
         writer.writerows(rows)
 
 
+def write(rows: Iterable[dict[str, Any]], columns: Sequence[str], path: Path) -> None:
+    """Write rows anew; interrupted, it leaves the file as it was."""
+    new = path.with_suffix(".new")
+    with new.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns)
+        writer.writeheader()
+        writer.writerows(rows)
+    new.replace(path)
+
+
 def key(cell: Any) -> tuple[str, ...]:
     """What tells a cell from all others, as a CSV holds it: the fields by which it is compared."""
     return tuple(str(getattr(cell, field.name)) for field in dataclasses.fields(cell) if field.compare)
@@ -113,6 +134,7 @@ def run_missing(
     output: Path,
     jobs: int,
     say: Callable[[Any], str],
+    fresh: bool = False,
 ) -> int:
     """Run the cells of which the CSV has no row, in processes, and write what each gives as it comes.
 
@@ -128,6 +150,8 @@ def run_missing(
         Cells at a time.
     say : callable
         What ``run`` returned -> what to print of it.
+    fresh : bool, default=False
+        Whether each cell has a process of its own, where memory is measured.
 
     Returns
     -------
@@ -143,7 +167,13 @@ def run_missing(
     start, n_failures = time.perf_counter(), 0
     # Fresh processes, since a copy of this one could hold locks of its threads. Ctrl-C ends them: a fit would take it
     # for the end of its iterations, and go on to the next.
-    with ProcessPoolExecutor(jobs, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_DFL)) as pool:
+    context = get_context("forkserver" if fresh else "spawn")
+    if fresh:  # imported once; a process has no memory of another's fits
+        context.set_forkserver_preload(["skevgp", "skevgp.datasets", "sklearn.gaussian_process", "pinocchio"])
+    with ProcessPoolExecutor(
+        *(jobs, context, signal.signal, (signal.SIGINT, signal.SIG_DFL)),
+        max_tasks_per_child=1 if fresh else None,
+    ) as pool:
         pending = {pool.submit(run, cell): cell for cell in missing}
         try:
             for count, future in enumerate(as_completed(pending), start=1):
@@ -196,3 +226,40 @@ def save_picture(figure: Any, path: Path) -> None:
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
     image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+
+
+def anonymous_memory() -> float:
+    """Of this process, in MB; its mapped files, which are data, are not counted where the system tells them apart."""
+    try:
+        return float(Path("/proc/self/status").read_text().split("RssAnon:")[1].split()[0]) / 1024
+    except (OSError, IndexError):
+        return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+
+@contextmanager
+def peak_memory() -> Iterator[Callable[[], float]]:
+    """Gives a function that tells how far memory rose inside the ``with``, in MB."""
+    before = peak = anonymous_memory()
+    done = threading.Event()
+
+    def watch() -> None:
+        nonlocal peak
+        while not done.wait(0.005):
+            peak = max(peak, anonymous_memory())
+
+    thread = threading.Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield lambda: peak - before
+    finally:
+        done.set()
+        thread.join()
+
+
+def noisy_waves(n_rows: int, n_columns: int, rng: np.random.RandomState) -> Iterator[tuple[np.ndarray, ...]]:
+    """Endless pieces (X, y, y without noise) of a smooth function of columns in [-2, 2], with noise of std 0.1."""
+    directions = rng.randn(n_columns, 3) / np.sqrt(n_columns)
+    while True:
+        X = rng.uniform(-2.0, 2.0, (n_rows, n_columns))
+        truth = np.sin(X @ directions).sum(axis=1)
+        yield X, truth + 0.1 * rng.randn(n_rows), truth

@@ -13,9 +13,6 @@ Writes one row per fit to a CSV (fits that are there already are not repeated) a
 
 from __future__ import annotations
 
-import argparse
-import csv
-import platform
 import time
 import traceback
 import warnings
@@ -24,35 +21,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import harness
 import numpy as np
-import scipy
-import sklearn
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
-import skevgp
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.inference import model as sparse_model
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
-COLUMNS = [
-    *(
-        "part",
-        "case",
-        "variant",
-        "seed",
-        "outcome",
-        "bound_per_row",
-        "gain_per_row",
-        "error",
-        "noise_share",
-        "n_iter",
-        "seconds",
-    ),
-    *("versions", "machine"),
-]
+COLUMNS = ["part", "case", "variant", "seed", "outcome", "bound_per_row", "gain_per_row", "error", "noise_share"]
+COLUMNS += ["n_iter", "seconds", "versions", "machine"]
 FIXED_JITTERS = (1e-4, 1e-6, 1e-8, 1e-10, 1e-12)
 # Errors below this share of the target's standard deviation count as equal.
 ERROR_FLOOR = 1e-9
@@ -337,19 +318,15 @@ def summary(part: str, rows: list[dict[str, Any]]) -> None:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = harness.argument_parser(__doc__, quick="a few fits of each part", in_processes=False)
     parser.add_argument("--parts", nargs="+", choices=PARTS, default=list(PARTS), help="default: all")
     parser.add_argument("--cases", default="", help="only cases whose name contains this")
-    parser.add_argument("--quick", action="store_true", help="a few fits of each part")
     parser.add_argument("--restarts", type=int, default=2, help="of the seeds' part; default: %(default)s")
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "robustness.csv")
     options = parser.parse_args(arguments)
-
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    rows = list(csv.DictReader(options.output.read_text().splitlines())) if options.output.exists() else []
+    output = harness.output_path(options, "robustness")
+    rows: list[dict[str, Any]] = list(harness.read(output))
     done = {(row["part"], row["case"], row["variant"], int(row["seed"])) for row in rows}
-    versions = " ".join(f"{package.__name__} {package.__version__}" for package in (skevgp, np, scipy, sklearn))
-    machine = platform.processor() or platform.machine()
+    where = harness.provenance()
     for part in options.parts:
         for case, variant, seed, run in jobs(part, options.quick, options.restarts, rows):
             if (part, case, variant, seed) in done or options.cases not in case:
@@ -361,16 +338,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
             row = dict.fromkeys(COLUMNS, "") | values
             row |= {"part": part, "case": case, "variant": variant, "seed": seed}
             # Once per run: the file stays small.
-            row |= {"versions": versions, "machine": machine}
-            versions = machine = ""
-            row = {name: str(value) for name, value in row.items()}
-            rows.append(row)
-            new = not options.output.exists()
-            with options.output.open("a", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                if new:
-                    writer.writeheader()
-                writer.writerow(row)
+            row |= {name: where.pop(name, "") for name in ("versions", "machine")}
+            rows.append({name: str(value) for name, value in row.items()})
+            harness.append(row, output)
         summary(part, [row for row in rows if row["part"] == part])
 
 

@@ -11,74 +11,61 @@ and imported packages) are taken. A cell that is in the CSV already is not run a
 
 from __future__ import annotations
 
-import argparse
-import csv
-import json
-import platform
-import resource
-import subprocess
-import sys
 import tempfile
-import threading
 import time
 import warnings
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
+import harness
 import numpy as np
-import scipy
-import sklearn
 
-import skevgp
 from skevgp import EVGPRegressor
 from skevgp.inference.objectives import BoundObjective
 
 ENGINES = ("1 thread", "2 threads", "Dask, 2 workers")
-COLUMNS = ["n_rows", "n_columns", "n_inducing", "engine", "max_iter", "evaluation_seconds", "n_evaluations"]
-COLUMNS += ["fit_seconds", "memory_mb", "data_mb", "r2", "noise_sd", "converged", "versions", "machine"]
 N_COLUMNS, N_INDUCING, CHUNK = 8, 100, 50_000
 
 
 def make_files(folder: Path, n_rows: int) -> tuple[Path, Path]:
     """A smooth function of 8 columns plus noise of standard deviation 0.1, in .npy files, written piece by piece."""
-    rng = np.random.RandomState(0)
-    directions = rng.randn(N_COLUMNS, 3) / np.sqrt(N_COLUMNS)
     paths = folder / f"X{n_rows}.npy", folder / f"y{n_rows}.npy"
     if not paths[1].exists():
         X = np.lib.format.open_memmap(paths[0], "w+", np.float64, (n_rows, N_COLUMNS))
         y = np.lib.format.open_memmap(paths[1], "w+", np.float64, (n_rows,))
-        for first in range(0, n_rows, CHUNK):
-            rows = slice(first, min(first + CHUNK, n_rows))
-            X[rows] = rng.uniform(-2.0, 2.0, (rows.stop - first, N_COLUMNS))
-            y[rows] = np.sin(X[rows] @ directions).sum(axis=1) + 0.1 * rng.randn(rows.stop - first)
+        starts = range(0, n_rows, CHUNK)
+        pieces = harness.noisy_waves(min(CHUNK, n_rows), N_COLUMNS, np.random.RandomState(0))
+        for first, piece in zip(starts, pieces, strict=False):
+            X[first : first + CHUNK], y[first : first + CHUNK] = (part[: n_rows - first] for part in piece[:2])
         X.flush()
         y.flush()
     return paths
 
 
-class PeakMemory(threading.Thread):
-    """The largest anonymous memory of this process (its mapped files are the data), in MB, while it runs."""
+@dataclass(frozen=True)
+class Cell:
+    """One fit.
 
-    def __init__(self) -> None:
-        super().__init__(daemon=True)
-        self.before = self.peak = self.now()
-        self.done = threading.Event()
+    Attributes
+    ----------
+    n_rows : int
+    engine : str
+    max_iter : int
+    folder : Path
+        Of the data.
+    """
 
-    @staticmethod
-    def now() -> float:
-        try:
-            status = Path("/proc/self/status").read_text()
-            return float(status.split("RssAnon:")[1].split()[0]) / 1024
-        except (OSError, IndexError):
-            return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-
-    def run(self) -> None:
-        while not self.done.wait(0.005):
-            self.peak = max(self.peak, self.now())
+    n_rows: int
+    engine: str
+    max_iter: int
+    folder: Path = field(compare=False)
 
 
-def run(n_rows: int, engine: str, max_iter: int, folder: Path) -> dict[str, object]:
+def run(cell: Cell) -> dict[str, Any]:
     """One cell, in this process."""
-    paths = make_files(folder, n_rows)
+    n_rows, engine, max_iter = cell.n_rows, cell.engine, cell.max_iter
+    paths = make_files(cell.folder, n_rows)
     X, y = (np.load(path, mmap_mode="r") for path in paths)
     client = None
     if engine.startswith("Dask"):
@@ -118,25 +105,36 @@ def run(n_rows: int, engine: str, max_iter: int, folder: Path) -> dict[str, obje
     BoundObjective.__call__ = timed  # type: ignore[method-assign]
     n_jobs = 2 if engine.startswith("2") else 1
     model = EVGPRegressor(n_inducing=N_INDUCING, max_iter=max_iter, n_jobs=n_jobs, random_state=0)
-    memory = PeakMemory()
-    memory.start()
-    start = time.perf_counter()
-    with warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
         warnings.simplefilter("always")
+        start = time.perf_counter()
         model.fit(X, y)
-    fit_seconds = time.perf_counter() - start
-    memory.done.set()
-    memory.join()
+        fit_seconds = time.perf_counter() - start
     test = np.random.RandomState(1).randint(n_rows, size=min(n_rows, 5000))
     X, y = (np.load(path, mmap_mode="r")[np.sort(test)] for path in paths)
     if client is not None:
         client.close()
         cluster.close()
-    versions = " ".join(f"{package.__name__} {package.__version__}" for package in (skevgp, np, scipy, sklearn))
-    values = (n_rows, N_COLUMNS, N_INDUCING, engine, max_iter, np.median(seconds), len(seconds), fit_seconds)
-    values += (memory.peak - memory.before, 8e-6 * n_rows * (N_COLUMNS + 1), model.score(X, y))
-    values += (np.sqrt(model.noise_variance_), not caught, versions, platform.processor() or platform.machine())
-    return dict(zip(COLUMNS, values, strict=True))
+    where = harness.provenance()
+    return {
+        **{"n_rows": n_rows, "n_columns": N_COLUMNS, "n_inducing": N_INDUCING, "engine": engine, "max_iter": max_iter},
+        "evaluation_seconds": np.median(seconds),
+        "n_evaluations": len(seconds),
+        "fit_seconds": fit_seconds,
+        "memory_mb": memory(),
+        "data_mb": 8e-6 * n_rows * (N_COLUMNS + 1),
+        "r2": model.score(X, y),
+        "noise_sd": np.sqrt(model.noise_variance_),
+        "converged": not caught,
+        **{name: where[name] for name in ("versions", "machine")},
+    }
+
+
+def say(row: dict[str, Any]) -> str:
+    return (
+        f"{1000 * row['evaluation_seconds']:.1f} ms per evaluation, {row['memory_mb']:.0f} MB, "
+        f"fit {row['fit_seconds']:.1f} s"
+    )
 
 
 def plot(rows: list[dict[str, str]], path: Path) -> None:
@@ -147,14 +145,11 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
 
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     for engine, colour, marker in zip(ENGINES, ("#0072B2", "#D55E00", "#009E73"), "os^", strict=True):
-        of = sorted(
-            (float(r["n_rows"]), float(r["evaluation_seconds"]), float(r["memory_mb"]))
-            for r in rows
-            if r["engine"] == engine and int(r["max_iter"]) < 1000
-        )
+        of = [row for row in rows if row["engine"] == engine and int(row["max_iter"]) < 1000]
         if not of:
             continue
-        n, seconds, memory = np.array(of).T
+        of.sort(key=lambda row: int(row["n_rows"]))
+        n, seconds, memory = (harness.column(of, name) for name in ("n_rows", "evaluation_seconds", "memory_mb"))
         left.loglog(n, seconds, marker + "-", color=colour, label=engine)
         right.semilogx(
             n, memory, marker + "-", color=colour, label=engine + (": the client" if "Dask" in engine else "")
@@ -172,49 +167,24 @@ def plot(rows: list[dict[str, str]], path: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--quick", action="store_true", help="up to 10,000 rows")
+    parser = harness.argument_parser(__doc__, quick="up to 10,000 rows", in_processes=False)
     parser.add_argument("--full-fit", action="store_true", help="also a million rows to convergence, on two threads")
     parser.add_argument("--engines", nargs="+", choices=ENGINES, default=list(ENGINES))
     parser.add_argument("--redo", action="store_true", help="run cells again that are in the CSV")
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "scaling.csv")
-    parser.add_argument("--cell", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    if options.cell:
-        cell = json.loads(options.cell)
-        print(json.dumps(run(cell["n_rows"], cell["engine"], cell["max_iter"], Path(cell["folder"])), default=str))
-        return
-
-    options.output.parent.mkdir(parents=True, exist_ok=True)
+    output = harness.output_path(options, "scaling")
     sizes = (1_000, 10_000) if options.quick else (10_000, 30_000, 100_000, 300_000, 1_000_000)
-    cells = [(n, engine, 8) for n in sizes for engine in options.engines]
-    if options.full_fit:
-        cells.append((sizes[-1], "2 threads", 1000))
-    rows = list(csv.DictReader(options.output.open())) if options.output.exists() else []
-    if options.redo:
-        again = {(str(n), engine, str(max_iter)) for n, engine, max_iter in cells}
-        rows = [row for row in rows if (row["n_rows"], row["engine"], row["max_iter"]) not in again]
-    with tempfile.TemporaryDirectory() as folder:
-        for n_rows, engine, max_iter in cells:
-            if any(
-                (row["n_rows"], row["engine"], row["max_iter"]) == (str(n_rows), engine, str(max_iter)) for row in rows
-            ):
-                continue
-            cell = {"n_rows": n_rows, "engine": engine, "max_iter": max_iter, "folder": folder}
-            command = [sys.executable, __file__, "--cell", json.dumps(cell)]
-            done = subprocess.run(command, check=True, capture_output=True, text=True)
-            row = {name: str(value) for name, value in json.loads(done.stdout.splitlines()[-1]).items()}
-            rows.append(row)
-            rows.sort(key=lambda row: (row["engine"], int(row["max_iter"]), int(row["n_rows"])))
-            with options.output.open("w", newline="") as file:
-                writer = csv.DictWriter(file, COLUMNS)
-                writer.writeheader()
-                writer.writerows(rows)
-            print(
-                f"{n_rows:9,d} rows, {engine:16s}: {1000 * float(row['evaluation_seconds']):8.1f} ms per evaluation, "
-                f"{float(row['memory_mb']):5.0f} MB, fit {float(row['fit_seconds']):6.1f} s",
-                flush=True,
-            )
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        cells = [Cell(n, engine, 8, folder) for n in sizes for engine in options.engines]
+        if options.full_fit:
+            cells.append(Cell(sizes[-1], "2 threads", 1000, folder))
+        if options.redo and (rows := harness.read(output)):
+            again = set(map(harness.key, cells))
+            kept = [row for row in rows if (row["n_rows"], row["engine"], row["max_iter"]) not in again]
+            harness.write(kept, list(rows[0]), output)
+        n_failures = harness.run_missing(cells, run, output, 1, say, fresh=True)
+    rows = harness.read(output)
     for engine in ENGINES:
         of = [
             row
@@ -222,9 +192,12 @@ def main() -> None:
             if row["engine"] == engine and int(row["max_iter"]) < 1000 and int(row["n_rows"]) >= sizes[0]
         ]
         if len(of) > 1:
-            n, seconds = np.array([(float(row["n_rows"]), float(row["evaluation_seconds"])) for row in of]).T
+            n, seconds = (harness.column(of, name) for name in ("n_rows", "evaluation_seconds"))
             print(f"{engine}: slope of log time over log rows {np.polyfit(np.log(n), np.log(seconds), 1)[0]:.2f}")
-    plot(rows, options.output.with_suffix(".png"))
+    if rows:
+        plot(rows, output.with_suffix(".png"))
+    if n_failures:
+        raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
 
 
 if __name__ == "__main__":

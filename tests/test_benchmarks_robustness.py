@@ -20,7 +20,9 @@ def robustness():
     module = importlib.util.module_from_spec(spec)
     # Dataclasses look their module up.
     sys.modules[spec.name] = module
-    spec.loader.exec_module(module)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(PATH.parent))  # where it finds the module beside it
+        spec.loader.exec_module(module)
     yield module
     del sys.modules[spec.name]
 
