@@ -340,7 +340,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             # Once per run: the file stays small.
             row |= {name: where.pop(name, "") for name in ("versions", "machine")}
             rows.append({name: str(value) for name, value in row.items()})
-            harness.append(row, output)
+            harness.append([row], output)
         summary(part, [row for row in rows if row["part"] == part])
 
 
