@@ -51,10 +51,10 @@ class Curve:
         return next((str(size) for size, own in zip(self.n_rows, self.mean, strict=True) if own <= error), "—")
 
     def doubling(self) -> str:
-        """What share of the Error a doubling of the rows leaves, by the last two sizes; in italics if most of it."""
+        """What share of the Error a doubling of the rows leaves, by the last three sizes; in italics if most of it."""
         if len(self.n_rows) < 2:
             return ""
-        ratio = (self.mean[-1] / self.mean[-2]) ** (1 / np.log2(self.n_rows[-1] / self.n_rows[-2]))
+        ratio = 2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(self.mean[-3:]), 1)[0]
         return f"*{ratio:.2f}*" if ratio > PLATEAU else f"{ratio:.2f}"
 
 
@@ -114,7 +114,7 @@ def paragraphs(rows: list[Row]) -> list[str]:
             parts += [
                 f"### {system}",
                 error_table("Error of", models) + f"\nIn the paper, with all rows: {in_the_paper(system)}.",
-                error_table("median row of", medians[system]),
+                error_table("median row of", medians[system], spread=False),
             ]
         parts += ["### What the paper says of it", *claims(curves)]
     limits = sorted(
@@ -132,16 +132,17 @@ def paragraphs(rows: list[Row]) -> list[str]:
     return parts
 
 
-def error_table(corner: str, models: dict[str, Curve]) -> str:
-    """A line per model, a column per number of rows."""
+def error_table(corner: str, models: dict[str, Curve], spread: bool = True) -> str:
+    """A line per model, a column per number of rows: means over runs, and how far these spread."""
     sizes = sorted({size for curve in models.values() for size in curve.n_rows})
     lines = []
     for name, curve in models.items():
         cells = dict.fromkeys(sizes, "")
         for size, errors in zip(curve.n_rows, curve.errors, strict=True):
             own = errors[np.isfinite(errors)]
-            spread = f" ({figure_of(own.min())} to {figure_of(own.max())}, {len(own)})" if len(own) > 1 else ""
-            cells[size] = f"{figure_of(own.mean())}{spread}"
+            cells[size] = figure_of(own.mean())
+            if spread and len(own) > 1:
+                cells[size] += f" ({figure_of(own.min())} to {figure_of(own.max())}, {len(own)})"
         lines.append([name, *cells.values()])
     return table([corner, *(f"{size} rows" for size in sizes)], lines)
 
@@ -170,7 +171,7 @@ def claims(curves: Curves) -> Iterator[str]:
     yield "**EVGP is the most accurate.** The model of the lowest Error, with so many rows (without the nominal arm):"
     yield "\n".join(f"* {system}: {lowest(models)}" for system, models in curves.items())
     yield (
-        "**VGP and RES-VGP plateau.** What a doubling of the rows leaves of the Error, measured over the last step (a "
+        "**VGP and RES-VGP plateau.** What a doubling of the rows leaves of the Error, over the last three sizes (a "
         f"plateau, in italics, is above {PLATEAU}):"
     )
     yield table(
@@ -251,7 +252,7 @@ def plot(rows: list[Row], path: Path) -> None:
                     LearningCurveDisplay(curve.n_rows, curve.errors).plot(axes, label=name, color=COLOURS[name])
             axes.set(xlabel="", ylabel="")
             axes.grid(alpha=0.3)
-            axes.tick_params(labelsize=8)
+            axes.tick_params(labelsize=7)
             axes.spines[["top", "right"]].set_visible(False)
         column[0].set_title(system, fontsize=11)
         column[1].set_xlabel("training rows", fontsize=9)
@@ -269,5 +270,5 @@ def plot(rows: list[Row], path: Path) -> None:
         frameon=False,
         title="a quick run, not to be compared" if rows[0]["size"] == "quick" else None,
     )
-    figure.savefig(path, dpi=110)
+    figure.savefig(path, dpi=110, pil_kwargs={"optimize": True})
     plt.close(figure)
