@@ -126,8 +126,8 @@ def paragraphs(rows: list[Row]) -> list[str]:
         parts.append(f"Iterations of the GPs were limited by `--max-iter`: {text}.")
     stopped = sum(row["converged"] == "False" for row in rows)
     parts.append(
-        "The median row is the median of the error over test rows; the mean is set by the few rows outside the range "
-        f"of the training data. {stopped} of {len(rows)} fits ended with a ConvergenceWarning."
+        "The median row is the median of the error over test rows: far below the Error where few rows make the Error, "
+        f"those far from the training data. {stopped} of {len(rows)} fits ended with a ConvergenceWarning."
     )
     return parts
 
@@ -183,7 +183,7 @@ def claims(curves: Curves) -> Iterator[str]:
     )
     yield (
         "**The gap from RES-DBNN to EVGP-IFG is reduced with more data, and that from IF to IFG.** Difference of the "
-        "Errors, and their ratio:"
+        "Errors, and their ratio (—: there is no gap to begin with):"
     )
     yield table(
         ["system", "from EVGP-IFG to", "with the fewest rows", "with the most", "difference reduced", "ratio reduced"],
@@ -211,10 +211,12 @@ def common(*curves: Curve) -> tuple[np.ndarray, ...]:
 
 
 def gap(other: Curve, ifg: Curve) -> list[str]:
-    """The first and the last, and whether the last is less, as a difference and as a ratio."""
+    """The first and the last, and whether the last is less, as a difference and as a ratio: if there was one."""
     _, other_errors, errors = common(other, ifg)
     differences, ratios = other_errors - errors, other_errors / errors
     cells = [f"{figure_of(differences[end])} (× {figure_of(ratios[end])})" for end in (0, -1)]
+    if differences[0] <= 0:
+        return [*cells, "—", "—"]
     return cells + ["yes" if values[-1] < values[0] else "no" for values in (differences, ratios)]
 
 
@@ -252,7 +254,7 @@ def plot(rows: list[Row], path: Path) -> None:
                     LearningCurveDisplay(curve.n_rows, curve.errors).plot(axes, label=name, color=COLOURS[name])
             axes.set(xlabel="", ylabel="")
             axes.grid(alpha=0.3)
-            axes.tick_params(labelsize=7)
+            axes.tick_params(which="both", labelsize=7)
             axes.spines[["top", "right"]].set_visible(False)
         column[0].set_title(system, fontsize=11)
         column[1].set_xlabel("training rows", fontsize=9)
