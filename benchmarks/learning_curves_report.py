@@ -83,8 +83,9 @@ def curves_of(rows: list[Row], setting: str, measure: str = "error_mean") -> Cur
 
 
 def settings_of(rows: list[Row]) -> list[str]:
-    """Of the file, skevgp first, without the nominal one, which is shown beside it."""
-    return sorted({row["setting"] for row in rows} - {"skevgp-nominal"}, key=lambda name: (name != "skevgp", name))
+    """Of the file, skevgp first; the nominal one is shown with it."""
+    names = {row["setting"].removesuffix("-nominal") for row in rows}
+    return sorted(names, key=lambda name: (name != "skevgp", name))
 
 
 def paragraphs(rows: list[Row]) -> list[str]:
@@ -169,7 +170,7 @@ def claims(curves: Curves) -> Iterator[str]:
             ],
         )
     yield "**EVGP is the most accurate.** The model of the lowest Error, with so many rows (without the nominal arm):"
-    yield "\n".join(f"* {system}: {lowest(models)}" for system, models in curves.items())
+    yield "\n".join(f"* {system}: {lowest(models)}" for system, models in curves.items() if set(models) != {NOMINAL})
     yield (
         "**VGP and RES-VGP plateau.** What a doubling of the rows leaves of the Error, over the last three sizes (a "
         f"plateau, in italics, is above {PLATEAU}):"
@@ -212,7 +213,9 @@ def common(*curves: Curve) -> tuple[np.ndarray, ...]:
 
 def gap(other: Curve, ifg: Curve) -> list[str]:
     """The first and the last, and whether the last is less, as a difference and as a ratio: if there was one."""
-    _, other_errors, errors = common(other, ifg)
+    sizes, other_errors, errors = common(other, ifg)
+    if not len(sizes):
+        return [""] * 4
     differences, ratios = other_errors - errors, other_errors / errors
     cells = [f"{figure_of(differences[end])} (× {figure_of(ratios[end])})" for end in (0, -1)]
     if differences[0] <= 0:

@@ -133,12 +133,16 @@ def test_the_page_tells_means_and_ranges_and_checks_the_claims():
     assert "| pendulum | EVGP-IF | -0.500 (× 0.500) | 0.250 (× 2.00) | — | — |" in never
 
 
-def test_a_page_of_one_model_and_one_size_says_what_it_can():
-    from learning_curves_report import paragraphs
+def test_a_page_of_few_rows_says_what_it_can(tmp_path):
+    from learning_curves_report import paragraphs, plot
 
     page = "\n".join(paragraphs(made_up(VGP={100: [4.0]})))
     assert "| VGP | 4.00 |" in page
     assert "EVGP needs fewer" not in page
+    assert "| EVGP-IF |  |  |" in "\n".join(paragraphs(made_up(EVGP_IF={100: [1.0]}, EVGP_IFG={400: [2.0]})))
+    nominal = [{**row, "system": "iiwa14", "setting": "skevgp-nominal"} for row in made_up(EVGP_IFG={100: [1.0]})]
+    assert "| EVGP-IFG, nominal | 1.00 |" in "\n".join(paragraphs(nominal))
+    plot(nominal, tmp_path / "nominal.png")
 
 
 def test_each_panel_draws_its_models(tmp_path, monkeypatch):
