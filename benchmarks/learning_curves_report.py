@@ -220,6 +220,8 @@ def gap(other: Curve, ifg: Curve) -> list[str]:
     cells = [f"{figure_of(differences[end])} (× {figure_of(ratios[end])})" for end in (0, -1)]
     if differences[0] <= 0:
         return [*cells, "—", "—"]
+    if differences[-1] < 0:
+        return [*cells, "reversed", "reversed"]
     return cells + ["yes" if values[-1] < values[0] else "no" for values in (differences, ratios)]
 
 

@@ -128,7 +128,7 @@ def test_the_page_tells_means_and_ranges_and_checks_the_claims():
     assert "0 of 19 fits ended with a ConvergenceWarning" in page
     worse = "\n".join(paragraphs(made_up(EVGP_IF={100: [1.0], 400: [0.5]}, EVGP_IFG={100: [0.5], 400: [1.5]})))
     assert "Not so: pendulum with 400 rows (1.50 against 0.500)." in worse
-    assert "| pendulum | EVGP-IF | 0.500 (× 2.00) | -1.00 (× 0.333) | yes | yes |" in worse
+    assert "| pendulum | EVGP-IF | 0.500 (× 2.00) | -1.00 (× 0.333) | reversed | reversed |" in worse
     never = "\n".join(paragraphs(made_up(EVGP_IF={100: [0.5], 400: [0.5]}, EVGP_IFG={100: [1.0], 400: [0.25]})))
     assert "| pendulum | EVGP-IF | -0.500 (× 0.500) | 0.250 (× 2.00) | — | — |" in never
 
