@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import time
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import harness
 import numpy as np
 from sklearn.base import RegressorMixin, TransformerMixin
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.pipeline import make_pipeline, make_union
+from sklearn.utils import Bunch
+from threadpoolctl import threadpool_limits
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.datasets import perturb_robot
@@ -166,4 +172,43 @@ def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str,
         "cr2": cr2,
         "cr3": cr3,
         "nlpd": negative_log_predictive_density(target, mean, std),
+    }
+
+
+def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str, Any]:
+    """Fit a model, look at it on test rows, and tell it all in a row of a CSV.
+
+    Parameters
+    ----------
+    fit : Fit
+    train, test : Bunch
+        With ``data`` and ``target``.
+    **columns
+        What else the row tells, of the data.
+
+    Returns
+    -------
+    row : dict
+        ``fit_seconds`` is processor time of one thread.
+    """
+    regressor = build(fit)
+    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ConvergenceWarning)
+        start = time.process_time()
+        regressor.fit(train.data, train.target)
+        seconds = time.process_time() - start
+        mean, std = regressor.predict(test.data, return_std=True)
+    fitted = fitted_part(regressor)
+    return {
+        **{name: getattr(fit, name) for name in ("system", "model", "setting", "seed")},
+        **measures(test.target, mean, std),
+        "n_parameters": fitted.n_parameters_,
+        "fit_seconds": seconds,
+        **columns,
+        "size": fit.size,
+        "max_iter": "" if fit.max_iter is None or fit.model == "RES-DBNN" else fit.max_iter,
+        "n_iter": fitted.n_iter_,
+        "bound_per_row": getattr(fitted, "lower_bound_", np.nan) / len(train.data),
+        "converged": not any(issubclass(warning.category, ConvergenceWarning) for warning in caught),
+        **harness.provenance(),
     }

@@ -21,8 +21,6 @@ acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minu
 from __future__ import annotations
 
 import itertools
-import time
-import warnings
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Any
@@ -30,10 +28,8 @@ from typing import Any
 import harness
 import numpy as np
 import table3_report
-from paper_models import MODELS, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, build, fitted_part, has, measures
-from sklearn.exceptions import ConvergenceWarning
+from paper_models import MODELS, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, fitted_row, has
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 from skevgp.datasets import make_dynamics
 
@@ -76,28 +72,8 @@ def data(system: str, seed: int, noise: float, size: str) -> tuple[Bunch, Bunch]
 def run(cell: Cell) -> dict[str, Any]:
     """Fit one model on one training set, and look at it on one test set."""
     train, test = data(cell.system, cell.seed, cell.noise, cell.size)
-    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter))
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ConvergenceWarning)
-        start = time.process_time()
-        regressor.fit(train.data, train.target)
-        seconds = time.process_time() - start
-        mean, std = regressor.predict(test.data, return_std=True)
-    fitted = fitted_part(regressor)
-    bound = getattr(fitted, "lower_bound_", np.nan) / len(train.data)
-    return {
-        **{name: getattr(cell, name) for name in ("system", "model", "setting", "seed")},
-        **measures(test.target, mean, std),
-        "n_parameters": fitted.n_parameters_,
-        "fit_seconds": seconds,
-        "noise": cell.noise,
-        "size": cell.size,
-        "max_iter": "" if cell.max_iter is None or cell.model == "RES-DBNN" else cell.max_iter,
-        "n_iter": fitted.n_iter_,
-        "bound_per_row": bound,
-        "converged": not any(issubclass(warning.category, ConvergenceWarning) for warning in caught),
-        **harness.provenance(),
-    }
+    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
+    return fitted_row(fit, train, test, noise=cell.noise)
 
 
 def say(row: dict[str, Any]) -> str:

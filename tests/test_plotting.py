@@ -6,14 +6,19 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.linear_model import LinearRegression
+from sklearn.metrics import make_scorer, r2_score
+from sklearn.model_selection import learning_curve
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
-from skevgp.plotting import CoefficientDisplay, PosteriorDisplay
+from skevgp.metrics import prediction_error
+from skevgp.plotting import CoefficientDisplay, LearningCurveDisplay, PosteriorDisplay
 
 mpl.use("Agg")
 X, y = make_toy(30, random_state=0, return_X_y=True)
@@ -33,6 +38,30 @@ def close_figures():
 @pytest.fixture
 def trend():
     return fitted(Y, PolynomialFeatures(1))
+
+
+class Witness(RegressorMixin, BaseEstimator):
+    """It writes down the numbers of its training rows, which are its input; clones write on the same list."""
+
+    def __init__(self, seen=None):
+        self.seen = seen
+
+    def __sklearn_clone__(self):
+        return self
+
+    def fit(self, X, y):
+        self.seen.append(X[:, 0].tolist())
+        return self
+
+    def predict(self, X):
+        return np.zeros((len(X), 2))
+
+
+def learning_curve_of(estimator=None, inputs=X, targets=Y, sizes=(10, 20, 30), **options):
+    """Tested on the first rows."""
+    return LearningCurveDisplay.from_estimator(
+        LinearRegression() if estimator is None else estimator, inputs, targets, X[:9], Y[:9], sizes=sizes, **options
+    )
 
 
 def lines(display):
@@ -219,6 +248,7 @@ def test_weights_need_a_fitted_regressor():
     [
         lambda model, **where: PosteriorDisplay.from_estimator(model, X, **where),
         lambda model, **where: CoefficientDisplay.from_estimator(model, **where),
+        lambda model, **where: learning_curve_of(n_runs=1, **where),
     ],
 )
 def test_given_axes_are_used(trend, draw):
@@ -234,6 +264,7 @@ def test_given_axes_are_used(trend, draw):
     [
         lambda model: PosteriorDisplay.from_estimator(model, X),
         lambda model: CoefficientDisplay.from_estimator(model),
+        lambda model: learning_curve_of(n_runs=1),
     ],
 )
 def test_without_axes_there_is_a_new_figure(trend, draw):
@@ -247,6 +278,7 @@ def test_without_axes_there_is_a_new_figure(trend, draw):
     [
         PosteriorDisplay(np.arange(3.0), np.zeros(3), np.ones(3)),
         CoefficientDisplay(["a"], *np.ones((4, 1))),
+        LearningCurveDisplay(np.arange(3.0), np.ones((3, 2))),
     ],
     ids=lambda display: type(display).__name__,
 )
@@ -279,3 +311,119 @@ def test_a_pipeline_of_maps_without_names_is_numbered():
     features = make_pipeline(FunctionTransformer())
     model = EVGPRegressor(features, n_inducing=3, max_iter=0).fit(np.arange(10.0)[:, np.newaxis], np.arange(10.0))
     assert CoefficientDisplay.from_estimator(model).names == ["h0"]
+
+
+def test_the_curve_is_the_mean_of_runs_and_the_band_their_range():
+    scores = np.array([[4.0, 8.0, 6.0], [1.0, np.nan, 3.0]])
+    display = LearningCurveDisplay(np.array([10, 40]), scores).plot(label="EVGP", color="#D55E00")
+    line = lines(display)["EVGP"]
+    assert_array_equal(line.get_xydata(), [[10, 6], [40, 2]])
+    assert to_rgb(line.get_color()) == to_rgb("#D55E00")
+    (area,) = display.ax_.collections
+    assert {tuple(corner) for corner in area.get_paths()[0].vertices} == {(10, 4), (10, 8), (40, 1), (40, 3)}
+    assert_allclose(area.get_facecolor()[0, :3], to_rgb("#D55E00"))
+
+
+def test_curves_on_the_same_axes_have_colours_of_their_own():
+    display = LearningCurveDisplay(np.array([10, 40]), np.ones((2, 1)), "NLPD").plot(label="0")
+    for number in range(1, 6):
+        display.plot(display.ax_, label=str(number))
+    assert len({to_rgb(line.get_color()) for line in lines(display).values()}) == 6
+    assert (display.ax_.get_xlabel(), display.ax_.get_ylabel()) == ("training rows", "NLPD")
+
+
+@pytest.mark.parametrize(
+    ("lowest", "log_scale", "scale"),
+    [(1.0, None, "log"), (1.0, False, "linear"), (1.0, True, "log"), (0.0, None, "linear"), (-1.0, False, "linear")],
+)
+def test_axes_are_logarithmic_where_scores_are_positive_or_as_told(lowest, log_scale, scale):
+    axes = LearningCurveDisplay(np.array([10, 40]), np.array([[2.0], [lowest]])).plot(log_scale=log_scale).ax_
+    assert (axes.get_xscale(), axes.get_yscale()) == (scale, scale)
+    if scale == "log":
+        assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
+
+
+def test_scores_that_have_no_logarithm_are_named():
+    with pytest.raises(ValueError, match=r"log_scale=True needs positive scores; the smallest is -1\.0"):
+        LearningCurveDisplay(np.array([10, 40]), np.array([[2.0], [-1.0]])).plot(log_scale=True)
+
+
+def test_scores_are_those_of_scikit_learn_on_the_same_rows():
+    orders = [np.argsort(rng.permutation(30)) for rng in [np.random.RandomState(3)] for _ in range(2)]
+    sizes, _, expected = learning_curve(
+        LinearRegression(),
+        *(np.vstack(both) for both in ((X, X[:9]), (Y, Y[:9]))),
+        train_sizes=[5, 20, 30],
+        cv=[(order, np.arange(30, 39)) for order in orders],
+        scoring=make_scorer(prediction_error),
+    )
+    display = learning_curve_of(sizes=[5, 20, 30], n_runs=2, random_state=3)
+    assert_array_equal(display.n_rows, sizes)
+    assert_allclose(display.scores, expected)
+    assert_allclose(display.ax_.lines[0].get_ydata(), expected.mean(axis=1))
+    assert display.ax_.get_ylabel() == "prediction error"
+
+
+def test_whole_groups_are_added_in_an_order_of_each_run():
+    seen = []
+    numbers, groups = np.arange(30.0)[:, np.newaxis], np.repeat(["c", "a", "b", "d"], [3, 7, 15, 5])
+    display = learning_curve_of(Witness(seen), numbers, sizes=[1, 2, 4], groups=groups, n_runs=3, random_state=0)
+    seen = np.reshape(np.array(seen, dtype=object), (3, 3))
+    for run in seen:
+        found = [groups[np.array(rows, dtype=int)] for rows in run]
+        assert [len(set(own)) for own in found] == [1, 2, 4]
+        assert all(len(own) == np.isin(groups, own).sum() for own in found)
+        assert set(run[0]) < set(run[1]) < set(run[2])
+    assert len({tuple(run[0]) for run in seen}) > 1
+    assert_array_equal(display.n_rows, [np.mean([len(rows) for rows in sizes]) for sizes in seen.T])
+
+
+def test_the_same_random_state_gives_the_same_curve():
+    first, second, third = (learning_curve_of(n_runs=2, random_state=state).scores for state in (0, 0, 1))
+    assert_array_equal(first, second)
+    assert (first[0] != third[0]).any()
+
+
+def test_another_score_can_be_drawn():
+    display = learning_curve_of(score=r2_score, sizes=[30], n_runs=1)
+    assert display.scores == pytest.approx(np.array([[r2_score(Y[:9], LinearRegression().fit(X, Y).predict(X[:9]))]]))
+    assert display.ax_.get_ylabel() == "r2 score"
+
+
+def test_data_frames_stay_data_frames():
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"place": X[:, 0]})
+    curve = LearningCurveDisplay.from_estimator(LinearRegression(), frame, Y, frame, Y, sizes=[30], n_runs=1)
+    assert curve.scores == pytest.approx(np.array([[prediction_error(Y, LinearRegression().fit(X, Y).predict(X))]]))
+
+
+@pytest.mark.parametrize(
+    ("sizes", "problem", "message"),
+    [
+        ([], ValueError, r"sizes=\[\] must ascend"),
+        ([5, 5], ValueError, r"sizes=\[5, 5\] must ascend"),
+        ([5, 31], ValueError, r"sizes=\[5, 31\] must ascend, from at least 1 to at most the 30 groups"),
+        ([0, 5], ValueError, r"sizes\[0\] must be at least 1; got 0"),
+        ([5, 0.5], TypeError, r"sizes\[0\] must be an integer; got 5\.0"),
+    ],
+)
+def test_sizes_that_are_not_numbers_of_groups_are_named(sizes, problem, message):
+    with pytest.raises(problem, match=message):
+        learning_curve_of(sizes=sizes)
+
+
+def test_a_curve_needs_a_run_and_rows_of_one_length():
+    with pytest.raises(ValueError, match="n_runs must be at least 1; got 0"):
+        learning_curve_of(n_runs=0)
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        learning_curve_of(targets=Y[:5])
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        learning_curve_of(groups=np.zeros(5))
+
+
+def test_without_matplotlib_nothing_is_fitted(monkeypatch):
+    witness = Witness([])
+    monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
+    with pytest.raises(ImportError, match="Plotting needs the optional package 'matplotlib'"):
+        learning_curve_of(witness)
+    assert not witness.seen

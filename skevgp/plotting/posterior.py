@@ -1,32 +1,14 @@
-"""Pictures in scikit-learn's Display convention: ``from_estimator`` computes, ``plot`` draws. Needs matplotlib."""
+"""PosteriorDisplay: predictions along a line."""
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Self
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_consistent_length, check_is_fitted
 
-from ._optional import require
-
-if TYPE_CHECKING:
-    from .regressor import EVGPRegressor
-
-__all__ = ["CoefficientDisplay", "PosteriorDisplay"]
-
-# Blue and orange of Okabe & Ito's palette, safe for colour-blind readers.
-_MODEL, _TRUTH, _INDUCING = "#0072B2", "#D55E00", "#009E73"
-
-
-def _axes(ax: Any) -> Any:
-    pyplot = require("matplotlib.pyplot", "Plotting")
-    return ax if ax is not None else pyplot.subplots()[1]
-
-
-def _check_output(output: int, n_outputs: int) -> None:
-    if not -n_outputs <= output < n_outputs:
-        raise ValueError(f"output={output!r} must be the index of one of {n_outputs} outputs.")
+from ._style import BLUE, GREEN, ORANGE, axes_of, check_output
 
 
 def _one_output(y: ArrayLike, output: int) -> np.ndarray:
@@ -141,7 +123,7 @@ class PosteriorDisplay:
         """
         check_is_fitted(estimator)
         mean, std = (part.reshape(len(part), -1) for part in estimator.predict(X, return_std=True))
-        _check_output(output, mean.shape[1])
+        check_output(output, mean.shape[1])
         mean, std = mean[:, output], std[:, output]
         values = np.asarray(X)
         one_column = values.ndim == 2 and values.shape[1] == 1
@@ -184,14 +166,14 @@ class PosteriorDisplay:
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
-        ax = _axes(ax)
+        ax = axes_of(ax)
         order = np.argsort(self.x, kind="stable")
         x, mean, std = self.x[order], self.mean[order], self.std[order]
         low, high = mean - n_std * std, mean + n_std * std
-        ax.fill_between(x, low, high, color=_MODEL, alpha=0.2, linewidth=0, label=f"±{n_std:g} std")
-        ax.plot(x, mean, color=_MODEL, label=label)
+        ax.fill_between(x, low, high, color=BLUE, alpha=0.2, linewidth=0, label=f"±{n_std:g} std")
+        ax.plot(x, mean, color=BLUE, label=label)
         if self.y is not None:
-            ax.plot(x, self.y[order], color=_TRUTH, linestyle="--", label="observed")
+            ax.plot(x, self.y[order], color=ORANGE, linestyle="--", label="observed")
         if self.x_train is not None:
             ax.plot(self.x_train, self.y_train, ".", color="0.35", markersize=3, zorder=1, label="training data")
         if self.inducing_points is not None:
@@ -200,141 +182,9 @@ class PosteriorDisplay:
                 self.inducing_points,
                 np.full(len(self.inducing_points), 0.03),
                 "x",
-                color=_INDUCING,
+                color=GREEN,
                 transform=ax.get_xaxis_transform(),
                 label="inducing points",
             )
-        self.ax_, self.figure_ = ax, ax.figure
-        return self
-
-
-class CoefficientDisplay:
-    """Posterior weights of the explicit features beside their prior, with bars of standard deviations.
-
-    Parameters
-    ----------
-    names : sequence of str
-        Of the weights.
-    mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
-
-    Attributes
-    ----------
-    ax_ : matplotlib Axes
-    figure_ : matplotlib Figure
-
-    See Also
-    --------
-    CoefficientDisplay.from_estimator : Make one from a fitted regressor.
-
-    Examples
-    --------
-    >>> from sklearn.preprocessing import PolynomialFeatures
-    >>> from skevgp import EVGPRegressor
-    >>> from skevgp.datasets import make_toy
-    >>> from skevgp.plotting import CoefficientDisplay
-    >>> X, y = make_toy(random_state=0, return_X_y=True)
-    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
-    >>> CoefficientDisplay.from_estimator(model).names
-    ['1', 'x0']
-    """
-
-    def __init__(
-        self,
-        names: list[str],
-        mean: np.ndarray,
-        std: np.ndarray,
-        prior_mean: np.ndarray,
-        prior_std: np.ndarray,
-    ):
-        self.names = names
-        self.mean = mean
-        self.std = std
-        self.prior_mean = prior_mean
-        self.prior_std = prior_std
-
-    @classmethod
-    def from_estimator(cls, estimator: EVGPRegressor, *, output: int = 0, ax: Any = None, n_std: float = 2.0) -> Self:
-        """Read the weights off a fitted regressor and draw.
-
-        Parameters
-        ----------
-        estimator : EVGPRegressor
-            Fitted, with a feature map.
-        output : int, default=0
-            Which output's weights to draw.
-        ax : matplotlib Axes, default=None
-            By default new axes.
-        n_std : float, default=2.0
-            Half length of the bars, in standard deviations.
-
-        Returns
-        -------
-        display : CoefficientDisplay
-
-        Raises
-        ------
-        ValueError
-            If the regressor has no explicit features, or there is no such output.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
-        """
-        check_is_fitted(estimator)
-        n_outputs, width = np.atleast_2d(estimator.coef_).shape
-        if width == 0:
-            raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
-        _check_output(output, n_outputs)
-        try:
-            names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
-        except AttributeError:  # A map, or a step of it, that does not name its features.
-            names = [f"h{index}" for index in range(width)]
-        parts = (
-            np.atleast_2d(part)[output]
-            for part in (
-                estimator.coef_,
-                estimator.coef_std_,
-                estimator.coef_prior_mean_,
-                estimator.coef_prior_scale_,
-            )
-        )
-        return cls(names, *parts).plot(ax=ax, n_std=n_std)
-
-    def plot(self, ax: Any = None, *, n_std: float = 2.0) -> Self:
-        """Draw.
-
-        Parameters
-        ----------
-        ax : matplotlib Axes, default=None
-            By default new axes.
-        n_std : float, default=2.0
-            Half length of the bars, in standard deviations.
-
-        Returns
-        -------
-        self : object
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
-        """
-        ax = _axes(ax)
-        places = np.arange(len(self.names))[::-1]
-        for mean, std, shift, colour, marker, label in (
-            (self.prior_mean, self.prior_std, 0.12, "0.55", "s", "prior"),
-            (self.mean, self.std, -0.12, _MODEL, "o", "posterior"),
-        ):
-            ax.errorbar(
-                mean,
-                places + shift,
-                xerr=n_std * std,
-                fmt=marker,
-                color=colour,
-                capsize=3,
-                label=f"{label} ±{n_std:g} std",
-            )
-        ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
-        ax.set_yticks(places, self.names)
-        ax.margins(x=0.1)
-        ax.set_ylim(-0.6, len(self.names) - 0.4)
         self.ax_, self.figure_ = ax, ax.figure
         return self

@@ -1,0 +1,145 @@
+"""CoefficientDisplay: what the explicit features' weights have become."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from sklearn.utils.validation import check_is_fitted
+
+from ._style import BLUE, axes_of, check_output
+
+if TYPE_CHECKING:
+    from ..regressor import EVGPRegressor
+
+
+class CoefficientDisplay:
+    """Posterior weights of the explicit features beside their prior, with bars of standard deviations.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Of the weights.
+    mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
+
+    Attributes
+    ----------
+    ax_ : matplotlib Axes
+    figure_ : matplotlib Figure
+
+    See Also
+    --------
+    CoefficientDisplay.from_estimator : Make one from a fitted regressor.
+
+    Examples
+    --------
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.plotting import CoefficientDisplay
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, random_state=0).fit(X, y)
+    >>> CoefficientDisplay.from_estimator(model).names
+    ['1', 'x0']
+    """
+
+    def __init__(
+        self,
+        names: list[str],
+        mean: np.ndarray,
+        std: np.ndarray,
+        prior_mean: np.ndarray,
+        prior_std: np.ndarray,
+    ):
+        self.names = names
+        self.mean = mean
+        self.std = std
+        self.prior_mean = prior_mean
+        self.prior_std = prior_std
+
+    @classmethod
+    def from_estimator(cls, estimator: EVGPRegressor, *, output: int = 0, ax: Any = None, n_std: float = 2.0) -> Self:
+        """Read the weights off a fitted regressor and draw.
+
+        Parameters
+        ----------
+        estimator : EVGPRegressor
+            Fitted, with a feature map.
+        output : int, default=0
+            Which output's weights to draw.
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        n_std : float, default=2.0
+            Half length of the bars, in standard deviations.
+
+        Returns
+        -------
+        display : CoefficientDisplay
+
+        Raises
+        ------
+        ValueError
+            If the regressor has no explicit features, or there is no such output.
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        check_is_fitted(estimator)
+        n_outputs, width = np.atleast_2d(estimator.coef_).shape
+        if width == 0:
+            raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
+        check_output(output, n_outputs)
+        try:
+            names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
+        except AttributeError:  # A map, or a step of it, that does not name its features.
+            names = [f"h{index}" for index in range(width)]
+        parts = (
+            np.atleast_2d(part)[output]
+            for part in (
+                estimator.coef_,
+                estimator.coef_std_,
+                estimator.coef_prior_mean_,
+                estimator.coef_prior_scale_,
+            )
+        )
+        return cls(names, *parts).plot(ax=ax, n_std=n_std)
+
+    def plot(self, ax: Any = None, *, n_std: float = 2.0) -> Self:
+        """Draw.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        n_std : float, default=2.0
+            Half length of the bars, in standard deviations.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        ax = axes_of(ax)
+        places = np.arange(len(self.names))[::-1]
+        for mean, std, shift, colour, marker, label in (
+            (self.prior_mean, self.prior_std, 0.12, "0.55", "s", "prior"),
+            (self.mean, self.std, -0.12, BLUE, "o", "posterior"),
+        ):
+            ax.errorbar(
+                mean,
+                places + shift,
+                xerr=n_std * std,
+                fmt=marker,
+                color=colour,
+                capsize=3,
+                label=f"{label} ±{n_std:g} std",
+            )
+        ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
+        ax.set_yticks(places, self.names)
+        ax.margins(x=0.1)
+        ax.set_ylim(-0.6, len(self.names) - 0.4)
+        self.ax_, self.figure_ = ax, ax.figure
+        return self

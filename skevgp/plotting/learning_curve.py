@@ -1,0 +1,197 @@
+"""LearningCurveDisplay: how the score on a test set grows with the training rows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import clone
+from sklearn.utils import _safe_indexing, check_random_state
+from sklearn.utils.validation import _num_samples, check_consistent_length
+
+from .._optional import require
+from .._validation import check_integer
+from ..metrics import prediction_error
+from ._style import PALETTE, axes_of
+
+
+class LearningCurveDisplay:
+    """Test score against the number of training rows: the mean of several runs, in a band from lowest to highest.
+
+    The paper's figure of section IV-B. Curves of several models can share axes.
+
+    Parameters
+    ----------
+    n_rows : ndarray of shape (n_sizes,)
+        Training rows, ascending.
+    scores : ndarray of shape (n_sizes, n_runs)
+        On test rows; NaN where a run is missing.
+    score_name : str, default="prediction error"
+        For the vertical axis.
+
+    Attributes
+    ----------
+    ax_ : matplotlib Axes
+    figure_ : matplotlib Figure
+
+    See Also
+    --------
+    LearningCurveDisplay.from_estimator : Make one by fitting a regressor to more and more rows.
+    sklearn.model_selection.LearningCurveDisplay : Scores by cross-validation, without a test set of their own.
+
+    Examples
+    --------
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_dynamics
+    >>> from skevgp.features import InertiaForceGravity
+    >>> from skevgp.plotting import LearningCurveDisplay
+    >>> train, test = (make_dynamics("pendulum", 4, 50, random_state=seed) for seed in (0, 1))
+    >>> display = LearningCurveDisplay.from_estimator(
+    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, tol=1e-3, random_state=0),
+    ...     *(train.data, train.target, test.data, test.target),
+    ...     sizes=[1, 4],
+    ...     groups=train.groups,
+    ...     n_runs=2,
+    ...     random_state=0,
+    ... )
+    >>> display.n_rows, display.scores.shape
+    (array([ 50., 200.]), (2, 2))
+    """
+
+    def __init__(self, n_rows: np.ndarray, scores: np.ndarray, score_name: str = "prediction error"):
+        self.n_rows = n_rows
+        self.scores = scores
+        self.score_name = score_name
+
+    @classmethod
+    def from_estimator(
+        cls,
+        estimator: Any,
+        X: ArrayLike,
+        y: ArrayLike,
+        X_test: ArrayLike,
+        y_test: ArrayLike,
+        *,
+        sizes: ArrayLike,
+        groups: ArrayLike | None = None,
+        n_runs: int = 4,
+        score: Callable[[Any, Any], float] = prediction_error,
+        random_state: int | np.random.RandomState | None = None,
+        ax: Any = None,
+        log_scale: bool | None = None,
+        label: str | None = None,
+        color: str | None = None,
+    ) -> Self:
+        """Fit clones to more and more of the training rows, test them all on the same rows, and draw.
+
+        Each run puts the groups in a random order of its own and adds them whole, so that the rows of a smaller size
+        are among those of a larger one.
+
+        Parameters
+        ----------
+        estimator : regressor
+            Not fitted itself.
+        X : array-like of shape (n_samples, n_features)
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        X_test, y_test : array-like
+            What every fit is tested on; columns like those of X and y.
+        sizes : array-like of shape (n_sizes,)
+            Numbers of groups to learn from, from 1 to all of them, ascending.
+        groups : array-like of shape (n_samples,), default=None
+            The trajectory of each row, as in `make_dynamics`; None is a group per row.
+        n_runs : int, default=4
+            Orders of the groups, at least 1.
+        score : callable, default=prediction_error
+            ``score(y_test, y_pred) -> float``.
+        random_state : int, RandomState instance or None, default=None
+            Draws the orders. What the estimator draws is up to its own ``random_state``.
+        ax : matplotlib Axes, default=None
+            Where to draw; by default on new axes.
+        log_scale : bool, default=None
+            As in `plot`.
+        label, color : str, default=None
+            As in `plot`.
+
+        Returns
+        -------
+        display : LearningCurveDisplay
+            Its ``n_rows`` are means over runs, should groups differ in length.
+
+        Raises
+        ------
+        ValueError
+            If a size is not a possible number of groups, sizes do not ascend, or X, y and groups differ in length.
+        TypeError
+            If a size or n_runs is not an integer.
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        require("matplotlib.pyplot", "Plotting")  # before the fits, not after them
+        check_consistent_length(X, y, groups)
+        groups = np.arange(_num_samples(X)) if groups is None else groups
+        labels, group_of_row = np.unique(groups, return_inverse=True)
+        steps = np.ravel(sizes).tolist()
+        for index, size in enumerate(steps):
+            check_integer(size, f"sizes[{index}]", minimum=1)
+        if not steps or min(np.diff(steps), default=1) < 1 or steps[-1] > len(labels):
+            raise ValueError(f"sizes={steps} must ascend, from at least 1 to at most the {len(labels)} groups.")
+        check_integer(n_runs, "n_runs", minimum=1)
+        rng = check_random_state(random_state)
+        n_rows, scores = np.empty((2, len(steps), n_runs))
+        for run in range(n_runs):
+            place_of_row = rng.permutation(len(labels))[group_of_row]
+            for index, size in enumerate(steps):
+                rows = np.flatnonzero(place_of_row < size)
+                fitted = clone(estimator).fit(_safe_indexing(X, rows), _safe_indexing(y, rows))
+                n_rows[index, run], scores[index, run] = len(rows), score(y_test, fitted.predict(X_test))
+        name = getattr(score, "__name__", "score").replace("_", " ")
+        return cls(n_rows.mean(axis=1), scores, name).plot(ax, log_scale=log_scale, label=label, color=color)
+
+    def plot(
+        self, ax: Any = None, *, log_scale: bool | None = None, label: str | None = None, color: str | None = None
+    ) -> Self:
+        """Draw.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        log_scale : bool, default=None
+            Whether both axes are logarithmic; None makes them so if all scores are positive.
+        label : str, default=None
+            Name of the line, for ``display.ax_.legend()``.
+        color : str, default=None
+            By default the first of a colour-blind-safe palette that is not yet on the axes.
+
+        Returns
+        -------
+        self : object
+
+        Raises
+        ------
+        ValueError
+            If ``log_scale=True`` and a score is not positive.
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        positive = bool(np.nanmin(self.scores) > 0)
+        if log_scale and not positive:
+            raise ValueError(f"log_scale=True needs positive scores; the smallest is {np.nanmin(self.scores)}.")
+        ax = axes_of(ax)
+        if color is None:
+            used = {line.get_color() for line in ax.lines}
+            color = next((free for free in PALETTE if free not in used), PALETTE[0])
+        low, high = np.nanmin(self.scores, axis=1), np.nanmax(self.scores, axis=1)
+        ax.fill_between(self.n_rows, low, high, color=color, alpha=0.2, linewidth=0)
+        ax.plot(self.n_rows, np.nanmean(self.scores, axis=1), ".-", color=color, label=label)
+        if positive if log_scale is None else log_scale:
+            ax.set_xscale("log")
+            ax.set_yscale("log")
+            ax.set_xticks(self.n_rows, [f"{count:g}" for count in self.n_rows])
+            ax.set_xticks([], minor=True)
+        ax.set_xlabel("training rows")
+        ax.set_ylabel(self.score_name)
+        self.ax_, self.figure_ = ax, ax.figure
+        return self
