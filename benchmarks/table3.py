@@ -3,7 +3,7 @@
 Writes one row per fit to a CSV as soon as it is done (what is there already is not fitted again), and from the CSV a
 Markdown table and a picture beside it. Models of seed s learn from data of random state s and are tested on 1000 + s.
 
-    python benchmarks/table3.py                             # everything, four seeds
+    python benchmarks/table3.py                             # everything, four seeds: days of one core
     python benchmarks/table3.py --quick                     # fewer rows and iterations, one seed: a few minutes
     python benchmarks/table3.py --systems iiwa14 --settings paper --max-iter 1000  # half an hour at most per fit
     python benchmarks/table3.py --systems pendulum --settings skevgp --seeds 10

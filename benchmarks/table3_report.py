@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from harness import Row, figure_of, provenance_text, table
+from harness import Row, figure_of, provenance_text, pyplot, save_picture, table
 from harness import column as of
 
 
@@ -105,7 +105,8 @@ def paragraphs(rows: list[Row]) -> list[str]:
     parts = [
         "# Table 3 of the paper, and ours",
         "Written by `benchmarks/table3.py`. Error is the mean over test rows of the norm of the error, in SI units. "
-        f"Noise: {rows[0]['noise']} of each training target's standard deviation. Seeds: {', '.join(map(str, seeds))}. "
+        f"Noise: {rows[0]['noise']} of each training target's standard deviation, on training and test "
+        f"targets. Seeds: {', '.join(map(str, seeds))}. "
         f"{provenance_text(rows)}",
     ]
     if rows[0]["size"] == "quick":
@@ -132,13 +133,14 @@ def paragraphs(rows: list[Row]) -> list[str]:
         for (system, model, setting), own in groups.items()
         if any(row["max_iter"] for row in own)
     ]
-    if "skevgp-angles" in settings:
-        parts.append(
-            "A kernel of sines and cosines cannot tell an angle from the same after a turn. VGP, whose targets are "
-            "angles, has no chance in the setting skevgp-angles; other models know that an angle starts where it is."
-        )
     if limited:
         parts.append(f"Iterations were limited by `--max-iter` in: {', '.join(limited)}.")
+    if any(key[1:] == ("VGP", "skevgp-angles") for key in groups):
+        parts.append(
+            "A kernel of sines and cosines cannot tell an angle from the same after a turn. Where joints turn, VGP, "
+            "whose targets are angles, cannot learn them in the setting skevgp-angles; the other models know that an "
+            "angle starts where it is."
+        )
     return parts
 
 
@@ -176,16 +178,11 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     groups = group(rows)
     systems = [system for system in PAPER if any(key[0] == system for key in groups)]
     n_columns = min(2, len(systems))
     n_rows = -(-len(systems) // n_columns)
-    figure, grid = plt.subplots(
+    figure, grid = pyplot().subplots(
         n_rows, n_columns, figsize=(1 + 4.2 * n_columns, 0.9 + 2.7 * n_rows), squeeze=False, layout="constrained"
     )
     settings = [setting for setting in STYLES if any(key[2] == setting for key in groups)]
@@ -223,5 +220,4 @@ def plot(rows: list[Row], path: Path) -> None:
     figure.legend(
         handles, labels, loc="outside upper center", ncols=columns, frameon=False, title=", ".join(notes) or None
     )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    save_picture(figure, path)

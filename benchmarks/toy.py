@@ -4,7 +4,7 @@ The models are scikit-learn's GaussianProcessRegressor (GP), the sparse GP with 
 h(x) = (1, x): EGP and EVGP. Writes one row per model and seed to a CSV (what is there already is not run again), the
 picture of seed 0 and a Markdown page. A seed draws the starts of the optimisers, the folds and, for make_toy, the data.
 
-    python benchmarks/toy.py                          # Snelson's points, downloaded once; make_toy's if that fails
+    python benchmarks/toy.py                          # four minutes of one core; Snelson's points are downloaded once
     python benchmarks/toy.py --data-home some/folder  # that holds train_inputs, train_outputs and test_inputs
     python benchmarks/toy.py --data toy               # make_toy's points, of the same shape
     python benchmarks/toy.py --quick                  # no restarts, three folds, one seed: seconds
@@ -179,12 +179,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
     displays : dict of PosteriorDisplay
         By name.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, grid = plt.subplots(2, 2, figsize=(9, 6.6), sharex=True, sharey=True, layout="constrained")
+    figure, grid = harness.pyplot().subplots(2, 2, figsize=(9, 6.6), sharex=True, sharey=True, layout="constrained")
     displays = {}
     for axes, (name, model) in zip(grid.flat, models.items(), strict=True):
         displays[name] = PosteriorDisplay.from_estimator(
@@ -209,8 +204,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
         axes.set_ylabel("y")
     handles, labels = grid[-1, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    harness.save_picture(figure, path)
     return displays
 
 
