@@ -147,7 +147,8 @@ def append(rows: Sequence[dict[str, Any]], path: Path) -> None:
         writer.writeheader()
     writer.writerows(rows)
     with path.open("ab", buffering=0) as file:
-        file.truncate(len(old.encode()))
+        if file.tell() > len(old.encode()):
+            file.truncate(len(old.encode()))
         file.write(new.getvalue().encode())
 
 
@@ -283,13 +284,13 @@ def pyplot() -> Any:
 
 
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure as a PNG of at most 128 colours, a third of the usual size, and close it."""
+    """Write a figure as a PNG of at most 256 colours, half of the usual size, and close it."""
     from PIL import Image
 
     figure.set_dpi(110)
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
     pyplot().close(figure)
 
 
