@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -241,6 +241,8 @@ def run_missing(
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():  # if it was for this process only: hours are not waited for
+                process.terminate()
             raise SystemExit(f"Interrupted. What is finished is in {output}; run again to go on.") from None
     return n_failures
 

@@ -1,6 +1,9 @@
 """What the benchmarks share: a CSV that survives interruptions and other versions, and options that are checked."""
 
+import os
+import signal
 import sys
+import time
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,6 +21,12 @@ class Cell:
 
 def row_of(cell):
     return {"name": cell.name, "value": len(cell.name)}
+
+
+def interrupt(cell):
+    """What a user or a scheduler does while a fit is running."""
+    os.kill(os.getppid(), signal.SIGINT)
+    time.sleep(3600)
 
 
 @pytest.fixture
@@ -56,6 +65,11 @@ def test_a_cell_asked_for_twice_runs_once(harness, tmp_path, capsys):
     assert harness.run_missing([Cell("a"), Cell("bb"), Cell("a", limit=3)], row_of, path, 1, str) == 0
     assert sorted(row["name"] for row in harness.read(path)) == ["a", "bb"]
     assert "0 of 2 cells" in capsys.readouterr().out
+
+
+def test_an_interrupt_of_the_main_process_ends_the_fits(harness, tmp_path):
+    with pytest.raises(SystemExit, match="Interrupted"):
+        harness.run_missing([Cell("a"), Cell("b")], interrupt, tmp_path / "t.csv", 1, str)
 
 
 def test_without_matplotlib_nothing_runs(harness, tmp_path, monkeypatch):
