@@ -268,7 +268,7 @@ def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> Non
     text = "\n\n".join(part.strip("\n") for part in parts) + "\n"
     if text.strip():
         output.with_suffix(".md").write_text(text)
-        print(f"\n{text}\n{output.with_suffix('.md')}, {output.with_suffix('.png')}")
+        print(f"\n{text}\n{output.with_suffix('.md')}, and pictures beside it")
     else:
         print(f"{output} has nothing of what was asked for: no page is written.")
     if n_failures:
