@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from harness import Row, column, figure_of, provenance_text, table
+from harness import Row, column, figure_of, provenance_text, pyplot, save_picture, table
 
 # Colour (Okabe & Ito's palette, safe for colour-blind readers), marker and line of each model.
 STYLES = {
@@ -206,15 +206,10 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
     from matplotlib.ticker import NullLocator
-    from PIL import Image
 
     found = {system: lines for system in SYSTEMS if (lines := lines_of(rows, system))}
-    figure, grid = plt.subplots(
+    figure, grid = pyplot().subplots(
         *(len(MEASURES), len(found)),
         figsize=(0.9 + 2.4 * len(found), 8.0),
         squeeze=False,
@@ -247,8 +242,4 @@ def plot(rows: list[Row], path: Path) -> None:
         label: handle for axes in grid[0] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
     figure.legend(handles.values(), handles, loc="outside upper center", ncols=min(3, 1 + len(found)), frameon=False)
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
-    with Image.open(path) as image:
-        few_colours = image.convert("RGB").quantize(128)  # a quarter of the bytes
-    few_colours.save(path, optimize=True)
+    save_picture(figure, path)

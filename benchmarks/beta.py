@@ -4,7 +4,7 @@ Fits EVGP-IF and EVGP-IFG and writes one row per weight to a CSV: prior and post
 the same weight. From the CSV come a Markdown page, which looks for the paper's observation (without features of gravity
 the weights of positions on velocities turn negative to imitate it), and a picture for each system.
 
-    python benchmarks/beta.py                                     # the acrobot, two seeds
+    python benchmarks/beta.py                                     # the acrobot, two seeds: an hour of one core
     python benchmarks/beta.py --quick                             # few rows and iterations: a minute
     python benchmarks/beta.py --systems pendulum cartpole iiwa14  # into the same file
     python benchmarks/beta.py --settings paper --max-iter 2000    # Adam's steps in place of 16000
@@ -106,8 +106,8 @@ def main() -> None:
         quick="12 trajectories, few iterations and one seed",
         seeds="seeds 0, 1, ...; default: 2, of a quick run 1",
         systems=SYSTEMS,
+        default_systems=["acrobot"],
     )
-    parser.set_defaults(systems=["acrobot"])
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: both")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=SETTINGS, help="default: both")
     parser.add_argument(

@@ -4,8 +4,9 @@ Measures evaluations of the bound with its gradient, steps of Adam in the paper'
 size of fitted models; writes one row per measurement to a CSV, and from the CSV exponents of power laws: a Markdown
 page and a picture.
 
-    python benchmarks/complexity.py          # two minutes of an idle core
-    python benchmarks/complexity.py --quick  # few sizes, seconds
+    python benchmarks/complexity.py                    # two minutes of an idle core
+    python benchmarks/complexity.py --quick            # few sizes, seconds
+    python benchmarks/complexity.py --systems network  # without the GPs; the page then has what the file has
 
 Times are processor time of one thread, the fastest of several repeats, on random rows of 5 columns. With --jobs above 1
 cells share caches, and times are less even.
@@ -18,7 +19,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import complexity_report
@@ -35,8 +36,9 @@ from skevgp.inference.elbo import ElboObjective
 
 N_COLUMNS = 5
 PAPER: dict[str, Any] = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
-# Seconds and number of repeats of a cell: at least, at most.
-PATIENCE, REPEATS = 1.0, (3, 30)
+# Of a cell the seconds, and the number of repeats, that are enough; and repeats in any case.
+PATIENCE, MOST, FEWEST = 1.0, 30, 3
+SYSTEMS = ("gp", "network")
 
 
 @dataclass(frozen=True)
@@ -50,6 +52,8 @@ class Cell:
     setting : str
         Of a bound what the outputs share, of a model "paper" or "skevgp"; else empty.
     n_rows, n_inducing, n_outputs, n_layers, n_units : int
+    repeats : int, default=3
+        Of a time, at least.
     """
 
     what: str
@@ -59,6 +63,7 @@ class Cell:
     n_outputs: int
     n_layers: int
     n_units: int
+    repeats: int = field(default=FEWEST, compare=False)
 
 
 def data(cell: Cell) -> tuple[np.ndarray, np.ndarray]:
@@ -110,7 +115,7 @@ def timed(cell: Cell) -> dict[str, Any]:
     seconds: list[float] = []
     with TIMED[cell.what](cell) as work:
         work()
-        while len(seconds) < REPEATS[0] or (sum(seconds) < PATIENCE and len(seconds) < REPEATS[1]):
+        while len(seconds) < cell.repeats or (sum(seconds) < PATIENCE and len(seconds) < MOST):
             start = time.process_time()
             work()
             seconds.append(time.process_time() - start)
@@ -139,7 +144,8 @@ def run(cell: Cell) -> dict[str, Any]:
         warnings.simplefilter("ignore", ConvergenceWarning)
         measured = timed(cell) if cell.what in TIMED else weighed(cell)
     names = ("seconds", "seconds_median", "repeats", "n_parameters", "n_bytes")
-    return {**vars(cell), **{name: measured.get(name, "") for name in names}, **harness.provenance()}
+    sizes = {own.name: getattr(cell, own.name) for own in fields(cell) if own.compare}
+    return {**sizes, **{name: measured.get(name, "") for name in names}, **harness.provenance()}
 
 
 def say(row: dict[str, Any]) -> str:
@@ -147,17 +153,32 @@ def say(row: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = harness.argument_parser(__doc__, quick="few sizes")
+    parser = harness.argument_parser(
+        __doc__,
+        quick="few sizes",
+        seeds="repeats of a time, at least, of the same random rows; what is in the CSV stays; default: 3",
+        systems=SYSTEMS,
+    )
     parser.set_defaults(jobs=1)
     options = parser.parse_args()
     output = harness.output_path(options, "complexity")
     curves = QUICK if options.quick else CURVES
-    cells = list(dict.fromkeys(Cell(**sizes) for curve in curves for sizes in curve.cells()))
+    repeats = FEWEST if options.seeds is None else options.seeds
+    cells = [
+        Cell(**sizes, repeats=repeats)
+        for curve in curves
+        if ("network" if "network" in curve.what else "gp") in options.systems
+        for sizes in curve.cells()
+    ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+
+    # Everything the file has of these sizes, not only what was asked for now.
     rows = harness.read(output)
-    if not n_failures:
+    curves = tuple(curve for curve in curves if curve.is_in(rows))
+    if curves:
         complexity_report.plot(curves, rows, output.with_suffix(".png"))
-    harness.write_report([] if n_failures else complexity_report.paragraphs(curves, rows), output, n_failures)
+    parts = complexity_report.paragraphs(curves, rows, options.quick) if curves else []
+    harness.write_report(parts, output, n_failures)
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from harness import Row, figure_of, provenance_text, save_picture, table
+from harness import Row, figure_of, provenance_text, pyplot, save_picture, table
 
 BATCH, NETWORK_BATCH = 512, 200
 # Few rows: what an evaluation takes whatever their number.
@@ -68,6 +68,11 @@ PANELS = (
 )
 
 
+def by_cell(rows: list[Row]) -> dict[tuple[str, ...], Row]:
+    """Each by what, setting and sizes."""
+    return {tuple(row[name] for name in ("what", "setting", *GP)): row for row in rows}
+
+
 @dataclass(frozen=True)
 class Curve:
     """Measurements that differ in one size.
@@ -108,9 +113,13 @@ class Curve:
             fixed["n_rows"] = FEW
         return [{**fixed, self.varied: size} for size in self.sizes or SIZES[self.varied]]
 
+    def is_in(self, rows: list[Row]) -> bool:
+        """Whether all of it was measured."""
+        return {tuple(map(str, cell.values())) for cell in self.cells()} <= by_cell(rows).keys()
+
     def points(self, rows: list[Row]) -> tuple[np.ndarray, np.ndarray]:
         """Sizes and what was measured."""
-        found = {tuple(row[name] for name in ("what", "setting", *GP)): row for row in rows}
+        found = by_cell(rows)
         values = [float(found[tuple(map(str, cell.values()))][self.value]) for cell in self.cells()]
         return np.array([cell[self.varied] for cell in self.cells()], float), np.array(values)
 
@@ -173,15 +182,17 @@ def exponent_text(values: tuple[float, float, float]) -> str:
     return f"{fitted:.2f} ({least:.2f} to {largest:.2f})"
 
 
-def paragraphs(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
+def paragraphs(curves: tuple[Curve, ...], rows: list[Row], quick: bool = False) -> list[str]:
     """A page: the exponents beside the paper's, and where they come from.
 
     Parameters
     ----------
     curves : tuple of Curve
-        `CURVES` or `QUICK`.
+        Of `CURVES` or `QUICK`; with only some of them there is nothing but the table.
     rows : list of dict
         Of the CSV, with all cells of the curves.
+    quick : bool, default=False
+        Whether they are of `QUICK`.
 
     Returns
     -------
@@ -206,10 +217,13 @@ def paragraphs(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
         "O(L n²) of both for the network, time linear in the rows |D| and space constant. Times are processor time of "
         f"one thread, the fastest of several repeats. {provenance_text(rows)}",
     ]
-    if curves is QUICK:
+    if quick:
         parts.append("**A quick run**: sizes too small for exponents to mean anything.")
     header = ["what", "against", "paper's exponent", "ours (between neighbours)", "fitted to", "smallest to largest"]
-    return [*parts, table(header, lines), "## Where they differ, and why", *explanations(curves, rows)]
+    parts.append(table(header, lines))
+    if len(curves) < len(CURVES):
+        return [*parts, "Not everything was measured; `benchmarks/complexity.py` goes on."]
+    return [*parts, "## Where they differ, and why", *explanations(curves, rows)]
 
 
 def explanations(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
@@ -278,16 +292,15 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
     from matplotlib.ticker import LogLocator, NullFormatter
 
-    figure, grid = plt.subplots(3, 3, figsize=(8.6, 8.4), layout="constrained")
+    figure, grid = pyplot().subplots(3, 3, figsize=(8.6, 8.4), layout="constrained")
     for panel, (axes, (title, xlabel, slopes)) in enumerate(zip(grid.flat, PANELS, strict=True)):
-        corner = np.zeros(2)
-        for curve in (own for own in curves if own.panel == panel):
+        shown, corner = [own for own in curves if own.panel == panel], np.zeros(2)
+        axes.set_visible(bool(shown))
+        if not shown:
+            continue
+        for curve in shown:
             sizes, values = curve.points(rows)
             values = values * {"seconds": 1e3, "n_bytes": 1e-6, "n_parameters": 8e-6}[curve.value]
             (colour, marker), dotted = STYLES[curve.what, curve.setting], curve.few or curve.value == "n_parameters"
@@ -307,11 +320,13 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
             axis.set_major_formatter(lambda value, _: f"{value:g}")
             axis.set_minor_formatter(NullFormatter())
         low, high = axes.get_ylim()
+        if high < 10.0 * low:  # a tick below and one above
+            low, high = 10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high))
         ends = np.array([axes.get_xlim()[0], corner[0]])
         for slope in slopes:
             line = 1.5 * corner[1] * (ends / corner[0]) ** slope
             axes.plot(ends, line, color="0.75", linewidth=0.7, zorder=0)
-        axes.set_ylim(low, high * (high / low) ** (0.1 + 0.085 * sum(own.panel == panel for own in curves)))
+        axes.set_ylim(low, high * (high / low) ** (0.1 + 0.085 * len(shown)))
         axes.set_title(title, fontsize=9)
         axes.set_xlabel(xlabel, fontsize=9)
         axes.tick_params(labelsize=8)
@@ -321,4 +336,3 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
         axes.set_ylabel(unit, fontsize=9)
     figure.suptitle("Behind each name its exponent; grey: slopes 1, 2 and 3", fontsize=9)
     save_picture(figure, path)
-    plt.close(figure)

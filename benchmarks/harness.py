@@ -5,8 +5,8 @@ from __future__ import annotations
 import argparse
 import csv
 import dataclasses
+import io
 import platform
-import resource
 import signal
 import threading
 import time
@@ -14,7 +14,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from datetime import UTC, datetime
-from multiprocessing import get_context
+from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
 
@@ -24,10 +24,25 @@ import scipy
 import sklearn
 
 import skevgp
+from skevgp._optional import require
 
 RESULTS = Path(__file__).parent / "results"
 
 Row = dict[str, str]  # of a CSV
+
+
+def positive(text: str) -> int:
+    """Of an option."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a positive integer")
+    return int(text)
+
+
+def csv_path(text: str) -> Path:
+    """Of an option; another suffix could be that of the page or the picture, which would overwrite the CSV."""
+    if Path(text).suffix != ".csv":
+        raise argparse.ArgumentTypeError(f"{text!r} must be a file that ends in .csv")
+    return Path(text)
 
 
 def argument_parser(
@@ -36,6 +51,7 @@ def argument_parser(
     quick: str,
     seeds: str | None = None,
     systems: Collection[str] = (),
+    default_systems: Collection[str] = (),
     in_processes: bool = True,
 ) -> argparse.ArgumentParser:
     """With the options of every benchmark.
@@ -50,6 +66,8 @@ def argument_parser(
         What --seeds counts and its default; None is a benchmark without seeds.
     systems : collection of str, default=()
         What --systems chooses from; empty is a benchmark of no system.
+    default_systems : collection of str, default=()
+        Empty: all.
     in_processes : bool, default=True
         Whether there is --jobs; a benchmark of the time on the wall runs one cell after the other.
 
@@ -60,15 +78,17 @@ def argument_parser(
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=quick)
     if seeds:
-        parser.add_argument("--seeds", type=int, help=seeds)
+        parser.add_argument("--seeds", type=positive, help=seeds)
     if systems:
-        parser.add_argument("--systems", nargs="+", choices=systems, default=list(systems), help="default: %(default)s")
-    if in_processes:
+        default = list(default_systems or systems)
         parser.add_argument(
-            "--jobs", type=int, default=joblib.cpu_count(), help="processes, each on one core; default: %(default)s"
+            "--systems", nargs="+", choices=systems, default=default, help=f"default: {' '.join(default)}"
         )
+    if in_processes:
+        said = "processes, each on one core; default: %(default)s"
+        parser.add_argument("--jobs", type=positive, default=joblib.cpu_count(), help=said)
     parser.add_argument(
-        "--output", type=Path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
+        "--output", type=csv_path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
     )
     return parser
 
@@ -96,21 +116,40 @@ def provenance_text(rows: Iterable[Row]) -> str:
     return f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}; {'; '.join(versions)}; {', '.join(machines)}."
 
 
+def whole_lines(path: Path) -> str:
+    """Of a CSV, without what an interrupted write may have left of a last one."""
+    if not path.exists():
+        return ""
+    text = path.read_bytes().decode()
+    return text[: text.rfind("\n") + 1]
+
+
 def read(path: Path) -> list[Row]:
     """The rows that are there."""
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+    return list(csv.DictReader(io.StringIO(whole_lines(path), newline="")))
 
 
 def append(rows: Sequence[dict[str, Any]], path: Path) -> None:
-    """Add rows, below a header of their keys if the file is new."""
-    with path.open("a", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]))
-        if file.tell() == 0:
-            writer.writeheader()
-        writer.writerows(rows)
+    """Add rows, below a header of their keys if the file is new; all of them or, interrupted, none.
+
+    Raises
+    ------
+    SystemExit
+        If the file has other columns.
+    """
+    old = whole_lines(path)
+    columns = next(csv.reader([old.partition("\n")[0]])) if old else list(rows[0])
+    if set(columns) != set(rows[0]):
+        raise SystemExit(f"{path} has other columns, of another version: give another --output, or move it away.")
+    new = io.StringIO(newline="")
+    writer = csv.DictWriter(new, columns)
+    if not old:
+        writer.writeheader()
+    writer.writerows(rows)
+    with path.open("ab", buffering=0) as file:
+        if file.tell() > len(old.encode()):
+            file.truncate(len(old.encode()))
+        file.write(new.getvalue().encode())
 
 
 def write(rows: Iterable[dict[str, Any]], columns: Sequence[str], path: Path) -> None:
@@ -157,9 +196,22 @@ def run_missing(
     -------
     n_failures : int
         Cells that raised; the others are in the CSV.
+
+    Raises
+    ------
+    SystemExit
+        If matplotlib is missing, or the CSV is of another benchmark or version.
     """
+    try:
+        require("matplotlib", "The picture")  # before the fits, not after them
+    except ImportError as problem:
+        raise SystemExit(str(problem)) from problem
+    cells = list(dict.fromkeys(cells))
     names = [field.name for field in dataclasses.fields(cells[0]) if field.compare] if cells else []
-    done = {tuple(row[name] for name in names) for row in read(output)}
+    rows = read(output)
+    if rows and not set(names) <= rows[0].keys():
+        raise SystemExit(f"{output} has no columns {sorted(set(names) - rows[0].keys())}: give another --output.")
+    done = {tuple(row[name] for name in names) for row in rows}
     missing = [cell for cell in cells if key(cell) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:
@@ -189,6 +241,8 @@ def run_missing(
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
+            for process in active_children():  # if it was for this process only: hours are not waited for
+                process.terminate()
             raise SystemExit(f"Interrupted. What is finished is in {output}; run again to go on.") from None
     return n_failures
 
@@ -210,22 +264,36 @@ def column(rows: Iterable[Row], name: str) -> np.ndarray:
 
 
 def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> None:
-    """Write paragraphs to the Markdown beside the CSV and print them; say in the exit code if cells failed."""
+    """Write paragraphs, if any, to the Markdown beside the CSV and print them; say in the exit code if cells failed."""
     text = "\n\n".join(part.strip("\n") for part in parts) + "\n"
-    output.with_suffix(".md").write_text(text)
-    print(f"\n{text}\n{output.with_suffix('.md')}, {output.with_suffix('.png')}")
+    if text.strip():
+        output.with_suffix(".md").write_text(text)
+        print(f"\n{text}\n{output.with_suffix('.md')}, and pictures beside it")
+    else:
+        print(f"{output} has nothing of what was asked for: no page is written.")
     if n_failures:
         raise SystemExit(f"{n_failures} cells failed; run again to try only these.")
 
 
+def pyplot() -> Any:
+    """matplotlib's, which draws into files."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    return pyplot
+
+
 def save_picture(figure: Any, path: Path) -> None:
-    """Write a figure as a PNG of at most 128 colours, a third of the usual size."""
+    """Write a figure as a PNG of at most 256 colours, half of the usual size, and close it."""
     from PIL import Image
 
     figure.set_dpi(110)
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
-    image.quantize(128, dither=Image.Dither.NONE).save(path, optimize=True)
+    image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)
+    pyplot().close(figure)
 
 
 def anonymous_memory() -> float:
@@ -233,6 +301,8 @@ def anonymous_memory() -> float:
     try:
         return float(Path("/proc/self/status").read_text().split("RssAnon:")[1].split()[0]) / 1024
     except (OSError, IndexError):
+        import resource  # not on Windows
+
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
 
 

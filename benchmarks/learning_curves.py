@@ -4,7 +4,7 @@ Writes one row per fit to a CSV as soon as it is done (what is there already is 
 page and a picture beside it. Run s learns from the first trajectories of the data of random state s, and more and more
 of them; all runs of a system are tested on the data of random state 1000.
 
-    python benchmarks/learning_curves.py                       # everything, four runs
+    python benchmarks/learning_curves.py                       # everything, four runs: many hours of one core
     python benchmarks/learning_curves.py --quick               # two sizes, few iterations, one run: a few minutes
     python benchmarks/learning_curves.py --systems pendulum --settings paper skevgp-angles
     python benchmarks/learning_curves.py --systems iiwa14 --max-iter 60  # of each EVGP, as the page then tells

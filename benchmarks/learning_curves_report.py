@@ -8,7 +8,7 @@ from functools import reduce
 from pathlib import Path
 
 import numpy as np
-from harness import Row, figure_of, provenance_text, table
+from harness import Row, figure_of, provenance_text, pyplot, save_picture, table
 from table3_report import PAPER
 
 from skevgp.plotting import LearningCurveDisplay
@@ -242,14 +242,9 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
     setting = settings_of(rows)[0]
     curves = curves_of(rows, setting)
-    figure, grid = plt.subplots(
+    figure, grid = pyplot().subplots(
         2, len(curves), figsize=(max(2.05 * len(curves), 3.6), 5.0), squeeze=False, layout="constrained"
     )
     for column, (system, models) in zip(grid.T, curves.items(), strict=True):
@@ -277,5 +272,4 @@ def plot(rows: list[Row], path: Path) -> None:
         frameon=False,
         title="a quick run, not to be compared" if rows[0]["size"] == "quick" else None,
     )
-    figure.savefig(path, dpi=110, pil_kwargs={"optimize": True})
-    plt.close(figure)
+    save_picture(figure, path)

@@ -138,12 +138,7 @@ def say(row: dict[str, Any]) -> str:
 
 
 def plot(rows: list[dict[str, str]], path: Path) -> None:
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.4), layout="constrained")
+    figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(9, 3.4), layout="constrained")
     for engine, colour, marker in zip(ENGINES, ("#0072B2", "#D55E00", "#009E73"), "os^", strict=True):
         of = [row for row in rows if row["engine"] == engine and int(row["max_iter"]) < 1000]
         if not of:

@@ -3,7 +3,7 @@
 Writes one row per fit to a CSV as soon as it is done (what is there already is not fitted again), and from the CSV a
 Markdown table and a picture beside it. Models of seed s learn from data of random state s and are tested on 1000 + s.
 
-    python benchmarks/table3.py                             # everything, four seeds
+    python benchmarks/table3.py                             # everything, four seeds: days of one core
     python benchmarks/table3.py --quick                     # fewer rows and iterations, one seed: a few minutes
     python benchmarks/table3.py --systems iiwa14 --settings paper --max-iter 1000  # half an hour at most per fit
     python benchmarks/table3.py --systems pendulum --settings skevgp --seeds 10
@@ -14,8 +14,9 @@ kernel sees sines and cosines of angles) and, for iiwa14's EVGP, "skevgp-nominal
 centres of mass and inertias are wrong by up to 20 % as further features). RES-DBNN has a standard normal prior on its
 weights in the paper's setting, and one that shrinks with the width of a layer in the others.
 
-In the paper's setting a fit takes 1 to 4 minutes of one core for the pendulum and the cartpole, 10 to 30 for the
-acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.
+In the paper's setting a fit of a GP takes 1 to 5 minutes of one core for the pendulum and the cartpole, 10 to 30 for
+the acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.
+A network takes seconds, for iiwa14 minutes.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ The models are scikit-learn's GaussianProcessRegressor (GP), the sparse GP with 
 h(x) = (1, x): EGP and EVGP. Writes one row per model and seed to a CSV (what is there already is not run again), the
 picture of seed 0 and a Markdown page. A seed draws the starts of the optimisers, the folds and, for make_toy, the data.
 
-    python benchmarks/toy.py                          # Snelson's points, downloaded once; make_toy's if that fails
+    python benchmarks/toy.py                          # four minutes of one core; Snelson's points are downloaded once
     python benchmarks/toy.py --data-home some/folder  # that holds train_inputs, train_outputs and test_inputs
-    python benchmarks/toy.py --data toy               # make_toy's points, of the same shape
+    python benchmarks/toy.py --systems toy            # make_toy's points, of the same shape
     python benchmarks/toy.py --quick                  # no restarts, three folds, one seed: seconds
 """
 
@@ -179,12 +179,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
     displays : dict of PosteriorDisplay
         By name.
     """
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot as plt
-
-    figure, grid = plt.subplots(2, 2, figsize=(9, 6.6), sharex=True, sharey=True, layout="constrained")
+    figure, grid = harness.pyplot().subplots(2, 2, figsize=(9, 6.6), sharex=True, sharey=True, layout="constrained")
     displays = {}
     for axes, (name, model) in zip(grid.flat, models.items(), strict=True):
         displays[name] = PosteriorDisplay.from_estimator(
@@ -209,8 +204,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
         axes.set_ylabel("y")
     handles, labels = grid[-1, -1].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
-    figure.savefig(path, dpi=100)
-    plt.close(figure)
+    harness.save_picture(figure, path)
     return displays
 
 
@@ -305,34 +299,49 @@ def main() -> None:
         __doc__, quick="no restarts, three folds and one seed", seeds="seeds 0, 1, ...; default: 4, of a quick run 1"
     )
     parser.add_argument(
-        "--data", "--systems", choices=SOURCES, help="default: Snelson's points, or make_toy's if they cannot be had"
+        *("--systems", "--data"),
+        nargs="+",
+        choices=SOURCES,
+        help="data; default: Snelson's points, or make_toy's if they cannot be had",
     )
     parser.add_argument("--data-home", type=Path, help="a folder with Snelson's files; default: scikit-learn's")
     options = parser.parse_args()
-    if options.data != "toy":
+    sources = list(dict.fromkeys(options.systems or ["snelson"]))
+    if "snelson" in sources:
         try:
             fetch_snelson(options.data_home, n_retries=1)
         except OSError as problem:
-            if options.data:
+            if options.systems:
                 raise SystemExit(str(problem)) from problem
             print(f"{problem}\nIn their place: {SOURCES['toy']}.", flush=True)
-            options.data = "toy"
-    which, size = options.data or "snelson", "quick" if options.quick else "full"
+            sources = ["toy"]
+    size = "quick" if options.quick else "full"
     n_seeds = (1 if options.quick else 4) if options.seeds is None else options.seeds
     output = harness.output_path(options, "toy")
-    cells = [Cell(which, name, seed, size, options.data_home) for seed in range(n_seeds) for name in MODELS]
+    cells = [
+        Cell(which, name, seed, size, options.data_home)
+        for which in sources
+        for seed in range(n_seeds)
+        for name in MODELS
+    ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say)
-    rows = [row for row in harness.read(output) if (row["data"], row["size"]) == (which, size)]
-    if n_failures or not rows:
+    if n_failures:
         harness.write_report([], output, n_failures)
-        return
 
-    data = load(cells[0])
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)  # in the CSV
-        models = {cell.model: build(cell).fit(data.data, data.target) for cell in cells[: len(MODELS)]}
-    displays = plot(models, data, SOURCES[which], output.with_suffix(".png"))
-    harness.write_report(paragraphs(rows, displays, data), output)
+    parts = []
+    for which in sources:
+        rows = [row for row in harness.read(output) if (row["data"], row["size"]) == (which, size)]
+        if not rows:
+            continue
+        first = [cell for cell in cells if (cell.data, cell.seed) == (which, 0)]
+        data = load(first[0])
+        with threadpool_limits(1), warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # in the CSV
+            models = {cell.model: build(cell).fit(data.data, data.target) for cell in first}
+        stem = output.stem if len(sources) == 1 else f"{output.stem}_{which}"
+        displays = plot(models, data, SOURCES[which], output.with_name(f"{stem}.png"))
+        parts += paragraphs(rows, displays, data)
+    harness.write_report(parts, output)
 
 
 if __name__ == "__main__":

@@ -100,7 +100,8 @@ def fits(weights):
 
 
 @pytest.mark.parametrize(
-    ("plain", "gravity", "seen"), [(-0.1, 0.01, True), (-0.1, -0.09, False), (-0.015, 0.0, False), (0.1, 0.0, False)]
+    ("plain", "gravity", "seen"),
+    [(-0.1, -0.005, True), (-0.1, 0.2, True), (-0.1, -0.02, False), (-0.015, 0.0, False), (0.1, 0.0, False)],
 )
 def test_the_papers_observation_is_looked_for(plain, gravity, seen):
     import beta_report

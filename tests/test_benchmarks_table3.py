@@ -81,7 +81,7 @@ def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
         assert row["converged"] == str(key[1] == "paper")
     assert "| 123 / 123 |" in page.read_text()  # parameters, ours and the paper's
     assert "/ 0.005 |" in page.read_text()
-    assert picture.stat().st_size > 10_000
+    assert picture.stat().st_size > 5_000
 
     # Of another noise, the file has one row, by hand: nothing is left to do, and the page is of this noise alone.
     with table.open("a", newline="") as file:
@@ -172,3 +172,19 @@ def test_settings_are_what_they_say():
     assert isinstance(physics, InertiaForce)
     _, other = (step for _, step in built("iiwa14", "EVGP-IF", "skevgp-nominal", seed=1).feature_map.transformer_list)
     assert not np.allclose(nominal.fit_transform(X), other.fit_transform(X))
+
+
+def test_a_page_says_where_it_falls_short():
+    from table3_report import group, shortfalls
+
+    def rows(model, *errors, cr2=0.95):
+        names = {"system": "pendulum", "model": model, "setting": "skevgp"}
+        return [{**names, "error_mean": str(error), "cr2": str(cr2)} for error in errors]
+
+    good = rows("EVGP-IFG", 0.004, 0.006) + rows("EVGP-IF", 0.01) + rows("VGP", 0.02)
+    assert shortfalls(group(good)).count(": nowhere.") == 3
+    bad = rows("EVGP-IFG", 0.004, 0.02, cr2=0.99) + rows("EVGP-IF", 0.011, cr2=0.92) + rows("RES-VGP", 0.001, cr2=0.5)
+    order, paper, calibration = shortfalls(group(bad)).splitlines()
+    assert "skevgp: EVGP-IFG 0.0120, EVGP-IF 0.0110; pendulum skevgp: EVGP-IF 0.0110, RES-VGP 0.00100." in order
+    assert paper.endswith(": pendulum EVGP-IFG skevgp (0.0120, there 0.005).")
+    assert calibration.endswith(": pendulum EVGP-IF skevgp (0.920); pendulum EVGP-IFG skevgp (0.990).")

@@ -75,7 +75,7 @@ def test_it_runs_and_resumes(run, tmp_path):
     assert picture.stat().st_size > 10_000
 
     before = table.read_text()
-    assert "4 of 4 cells" in run("--data", "toy")
+    assert "4 of 4 cells" in run("--systems", "toy", "toy")
     assert table.read_text() == before
 
 
