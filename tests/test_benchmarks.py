@@ -1,43 +1,18 @@
 """The benchmarks in short mode, with what is installed for the tests."""
 
-import csv
-import runpy
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
+from .conftest import read
+
+pytestmark = pytest.mark.usefixtures("benchmarks")
 
 
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-
-
-@pytest.fixture
-def run(monkeypatch, capsys):
-    def run(script, *arguments):
-        monkeypatch.setattr(sys, "argv", [script, *map(str, arguments)])
-        runpy.run_path(str(BENCHMARKS / script), run_name="__main__")
-        return capsys.readouterr().out
-
-    return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
-
-
-def test_against_peers(run, tmp_path):
+def test_against_peers(run_script, tmp_path):
     output = tmp_path / "peers.csv"
     arguments = ("--quick", "--models", "RES-VGP", "--sharing", "none", "--output", output)
-    said = run("against_peers.py", *arguments, "--peers", "skevgp", "scikit-learn BayesianRidge")
+    said = run_script("against_peers.py", *arguments, "--peers", "skevgp", "scikit-learn BayesianRidge")
     assert said.count("...") == 2
     own, line = read(output)
     assert (own["peer"], line["peer"]) == ("skevgp", "scikit-learn BayesianRidge")
@@ -56,14 +31,15 @@ def test_against_peers(run, tmp_path):
     assert (tmp_path / "peers.png").stat().st_size > 10_000
 
     # What is there is not run again, unless asked for; a fit without time left ends with what it has.
-    assert "..." not in run("against_peers.py", *arguments, "--peers", "skevgp")
-    assert run("against_peers.py", *arguments, "--peers", "skevgp", "--redo", "--time-limit", "0").count("...") == 1
+    assert "..." not in run_script("against_peers.py", *arguments, "--peers", "skevgp")
+    said = run_script("against_peers.py", *arguments, "--peers", "skevgp", "--redo", "--time-limit", 0)
+    assert said.count("...") == 1
     _, redone = read(output)
     assert redone["stop"] == "time"
     assert np.isfinite(float(redone["error_mean"]))
 
 
-def test_a_peer_that_fails_is_a_row_and_one_that_is_missing_is_left_out(run, tmp_path, monkeypatch):
+def test_a_peer_that_fails_is_a_row_and_one_that_is_missing_is_left_out(run_script, tmp_path, monkeypatch):
     import peer_models
 
     fails = peer_models.Peer(("sklearn.linear_model",), peer_models.fit_linear)
@@ -71,7 +47,9 @@ def test_a_peer_that_fails_is_a_row_and_one_that_is_missing_is_left_out(run, tmp
     # The process that fits knows no such peers.
     monkeypatch.setattr(peer_models, "PEERS", {"fails": fails, "missing": missing})
     output = tmp_path / "peers.csv"
-    said = run("against_peers.py", "--quick", "--models", "VGP", "--output", output, "--peers", "fails", "missing")
+    said = run_script(
+        "against_peers.py", "--quick", "--models", "VGP", "--output", output, "--peers", "fails", "missing"
+    )
     assert "missing: no_such_package is not installed" in said
     (row,) = read(output)
     assert row["stop"].startswith("failed: error: unknown peer 'fails'")
@@ -107,9 +85,9 @@ def test_the_curve_is_the_sum_of_the_best_bounds_so_far():
     assert watch.deadline(0) == pytest.approx(50.0, abs=1.0)
 
 
-def test_evaluation_cost(run, tmp_path):
+def test_evaluation_cost(run_script, tmp_path):
     output = tmp_path / "cost.csv"
-    run("evaluation_cost.py", "--quick", "--repeats", "3", "--cores", "1", "2", "--output", output)
+    run_script("evaluation_cost.py", "--quick", "--repeats", "3", "--cores", "1", "2", "--output", output)
     rows = read(output)
     assert [row["sweep"] for row in rows] == ["data", "data", "rows", "rows", "points", "points"]
     for row in rows:

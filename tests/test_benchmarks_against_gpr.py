@@ -1,10 +1,5 @@
 """The comparison with scikit-learn's GPR on a few rows."""
 
-import csv
-import runpy
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
@@ -15,31 +10,18 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.metrics import negative_log_predictive_density, prediction_error
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+from .conftest import read
 
-
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+pytestmark = pytest.mark.usefixtures("benchmarks")
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(run_script, tmp_path):
     def run(*arguments):
         options = ("--systems", "smooth", "--jobs", 2, "--output", tmp_path / "gpr.csv")
-        monkeypatch.setattr(sys, "argv", ["against_gpr.py", *map(str, (*options, *arguments))])
-        runpy.run_path(str(BENCHMARKS / "against_gpr.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("against_gpr.py", *options, *arguments)
 
     return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_it_runs_and_resumes_and_leaves_out_what_would_take_too_long(run, tmp_path):

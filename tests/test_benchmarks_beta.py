@@ -1,10 +1,6 @@
 """The benchmark of the paper's figure of b in short mode."""
 
-import csv
-import runpy
-import sys
 from contextlib import nullcontext
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,34 +10,21 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+from .conftest import read
+
+pytestmark = pytest.mark.usefixtures("benchmarks")
 PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
 
 
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-
-
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(run_script, tmp_path):
     """Tiny fits of the pendulum."""
 
     def run(*arguments):
         options = ("--quick", "--systems", "pendulum", "--max-iter", 2, "--jobs", 1, "--output", tmp_path / "b.csv")
-        monkeypatch.setattr(sys, "argv", ["beta.py", *map(str, (*options, *arguments))])
-        runpy.run_path(str(BENCHMARKS / "beta.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("beta.py", *options, *arguments)
 
     return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_it_runs_and_resumes_and_has_a_row_for_each_weight(run, tmp_path):

@@ -1,26 +1,15 @@
 """The benchmark of the paper's table of complexities in short mode."""
 
 import csv
-import runpy
-import sys
 from dataclasses import fields
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+pytestmark = pytest.mark.usefixtures("benchmarks")
 # Rows, points, outputs, layers, units.
 SMALL, NETWORK = (50, 7, 3, 0, 0), (400, 0, 3, 2, 6)
 D = 5
-
-
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
 
 
 @pytest.fixture
@@ -96,7 +85,7 @@ def test_exponents_are_those_of_power_laws(cell):
     np.testing.assert_allclose(curve.exponent(rows), 2.5)
 
 
-def test_what_is_there_is_not_measured_again_and_the_page_is_written(cell, tmp_path, monkeypatch, capsys):
+def test_what_is_there_is_not_measured_again_and_the_page_is_written(run_script, cell, tmp_path):
     from complexity_report import QUICK
 
     cells = {tuple(size.values()): size for curve in QUICK for size in curve.cells()}
@@ -117,9 +106,7 @@ def test_what_is_there_is_not_measured_again_and_the_page_is_written(cell, tmp_p
             writer.writerow({**size, **given, "versions": "none", "machine": "none"})
 
     def run(*systems):
-        monkeypatch.setattr(sys, "argv", ["complexity.py", "--quick", "--output", str(output), *systems])
-        runpy.run_path(str(BENCHMARKS / "complexity.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("complexity.py", "--quick", "--output", output, *systems)
 
     page = output.with_suffix(".md")
     assert "9 of 9 cells" in run("--systems", "network")

@@ -1,10 +1,5 @@
 """The benchmark of the paper's learning curves in short mode."""
 
-import csv
-import runpy
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
@@ -14,34 +9,21 @@ from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForceGravity
 from skevgp.metrics import prediction_error, std_norm
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+from .conftest import read
 
-
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+pytestmark = pytest.mark.usefixtures("benchmarks")
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(run_script, tmp_path):
     """Tiny fits of the pendulum's EVGP."""
 
     def run(*arguments):
         options = ("--quick", "--systems", "pendulum", "--max-iter", 2, "--jobs", 1, "--models", "EVGP-IFG")
         options += ("--output", tmp_path / "curves.csv")
-        monkeypatch.setattr(sys, "argv", ["learning_curves.py", *map(str, (*options, *arguments))])
-        runpy.run_path(str(BENCHMARKS / "learning_curves.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("learning_curves.py", *options, *arguments)
 
     return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def made_up(**errors):

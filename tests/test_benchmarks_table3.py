@@ -1,11 +1,8 @@
 """The benchmark of the paper's Table 3 in short mode."""
 
 import csv
-import runpy
-import sys
 from contextlib import nullcontext
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,38 +13,25 @@ from skevgp.datasets import make_dynamics
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity
 from skevgp.metrics import prediction_error, std_norm
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+from .conftest import read
+
+pytestmark = pytest.mark.usefixtures("benchmarks")
 COLUMNS = (
     "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,n_parameters,fit_seconds"
 )
 PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
 
 
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-
-
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(run_script, tmp_path):
     """Tiny fits of the pendulum's models."""
 
     def run(*arguments, max_iter=2):
         options = ("--quick", "--systems", "pendulum", "--max-iter", max_iter, "--jobs", 1)
         options += ("--output", tmp_path / "table.csv")
-        monkeypatch.setattr(sys, "argv", ["table3.py", *map(str, (*options, *arguments))])
-        runpy.run_path(str(BENCHMARKS / "table3.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("table3.py", *options, *arguments)
 
     return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
@@ -88,6 +72,8 @@ def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
         csv.DictWriter(file, rows["RES-VGP", "paper"]).writerow({**rows["RES-VGP", "paper"], "noise": "0.5"})
     assert "1 of 1 cells" in run("--models", "RES-VGP", "--settings", "paper", "--noise", "0.5")
     assert "Noise: 0.5 " in page.read_text()
+    assert "## CR-2, mean over seeds" in page.read_text()
+    assert "| VGP |" not in page.read_text()
     assert "RES-VGP | 1 |" in page.read_text()
     assert "EVGP-IFG | 1 |" not in page.read_text()
 
@@ -185,6 +171,7 @@ def test_a_page_says_where_it_falls_short():
     assert shortfalls(group(good)).count(": nowhere.") == 3
     bad = rows("EVGP-IFG", 0.004, 0.02, cr2=0.99) + rows("EVGP-IF", 0.011, cr2=0.92) + rows("RES-VGP", 0.001, cr2=0.5)
     order, paper, calibration = shortfalls(group(bad)).splitlines()
+    assert shortfalls(group(bad), with_noise=True) == calibration
     assert "skevgp: EVGP-IFG 0.0120, EVGP-IF 0.0110; pendulum skevgp: EVGP-IF 0.0110, RES-VGP 0.00100." in order
     assert paper.endswith(": pendulum EVGP-IFG skevgp (0.0120, there 0.005).")
     assert calibration.endswith(": pendulum EVGP-IF skevgp (0.920); pendulum EVGP-IFG skevgp (0.990).")

@@ -1,10 +1,5 @@
 """The benchmark of the paper's toy figure in short mode."""
 
-import csv
-import runpy
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 from matplotlib import pyplot
@@ -13,31 +8,18 @@ from sklearn.preprocessing import PolynomialFeatures
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
 
-BENCHMARKS = Path(__file__).parents[1] / "benchmarks"
-pytestmark = pytest.mark.skipif(not BENCHMARKS.exists(), reason="the benchmarks are not part of the installed package")
+from .conftest import read
 
-
-@pytest.fixture(autouse=True)
-def as_a_script(monkeypatch):
-    """Scripts find the modules beside them."""
-    monkeypatch.syspath_prepend(str(BENCHMARKS))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
+pytestmark = pytest.mark.usefixtures("benchmarks")
 
 
 @pytest.fixture
-def run(monkeypatch, capsys, tmp_path):
+def run(run_script, tmp_path):
     def run(*arguments):
         options = ("--quick", "--jobs", 1, "--output", tmp_path / "toy.csv")
-        monkeypatch.setattr(sys, "argv", ["toy.py", *map(str, (*options, *arguments))])
-        runpy.run_path(str(BENCHMARKS / "toy.py"), run_name="__main__")
-        return capsys.readouterr().out
+        return run_script("toy.py", *options, *arguments)
 
     return run
-
-
-def read(path):
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
 
 
 def test_it_runs_and_resumes(run, tmp_path):

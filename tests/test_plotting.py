@@ -343,6 +343,12 @@ def test_axes_are_logarithmic_where_scores_are_positive_or_as_told(lowest, log_s
         assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
 
 
+def test_curves_on_the_same_axes_have_a_tick_for_every_number_of_rows():
+    axes = LearningCurveDisplay(np.array([10, 40]), np.ones((2, 1))).plot().ax_
+    LearningCurveDisplay(np.array([20, 40]), np.ones((2, 1))).plot(axes)
+    assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "20", "40"]
+
+
 def test_scores_that_have_no_logarithm_are_named():
     with pytest.raises(ValueError, match=r"log_scale=True needs positive scores; the smallest is -1\.0"):
         LearningCurveDisplay(np.array([10, 40]), np.array([[2.0], [-1.0]])).plot(log_scale=True)

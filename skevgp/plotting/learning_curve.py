@@ -187,9 +187,11 @@ class LearningCurveDisplay:
         ax.fill_between(self.n_rows, low, high, color=color, alpha=0.2, linewidth=0)
         ax.plot(self.n_rows, np.nanmean(self.scores, axis=1), ".-", color=color, label=label)
         if positive if log_scale is None else log_scale:
+            # Of curves that are on the axes already; the scale forgets them.
+            counts = np.union1d(getattr(ax.xaxis.get_major_locator(), "locs", []), self.n_rows)
             ax.set_xscale("log")
             ax.set_yscale("log")
-            ax.set_xticks(self.n_rows, [f"{count:g}" for count in self.n_rows])
+            ax.set_xticks(counts, [f"{count:g}" for count in counts])
             ax.set_xticks([], minor=True)
         ax.set_xlabel("training rows")
         ax.set_ylabel(self.score_name)
