@@ -175,7 +175,9 @@ def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str,
     }
 
 
-def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str, Any]:
+def fitted_row(
+    fit: Fit, train: Bunch, test: Bunch, changes: dict[str, Any] | None = None, **columns: Any
+) -> dict[str, Any]:
     """Fit a model, look at it on test rows, and tell it all in a row of a CSV.
 
     Parameters
@@ -183,6 +185,8 @@ def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str,
     fit : Fit
     train, test : Bunch
         With ``data`` and ``target``.
+    changes : dict, default=None
+        Of the regressor's parameters.
     **columns
         What else the row tells, of the data.
 
@@ -191,7 +195,7 @@ def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str,
     row : dict
         ``fit_seconds`` is processor time of one thread.
     """
-    regressor = build(fit)
+    regressor = build(fit).set_params(**(changes or {}))
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ConvergenceWarning)
         start = time.process_time()
