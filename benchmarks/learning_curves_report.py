@@ -242,6 +242,8 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
+    from matplotlib import ticker
+
     setting = settings_of(rows)[0]
     curves = curves_of(rows, setting)
     figure, grid = pyplot().subplots(
@@ -255,6 +257,9 @@ def plot(rows: list[Row], path: Path) -> None:
             axes.set(xlabel="", ylabel="")
             axes.grid(alpha=0.3)
             axes.tick_params(which="both", labelsize=7)
+            axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+            axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+            axes.yaxis.set_minor_formatter(ticker.NullFormatter())
             axes.spines[["top", "right"]].set_visible(False)
         column[0].set_title(system, fontsize=11)
         column[1].set_xlabel("training rows", fontsize=9)

@@ -3,7 +3,10 @@
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
+
+from .conftest import read
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
@@ -28,3 +31,27 @@ def test_what_it_names_is_there(page):
     assert len(links) > 20
     assert len(scripts) > 5
     assert [path for path in (*links, *scripts) if not (ROOT / path).exists()] == []
+
+
+def test_the_readme_has_the_same_errors():
+    readme = (ROOT / "README.md").read_text()
+    columns = {"skevgp": 3, "skevgp-angles": 4, "skevgp-nominal": 5}
+    shown = {
+        cells[0].split()[0]: cells
+        for line in readme.splitlines()
+        if re.match(r"\| (pendulum|cartpole|acrobot|iiwa14).* \| \d+ \| 0\.\d+ \|", line)
+        for cells in [[cell.strip() for cell in line.strip("|").split("|")]]
+    }
+    assert len(shown) == 4
+    errors = {}
+    for row in read(RESULTS / "table3.csv"):
+        if row["model"] == "EVGP-IFG" and row["setting"] in columns:
+            errors.setdefault((row["system"], row["setting"]), []).append(float(row["error_mean"]))
+    compared = 0
+    for (system, setting), values in errors.items():
+        text = shown[system][columns[setting]]
+        if text:
+            assert len(values) == 4
+            assert text == f"{np.mean(values):.{len(text) - 2}f}"
+            compared += 1
+    assert compared == 8
