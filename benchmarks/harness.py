@@ -100,12 +100,20 @@ def output_path(options: argparse.Namespace, name: str) -> Path:
     return path
 
 
+def processor() -> str:
+    """Its name, where the system tells it."""
+    try:
+        return Path("/proc/cpuinfo").read_text().split("model name")[1].split("\n")[0].strip("\t :")
+    except (OSError, IndexError):
+        return platform.processor() or platform.machine()
+
+
 def provenance() -> dict[str, str]:
     """Columns that say when, with what and where a row was measured."""
     return {
         "date": datetime.now(UTC).date().isoformat(),
         "versions": " ".join(f"{package.__name__} {package.__version__}" for package in (skevgp, np, scipy, sklearn)),
-        "machine": platform.processor() or platform.machine(),
+        "machine": processor(),
     }
 
 
@@ -283,6 +291,18 @@ def pyplot() -> Any:
     from matplotlib import pyplot
 
     return pyplot
+
+
+def logarithmic(axes: Any) -> None:
+    """Give the vertical axis a logarithmic scale, with plain numbers for 1, 2 and 5 where there is room."""
+    from matplotlib import ticker
+
+    axes.set_yscale("log")
+    low, high = np.log10(axes.get_ylim())
+    if high - low < 3.0:
+        axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
+    axes.yaxis.set_minor_formatter(ticker.NullFormatter())
 
 
 def save_picture(figure: Any, path: Path) -> None:

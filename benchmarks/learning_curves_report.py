@@ -8,7 +8,7 @@ from functools import reduce
 from pathlib import Path
 
 import numpy as np
-from harness import Row, figure_of, provenance_text, pyplot, save_picture, table
+from harness import Row, figure_of, logarithmic, provenance_text, pyplot, save_picture, table
 from table3_report import PAPER
 
 from skevgp.plotting import LearningCurveDisplay
@@ -242,8 +242,6 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    from matplotlib import ticker
-
     setting = settings_of(rows)[0]
     curves = curves_of(rows, setting)
     figure, grid = pyplot().subplots(
@@ -257,14 +255,15 @@ def plot(rows: list[Row], path: Path) -> None:
             axes.set(xlabel="", ylabel="")
             axes.grid(alpha=0.3)
             axes.tick_params(which="both", labelsize=7)
-            axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-            axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
-            axes.yaxis.set_minor_formatter(ticker.NullFormatter())
+            logarithmic(axes)
             axes.spines[["top", "right"]].set_visible(False)
-        column[0].set_title(system, fontsize=11)
+        n_runs = max(curve.errors.shape[1] for curve in models.values())
+        column[0].set_title(f"{system} ({n_runs} run{'s' * (n_runs > 1)})", fontsize=11)
         column[1].set_xlabel("training rows", fontsize=9)
     for axes, what in zip(grid[:, 0], ("all models", "EVGP only"), strict=True):
         axes.set_ylabel(f"test Error, {what}", fontsize=9)
+    notes = ["mean, and band from lowest to highest run"]
+    notes += ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
     handles = {
         label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
@@ -275,6 +274,7 @@ def plot(rows: list[Row], path: Path) -> None:
         ncols=6 if len(curves) > 2 else 2,
         fontsize=9,
         frameon=False,
-        title="a quick run, not to be compared" if rows[0]["size"] == "quick" else None,
+        title="; ".join(notes),
+        title_fontsize=9,
     )
     save_picture(figure, path)

@@ -186,7 +186,7 @@ def fitted_row(
     train, test : Bunch
         With ``data`` and ``target``.
     changes : dict, default=None
-        Of the regressor's parameters.
+        Parameters set on the regressor on top of the setting's.
     **columns
         What else the row tells, of the data.
 
@@ -195,7 +195,8 @@ def fitted_row(
     row : dict
         ``fit_seconds`` is processor time of one thread.
     """
-    regressor = build(fit).set_params(**(changes or {}))
+    changes = changes or {}
+    regressor, max_iter = build(fit).set_params(**changes), changes.get("max_iter", fit.max_iter)
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ConvergenceWarning)
         start = time.process_time()
@@ -210,7 +211,7 @@ def fitted_row(
         "fit_seconds": seconds,
         **columns,
         "size": fit.size,
-        "max_iter": "" if fit.max_iter is None or fit.model == "RES-DBNN" else fit.max_iter,
+        "max_iter": "" if max_iter is None or fit.model == "RES-DBNN" else max_iter,
         "n_iter": fitted.n_iter_,
         "bound_per_row": getattr(fitted, "lower_bound_", np.nan) / len(train.data),
         "converged": not any(issubclass(warning.category, ConvergenceWarning) for warning in caught),

@@ -25,6 +25,8 @@ def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
         model.fit(train.data, train.target)
     adam, full = read(output)
     assert (adam["variant"], adam["n_parameters"], adam["n_iter"]) == ("Adam", "1741", "50")
+    assert "setting" not in adam
+    assert adam["max_iter"] == full["max_iter"] == "50"
     assert (full["variant"], full["n_parameters"]) == ("L-BFGS, full posterior", str(model.n_parameters_))
     error = prediction_error(test.target, model.predict(test.data))
     assert float(full["error_mean"]) == pytest.approx(error, rel=1e-6)
@@ -34,6 +36,13 @@ def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
     assert "In the paper: 0.011." in page
     assert "EVGP-IF\n" not in page
     assert output.with_suffix(".png").stat().st_size > 5_000
+
+
+def test_variants_change_parameters_that_exist():
+    from cartpole import VARIANTS
+
+    for changes in VARIANTS.values():
+        EVGPRegressor().set_params(**changes)
 
 
 def test_a_page_has_the_mean_of_data_sets_and_each():
