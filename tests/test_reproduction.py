@@ -25,6 +25,26 @@ def test_the_errors_are_those_of_table_3(page):
     assert set(rows) <= set((RESULTS / "table3.md").read_text().splitlines())
 
 
+def test_what_was_tried_on_the_cartpole_is_that_of_its_page(page):
+    lines = [line for line in page.splitlines() if re.match(r"\| (Adam|L-BFGS|skevgp's defaults)", line)]
+    assert len(lines) > 10
+    assert set(lines) <= set((RESULTS / "cartpole.md").read_text().splitlines())
+
+
+def test_the_calibration_is_that_of_the_results(page):
+    rows = read(RESULTS / "table3_noise0.01.csv")
+    lines = re.findall(r"^\| (\w+) (EVGP-\w+) \| ([^|]*) \|(.*)\|(.*)\|(.*)\|$", page, re.MULTILINE)
+    assert len(lines) == 8
+    for system, model, seeds, *cells in lines:
+        counts = set()
+        for setting, cell in zip(("skevgp", "skevgp-angles", "skevgp-nominal"), cells, strict=True):
+            wanted = (system, model, setting)
+            cr2 = [float(row["cr2"]) for row in rows if (row["system"], row["model"], row["setting"]) == wanted]
+            assert cell.strip() == (f"{np.mean(cr2):.3f}" if cr2 else "")
+            counts |= {len(cr2)} - {0}
+        assert seeds == " to ".join(map(str, sorted(counts)))
+
+
 def test_what_it_names_is_there(page):
     links = re.findall(r"\]\(([^)#]+)[^)]*\)", page)
     scripts = re.findall(r"python (benchmarks/\w+\.py)", page)
