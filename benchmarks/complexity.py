@@ -31,8 +31,8 @@ from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import threadpool_limits
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor
-from skevgp.inference.adam import adam
 from skevgp.inference.elbo import ElboObjective
+from skevgp.optimizers.adam import adam
 
 N_COLUMNS = 5
 PAPER: dict[str, Any] = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}

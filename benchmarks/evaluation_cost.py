@@ -23,16 +23,17 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 import skevgp
+from skevgp.fitting.start import FIRST_NOISE, spread_of, starting_table
+from skevgp.fitting.units import Frame
 from skevgp.inference.bounds import PosteriorFamily
-from skevgp.inference.frame import Frame
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
-from skevgp.inference.parameters import ParameterTable, Start
-from skevgp.inference.rows import Rows
-from skevgp.inference.source import LocalSource, moments_of_rows
-from skevgp.inference.start import FIRST_NOISE, Starts, spread_of, starting_table
-from skevgp.inference.threads import BlockMap, single_threaded_libraries
-from skevgp.kernels import SquaredExponential
+from skevgp.kernels.parse import Start, Starts
+from skevgp.kernels.stationary import SquaredExponential
+from skevgp.optimizers.parameters import ParameterTable
+from skevgp.rows.internal import Rows
+from skevgp.rows.source import LocalSource, moments_of_rows
+from skevgp.rows.threads import BlockMap, single_threaded_libraries
 
 # Rows, inducing points, columns, outputs: of the pendulum, the cartpole, the acrobot, the IIWA.
 NAMED = {

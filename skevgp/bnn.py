@@ -18,9 +18,9 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ._progress import Progress
 from ._shapes import like_y
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
-from .inference.network import VariationalNetwork
-from .inference.threads import single_threaded_libraries
-from .inference.training import Scaling, Training, train
+from .network.model import VariationalNetwork
+from .network.training import Scaling, Training, train
+from .rows.threads import single_threaded_libraries
 
 # Without max_iter: so many epochs, or more if they make fewer steps than this.
 _EPOCHS, _STEPS = 100, 5000

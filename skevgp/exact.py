@@ -14,12 +14,12 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
-from ._dask import is_dask
-from ._explicit_gp import ExplicitGaussianProcess
+from ._base import ExplicitGaussianProcess
 from ._progress import Progress
 from ._validation import unchanged_if_it_fails
 from .inference.exact import ExactFit, ExactOptions
-from .inference.threads import single_threaded_libraries
+from .rows.dask import is_dask
+from .rows.threads import single_threaded_libraries
 
 
 class EGPRegressor(ExplicitGaussianProcess):

@@ -17,13 +17,13 @@ from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 from sklearn.utils._param_validation import Interval, StrOptions
 
-from ._explicit_gp import ExplicitGaussianProcess
+from ._base import ExplicitGaussianProcess
 from ._progress import Progress
 from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
-from .inference.inducing import Placement
-from .inference.learning import Options
-from .inference.outputs import FittedOutputs
-from .inference.threads import single_threaded_libraries
+from .fitting.inducing import Placement
+from .fitting.outputs import FittedOutputs
+from .fitting.strategy import Options
+from .rows.threads import single_threaded_libraries
 
 _MAX_ITER = {"lbfgs": 1000, "adam": 16000}
 

@@ -208,7 +208,7 @@ def test_a_loss_that_still_falls_is_told():
 
 
 def test_an_interruption_keeps_a_usable_model(monkeypatch):
-    from skevgp.inference.network import VariationalNetwork
+    from skevgp.network.model import VariationalNetwork
 
     original, calls = VariationalNetwork.loss_and_gradient, []
 

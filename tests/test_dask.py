@@ -10,7 +10,8 @@ import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import EVGPRegressor, _dask
+from skevgp import EVGPRegressor
+from skevgp.rows import dask as _dask
 
 dask = pytest.importorskip("dask")
 da = pytest.importorskip("dask.array")

@@ -16,8 +16,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from .blocks import LinearStatistics
-from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from ..rows.blocks import LinearStatistics
 from .statistics import SufficientStatistics
 
 PosteriorFamily = Literal["full", "diagonal"]

@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from .blocks import Blocks
+from .._linalg import cholesky_pullback
+from ..optimizers.parameters import ParameterTable
+from ..rows.blocks import Blocks
 from .bounds import LOG_2PI
 from .families import DiagonalFamily, Family, FullFamily, Group, NaturalFamily
-from .linalg import cholesky_pullback
 from .model import SparseModel
-from .parameters import ParameterTable
 from .posterior import Posterior
 from .statistics import SufficientStatistics, collect, pull_back
 

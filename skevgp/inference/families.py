@@ -13,10 +13,10 @@ from typing import Protocol
 
 import numpy as np
 
+from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from ..optimizers.parameters import Parameter
 from .bounds import CoefficientPrior, WhitenedPosterior, projected
-from .linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from .model import Values, diagonal_root, log_variances
-from .parameters import Parameter
 from .statistics import SufficientStatistics
 
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from .blocks import Blocks
+from .._linalg import jittered_cholesky, triangular_inverse
+from ..rows.blocks import Blocks
 from .bounds import BoundAtOptimum, CoefficientPrior, PosteriorFamily
-from .linalg import jittered_cholesky, triangular_inverse
 from .posterior import InducingSet, Posterior
 from .statistics import Kernel, SufficientStatistics, collect
 

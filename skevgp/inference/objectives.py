@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from .blocks import Blocks
+from .._linalg import cholesky_pullback
+from ..optimizers.parameters import ParameterTable
+from ..rows.blocks import Blocks
 from .bounds import Residuals
-from .linalg import cholesky_pullback
 from .model import SparseModel
-from .parameters import ParameterTable
 from .statistics import collect, pull_back
 
 

@@ -14,8 +14,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .blocks import Block, Blocks
-from .linalg import diagonal_of
+from .._linalg import diagonal_of
+from ..rows.blocks import Block, Blocks
 
 
 class KernelAt(Protocol):

@@ -3,12 +3,12 @@ import numpy as np
 import pytest
 from autograd import grad
 
+from skevgp._linalg import NotPositiveDefiniteError
 from skevgp.inference.bounds import BoundAtOptimum
-from skevgp.inference.linalg import NotPositiveDefiniteError
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 
-from .oracle import central_differences, collapsed_bound, problem, relative_error, whitened
+from ..oracle import central_differences, collapsed_bound, problem, relative_error, whitened
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)
@@ -54,9 +54,9 @@ def test_gradient_agrees_with_finite_differences(family, shared):
 
 
 def test_gradient_with_one_lengthscale_for_all_columns():
-    from skevgp.inference.parameters import Start
-    from skevgp.inference.start import Starts, starting_table
-    from skevgp.kernels import SquaredExponential
+    from skevgp.fitting.start import starting_table
+    from skevgp.kernels.parse import Start, Starts
+    from skevgp.kernels.stationary import SquaredExponential
 
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
@@ -73,7 +73,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
 def test_recomputed_blocks_give_the_same_as_kept_ones(family, monkeypatch):
     model, rows, table = problem(family)
     kept = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
-    monkeypatch.setattr("skevgp.inference.blocks.KEEP_BYTES", 0)
+    monkeypatch.setattr("skevgp.rows.blocks.KEEP_BYTES", 0)
     recomputed = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
     assert kept[0] == recomputed[0]
     np.testing.assert_array_equal(kept[1], recomputed[1])

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from autograd import grad, value_and_grad
 
-from skevgp.inference.blocks import Batch
 from skevgp.inference.elbo import ElboObjective
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.statistics import SufficientStatistics
+from skevgp.rows.blocks import Batch
 
-from .oracle import central_differences, negative_elbo, problem, relative_error, whitened
+from ..oracle import central_differences, negative_elbo, problem, relative_error, whitened
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from skevgp.inference.bounds import CoefficientPrior
-from skevgp.inference.covariances import Constant, DotProduct, Sum
 from skevgp.inference.exact import ExactModel
-from skevgp.inference.source import RawRows
-from skevgp.kernels import SquaredExponential
+from skevgp.kernels.covariances import Constant, DotProduct, Sum
+from skevgp.kernels.stationary import SquaredExponential
+from skevgp.rows.source import RawRows
 
-from .oracle import central_differences, relative_error, squared_exponential
+from ..oracle import central_differences, relative_error, squared_exponential
 
 LOG_2PI = np.log(2 * np.pi)
 N, D, P, O = 25, 2, 3, 2  # noqa: E741

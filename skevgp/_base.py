@@ -1,0 +1,281 @@
+"""What the sparse and the exact model share: intake of X and y, maps, priors, prediction."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from numbers import Integral, Real
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin
+from sklearn.gaussian_process.kernels import Kernel
+from sklearn.utils import _safe_indexing, check_random_state
+from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from ._coef_prior import resolve_coef_prior, wide_scale
+from ._shapes import like_y
+from ._validation import check_integer, check_magnitude, check_not_vanishing, is_plain
+from .fitting.units import Frame
+from .inference.posterior import Posterior
+from .kernels.parse import KernelSpec, parse_kernel
+from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
+from .rows.mapped import MappedRows, map_rows
+from .rows.maps import fit_map
+from .rows.source import LocalSource, Source, moments_of_rows
+
+# float32 is not copied as a whole: pieces of it become float64.
+_DTYPES = [np.float64, np.float32]
+# In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
+_VAGUE = 1e3
+
+
+@dataclass(frozen=True)
+class Problem:
+    """What a fit starts from.
+
+    Attributes
+    ----------
+    source : Source
+        The rows through the maps.
+    frame : Frame
+    spec : KernelSpec
+        With the start of the noise.
+    vague : ndarray of shape (o, p)
+        Which weights have an infinite prior scale; in ``frame.prior`` theirs is very wide.
+    """
+
+    source: Source
+    frame: Frame
+    spec: KernelSpec
+    vague: np.ndarray
+
+
+class Fitted(Protocol):
+    """What `ExplicitGaussianProcess` needs of a fit."""
+
+    @property
+    def frame(self) -> Frame:
+        """Where centre, target_mean, units and prior are."""
+
+    def posterior(self) -> Posterior:
+        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+
+    def bounds(self, name: str, output: int) -> np.ndarray:
+        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+
+
+class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
+    """A Gaussian process with explicit features, however it is fitted."""
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "feature_map": "no_validation",
+        "kernel": "no_validation",
+        "kernel_map": "no_validation",
+        "coef_mean": ["array-like", Real, StrOptions({"auto"})],
+        "coef_scale": ["array-like", Real, StrOptions({"auto"})],
+        "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
+        "normalize_y": ["boolean"],
+        "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "n_restarts": [Interval(Integral, 0, None, closed="left")],
+        "tol": [Interval(Real, 0, None, closed="left")],
+        "random_state": ["random_state"],
+        "verbose": ["verbose"],
+    }
+
+    feature_map: TransformerMixin | None
+    kernel: Kernel | Callable[..., Any] | None
+    kernel_map: TransformerMixin | None
+    coef_mean: ArrayLike | str
+    coef_scale: ArrayLike | str
+    noise_variance: float | None
+    normalize_y: bool
+
+    _fitted: Fitted
+    _spec: KernelSpec
+    _single_output: bool
+
+    def predict(
+        self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
+    ) -> Any:
+        """Predict y.
+
+        Parameters
+        ----------
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            For a Dask array the results are lazy Dask arrays of the same chunks.
+        return_std : bool, default=False
+            Whether to return the standard deviation too.
+        return_cov : bool, default=False
+            Whether to return the covariance between rows too.
+        include_noise : bool, default=True
+            Whether they are of y, with the learned noise, or of the noise-free g(x).
+
+        Returns
+        -------
+        mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+        std : ndarray of the same shape
+            If ``return_std``.
+        cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
+            If ``return_cov``.
+
+        Raises
+        ------
+        ValueError
+            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+        """
+        if return_std and return_cov:
+            raise ValueError("At most one of return_std and return_cov can be asked for.")
+        if not hasattr(self, "_posterior"):
+            check_is_fitted(self)
+        if is_dask(X):
+            if return_cov:
+                raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+            X = as_rows(X, "X", known=False)
+            self._validated(X)
+            shape = () if self._n_outputs == 1 else (self._n_outputs,)
+            return predict_chunks(self, X, return_std, include_noise, shape)
+        given: Any = X
+        array: Any = X
+        if not is_plain(self, X):
+            given, array, _ = self._validated(X)
+        noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
+        if return_cov:
+            mean, cov = self._posterior.covariance(*self._inputs_and_features(given, array, slice(None)))
+            cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
+            return like_y(mean + self._fitted.frame.target_mean), like_y(cov)
+        means, deviations = [], []
+        size = self._posterior.rows_at_once
+        for first in range(0, len(array), size):
+            rows = self._inputs_and_features(given, array, slice(first, first + size))
+            mean, variance = self._posterior.predict(*rows, return_std)
+            means.append(mean + self._fitted.frame.target_mean)
+            if variance is not None:
+                deviations.append(np.sqrt(variance + noise))
+        mean = like_y(np.concatenate(means))
+        return (mean, like_y(np.concatenate(deviations))) if return_std else mean
+
+    def sample_y(
+        self,
+        X: ArrayLike,
+        n_samples: int = 1,
+        random_state: int | np.random.RandomState | None = 0,
+        include_noise: bool = True,
+    ) -> np.ndarray:
+        """Draw functions from the posterior at some rows.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_rows, n_features)
+        n_samples : int, default=1
+            How many functions.
+        random_state : int, RandomState instance or None, default=0
+        include_noise : bool, default=True
+            Whether samples are of y, with the learned noise, or of the noise-free g(x).
+
+        Returns
+        -------
+        samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+        """
+        check_integer(n_samples, "n_samples", minimum=1)
+        rng = check_random_state(random_state)
+        mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
+        single = mean.ndim == 1
+        mean, cov = mean.reshape(len(mean), -1), cov.reshape(len(mean), len(mean), -1)
+        samples = np.stack(
+            [
+                rng.multivariate_normal(mean[:, o], cov[:, :, o], n_samples, check_valid="ignore").T
+                for o in range(mean.shape[1])
+            ],
+            axis=1,
+        )
+        return samples[:, 0] if single else samples
+
+    def _problem(self, X: Any, y: Any, allow_vague: bool = False) -> Problem:
+        """Look at X and y for a new fit: maps, kernel, prior and units."""
+        given, X, y = self._validated(X, y, reset=True)
+        fit_to = fit_map_to_chunks if is_dask(X) else fit_map
+        self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
+        self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
+        source = self._source(given, X, y)
+        inputs, features, targets = source.sum(moments_of_rows)
+        check_not_vanishing(targets.largest, "y")
+        check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
+        spec = parse_kernel(self.kernel, len(inputs.mean))
+        if self.noise_variance is not None:
+            if spec.starts.noise.value is not None:
+                raise ValueError(
+                    f"The noise starts either from noise_variance={self.noise_variance!r} or from the WhiteKernel of "
+                    f"kernel={self.kernel!r}; give one of them."
+                )
+            spec = spec.with_noise(self.noise_variance)
+        wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest)
+        mean, scale = resolve_coef_prior(
+            self.coef_mean, self.coef_scale, self.feature_map_, given, wide, allow_vague=allow_vague
+        )
+        vague = np.isinf(scale)
+        unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
+        target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
+        frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
+        self._spec, self._single_output = spec, y.ndim == 1
+        return Problem(source, frame, spec, vague)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "_posterior")
+
+    def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
+        """X as the maps shall see it (a data frame stays one), X and y as arrays."""
+        if is_dask(X):
+            validate_data(self, X, reset=reset, skip_check_array=True)
+            X, y = (X, np.empty(0)) if y is None and not reset else aligned(X, y)
+            return X, X, y
+        given = X
+        if y is None and not reset:
+            X, y = validate_data(self, X, reset=False, dtype=_DTYPES), np.empty(0)
+        else:
+            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=_DTYPES)
+            y = y if y.dtype.kind == "f" else np.asarray(y, dtype=np.float64)
+        check_magnitude(X, "X")
+        check_magnitude(y, "y")
+        return (given if hasattr(given, "iloc") else X), X, y
+
+    def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's centred inputs and the features of rows."""
+        array = np.asarray(X[rows], dtype=np.float64)
+        given = array if given is X else _safe_indexing(given, rows)
+        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
+        return inputs - self._fitted.frame.centre, features
+
+    def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
+        """The rows through the maps."""
+        if is_dask(X):
+            return DaskSource(X, y, self.feature_map_, self.kernel_map_)
+        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
+
+    def _set_common_attributes(self) -> None:
+        """What is known of weights, noise and kernel."""
+        fitted, prior = self._fitted, self._fitted.frame.prior
+        self._posterior: Posterior = fitted.posterior()
+        first = 0 if self._single_output else slice(None)
+        mean, covariance = self._posterior.coefficients()
+        self.coef_, self.coef_cov_ = mean[first], covariance[first]
+        self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+        self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
+        kernels = [
+            self._spec.to_sklearn(
+                np.exp(group.hyperparameters),
+                fitted.bounds("hyperparameters", o),
+                float(self._posterior.signal[o]),
+                fitted.bounds("signal", o),
+            )
+            for group in self._posterior.inducing
+            for o in range(len(prior.mean))[group.outputs]
+        ]
+        self.kernel_ = kernels[0] if self._single_output else kernels
+
+    @property
+    def _n_outputs(self) -> int:
+        return len(self._posterior.noise)

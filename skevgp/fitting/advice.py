@@ -1,0 +1,82 @@
+"""What the user should know of how a fit went: sentences, empty if there is nothing to say."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..inference.bounds import CoefficientPrior
+from ..optimizers.lbfgs import Minimum
+from ..rows.internal import Rows
+from .start import alike_neighbours
+
+# When no start got below this share, the user should know.
+_NOTHING_LEARNED = 0.99
+# y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
+_FAR, _FAR_WEIGHT = 1e4, 100.0
+
+
+def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float, sparse: bool = True) -> str:
+    """Whether the optimiser ended before it converged, and why.
+
+    Parameters
+    ----------
+    minimum : Minimum
+    max_iter : int
+    spent : int
+        Iterations of ``max_iter`` before those of ``minimum``.
+    tol : float
+        In nats.
+    sparse : bool, default=True
+        Whether there are inducing points.
+    """
+    n_iter = spent + minimum.n_iter
+    if minimum.interrupted:
+        return interrupted(n_iter)
+    if minimum.converged:
+        return ""
+    if n_iter < max_iter:
+        return (
+            f"L-BFGS stopped after {n_iter} iterations: rounding errors keep hiding the way up, as in data without "
+            f"noise. The best parameters are kept; a larger tol{', fewer inducing points' if sparse else ''} or a "
+            "WhiteKernel with a lower bound on the noise end sooner."
+        )
+    return (
+        f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
+        f"max_iter, or stop earlier on purpose with a larger tol (now {tol})."
+    )
+
+
+def interrupted(n_iter: int) -> str:
+    """That Ctrl-C ended the fit."""
+    return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
+
+
+def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
+    """Whether y, or a weight, is so far from its prior mean that the fit suffers."""
+    if (rows.scatter() < _FAR**-2).any():
+        return (
+            f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
+            "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."
+        )
+    if (np.abs(prior.reference) > _FAR_WEIGHT).any():
+        return (
+            f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
+            "raise coef_scale or, if it is an intercept's, set normalize_y=True."
+        )
+    return ""
+
+
+def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
+    """Whether noise variances (o,) explain everything of targets whose neighbouring rows are alike."""
+    nothing = noise > _NOTHING_LEARNED * rows.scatter()
+    if nothing.any():
+        # Where residuals look like noise, noise is the answer.
+        nothing &= alike_neighbours(rows)
+    if not nothing.any():
+        return ""
+    return (
+        f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
+        "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
+        f"Raise {'n_inducing or ' if sparse else ''}n_restarts, let kernel or noise_variance start elsewhere, or look "
+        "at the scales of the kernel's columns."
+    )

@@ -1,0 +1,135 @@
+"""Where inducing points start."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from sklearn.cluster import KMeans
+from sklearn.exceptions import ConvergenceWarning
+
+from ..inference.statistics import Kernel
+from ..rows.source import Moments
+from .start import spread_of
+
+# On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
+MAX_SAMPLE = 10_000
+# The greedy search keeps so many numbers at most, 80 MB.
+LARGEST_SEARCH = 10_000_000
+# Below this share of the prior variance, what is left is rounding: it no longer tells which row is the least known.
+_EXHAUSTED = 1e-10
+
+
+@dataclass(frozen=True)
+class Placement:
+    """How inducing points are chosen.
+
+    Attributes
+    ----------
+    method : {"auto", "k-means", "greedy"} or ndarray of shape (m, d)
+        ``"auto"`` starts as ``"k-means"``; or the points themselves, in the same units as the inputs.
+    n_inducing : int
+        At most so many points; an array brings its own number.
+    """
+
+    method: Literal["auto", "k-means", "greedy"] | np.ndarray
+    n_inducing: int
+
+    @property
+    def anew(self) -> Placement | None:
+        """How to place them once more, when the kernel has learned something; None if they stay."""
+        by_user = isinstance(self.method, np.ndarray)
+        return replace(self, method="greedy") if not by_user and self.method == "auto" else None
+
+    @property
+    def sample_size(self) -> int:
+        """How many rows are enough to choose from."""
+        if isinstance(self.method, str) and self.method == "greedy":
+            return max(2 * self.n_inducing, min(MAX_SAMPLE, LARGEST_SEARCH // self.n_inducing))
+        return max(MAX_SAMPLE, 10 * self.n_inducing)
+
+    def points(
+        self, inputs: np.ndarray, kernel: Kernel, hyperparameters: np.ndarray, rng: np.random.RandomState
+    ) -> np.ndarray:
+        """Choose the points.
+
+        Parameters
+        ----------
+        inputs : ndarray of shape (n_rows, d)
+            Centred; of all rows, or of ``sample_size`` of them.
+        kernel : Kernel
+        hyperparameters : ndarray of shape (n_hyper,)
+            As the kernel takes them; only ``"greedy"`` asks the kernel.
+        rng : RandomState
+
+        Returns
+        -------
+        inducing_points : ndarray of shape (m, d)
+            With m = min(n_inducing, distinct rows): all distinct rows, in the order of their first appearance, if there
+            are no more than ``n_inducing``.
+        """
+        if isinstance(self.method, np.ndarray):
+            return self.method
+        _, first = np.unique(inputs, axis=0, return_index=True)
+        distinct = inputs[np.sort(first)]
+        if len(distinct) <= self.n_inducing:
+            return distinct
+        if self.method == "greedy":
+            return _least_known(distinct[rng.permutation(len(distinct))], self.n_inducing, kernel, hyperparameters)
+        return _cluster_centres(inputs, self.n_inducing, rng)
+
+
+def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
+    """k-means, each column scaled to unit standard deviation; fewer points where rows differ by rounding only."""
+    scale = spread_of(Moments.of(inputs))
+    with warnings.catch_warnings():
+        # Of rows that differ by rounding only: fewer points are then the right answer.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit(inputs / scale)
+    # Kept in k-means++'s order, the first ones far apart: sorted, each would almost follow from the one before, and
+    # Adam's steps in whitened coordinates would be smaller (its error on the pendulum grew by half).
+    _, first = np.unique(clusters.cluster_centers_, axis=0, return_index=True)
+    return clusters.cluster_centers_[np.sort(first)] * scale
+
+
+def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparameters: np.ndarray) -> np.ndarray:
+    """One after the other the row whose variance given the rows before, k(x, x) - q(x, x), is the largest.
+
+    (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in Gaussian process regression",
+    section 4.2.3: the greedy maximum of the determinant of k(X_m, X_m).) A Cholesky factorisation with pivots, O(n m²).
+    Once every row follows from the chosen ones but for rounding, the row farthest from them is next.
+
+    Parameters
+    ----------
+    inputs : ndarray of shape (n, d)
+        Distinct rows; of rows that are equally little known the first is taken.
+    n_inducing : int
+        m < n.
+    kernel : Kernel
+    hyperparameters : ndarray of shape (n_hyper,)
+
+    Returns
+    -------
+    inducing_points : ndarray of shape (m, d)
+    """
+    prepared = kernel.prepare(inputs)
+    variance = np.array(np.broadcast_to(kernel.at(hyperparameters, inputs[:1]).diagonal(prepared), len(inputs)))
+    enough = _EXHAUSTED * variance.max()
+    scaled = inputs / spread_of(Moments.of(inputs))
+    distance = np.full(len(inputs), np.inf)
+    rows, chosen = np.empty((n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
+    for count in range(n_inducing):
+        known = count > 0 and not variance.max() > enough
+        pivot = chosen[count] = int(np.argmax(distance if known else variance))
+        distance = np.minimum(distance, ((scaled - scaled[pivot]) ** 2).sum(axis=1))
+        if known:
+            variance[:] = 0.0
+            continue
+        row = kernel.at(hyperparameters, inputs[[pivot]]).cross(prepared)[0]
+        rows[count] = (row - rows[:count, pivot] @ rows[:count]) / np.sqrt(variance[pivot])
+        variance = np.maximum(variance - rows[count] ** 2, 0.0)
+        # Exactly: what rounding leaves of it must not be chosen again.
+        variance[pivot] = 0.0
+    return inputs[chosen]

@@ -1,0 +1,280 @@
+"""Where a fit starts: what the features alone explain, and the first value and bounds of each parameter."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import cho_solve
+from scipy.spatial import cKDTree
+
+from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
+from ..inference.statistics import Kernel
+from ..kernels.parse import Start, Starts
+from ..optimizers.parameters import Parameter, ParameterTable
+from ..rows.internal import Rows
+from ..rows.source import Moments, RawRows, Source
+
+# Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
+# all strangers, whatever the number of columns.
+_LENGTHSCALE = 0.6
+_LENGTHSCALE_BOUNDS = 1e-2, 1e4
+
+# In units of the variance that the features alone leave over. A low first noise keeps L-BFGS out of the optimum where
+# the noise explains everything; Adam, whose steps do not grow with the gradient, starts nearer to the data's scatter.
+FIRST_NOISE = {"lbfgs": 1e-4, "adam": 1e-2}
+# Below 1e-10 of it, rounding in k(x, x) - |v|² (about 1e-16 times the condition of L, 1e6) outweighs the noise.
+_NOISE_BOUNDS = 1e-10, 1e2
+# Of squared target units, however little they scatter: about the rounding error of the residuals.
+_LOWEST_NOISE = 1e-20
+# So that the lowest noise variance in the user's units is not rounded to 0.
+_SMALLEST_UNIT = 1e-140
+_NEIGHBOUR_SAMPLE = 2000
+# A function that varies by more than ten times the data's scatter would do so outside of them only: without an upper
+# bound L-BFGS makes long waves of huge height from small ones (on the cartpole, Errors outside the data of 50).
+_SIGNAL_BOUNDS = 1e-8, 1e2
+
+
+@dataclass(frozen=True)
+class _LeftOver:
+    """Rows -> Hᵀl (p, o) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH too, if asked for."""
+
+    target_mean: np.ndarray
+    coef: np.ndarray
+    with_products: bool = False
+
+    def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
+        left_over = raw.targets - self.target_mean - raw.features @ self.coef.T
+        H = raw.features
+        sums = H.T @ left_over, np.einsum("no,no->o", left_over, left_over)
+        return (*sums, H.T @ H) if self.with_products else sums
+
+
+def features_alone(
+    source: Source, target_mean: np.ndarray, mean: np.ndarray, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable w of y = target_mean + H (mean + diag(scale) w) + ε, w ~ N(0, I), for each output.
+
+    The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
+    the rounding of the normal equations.
+
+    Parameters
+    ----------
+    source : Source
+        n rows with p features and o targets.
+    target_mean : ndarray of shape (o,)
+    mean : ndarray of shape (o, p)
+        Prior means.
+    scale : ndarray of shape (o, p)
+        Prior standard deviations; 0 keeps a coefficient at its mean.
+
+    Returns
+    -------
+    w : ndarray of shape (o, p)
+    left_over : ndarray of shape (o,)
+        Root mean square of what they leave over.
+    """
+    w = np.zeros(scale.shape)
+    HL, squares, HH = source.sum(_LeftOver(target_mean, mean, with_products=True))
+    moving = [o for o in range(len(scale)) if squares[o] > 0.0 and scale[o].any()]
+    share = 1e-12
+    for _ in range(2 if moving else 0):
+        noise = share * squares / source.n_rows
+        share = 1.0
+        roots = {}
+        for o in moving:
+            precision = scale[o][:, np.newaxis] * HH * scale[o]
+            diagonal_of(precision)[...] += noise[o]
+            roots[o] = jittered_cholesky(precision) if noise[o] > 0.0 else None
+        for _ in range(3):
+            for o in moving:
+                if roots[o] is not None:
+                    w[o] += cho_solve((roots[o], True), scale[o] * HL[:, o] - noise[o] * w[o])
+            HL, squares = source.sum(_LeftOver(target_mean, mean + scale * w))
+    return w, np.sqrt(squares / source.n_rows)
+
+
+def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
+
+    Parameters
+    ----------
+    left_over : ndarray of shape (o,)
+        Root mean square.
+    largest : ndarray of shape (o,)
+        Of the target's absolute values.
+
+    Returns
+    -------
+    unit : ndarray of shape (o,)
+    """
+    unit = np.maximum(left_over, 1e-14 * largest)
+    return np.where(unit > 0.0, np.maximum(unit, _SMALLEST_UNIT), 1.0)
+
+
+def spread_of(inputs: Moments) -> np.ndarray:
+    """The root mean square (d,) of each centred column; 1 where the column is constant."""
+    return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
+
+
+def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
+    """The mean of k̃(x, x) over the first inducing points; on the way it is seen whether k̃ works there.
+
+    Parameters
+    ----------
+    kernel : Kernel
+    hyperparameters : ndarray of shape (n_hyper,)
+        First values of the user's.
+    inducing_points : ndarray of shape (m, d)
+
+    Returns
+    -------
+    variance : float
+        Above 0.
+
+    Raises
+    ------
+    ValueError
+        If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, has another diagonal than
+        k̃(x, x), or cannot be differentiated where x = x'.
+    """
+    at = kernel.at(np.log(hyperparameters), inducing_points)
+    K = at.matrix()
+    if not np.isfinite(K).all():
+        raise ValueError("kernel: k(X, X) is not finite, with its hyperparameters where they start.")
+    variance = float(np.mean(np.diagonal(K)))
+    if np.abs(K - K.T).max() > 1e-8 * np.abs(K).max():
+        raise ValueError("kernel: k(X, X) must be symmetric.")
+    try:
+        if not np.diagonal(K).min() >= 0.0 < variance:
+            raise NotPositiveDefiniteError
+        jittered_cholesky(K)
+    except NotPositiveDefiniteError:
+        raise ValueError(
+            "kernel: k(X, X) must be positive semi-definite and not 0; with its hyperparameters where they start it is "
+            "not. (ExpSineSquared is one of a single column, times others.)"
+        ) from None
+    difference = np.abs(at.diagonal(kernel.prepare(inducing_points)) - np.diagonal(K)).max()
+    if not difference <= 1e-6 * np.diagonal(K).max():
+        raise ValueError("kernel: its function for the diagonal does not return the k(x, x) of k(X, X).")
+    if not all(np.isfinite(gradient).all() for gradient in at.finish_pullback(at.start_pullback(), np.eye(len(K)))):
+        raise ValueError(
+            "kernel: its gradient is not finite where x = x'. A function of the distance needs a squared distance that "
+            "is not quite 0 there: anp.sqrt(squares + 1e-12)."
+        )
+    return variance
+
+
+def alike_neighbours(rows: Rows) -> np.ndarray:
+    """Whether neighbouring rows have residuals more alike than noise has: then there is something to learn.
+
+    The mean square difference of residuals between each row and its nearest neighbour is about twice their variance if
+    they are noise (von Neumann 1941, for rows in order); less by four of its standard errors, about 1.6 / √n each, is
+    more than chance.
+
+    Parameters
+    ----------
+    rows : Rows
+
+    Returns
+    -------
+    alike : ndarray of shape (o,)
+    """
+    if not (rows.inputs.variance > _SMALLEST_UNIT**2).any():
+        return np.zeros(len(rows.scatter()), dtype=bool)
+    some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
+    inputs, residuals = some.inputs / spread_of(rows.inputs), some.targets
+    if len(inputs) < 2:
+        return np.zeros(residuals.shape[1], dtype=bool)
+    _, nearest = cKDTree(inputs).query(inputs, 2)
+    difference = np.mean((residuals[nearest[:, 0]] - residuals[nearest[:, 1]]) ** 2, axis=0)
+    return difference < 2.0 * residuals.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(inputs)))
+
+
+def starting_table(
+    spread: np.ndarray,
+    inducing_points: np.ndarray,
+    target_unit: np.ndarray,
+    starts: Starts,
+    scatter: np.ndarray,
+    first_noise: float,
+    n_hyperparameters: int,
+    mean_variance: float = 1.0,
+) -> ParameterTable:
+    """The parameters of a sparse model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
+
+    Parameters
+    ----------
+    spread : ndarray of shape (d,)
+        Of the kernel's inputs: `spread_of`.
+    inducing_points : ndarray of shape (g, m, d)
+        One set per group of outputs.
+    target_unit : ndarray of shape (o,)
+        The size of what the features alone leave over.
+    starts : Starts
+        What the user says of them.
+    scatter : ndarray of shape (o,)
+        Variance of the residuals, in squared target units: 1, but for targets far from 0.
+    first_noise : float
+        Where the noise variance starts, as a share of the scatter, if the user does not say.
+    n_hyperparameters : int
+        1 or d, unless the user says where they start.
+    mean_variance : float, default=1.0
+        Of k̃(x, x), with the hyperparameters where they start.
+
+    Returns
+    -------
+    table : ParameterTable
+        With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
+    """
+    o = np.ones(len(target_unit))
+    typical = spread if n_hyperparameters > 1 else np.sqrt(np.mean(spread**2, keepdims=True))
+    root_d = np.sqrt(len(spread))
+    lower, upper = _LENGTHSCALE_BOUNDS
+    lengthscales = _LENGTHSCALE * root_d * typical
+    signal = o / mean_variance
+    return ParameterTable(
+        [
+            parameter_of(
+                starts.hyperparameters,
+                "hyperparameters",
+                lengthscales if starts.hyperparameters.value is None else starts.hyperparameters.value,
+                lower * typical,
+                upper * root_d * typical,
+                1.0,
+            ),
+            parameter_of(
+                starts.signal, "signal", signal, _SIGNAL_BOUNDS[0] * signal, _SIGNAL_BOUNDS[1] * signal, target_unit**2
+            ),
+            parameter_of(
+                starts.noise,
+                "noise",
+                first_noise * scatter,
+                np.maximum(_NOISE_BOUNDS[0] * scatter, _LOWEST_NOISE),
+                _NOISE_BOUNDS[1] * o,
+                target_unit**2,
+            ),
+            Parameter("inducing_points", inducing_points, unit=spread),
+        ]
+    )
+
+
+def parameter_of(
+    start: Start, name: str, default: np.ndarray, lower: np.ndarray, upper: np.ndarray, unit: np.ndarray | float
+) -> Parameter:
+    """A row of the table, in internal units.
+
+    Parameters
+    ----------
+    start : Start
+        What the user says, in his units.
+    name : str
+    default, lower, upper : ndarray of the parameter's shape
+        Start and bounds, in internal units, where the user says nothing; a start is put inside the bounds.
+    unit : ndarray or float
+        The user's values are divided by it.
+    """
+    first = default if start.value is None else np.broadcast_to(start.value / unit, default.shape)
+    if start.bounds is not None:
+        lower, upper = start.bounds[:, 0] / unit, start.bounds[:, 1] / unit
+    return Parameter(name, first, "log", lower, upper, fixed=start.fixed)

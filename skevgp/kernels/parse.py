@@ -1,0 +1,301 @@
+"""scikit-learn kernels -> covariances that the inference can differentiate, and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+from typing import Any
+
+import numpy as np
+from sklearn.base import clone
+from sklearn.gaussian_process import kernels as sk
+
+from .covariances import Constant, Covariance, DotProduct, Product, Sum
+from .function_kernel import FunctionKernel
+from .stationary import (
+    LARGEST_NU,
+    ExpSineSquared,
+    Matern,
+    Matern12,
+    Matern32,
+    Matern52,
+    Profile,
+    RationalQuadratic,
+    SquaredExponential,
+    Stationary,
+)
+
+__all__ = ["FunctionKernel"]
+
+# Their squares neither vanish nor overflow.
+SMALLEST, LARGEST = 1e-100, 1e100
+
+WORKING = (
+    "ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct, FunctionKernel, sums and products of "
+    "these, and a WhiteKernel as one of the terms of the outermost sum"
+)
+
+_MATERN: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
+
+
+@dataclass(frozen=True)
+class Start:
+    """What a user says of a positive parameter; what is None is chosen from the data.
+
+    Attributes
+    ----------
+    value : ndarray of shape (n,), or None
+    bounds : ndarray of shape (n, 2), or None
+    fixed : bool or ndarray of shape (n,)
+    """
+
+    value: np.ndarray | None = None
+    bounds: np.ndarray | None = None
+    fixed: bool | np.ndarray = False
+
+
+@dataclass(frozen=True)
+class Starts:
+    """What the user says of the kernel and the noise.
+
+    Attributes
+    ----------
+    hyperparameters : Start
+        Of k̃.
+    signal : Start
+        s², the same for all outputs.
+    noise : Start
+        σ², the same for all outputs.
+    """
+
+    hyperparameters: Start
+    signal: Start
+    noise: Start
+
+
+@dataclass(frozen=True)
+class KernelSpec:
+    """What a user's kernel says: k = s² k̃ (+ noise).
+
+    Attributes
+    ----------
+    covariance : Covariance
+        k̃.
+    starts : Starts
+        Of k̃'s hyperparameters, s² and, from a top-level WhiteKernel, σ².
+    tree : Kernel
+        s² k̃ as a scikit-learn kernel.
+    signal : Kernel
+        The ConstantKernel in it that is s².
+    """
+
+    covariance: Covariance
+    starts: Starts
+    tree: sk.Kernel
+    signal: sk.Kernel
+
+    def with_noise(self, noise_variance: float) -> KernelSpec:
+        """The same kernel with a start of the noise."""
+        return replace(self, starts=replace(self.starts, noise=Start(np.array([float(noise_variance)]))))
+
+    def to_sklearn(
+        self, hyperparameters: np.ndarray, hyper_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
+    ) -> sk.Kernel:
+        """The fitted s² k̃ as a scikit-learn kernel, of the user's form and with the user's bounds.
+
+        Parameters
+        ----------
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        hyper_bounds : ndarray of shape (n_hyper, 2)
+        signal : float
+            s².
+        signal_bounds : ndarray of shape (1, 2)
+
+        Returns
+        -------
+        kernel : Kernel
+        """
+        rows = iter(np.column_stack([hyperparameters, hyper_bounds]))
+
+        def fitted(kernel: sk.Kernel) -> sk.Kernel:
+            if isinstance(kernel, sk.KernelOperator):
+                return type(kernel)(fitted(kernel.k1), fitted(kernel.k2))
+            if kernel is self.signal:
+                return _fitted(kernel, iter([(signal, *signal_bounds[0])]), self.starts.signal.bounds is None)
+            return _fitted(kernel, rows, self.starts.hyperparameters.bounds is None)
+
+        return fitted(self.tree)
+
+
+def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kernel:
+    """A copy of a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""
+    found = clone(kernel)
+    for hyperparameter in kernel.hyperparameters:
+        own = np.array(list(islice(rows, hyperparameter.n_elements)))
+        # What is fixed keeps all its digits.
+        if not hyperparameter.fixed:
+            one = len(own) == 1
+            found.set_params(**{hyperparameter.name: float(own[0, 0]) if one else own[:, 0]})
+            if set_bounds:
+                found.set_params(**{f"{hyperparameter.name}_bounds": tuple(own[0, 1:].tolist()) if one else own[:, 1:]})
+    return found
+
+
+def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) -> KernelSpec:
+    """Read a scikit-learn kernel.
+
+    Parameters
+    ----------
+    kernel : sklearn.gaussian_process.kernels.Kernel, callable or None
+        A callable is the function of a `FunctionKernel`. None is a squared exponential with one lengthscale per column,
+        all starts taken from the data.
+    n_columns : int
+        Width of the kernel's inputs.
+
+    Returns
+    -------
+    spec : KernelSpec
+
+    Raises
+    ------
+    TypeError
+        If it is not a kernel.
+    ValueError
+        If part of it does not work (the message names it and lists what does), its length scales do not fit the
+        columns, or a value or bound is out of range.
+    """
+    signal = sk.ConstantKernel()
+    if kernel is None:
+        shape = sk.RBF(np.ones(n_columns) if n_columns > 1 else 1.0)
+        return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()), signal * shape, signal)
+    if callable(kernel) and not isinstance(kernel, sk.Kernel | type):
+        kernel = FunctionKernel(kernel)
+    if not isinstance(kernel, sk.Kernel):
+        raise TypeError(
+            "kernel must be a kernel of sklearn.gaussian_process.kernels, a function k(X, Z) in autograd.numpy, or "
+            f"None; got {kernel!r}. These work: {WORKING}."
+        )
+    # A copy: the same kernel may be in a tree twice.
+    tree, noise = _without_noise(clone(kernel))
+    if tree is None or len(noise) > 1:
+        said = "it has no other term" if tree is None else f"there are {len(noise)}"
+        raise ValueError(f"kernel={kernel!r}: of WhiteKernel there can be one, plus what it is the noise of; {said}.")
+    constant = _outermost_constant(tree)
+    signal_start = Start()
+    if constant is None:
+        tree = signal * tree
+    else:
+        signal, signal_start = constant, _starts(constant)
+    starts: list[Start] = []
+    covariance = _covariance(tree, signal, n_columns, starts)
+    assert covariance is not None
+    return KernelSpec(
+        covariance,
+        Starts(_joined(starts), signal_start, _starts(noise[0]) if noise else Start()),
+        tree,
+        signal,
+    )
+
+
+def _without_noise(kernel: Any) -> tuple[Any, list[Any]]:
+    """The kernel without the WhiteKernels of its outermost sum (None if that leaves nothing), and these."""
+    if isinstance(kernel, sk.WhiteKernel):
+        return None, [kernel]
+    if type(kernel) is not sk.Sum:
+        return kernel, []
+    (first, noise), (second, more_noise) = _without_noise(kernel.k1), _without_noise(kernel.k2)
+    if first is None or second is None:
+        return (second if first is None else first), noise + more_noise
+    return sk.Sum(first, second), noise + more_noise
+
+
+def _outermost_constant(kernel: Any) -> Any:
+    """The ConstantKernel that is a factor of all else with the fewest products around it; None if there is none."""
+    level = [kernel]
+    while level := [part for product in level if type(product) is sk.Product for part in (product.k1, product.k2)]:
+        for part in level:
+            if type(part) is sk.ConstantKernel:
+                return part
+    return None
+
+
+def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -> Covariance | None:
+    """The covariance of (part of) a tree, None for s²; appends what the user says of its hyperparameters."""
+    if kernel is signal:
+        return None
+    if type(kernel) in (sk.Sum, sk.Product):
+        kind = Sum if type(kernel) is sk.Sum else Product
+        operands = _operands(kernel, type(kernel))
+        parts = [part for own in operands if (part := _covariance(own, signal, n_columns, starts)) is not None]
+        return kind(tuple(parts)) if len(parts) > 1 else parts[0]
+    found = _simple_covariance(kernel, n_columns)
+    starts.append(_starts(kernel))
+    return found
+
+
+def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
+    kind = type(kernel)
+    if kind is sk.ConstantKernel:
+        return Constant()
+    if kind is sk.DotProduct:
+        return DotProduct()
+    if kind is sk.RationalQuadratic:
+        return Stationary(RationalQuadratic(), n_columns, isotropic=True)
+    if kind is sk.ExpSineSquared:
+        return Stationary(ExpSineSquared(), n_columns, isotropic=True)
+    if kind is FunctionKernel:
+        return kernel.covariance()
+    if kind not in (sk.RBF, sk.Matern):
+        raise ValueError(f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {WORKING}.")
+
+    if kernel.anisotropic and len(kernel.length_scale) != n_columns:
+        raise ValueError(
+            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
+            "give one length scale, or one per column."
+        )
+    if kind is sk.RBF or kernel.nu == np.inf:
+        return SquaredExponential(n_columns, isotropic=not kernel.anisotropic)
+    if not 0.0 < kernel.nu <= LARGEST_NU:
+        raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
+    return Stationary(_MATERN.get(kernel.nu, Matern(float(kernel.nu))), n_columns, isotropic=not kernel.anisotropic)
+
+
+def _operands(kernel: Any, operator: Any) -> Iterator[Any]:
+    """The operands of nested sums (or products), from left to right."""
+    if type(kernel) is operator:
+        yield from _operands(kernel.k1, operator)
+        yield from _operands(kernel.k2, operator)
+    else:
+        yield kernel
+
+
+def _starts(kernel: sk.Kernel) -> Start:
+    """Values and bounds of a simple kernel's hyperparameters, checked."""
+    values = kernel.get_params()
+    return _joined([_start(hyperparameter, values[hyperparameter.name]) for hyperparameter in kernel.hyperparameters])
+
+
+def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
+    """A hyperparameter's value and bounds, checked."""
+    value = np.atleast_1d(np.asarray(value, dtype=float))
+    if not ((value >= SMALLEST) & (value <= LARGEST)).all():
+        raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
+    if hyperparameter.fixed:
+        return Start(value, np.column_stack([value, value]), np.ones(len(value), dtype=bool))
+    bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
+    if not ((bounds[:, 0] > 0.0) & (bounds[:, 0] <= bounds[:, 1])).all():
+        raise ValueError(
+            f"kernel: {hyperparameter.name}_bounds must be above 0, the lower ones first; got {bounds.tolist()}."
+        )
+    return Start(value, bounds, np.zeros(len(value), dtype=bool))
+
+
+def _joined(starts: list[Start]) -> Start:
+    """Several starts one after the other."""
+    return Start(
+        np.concatenate([np.empty(0), *(start.value for start in starts)]),
+        np.concatenate([np.empty((0, 2)), *(start.bounds for start in starts)]),
+        np.concatenate([np.empty(0, dtype=bool), *(start.fixed for start in starts)]),
+    )

@@ -1,0 +1,1 @@
+"""The Bayesian network's loss and training."""

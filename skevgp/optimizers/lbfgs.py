@@ -1,0 +1,157 @@
+"""Minimise f(θ) -> (value, gradient) of all rows: L-BFGS. (Mini-batches: `adam`.)"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.optimize import OptimizeResult, minimize
+
+from .._linalg import NotPositiveDefiniteError
+
+Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
+# report(iteration, loss): called once per iteration.
+Report = Callable[[int, float], None]
+
+_MAX_RESTARTS = 10
+_PATIENCE = 3
+# Relative size of a step that changes the loss by its rounding error only.
+_HAIR = 1e-10
+# A fresh start is worth another when it lowers the loss by this many times the tolerance.
+_WORTH = 100.0
+
+
+@dataclass
+class Minimum:
+    """What an optimiser found.
+
+    Attributes
+    ----------
+    x : ndarray
+        The best point seen.
+    loss : float
+        Its value.
+    loss_curve : list of float
+        The loss per iteration.
+    converged : bool
+    interrupted : bool
+        Whether Ctrl-C ended it.
+    others : tuple of ndarray
+        Where losses are noisy: points that may be better.
+    """
+
+    x: np.ndarray
+    loss: float
+    loss_curve: list[float] = field(default_factory=list)
+    converged: bool = False
+    interrupted: bool = False
+    others: tuple[np.ndarray, ...] = ()
+
+    @property
+    def n_iter(self) -> int:
+        return len(self.loss_curve)
+
+
+class _Guarded:
+    """An objective that never raises and never returns NaN, and remembers the best point it has seen."""
+
+    def __init__(self, objective: Objective, start: np.ndarray):
+        self._objective = objective
+        self.x, self.loss = start.copy(), np.inf
+
+    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+        try:
+            loss, gradient = self._objective(x)
+        except NotPositiveDefiniteError:
+            loss, gradient = np.nan, np.full_like(x, np.nan)
+        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+            # A line search that stepped too far: far above the best loss, but finite, so that it interpolates back.
+            worst = self.loss + 10.0 * (1.0 + abs(self.loss)) if np.isfinite(self.loss) else 1e100
+            return worst, np.zeros_like(x)
+        if loss < self.loss:
+            self.x, self.loss = x.copy(), loss
+        return loss, gradient
+
+
+def _nudged(guarded: _Guarded, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
+    """A point next to the best with a middling loss, and how much the loss scatters there: its rounding error."""
+    rng, best = np.random.RandomState(0), guarded.x
+    points = [np.clip(best + _HAIR * np.maximum(np.abs(best), 1.0) * rng.randn(len(best)), *bounds) for _ in range(5)]
+    losses = np.array([guarded(point)[0] for point in points])
+    return points[int(np.argsort(losses)[2])], float(losses.std())
+
+
+def lbfgs(
+    objective: Objective,
+    start: np.ndarray,
+    bounds: tuple[np.ndarray, np.ndarray],
+    max_iter: int,
+    tol: float,
+    report: Report | None = None,
+) -> Minimum:
+    """L-BFGS-B (SciPy), started anew from the best point when it stalls or a line search fails.
+
+    Parameters
+    ----------
+    objective : callable
+        x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
+    start : ndarray of shape (size,)
+    bounds : (lower, upper), each of shape (size,)
+    max_iter : int
+        Iterations in all.
+    tol : float
+        Start anew when each of three iterations in a row lowers the loss by less than this; stop when that no longer
+        lowers it by a hundred times as much.
+    report : callable, default=None
+
+    Returns
+    -------
+    minimum : Minimum
+    """
+    guarded = _Guarded(objective, start)
+    minimum = Minimum(start, np.inf)
+    stalled = 0
+
+    def callback(intermediate_result: OptimizeResult) -> None:
+        # The iterate's own loss: a probe of a line search may have seen a better one by chance.
+        nonlocal stalled
+        loss = float(intermediate_result.fun)
+        before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
+        minimum.loss_curve.append(loss)
+        if report is not None:
+            report(minimum.n_iter, loss)
+        stalled = stalled + 1 if before - loss < tol else 0
+        if stalled >= _PATIENCE:
+            raise StopIteration
+
+    try:
+        guarded(start)
+        # Nothing to move, or asked not to: the start is the answer.
+        minimum.converged = len(start) == 0 or max_iter == 0
+        x, enough = start, -np.inf
+        for _ in range(1 + _MAX_RESTARTS):
+            remaining = max_iter - minimum.n_iter
+            if minimum.converged or remaining <= 0:
+                break
+            before, stalled = guarded.loss, 0
+            result = minimize(
+                guarded,
+                x,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=np.column_stack(bounds),
+                callback=callback,
+                options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": 0.0, "gtol": 1e-9},
+            )
+            if result.status == 1:
+                break
+            # It stalled, or a line search failed: either it is done, or memory and rounding errors led it astray.
+            # Start anew a hair away, where the loss is not what rounding made of it here, until that gains no more.
+            minimum.converged = before - guarded.loss <= enough
+            x, rounding = _nudged(guarded, bounds)
+            enough = max(_WORTH * tol, 2.0 * rounding)
+    except KeyboardInterrupt:
+        minimum.interrupted = True
+    minimum.x, minimum.loss = guarded.x, guarded.loss
+    return minimum

@@ -1,0 +1,147 @@
+"""Named parameters <-> one flat vector of coordinates, with transforms and bounds."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import autograd.numpy as anp
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """A row of the table.
+
+    Attributes
+    ----------
+    name : str
+    start : ndarray
+        First value, in the parameter's own units; its shape is the parameter's.
+    transform : {"identity", "log"}
+        The optimiser moves ``value / unit`` or ``log(value)``.
+    lower, upper : ndarray or float
+        Bounds of the value, broadcast to its shape.
+    unit : ndarray or float
+        Size of a typical change, for ``"identity"``.
+    fixed : bool or ndarray of bool
+        Whether it stays where it starts; an array of its shape says so of each entry.
+    """
+
+    name: str
+    start: np.ndarray
+    transform: Literal["identity", "log"] = "identity"
+    lower: np.ndarray | float = -np.inf
+    upper: np.ndarray | float = np.inf
+    unit: np.ndarray | float = 1.0
+    fixed: bool | np.ndarray = False
+
+    @property
+    def free(self) -> np.ndarray:
+        """Which of its entries move, flat."""
+        return ~np.broadcast_to(self.fixed, self.start.shape).ravel()
+
+    def coordinate(self, value: np.ndarray | float) -> np.ndarray:
+        """The optimiser's coordinates of a value, flat."""
+        value = np.broadcast_to(value, self.start.shape)
+        if self.transform == "log":
+            with np.errstate(divide="ignore"):
+                return np.log(np.maximum(value, 0.0)).ravel()
+        return (value / self.unit).ravel()
+
+    def value_bounds(self) -> np.ndarray:
+        """Bounds of each entry, (size, 2), in the parameter's own units."""
+        bounds = np.broadcast_to(self.lower, self.start.shape), np.broadcast_to(self.upper, self.start.shape)
+        return np.column_stack([np.ravel(bound) for bound in bounds])
+
+    def value(self, coordinate: np.ndarray) -> np.ndarray:
+        """The value at a coordinate of the parameter's shape."""
+        return np.exp(coordinate) if self.transform == "log" else coordinate * self.unit
+
+
+def _shape(values: dict[str, np.ndarray], name: str) -> tuple[int, ...] | None:
+    return values[name].shape if name in values else None
+
+
+class ParameterTable:
+    """Parameters in a fixed order; the free ones make up the flat vector that an optimiser moves.
+
+    Parameters
+    ----------
+    parameters : sequence of Parameter
+        With distinct names.
+    """
+
+    def __init__(self, parameters: Sequence[Parameter]):
+        self.parameters = tuple(parameters)
+        self._slices: dict[str, slice] = {}
+        end = 0
+        # For parameters of which only some entries move.
+        self._free: dict[str, np.ndarray] = {}
+        for parameter in self.parameters:
+            free = parameter.free
+            if free.any():
+                self._slices[parameter.name] = slice(end, end + free.sum())
+                end += int(free.sum())
+                if not free.all():
+                    self._free[parameter.name] = free
+        self.size = end
+
+    def __getitem__(self, name: str) -> Parameter:
+        return next(parameter for parameter in self.parameters if parameter.name == name)
+
+    def started_at(self, values: dict[str, np.ndarray]) -> ParameterTable:
+        """The same table with other starts, for what is free of the parameters whose shapes agree."""
+        return ParameterTable(
+            [
+                replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
+                if _shape(values, parameter.name) == parameter.start.shape
+                else parameter
+                for parameter in self.parameters
+            ]
+        )
+
+    def start(self) -> np.ndarray:
+        """The flat vector (size,) of the starts, put inside their bounds."""
+        flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})
+        return np.clip(flat, *self.bounds())
+
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds (size,) of the flat vector."""
+        lower = self.flat({parameter.name: parameter.coordinate(parameter.lower) for parameter in self.parameters})
+        upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
+        return lower, upper
+
+    def coordinates(self, flat: Any) -> dict[str, Any]:
+        """The coordinates by name, each in its parameter's shape; can be traced by autograd."""
+        found = {}
+        for parameter in self.parameters:
+            name = parameter.name
+            if name in self._free:
+                free, first = self._free[name], self._slices[name].start
+                # What a fixed entry takes from the vector is thrown away.
+                source = first + np.maximum(np.cumsum(free) - 1, 0)
+                part = anp.where(free, flat[source], parameter.coordinate(parameter.start))
+            elif name in self._slices:
+                part = flat[self._slices[name]]
+            else:
+                part = parameter.coordinate(parameter.start)
+            found[name] = part.reshape(parameter.start.shape)
+        return found
+
+    def values(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+        """The values by name, in the parameters' own units."""
+        coordinates = self.coordinates(flat)
+        return {parameter.name: parameter.value(coordinates[parameter.name]) for parameter in self.parameters}
+
+    def flat(self, parts: dict[str, np.ndarray]) -> np.ndarray:
+        """Join the free parameters' parts (coordinates or gradients) into a vector (size,)."""
+        if not self._slices:
+            return np.empty(0)
+        return np.concatenate(
+            [
+                np.ravel(parts[name])[self._free[name]] if name in self._free else np.ravel(parts[name])
+                for name in self._slices
+            ]
+        )

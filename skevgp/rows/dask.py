@@ -1,0 +1,244 @@
+"""Dask arrays as data: chunks stay where they are, sums travel; predictions are lazy."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from copy import copy, deepcopy
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from sklearn.utils import check_array
+
+from .._optional import require
+from .._validation import as_floats, check_magnitude
+from .blocks import Block, Blocks, LinearStatistics, LocalBlocks
+from .mapped import MappedRows
+from .maps import fit_map, fresh_map
+from .source import LocalSource, RawRows
+from .threads import BlockMap, ordered_sum, single_threaded_libraries
+
+# Sums of so many partitions are added up on a worker at a time.
+_SUMMED_AT_ONCE = 8
+# A map without partial_fit is fitted to so many rows, evenly spread.
+_MAP_SAMPLE = 10_000
+
+
+def is_dask(values: Any) -> bool:
+    """Whether it is a Dask collection; does not import Dask."""
+    return hasattr(values, "__dask_graph__")
+
+
+def _dask() -> Any:
+    return require("dask", "Working with Dask arrays")
+
+
+def _dask_array() -> Any:
+    return require("dask.array", "Working with Dask arrays")
+
+
+def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,), known: bool = True) -> Any:
+    """A Dask array whose chunks are whole rows, at least one and of known number if so asked, or an error."""
+    da = _dask_array()
+    if not isinstance(values, da.Array):
+        raise TypeError(
+            f"{name} must be a Dask array (of a Dask data frame: .to_dask_array(lengths=True)); got {values!r}."
+        )
+    if values.ndim not in ndims:
+        raise ValueError(f"{name} must have {' or '.join(map(str, ndims))} dimensions; got the shape {values.shape}.")
+    if values.ndim > 1 and values.numblocks[1] > 1:
+        values = values.rechunk({1: -1})
+    if known and np.isnan(values.shape[0]):
+        values = values.copy().compute_chunk_sizes()  # in place
+    if known and 0 in values.shape:
+        raise ValueError(f"{name} is empty: its shape is {values.shape}.")
+    return values
+
+
+def aligned(X: Any, y: Any) -> tuple[Any, Any]:
+    """X and y as Dask arrays of the same chunks of rows, none of them empty."""
+    da = _dask_array()
+    X = as_rows(X, "X")
+    y = as_rows(y if is_dask(y) else da.from_array(as_floats(y, "y"), chunks="auto"), "y", (1, 2))
+    if len(X) != len(y):
+        raise ValueError(f"X has {len(X)} rows, but y has {len(y)}.")
+    rows = tuple(n for n in X.chunks[0] if n)
+    return X.rechunk({0: rows}), y.rechunk({0: rows})
+
+
+def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
+    """A fitted clone of a transformer, or None: chunk by chunk if it has ``partial_fit``, else to a sample of rows."""
+    if feature_map is None:
+        return None
+    delayed = _dask().delayed
+    fitted = fresh_map(feature_map, name)
+    if not hasattr(fitted, "partial_fit"):
+        chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAP_SAMPLE)).astype(int))
+        sample_X, sample_y = _dask().compute(X[chosen], y[chosen])
+        return fit_map(feature_map, sample_X, sample_y, name)
+    fitted = delayed(fitted, traverse=False)
+    for X_chunk, y_chunk in zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True):
+        fitted = delayed(_partly_fitted)(fitted, X_chunk, y_chunk)
+    return fitted.compute()
+
+
+class DaskSource:
+    """Rows that Dask's workers hold.
+
+    Parameters
+    ----------
+    X : dask.array.Array of shape (n, n_columns)
+    y : dask.array.Array of shape (n,) or (n, o)
+        In the same chunks.
+    feature_map, kernel_map : transformer or None
+        Fitted.
+    """
+
+    def __init__(self, X: Any, y: Any, feature_map: Any, kernel_map: Any):
+        dask = _dask()
+        maps = dask.delayed((feature_map, kernel_map), traverse=False)
+        chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
+        self._partitions: Sequence[Any] = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
+        self._ends: np.ndarray = np.cumsum(X.chunks[0])
+        self.n_rows = len(X)
+
+    def sum(self, function: Callable[[RawRows], Any]) -> Any:
+        return _sum_over(self._partitions, function)
+
+    def take(self, rows: np.ndarray) -> RawRows:
+        dask = _dask()
+        owners = np.searchsorted(self._ends, rows, side="right")
+        order = np.argsort(owners, kind="stable")
+        parts = []
+        for owner in np.unique(owners):
+            first = self._ends[owner - 1] if owner else 0
+            own = rows[order][owners[order] == owner] - first
+            parts.append(dask.delayed(_taken)(self._partitions[owner], own))
+        found = dask.compute(*parts)
+        back = np.argsort(order)
+        return RawRows(*(np.concatenate(columns)[back] for columns in zip(*found, strict=True)))
+
+    def part(self, first: int, end: int) -> DaskSource:
+        delayed, part = _dask().delayed, copy(self)
+        starts = np.append(0, self._ends[:-1])
+        cuts = np.column_stack([np.maximum(first - starts, 0), np.minimum(end, self._ends) - starts]).tolist()
+        owners = [owner for owner, (begin, stop) in enumerate(cuts) if begin < stop]
+        part._partitions = [delayed(_cut)(self._partitions[owner], *cuts[owner]) for owner in owners]
+        part._ends = np.cumsum([cuts[owner][1] - cuts[owner][0] for owner in owners])
+        part.n_rows = end - first
+        return part
+
+    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+        return DaskBlocks(self._partitions, make, n_inducing)
+
+
+class DaskBlocks:
+    """Blocks that Dask's workers make of their partitions and keep."""
+
+    def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], Block], n_inducing: int):
+        dask = _dask()
+        shared = dask.delayed(make, traverse=False)
+        self._partitions = _held([dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions])
+
+    @cached_property
+    def linear(self) -> LinearStatistics:
+        return self.sum(LinearStatistics.of)
+
+    def sum(self, function: Callable[[Block], Any]) -> Any:
+        return _sum_over(self._partitions, function)
+
+
+def _held(parts: list[Any]) -> Sequence[Any]:
+    """Kept by the workers of a cluster; without one made anew at each pass, since they might not all fit here."""
+    try:
+        require("distributed", "Fitting on a cluster").get_client()
+    except (ImportError, ValueError):
+        return parts
+    return _dask().persist(*parts)
+
+
+def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:
+    """One map-reduce round; the order of summation depends on nothing but the number of partitions."""
+    delayed = _dask().delayed
+    shared = delayed(function, traverse=False)
+    sums = [delayed(_partition_sum)(partition, shared) for partition in partitions]
+    while len(sums) > 1:
+        groups = (sums[first : first + _SUMMED_AT_ONCE] for first in range(0, len(sums), _SUMMED_AT_ONCE))
+        sums = [delayed(ordered_sum)(group) for group in groups]
+    return sums[0].compute()
+
+
+def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, shape: tuple[int, ...]) -> Any:
+    """Mean, or mean and standard deviation, as lazy Dask arrays.
+
+    Parameters
+    ----------
+    model : estimator
+        With ``predict``.
+    X : dask.array.Array of shape (n, n_columns)
+    return_std, include_noise : bool
+    shape : tuple
+        () or (o,): of one prediction.
+    """
+    delayed = _dask().delayed
+    # As it is now, whatever is folded into it before the result is computed.
+    model = copy(model)
+    n_outputs = shape[0] if shape else 1
+    width = n_outputs * (1 + return_std)
+    both = X.map_blocks(
+        _predicted,
+        model=delayed(model, traverse=False),
+        return_std=return_std,
+        include_noise=include_noise,
+        width=width,
+        chunks=(X.chunks[0], (width,)),
+        dtype=np.float64,
+        meta=np.empty((0, width)),
+    )
+    columns = slice(None) if shape else 0
+    mean = both[:, :n_outputs][:, columns]
+    return (mean, both[:, n_outputs:][:, columns]) if return_std else mean
+
+
+# --- what runs on the workers ------------------------------------------------------------------------------------
+
+
+def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any]) -> LocalSource:
+    # Partitions are worked on at the same time, and transformers need not be safe for that.
+    maps = deepcopy(maps)
+    X = check_array(X, dtype=[np.float64, np.float32], input_name="X")
+    y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
+    check_magnitude(X, "X")
+    check_magnitude(y, "y")
+    return LocalSource(MappedRows(X, X, y, *maps), len(X))
+
+
+def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
+    return partition.part(first, end)
+
+
+def _blocks(partition: LocalSource, make: Callable[[RawRows], Block], n_inducing: int) -> Blocks:
+    return LocalBlocks(partition.through(make), partition.n_rows, n_inducing, keep=False)
+
+
+def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:
+    with single_threaded_libraries():
+        return partition.sum(function)
+
+
+def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    raw = partition.take(rows)
+    return raw.inputs, raw.features, raw.targets
+
+
+def _partly_fitted(fitted: Any, X: np.ndarray, y: np.ndarray) -> Any:
+    return deepcopy(fitted).partial_fit(X, y)
+
+
+def _predicted(X: np.ndarray, model: Any, return_std: bool, include_noise: bool, width: int) -> np.ndarray:
+    if len(X) == 0:
+        return np.empty((0, width))
+    model = copy(model)
+    model.feature_map_, model.kernel_map_ = deepcopy((model.feature_map_, model.kernel_map_))
+    found = model.predict(X, return_std=return_std, include_noise=include_noise)
+    return np.hstack([part.reshape(len(X), -1) for part in (found if return_std else (found,))])

@@ -1,0 +1,76 @@
+"""The rows of X and y as the inference sees them: through the user's maps, in pieces, in float64."""
+
+from __future__ import annotations
+
+from threading import Lock
+from typing import Any
+
+import numpy as np
+from sklearn.utils import _safe_indexing
+
+from .maps import MAP_ROWS, apply_map
+from .source import RawRows
+
+# What the maps make of all rows is kept if it fits in so many bytes; else they are applied anew at each pass.
+MAPPED_BYTES = 32 * 2**20
+
+
+class MappedRows:
+    """Loads rows: a slice or indices -> kernel inputs, features and targets.
+
+    Parameters
+    ----------
+    given : array-like of shape (n, n_columns)
+        What the maps see: X as the user gave it if it is a data frame, else X.
+    X : ndarray of shape (n, n_columns)
+    y : ndarray of shape (n, o)
+    feature_map, kernel_map : transformer or None
+        Fitted.
+    """
+
+    def __init__(self, given: Any, X: np.ndarray, y: np.ndarray, feature_map: Any, kernel_map: Any):
+        self.given, self.X, self.y = given, X, y
+        self.feature_map, self.kernel_map = feature_map, kernel_map
+        self._mapped: tuple[np.ndarray, np.ndarray] | None = None
+        self._lock = Lock()
+        self._widths: tuple[int, int] | None = None
+        first = self._through_maps(slice(0, MAP_ROWS))
+        made = (first[0].shape[1] if kernel_map is not None else 0) + first[1].shape[1]
+        if made and 8 * made * len(X) <= MAPPED_BYTES:
+            self._mapped = first if len(X) <= MAP_ROWS else self._through_maps(slice(0, len(X)))
+
+    def __call__(self, rows: slice | np.ndarray) -> RawRows:
+        if self._mapped is not None:
+            inputs, features = (values[rows] for values in self._mapped)
+        else:
+            # Transformers need not be safe to call from several threads.
+            with self._lock:
+                inputs, features = self._through_maps(rows)
+        return RawRows(inputs, features, np.asarray(self.y[rows], dtype=np.float64))
+
+    def _through_maps(self, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's inputs and the features of rows."""
+        X = np.asarray(self.X[rows], dtype=np.float64)
+        given = X if self.given is self.X else _safe_indexing(self.given, rows)
+        mapped = map_rows(given, X, self.feature_map, self.kernel_map)
+        widths = mapped[0].shape[1], mapped[1].shape[1]
+        if self._widths not in (None, widths):
+            raise ValueError(
+                "kernel_map and feature_map must return the same number of columns for all rows; they returned "
+                f"{self._widths} and {widths}."
+            )
+        self._widths = widths
+        return mapped
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=Lock())
+
+
+def map_rows(given: Any, X: np.ndarray, feature_map: Any, kernel_map: Any) -> tuple[np.ndarray, np.ndarray]:
+    """The kernel's inputs and the features of rows X; the maps see ``given``."""
+    inputs = X if kernel_map is None else apply_map(kernel_map, given, "kernel_map")
+    features = np.empty((len(X), 0)) if feature_map is None else apply_map(feature_map, given, "feature_map")
+    return inputs, features

@@ -1,0 +1,120 @@
+"""Applying a user's transformer to rows, and checking what comes back."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy.sparse import issparse
+from sklearn.base import clone
+from sklearn.pipeline import FeatureUnion
+from sklearn.utils import _safe_indexing
+
+from .._validation import LARGEST, as_floats, check_magnitude
+
+# Rows that a map sees at once.
+MAP_ROWS = 16_384
+
+
+def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
+    """A fitted clone of a transformer, or None.
+
+    Parameters
+    ----------
+    feature_map : transformer or None
+    X : array-like of shape (n, d)
+        As the user gave it.
+    y : ndarray of shape (n,) or (n, o)
+    name : str
+        The argument's name, for errors.
+
+    Raises
+    ------
+    TypeError
+        If it is not a transformer.
+    """
+    return None if feature_map is None else fresh_map(feature_map, name).fit(X, y)
+
+
+def fresh_map(feature_map: Any, name: str) -> Any:
+    """A clone of a transformer, or a TypeError that names it."""
+    if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
+        raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
+    try:
+        return clone(feature_map)
+    except TypeError as error:
+        raise TypeError(f"{name}={feature_map!r} cannot be cloned: {error}") from error
+
+
+def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
+    """What a fitted map makes of rows, block by block.
+
+    Parameters
+    ----------
+    fitted_map : transformer
+    X : array-like of shape (n, d)
+        As the user gave it.
+    name : str
+        The argument's name, for errors.
+
+    Returns
+    -------
+    values : ndarray of shape (n, width)
+
+    Raises
+    ------
+    ValueError
+        If it returns the wrong number of rows, not two dimensions or values that are not finite.
+    """
+    n_rows = X.shape[0]
+    blocks: list[np.ndarray] = []
+    for first in range(0, n_rows, MAP_ROWS):
+        rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
+        values = _transform(fitted_map, rows)
+        if not _is_good(values, rows.shape[0]):
+            values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
+        if blocks and values.shape[1] != blocks[0].shape[1]:
+            raise ValueError(
+                f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
+                f"{blocks[0].shape[1]} and {values.shape[1]}."
+            )
+        blocks.append(values)
+    return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
+
+
+def _transform(fitted_map: Any, rows: Any) -> Any:
+    """What the map returns; for a row of a union, its own bookkeeping would take longer than all its parts."""
+    if type(fitted_map) is FeatureUnion and type(rows) is np.ndarray and fitted_map.transformer_weights is None:
+        maps = [part for _, part in fitted_map.transformer_list]
+        if not any(isinstance(part, str) for part in maps):
+            parts = [part.transform(rows) for part in maps]
+            if all(type(part) is np.ndarray and part.shape[:1] == rows.shape[:1] for part in parts):
+                return np.hstack(parts)
+    return fitted_map.transform(rows)
+
+
+def _is_good(values: Any, n_rows: int) -> bool:
+    """Whether it needs no other check: what nearly every map returns, and a message takes longer than the features."""
+    return (
+        type(values) is np.ndarray
+        and values.dtype == np.float64
+        and values.ndim == 2
+        and len(values) == n_rows
+        and values.shape[1] > 0
+        and bool(np.abs(values).max() <= LARGEST)  # False if there is a NaN
+    )
+
+
+def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
+    """What a map returned as an array of floats, or an error that names the map."""
+    values = as_floats(values.toarray() if issparse(values) else values, f"What {called} returns")
+    if values.ndim != 2 or len(values) != n_rows:
+        raise ValueError(
+            f"{called} must return one row per row of X; for {n_rows} rows it returned the shape {values.shape}."
+        )
+    if not np.isfinite(values).all():
+        raise ValueError(f"{called} returned NaN or infinity for finite rows.")
+    if values.shape[1] == 0:
+        raise ValueError(f"{called} returned no columns.")
+    check_magnitude(values, f"What {called} returns")
+    return values

@@ -1,0 +1,88 @@
+import numpy as np
+import pytest
+from scipy.spatial.distance import cdist
+
+from skevgp.fitting.inducing import Placement
+from skevgp.kernels.stationary import SquaredExponential
+
+
+def points(X, n_inducing, method="k-means", lengthscale=1.0, seed=0):
+    kernel, hyperparameters = SquaredExponential(X.shape[1]), np.log(np.full(X.shape[1], lengthscale))
+    return Placement(method, n_inducing).points(X, kernel, hyperparameters, np.random.RandomState(seed))
+
+
+@pytest.mark.parametrize("method", ["k-means", "greedy"])
+def test_all_distinct_rows_serve_if_there_are_few(method):
+    X = np.array([[1.0], [0.0], [1.0], [2.0]])
+    np.testing.assert_array_equal(points(X, 10, method), [[1.0], [0.0], [2.0]])
+
+
+@pytest.mark.parametrize("method", ["k-means", "greedy"])
+def test_points_spread_over_the_data_whatever_the_scales(method):
+    scale = np.array([1e-6, 1e6])
+    X = np.random.RandomState(0).rand(2000, 2) * scale
+    chosen = points(X, 25, method, 0.2 * scale) / scale
+    assert chosen.shape == (25, 2)
+    nearest = np.linalg.norm(X[:, np.newaxis] / scale - chosen, axis=2).min(axis=1)
+    assert nearest.max() < 0.35
+
+
+@pytest.mark.parametrize("method", ["k-means", "greedy"])
+def test_a_sample_serves_for_many_rows(method, monkeypatch):
+    monkeypatch.setattr("skevgp.fitting.inducing.MAX_SAMPLE", 100)
+    X = np.random.RandomState(0).rand(5000, 1)
+    assert points(X, 100, method).shape == (100, 1)
+
+
+@pytest.mark.parametrize("method", ["k-means", "greedy"])
+def test_the_first_points_are_far_apart(method):
+    """Adam moves in coordinates whitened in this order; sorted points make each nearly follow from the one before."""
+    X = np.random.RandomState(0).rand(2000, 1)
+    chosen = points(X, 20, method, 0.1)[:, 0]
+    assert np.abs(np.diff(chosen[:5])).min() > 2.0 * np.diff(np.sort(chosen)).mean()
+
+
+def test_greedy_takes_the_row_of_largest_conditional_variance():
+    X = np.random.RandomState(0).randn(200, 3)
+    chosen = points(X, 12, "greedy", 1.5)
+
+    def k(A, B):
+        return np.exp(-0.5 * cdist(A / 1.5, B / 1.5, "sqeuclidean"))
+
+    for count in range(1, 12):
+        Z = chosen[:count]
+        left = 1.0 - np.einsum("ij,ij->j", k(Z, X), np.linalg.solve(k(Z, Z), k(Z, X)))
+        np.testing.assert_array_equal(chosen[count], X[np.argmax(left)])
+
+
+def test_greedy_leaves_less_unexplained_than_chance():
+    """The sum of k(x, x) - q(x, x), which the bound pays for (Titsias 2009, eq. 9)."""
+    X = np.random.RandomState(0).uniform(-3, 3, (500, 2))
+
+    def unexplained(Z):
+        K = np.exp(-0.5 * cdist(Z, Z, "sqeuclidean")) + 1e-10 * np.eye(len(Z))
+        U = np.exp(-0.5 * cdist(Z, X, "sqeuclidean"))
+        return len(X) - np.einsum("ij,ij->", U, np.linalg.solve(K, U))
+
+    assert unexplained(points(X, 30, "greedy")) < 0.8 * unexplained(X[:30])
+
+
+def test_greedy_breaks_ties_by_the_generator():
+    X = np.random.RandomState(0).randn(100, 2)
+    np.testing.assert_array_equal(points(X, 5, "greedy", seed=1), points(X, 5, "greedy", seed=1))
+    assert (points(X, 5, "greedy", seed=1) != points(X, 5, "greedy", seed=2)).any()
+
+
+@pytest.mark.parametrize("lengthscale", [1e4, 1.0, 1e-4])
+def test_greedy_goes_on_where_the_kernel_is_exhausted_or_every_row_a_stranger(lengthscale):
+    """A long lengthscale is known from one row; then the farthest row is next. Copies never serve twice."""
+    X = np.repeat(np.random.RandomState(0).rand(60, 1), 3, axis=0)
+    chosen = points(X, 40, "greedy", lengthscale)
+    assert len(np.unique(chosen, axis=0)) == 40
+    assert np.isin(chosen, X).all()
+    assert cdist(X, points(X, 10, "greedy", 1e4)).min(axis=1).max() < 0.1
+
+
+def test_given_points_are_taken_as_they_are():
+    Z = np.array([[1.0, 2.0], [1.0, 2.0], [0.0, -5.0]])
+    np.testing.assert_array_equal(points(np.random.RandomState(0).randn(50, 2), 10, Z), Z)

@@ -1,0 +1,82 @@
+import numpy as np
+import pytest
+
+from skevgp._linalg import NotPositiveDefiniteError
+from skevgp.optimizers.lbfgs import lbfgs
+
+FREE = (np.full(2, -np.inf), np.full(2, np.inf))
+
+
+def rosenbrock(x):
+    value = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
+    return value, np.array([-400.0 * x[0] * (x[1] - x[0] ** 2) - 2.0 * (1 - x[0]), 200.0 * (x[1] - x[0] ** 2)])
+
+
+def test_lbfgs_finds_the_minimum_and_reports_each_iteration():
+    seen = []
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 200, 1e-12, lambda i, loss: seen.append((i, loss)))
+    np.testing.assert_allclose(minimum.x, 1.0, atol=1e-5)
+    assert minimum.converged
+    assert [i for i, _ in seen] == list(range(1, minimum.n_iter + 1))
+    assert [loss for _, loss in seen] == minimum.loss_curve
+    assert (np.diff(minimum.loss_curve) <= 1e-15).all()
+
+
+def test_lbfgs_respects_bounds():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), (np.full(2, -2.0), np.full(2, 0.5)), 200, 1e-12)
+    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-4)
+
+
+def test_lbfgs_says_that_iterations_ran_out():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 3, 1e-12)
+    assert (minimum.converged, minimum.n_iter) == (False, 3)
+
+
+def test_lbfgs_with_no_iterations_keeps_the_start():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 0, 1e-12)
+    np.testing.assert_array_equal(minimum.x, [-1.0, 2.0])
+    assert minimum.converged
+    assert minimum.loss == rosenbrock(minimum.x)[0]
+
+
+@pytest.mark.parametrize("failure", ["raise", "nan", "infinite gradient"])
+def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
+    """A logarithmic barrier whose line searches step over the wall."""
+    pull, outside = np.array([10.0, -30.0]), []
+
+    def barrier(x):
+        if (np.abs(x) >= 1.0).any():
+            outside.append(x)
+            if failure == "raise":
+                raise NotPositiveDefiniteError("far out")
+            return (np.nan, np.zeros(2)) if failure == "nan" else (-1e9, np.full(2, np.inf))
+        return -np.log(1.0 - x**2).sum() - pull @ x, 2.0 * x / (1.0 - x**2) - pull
+
+    minimum = lbfgs(barrier, np.zeros(2), FREE, 300, 1e-12)
+    np.testing.assert_allclose(minimum.x, (-1.0 + np.sqrt(1.0 + pull**2)) / pull, atol=1e-6)
+    assert outside
+
+
+def test_lbfgs_ends_when_rounding_has_the_last_word():
+    def rough(x):
+        value, gradient = rosenbrock(x)
+        return round(value, 3), gradient
+
+    minimum = lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-6)
+    assert minimum.converged
+    assert minimum.loss < 0.01
+
+
+def test_ctrl_c_keeps_the_best_point_so_far():
+    calls = []
+
+    def interrupted(x):
+        calls.append(x)
+        if len(calls) > 8:
+            raise KeyboardInterrupt
+        return rosenbrock(x)
+
+    minimum = lbfgs(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1)
+    assert minimum.interrupted
+    assert not minimum.converged
+    assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]

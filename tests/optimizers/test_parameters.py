@@ -1,0 +1,92 @@
+import autograd.numpy as anp
+import numpy as np
+from autograd import grad
+
+from skevgp.optimizers.parameters import Parameter, ParameterTable
+
+
+def table():
+    return ParameterTable(
+        [
+            Parameter("length", np.array([1.0, 2.0]), "log", 0.5, np.array([3.0, 1.5])),
+            Parameter("noise", np.array([0.1]), "log", fixed=True),
+            Parameter("points", np.arange(6.0).reshape(1, 3, 2), unit=np.array([2.0, 4.0])),
+        ]
+    )
+
+
+def test_values_come_back():
+    values = table().values(table().start())
+    np.testing.assert_allclose(values["points"], np.arange(6.0).reshape(1, 3, 2))
+    np.testing.assert_allclose(values["noise"], [0.1])
+    assert table().size == 8
+
+
+def test_starts_are_put_inside_their_bounds():
+    np.testing.assert_allclose(table().values(table().start())["length"], [1.0, 1.5])
+
+
+def test_bounds_are_those_of_the_coordinates():
+    lower, upper = table().bounds()
+    np.testing.assert_allclose(lower[:2], np.log(0.5))
+    np.testing.assert_allclose(upper[:2], np.log([3.0, 1.5]))
+    assert np.isinf(upper[2:]).all()
+    np.testing.assert_allclose(table()["length"].value_bounds(), [[0.5, 3.0], [0.5, 1.5]])
+
+
+def test_a_change_of_one_unit_moves_the_coordinate_by_one():
+    flat = table().start()
+    flat[2:4] += 1.0
+    np.testing.assert_allclose(table().values(flat)["points"][0, 0], [2.0, 5.0])
+
+
+def test_warm_starts_take_over_only_what_fits():
+    again = table().started_at(
+        {"length": np.array([0.7, 0.8]), "noise": np.array([9.0]), "points": np.zeros((2, 3, 2))}
+    )
+    values = again.values(again.start())
+    np.testing.assert_allclose(values["length"], [0.7, 0.8])
+    np.testing.assert_allclose(values["noise"], [0.1])
+    np.testing.assert_allclose(values["points"], np.arange(6.0).reshape(1, 3, 2))
+
+
+def test_a_table_where_all_is_fixed_has_no_coordinates():
+    fixed = ParameterTable([Parameter("noise", np.array([0.1]), "log", fixed=True)])
+    assert fixed.start().shape == (0,)
+    np.testing.assert_allclose(fixed.values(fixed.start())["noise"], [0.1])
+
+
+def partly_fixed():
+    fixed = np.array([True, False, False, True])
+    return ParameterTable(
+        [
+            Parameter("shape", np.array([1.0, 2.0, 3.0, 4.0]), "log", 0.5, np.array([1.0, 5.0, 2.5, 3.0]), fixed=fixed),
+            Parameter("points", np.arange(2.0)),
+        ]
+    )
+
+
+def test_single_entries_can_be_fixed():
+    table = partly_fixed()
+    assert table.size == 4
+    np.testing.assert_allclose(table.values(table.start())["shape"], [1.0, 2.0, 2.5, 4.0])
+    lower, upper = table.bounds()
+    np.testing.assert_allclose(upper[:2], np.log([5.0, 2.5]))
+    np.testing.assert_allclose(lower[:2], np.log(0.5))
+    values = table.values(np.array([0.1, 0.2, 7.0, 8.0]))
+    np.testing.assert_allclose(values["shape"], [1.0, np.exp(0.1), np.exp(0.2), 4.0])
+    np.testing.assert_allclose(values["points"], [7.0, 8.0])
+    np.testing.assert_allclose(table.flat({"shape": np.arange(4.0), "points": np.ones(2)}), [1.0, 2.0, 1.0, 1.0])
+    again = table.started_at({"shape": np.array([9.0, 1.0, 2.0, 9.0])})
+    np.testing.assert_allclose(again.values(again.start())["shape"], [1.0, 1.0, 2.0, 4.0])
+
+
+def test_autograd_sees_only_the_free_entries():
+    gradient = grad(lambda flat: anp.sum(partly_fixed().coordinates(flat)["shape"] * np.arange(1.0, 5.0)))(np.ones(4))
+    np.testing.assert_array_equal(gradient, [2.0, 3.0, 0.0, 0.0])
+
+
+def test_a_parameter_without_entries_is_no_trouble():
+    table = ParameterTable([Parameter("none", np.empty(0), "log"), Parameter("points", np.arange(2.0))])
+    assert table.size == 2
+    assert table.values(table.start())["none"].shape == (0,)
