@@ -95,7 +95,6 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     _fitted: Fitted
     _spec: KernelSpec
-    _single_output: bool
 
     def predict(
         self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
@@ -135,7 +134,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
             X = as_rows(X, "X", known=False)
             self._validated(X)
-            shape = () if self._n_outputs == 1 else (self._n_outputs,)
+            shape = () if self._single_output else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
         given: Any = X
         array: Any = X
@@ -219,7 +218,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
-        self._spec, self._single_output = spec, y.ndim == 1
+        self._spec = spec
         return Problem(source, frame, spec, vague)
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -279,3 +278,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def _n_outputs(self) -> int:
         return len(self._posterior.noise)
+
+    @property
+    def _single_output(self) -> bool:
+        """Whether nothing has an axis of outputs: for a y of one column too, as in scikit-learn's GPR."""
+        return self._n_outputs == 1

@@ -67,7 +67,8 @@ class EGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has
+        an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
         Their posterior standard deviations.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
@@ -76,7 +77,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         The prior that was used.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.

@@ -123,7 +123,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has
+        an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
         Their posterior standard deviations.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
@@ -132,9 +133,9 @@ class EVGPRegressor(ExplicitGaussianProcess):
         The prior that was used.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    inducing_points_ : ndarray of shape (m, d) or, unless ``sharing="all"``, (n_outputs, m, d)
+    inducing_points_ : ndarray of shape (m, d) or, for several outputs unless ``sharing="all"``, (n_outputs, m, d)
         In the space of ``kernel_map``.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
@@ -380,7 +381,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self._set_common_attributes()
         fitted = self._fitted
         points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
-        self.inducing_points_ = points[0] if fitted.sharing == "all" else points
+        self.inducing_points_ = points[0] if fitted.sharing == "all" or self._single_output else points
         self.lower_bound_ = fitted.lower_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter

@@ -19,7 +19,7 @@ Y = np.column_stack([np.sin(2 * X[:, 0]) + X[:, 1], 3 * np.cos(X[:, 1]) * X[:, 0
 X_NEW = RNG.uniform(-2.5, 2.5, (30, 2))
 TREND = PolynomialFeatures(1)
 FIXED = ConstantKernel(1.4, "fixed") * RBF([0.9, 1.6], "fixed")
-TARGETS = [(Y[:, 0], (), 1), (Y[:, :1], (1,), 1), (Y, (2,), 2)]
+TARGETS = [(Y[:, 0], (), 1), (Y[:, :1], (), 1), (Y, (2,), 2)]
 IDS = ["one output", "one column", "two outputs"]
 
 
