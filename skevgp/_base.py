@@ -67,6 +67,21 @@ class Fitted(Protocol):
         """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
 
 
+class _OfWeights:
+    """An attribute that a fit sets if there are weights, and an AttributeError that says so if there are none."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, owner: type) -> Any:
+        # Python looks into the instance first.
+        if model is None:
+            return self
+        raise AttributeError(
+            f"{owner.__name__} has {self._name} only after a fit with a feature_map: without one there are no weights."
+        )
+
+
 class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """A Gaussian process with explicit features, however it is fitted."""
 
@@ -92,6 +107,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     coef_scale: ArrayLike | str
     noise_variance: float | None
     normalize_y: bool
+
+    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_ = (_OfWeights() for _ in range(5))
 
     _fitted: Fitted
     _spec: KernelSpec
@@ -254,14 +271,18 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
 
     def _set_common_attributes(self) -> None:
-        """What is known of weights, noise and kernel."""
+        """What is known of weights, if there are any, noise and kernel."""
         fitted, prior = self._fitted, self._fitted.frame.prior
         self._posterior: Posterior = fitted.posterior()
         first = 0 if self._single_output else slice(None)
-        mean, covariance = self._posterior.coefficients()
-        self.coef_, self.coef_cov_ = mean[first], covariance[first]
-        self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+        for name, attribute in vars(ExplicitGaussianProcess).items():
+            if isinstance(attribute, _OfWeights):
+                vars(self).pop(name, None)
+        if self.feature_map_ is not None:
+            mean, covariance = self._posterior.coefficients()
+            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+            self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
         self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
         kernels = [
             self._spec.to_sklearn(
