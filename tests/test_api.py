@@ -5,7 +5,7 @@ import pytest
 from sklearn.base import clone
 from sklearn.feature_selection import RFE, SelectFromModel
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import Kernel
+from sklearn.gaussian_process.kernels import RBF, Kernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -88,3 +88,13 @@ def test_columns_are_ranked_by_length_scales(model):
     getter = {"importance_getter": lambda model: 1 / model.kernel_.k2.length_scale}  # as the docstrings say
     for select in (SelectFromModel(model, **getter), RFE(model, n_features_to_select=1, **getter)):
         assert select.fit(rows, y).get_support().tolist() == [False, True, False, False]
+
+
+# --- errors -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("estimator", [EVGPRegressor, EGPRegressor])
+def test_a_kernel_as_the_first_argument_is_sent_to_kernel(estimator):
+    # As in scikit-learn's GaussianProcessRegressor, whose first argument it is.
+    with pytest.raises(TypeError, match=r"feature_map=RBF\(length_scale=2\) is a kernel: give it as kernel="):
+        estimator(RBF(2.0)).fit(X, Y)
