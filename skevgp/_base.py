@@ -140,7 +140,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+            If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
+            of the rows of a Dask array.
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
@@ -148,7 +149,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             check_is_fitted(self)
         if is_dask(X):
             if return_cov:
-                raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+                raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
             X = as_rows(X, "X", known=False)
             self._validated(X)
             shape = () if self._single_output else (self._n_outputs,)
@@ -194,8 +195,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+
+        Raises
+        ------
+        ValueError, TypeError
+            If X does not fit the training data, is not finite or is a Dask array, or ``n_samples`` is not a positive
+            integer.
         """
         check_integer(n_samples, "n_samples", minimum=1)
+        if is_dask(X):
+            raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
         rng = check_random_state(random_state)
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1
