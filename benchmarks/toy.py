@@ -97,7 +97,7 @@ def build(cell: Cell) -> RegressorMixin:
 
 def line_of(model: RegressorMixin) -> np.ndarray:
     """Intercept and slope of the explicit part, each with its standard deviation; zeros without features."""
-    if np.size(getattr(model, "coef_", ())) == 0:
+    if not hasattr(model, "coef_"):
         return np.zeros((2, 2))
     return np.column_stack([model.coef_, model.coef_std_])
 

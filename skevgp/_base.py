@@ -67,6 +67,21 @@ class Fitted(Protocol):
         """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
 
 
+class _OfWeights:
+    """An attribute that a fit sets if there are weights, and an AttributeError that says so if there are none."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, owner: type) -> Any:
+        # Python looks into the instance first.
+        if model is None:
+            return self
+        raise AttributeError(
+            f"{owner.__name__} has {self._name} only after a fit with a feature_map: without one there are no weights."
+        )
+
+
 class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     """A Gaussian process with explicit features, however it is fitted."""
 
@@ -93,9 +108,10 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     noise_variance: float | None
     normalize_y: bool
 
+    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_ = (_OfWeights() for _ in range(5))
+
     _fitted: Fitted
     _spec: KernelSpec
-    _single_output: bool
 
     def predict(
         self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
@@ -124,7 +140,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+            If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
+            of the rows of a Dask array.
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
@@ -132,10 +149,10 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             check_is_fitted(self)
         if is_dask(X):
             if return_cov:
-                raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+                raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
             X = as_rows(X, "X", known=False)
             self._validated(X)
-            shape = () if self._n_outputs == 1 else (self._n_outputs,)
+            shape = () if self._single_output else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
         given: Any = X
         array: Any = X
@@ -178,8 +195,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+
+        Raises
+        ------
+        ValueError, TypeError
+            If X does not fit the training data, is not finite or is a Dask array, or ``n_samples`` is not a positive
+            integer.
         """
         check_integer(n_samples, "n_samples", minimum=1)
+        if is_dask(X):
+            raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
         rng = check_random_state(random_state)
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1
@@ -219,7 +244,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
-        self._spec, self._single_output = spec, y.ndim == 1
+        self._spec = spec
         return Problem(source, frame, spec, vague)
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -255,14 +280,18 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
 
     def _set_common_attributes(self) -> None:
-        """What is known of weights, noise and kernel."""
+        """What is known of weights, if there are any, noise and kernel."""
         fitted, prior = self._fitted, self._fitted.frame.prior
         self._posterior: Posterior = fitted.posterior()
         first = 0 if self._single_output else slice(None)
-        mean, covariance = self._posterior.coefficients()
-        self.coef_, self.coef_cov_ = mean[first], covariance[first]
-        self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+        for name, attribute in vars(ExplicitGaussianProcess).items():
+            if isinstance(attribute, _OfWeights):
+                vars(self).pop(name, None)
+        if self.feature_map_ is not None:
+            mean, covariance = self._posterior.coefficients()
+            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+            self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
         self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
         kernels = [
             self._spec.to_sklearn(
@@ -279,3 +308,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     @property
     def _n_outputs(self) -> int:
         return len(self._posterior.noise)
+
+    @property
+    def _single_output(self) -> bool:
+        """Whether nothing has an axis of outputs: for a y of one column too, as in scikit-learn's GPR."""
+        return self._n_outputs == 1

@@ -329,7 +329,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for values, name in ((X, "X"), (targets, "y")):
             check_magnitude(values, name)
             check_not_vanishing(np.abs(values).max(axis=0), name)
-        self._single_output = y.ndim == 1
         return X, targets
 
     def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
@@ -368,7 +367,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.intercepts_ = [layer.bias for layer in layers]
         self.X_mean_ = self._scaling.x_mean.copy()
         noise = np.exp(log_noise)
-        self.noise_variance_ = float(noise[0]) if self._single_output else noise
+        self.noise_variance_ = float(noise[0]) if len(noise) == 1 else noise
         self.n_parameters_ = self._network.n_parameters
 
     @property

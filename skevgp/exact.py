@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from ._base import ExplicitGaussianProcess
 from ._progress import Progress
 from ._validation import unchanged_if_it_fails
-from .inference.exact import ExactFit, ExactOptions
+from .fitting.exact import ExactFit, ExactOptions
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 
@@ -67,16 +67,19 @@ class EGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
+        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
+        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
+        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations.
+        Their posterior standard deviations. Only with a ``feature_map``.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances.
+        Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used.
+        The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
@@ -187,7 +190,8 @@ class EGPRegressor(ExplicitGaussianProcess):
                 partial(Progress, self.verbose) if self.verbose else None,
             )
             self._set_common_attributes()
-            self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
+            if problem.vague.any():
+                self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
             self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)

@@ -123,18 +123,21 @@ class EVGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
+        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
+        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
+        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations.
+        Their posterior standard deviations. Only with a ``feature_map``.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances.
+        Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used.
+        The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    inducing_points_ : ndarray of shape (m, d) or, unless ``sharing="all"``, (n_outputs, m, d)
+    inducing_points_ : ndarray of shape (m, d) or, for several outputs unless ``sharing="all"``, (n_outputs, m, d)
         In the space of ``kernel_map``.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
@@ -380,7 +383,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self._set_common_attributes()
         fitted = self._fitted
         points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
-        self.inducing_points_ = points[0] if fitted.sharing == "all" else points
+        self.inducing_points_ = points[0] if fitted.sharing == "all" or self._single_output else points
         self.lower_bound_ = fitted.lower_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter

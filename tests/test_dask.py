@@ -245,6 +245,8 @@ def test_what_needs_all_rows_at_once_says_so():
     (rows,) = chunked(X_NEW, rows=(20, 30))
     with pytest.raises(ValueError, match="return_cov.*Dask"):
         fitted.predict(rows, return_cov=True)
+    with pytest.raises(ValueError, match="^sample_y needs all rows at once: not for Dask arrays"):
+        fitted.sample_y(rows)
     with pytest.raises(ValueError, match="2 features"):
         fitted.predict(da.zeros((5, 3)))
     with pytest.raises(TypeError, match="to_dask_array"):

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 from sklearn.base import clone
+from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
 from sklearn.utils import _safe_indexing
 
@@ -38,6 +39,8 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
 
 def fresh_map(feature_map: Any, name: str) -> Any:
     """A clone of a transformer, or a TypeError that names it."""
+    if isinstance(feature_map, Kernel):
+        raise TypeError(f"{name}={feature_map!r} is a kernel: give it as kernel=.")
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
     try:
