@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
-from sklearn.utils import _safe_indexing, check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
+from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
 from ._shapes import like_y
+from ._sklearn import Interval, StrOptions, safe_indexing
 from ._validation import check_integer, check_magnitude, check_not_vanishing, is_plain
 from .fitting.units import Frame
 from .inference.posterior import Posterior
@@ -269,7 +269,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's centred inputs and the features of rows."""
         array = np.asarray(X[rows], dtype=np.float64)
-        given = array if given is X else _safe_indexing(given, rows)
+        given = array if given is X else safe_indexing(given, rows)
         inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
         return inputs - self._fitted.frame.centre, features
 

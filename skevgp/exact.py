@@ -9,13 +9,14 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import TransformerMixin, _fit_context
+from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
 from ._base import ExplicitGaussianProcess
 from ._progress import Progress
+from ._sklearn import fit_context
 from ._validation import unchanged_if_it_fails
 from .fitting.exact import ExactFit, ExactOptions
 from .rows.dask import is_dask
@@ -147,7 +148,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.random_state = random_state
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit kernel and noise; the posterior is exact.
 

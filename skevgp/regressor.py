@@ -11,14 +11,14 @@ from typing import Any, ClassVar, Literal, Self, cast
 import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
-from sklearn.base import TransformerMixin, _fit_context
+from sklearn.base import TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 
 from ._base import ExplicitGaussianProcess
 from ._progress import Progress
+from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
 from .fitting.inducing import Placement
 from .fitting.outputs import FittedOutputs
@@ -253,7 +253,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self.random_state = random_state
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit kernel, noise, inducing points and posterior.
 
@@ -289,7 +289,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
             warnings.warn(message, ConvergenceWarning, stacklevel=3)
         return self
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 

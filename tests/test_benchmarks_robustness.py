@@ -11,7 +11,6 @@ import pytest
 from skevgp.inference.model import JITTER
 
 PATH = Path(__file__).parents[1] / "benchmarks" / "robustness.py"
-pytestmark = pytest.mark.skipif(not PATH.exists(), reason="the benchmarks are not part of the installed package")
 
 
 @pytest.fixture(scope="module")

@@ -5,6 +5,9 @@ import pickle
 import signal
 import time
 
+import dask
+import dask.array as da
+import distributed
 import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -12,10 +15,6 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, Stand
 
 from skevgp import EVGPRegressor
 from skevgp.rows import dask as _dask
-
-dask = pytest.importorskip("dask")
-da = pytest.importorskip("dask.array")
-distributed = pytest.importorskip("distributed")
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),

@@ -1,5 +1,6 @@
 import pickle
 
+import dask.array as da
 import numpy as np
 import pandas as pd
 import pytest
@@ -343,13 +344,11 @@ def test_bounds_and_fixed_values_are_respected():
 
 
 def test_dask_arrays_are_refused():
-    da = pytest.importorskip("dask.array")
     with pytest.raises(TypeError, match="use EVGPRegressor"):
         EGPRegressor().fit(da.from_array(X), Y)
 
 
 def test_dask_arrays_are_predicted():
-    da = pytest.importorskip("dask.array")
     m = fixed(feature_map=TREND).fit(X, Y)
     mean, std = m.predict(da.from_array(X_NEW, chunks=(10, 2)), return_std=True)
     expected = m.predict(X_NEW, return_std=True)

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import dask.array as dask_array
 import numpy as np
 import pytest
 
@@ -29,7 +30,6 @@ def test_any_robot_runs():
 
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
-    dask_array = pytest.importorskip("dask.array")
     files, chunks = SNIPPETS[3:]
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (500, 2))

@@ -10,7 +10,6 @@ from .conftest import read
 
 ROOT = Path(__file__).parents[1]
 RESULTS = ROOT / "benchmarks" / "results"
-pytestmark = pytest.mark.skipif(not RESULTS.exists(), reason="the benchmarks are not part of the installed package")
 
 
 @pytest.fixture(scope="module")

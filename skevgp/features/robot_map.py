@@ -7,10 +7,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin, _fit_context
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.metaestimators import available_if
-from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 
+from .._sklearn import check_feature_names_in, fit_context
 from .._validation import is_plain
 from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
@@ -35,7 +36,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
-    @_fit_context(prefer_skip_nested_validation=True)
+    @fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: object = None) -> Self:
         """Load the robot and check the columns.
 
@@ -108,7 +109,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         check_is_fitted(self)
         if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
             input_features = np.array(self._layout.column_names, dtype=object)
-        return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
+        return np.array(self._names(check_feature_names_in(self, input_features)), dtype=object)
 
     def _prepare(self, robot: Robot | None) -> None:
         """What `fit` keeps of the robot (read) besides the layout; nothing here."""

@@ -9,8 +9,8 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
-from sklearn.utils import _safe_indexing
 
+from .._sklearn import safe_indexing
 from .._validation import LARGEST, as_floats, check_magnitude
 
 # Rows that a map sees at once.
@@ -72,7 +72,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
-        rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
+        rows = X if n_rows <= MAP_ROWS else safe_indexing(X, slice(first, first + MAP_ROWS))
         values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")

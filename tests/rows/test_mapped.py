@@ -1,6 +1,5 @@
 """Rows in files and in memory: the same model, without a copy of the data."""
 
-import os
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
@@ -185,7 +184,6 @@ def test_every_row_gets_into_mini_batches_however_many_there_are(monkeypatch):
     assert set(np.concatenate(seen)) == set(range(n))
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
 def test_fits_have_the_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
     rng = np.random.RandomState(0)
@@ -202,7 +200,6 @@ def test_fits_have_the_same_bits_in_any_thread():
         np.testing.assert_array_equal(other.submit(points, 1).result(), expected)
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
 def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     def threads():
         return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
