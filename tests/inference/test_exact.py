@@ -7,7 +7,9 @@ import pytest
 
 from skevgp.inference.bounds import CoefficientPrior
 from skevgp.inference.exact import ExactModel
-from skevgp.kernels.covariances import Constant, DotProduct, Sum
+from skevgp.kernels.constant import Constant
+from skevgp.kernels.covariances import Sum
+from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import RawRows
 

@@ -23,8 +23,9 @@ from sklearn.gaussian_process.kernels import (
 
 from skevgp import EVGPRegressor
 from skevgp.kernels import FunctionKernel
-from skevgp.kernels.covariances import Constant, Product, Sum
-from skevgp.kernels.covariances import DotProduct as DotProductCovariance
+from skevgp.kernels.constant import Constant
+from skevgp.kernels.covariances import Product, Sum
+from skevgp.kernels.dot_product import DotProduct as DotProductCovariance
 from skevgp.kernels.parse import parse_kernel
 from skevgp.kernels.stationary import SquaredExponential
 
