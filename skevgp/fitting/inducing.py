@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from ..inference.statistics import Kernel
 from ..rows.source import Moments
-from .start import spread_of
+from .start import column_scale
 
 # On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
@@ -83,7 +83,7 @@ class Placement:
 
 def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
     """k-means, each column scaled to unit standard deviation; fewer points where rows differ by rounding only."""
-    scale = spread_of(Moments.of(inputs))
+    scale = column_scale(Moments.of(inputs))
     with warnings.catch_warnings():
         # Of rows that differ by rounding only: fewer points are then the right answer.
         warnings.simplefilter("ignore", ConvergenceWarning)
@@ -117,7 +117,7 @@ def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparam
     prepared = kernel.prepare(inputs)
     variance = np.array(np.broadcast_to(kernel.at(hyperparameters, inputs[:1]).diagonal(prepared), len(inputs)))
     enough = _EXHAUSTED * variance.max()
-    scaled = inputs / spread_of(Moments.of(inputs))
+    scaled = inputs / column_scale(Moments.of(inputs))
     distance = np.full(len(inputs), np.inf)
     rows, chosen = np.empty((n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
     for count in range(n_inducing):
