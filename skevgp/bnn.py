@@ -14,7 +14,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._progress import Progress
+from ._progress import monitor_of
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
@@ -301,6 +301,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start = network.start(rng)
         if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
             scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
+        monitor = monitor_of(self.verbose)
         training = train(
             network,
             start,
@@ -313,14 +314,14 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             learning_rate=self.learning_rate_init,
             tol=self.tol,
             patience=self.n_iter_no_change,
-            report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
+            monitor=monitor.seen_as(shift=scaling.log_unit),
         )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
         self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
         self._set_attributes()
-        return self._how_it_ended(training, max_iter)
+        return self._how_it_ended(training, max_iter, monitor.stopped)
 
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
@@ -348,8 +349,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
 
-    def _how_it_ended(self, training: Training, max_iter: int) -> str:
-        if training.minimum.interrupted:
+    def _how_it_ended(self, training: Training, max_iter: int, interrupted: bool) -> str:
+        if interrupted:
             return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
         if not training.minimum.converged:
             return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."

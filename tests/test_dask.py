@@ -15,6 +15,7 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, Stand
 
 from skevgp import EVGPRegressor
 from skevgp.rows import dask as _dask
+from skevgp.solvers import Adam
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),
@@ -81,7 +82,7 @@ def test_folds_on_two_workers_are_folds_of_arrays(cluster):
 
 
 def test_adam_takes_its_batches_from_the_chunks():
-    parameters = {"solver": "adam", "max_iter": 5, "batch_size": 100}
+    parameters = {"solver": Adam(batch_size=100), "max_iter": 5}
     assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))
 
 

@@ -192,7 +192,7 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     if _constant(rows.inputs).all():
         return np.zeros(len(rows.scatter()), dtype=bool)
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs, residuals = some.inputs / column_scale(rows.inputs), some.targets
+    inputs, residuals = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs), some.targets
     if len(inputs) < 2:
         return np.zeros(residuals.shape[1], dtype=bool)
     _, nearest = cKDTree(inputs).query(inputs, 2)
