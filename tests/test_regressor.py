@@ -479,20 +479,15 @@ def test_too_few_iterations_warn_and_say_what_to_change():
         model(max_iter=3).fit(X, Y)
 
 
-@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+@pytest.mark.parametrize("solver", [LBFGS, Adam])
 @pytest.mark.parametrize("sharing", ["all", "none"])
-def test_ctrl_c_keeps_the_best_parameters_and_warns(monkeypatch, sharing, solver):
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
+def test_ctrl_c_keeps_the_best_parameters_and_warns(sharing, solver):
+    def interrupt(iteration, bound):
+        if iteration == 3:
+            raise KeyboardInterrupt
 
-        def __call__(self, iteration, loss):
-            if iteration == 3:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
     with pytest.warns(ConvergenceWarning, match="interrupted after 3 iterations"):
-        m = model(verbose=1, solver=solver, sharing=sharing).fit(X, Y)
+        m = model(solver=solver(callback=interrupt), sharing=sharing).fit(X, Y)
     assert np.isfinite(m.predict(X_NEW)).all()
     assert m.n_iter_ == 3
 

@@ -1,6 +1,7 @@
 """Where fits start, how often, and what they say when they end badly."""
 
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
-from skevgp.fitting import strategy as learning
+from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (120, 2))
@@ -28,7 +29,7 @@ def model(**arguments):
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_restarts_keep_the_best_bound(sharing):
     once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
-    often = model(sharing=sharing, inducing_init="k-means", n_restarts=3).fit(X, Y)
+    often = model(sharing=sharing, inducing_init="k-means", solver=LBFGS(n_restarts=3)).fit(X, Y)
     assert often.lower_bound_ >= once.lower_bound_
     # Not all from the same place: the eight points leave several optima, of which the first is not the best.
     assert often.lower_bound_ > once.lower_bound_ + 1e-3
@@ -37,14 +38,13 @@ def test_restarts_keep_the_best_bound(sharing):
 
 
 def test_restarts_serve_adam_too():
-    arguments = {"solver": "adam", "max_iter": 200, "batch_size": 120}
-    once, often = model(**arguments).fit(X, Y), model(n_restarts=2, **arguments).fit(X, Y)
+    once, often = (model(solver=Adam(batch_size=120, n_restarts=n), max_iter=200).fit(X, Y) for n in (0, 2))
     assert often.lower_bound_ >= once.lower_bound_
 
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
-    fits = [model(sharing=sharing, n_restarts=2, n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
+    fits = [model(sharing=sharing, solver=LBFGS(n_restarts=2), n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
     for other in fits[1:]:
         assert other.lower_bound_ == fits[0].lower_bound_
         np.testing.assert_array_equal(other.inducing_points_, fits[0].inducing_points_)
@@ -52,7 +52,7 @@ def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
 
 def test_restarts_stay_inside_the_users_bounds():
     kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
-    m = model(kernel=kernel, n_restarts=3).fit(X, Y[:, 0])
+    m = model(kernel=kernel, solver=LBFGS(n_restarts=3)).fit(X, Y[:, 0])
     lengthscales = m.kernel_.k2.length_scale
     assert 0.9 - 1e-9 <= lengthscales[0] <= 1.1 + 1e-9
     assert 0.2 - 1e-9 <= lengthscales[1] <= 5.0 + 1e-9
@@ -61,26 +61,22 @@ def test_restarts_stay_inside_the_users_bounds():
 
 def test_without_iterations_there_is_nothing_to_restart():
     np.testing.assert_array_equal(
-        model(max_iter=0, n_restarts=5).fit(X, Y).inducing_points_, model(max_iter=0).fit(X, Y).inducing_points_
+        model(max_iter=0, solver=LBFGS(n_restarts=5)).fit(X, Y).inducing_points_,
+        model(max_iter=0).fit(X, Y).inducing_points_,
     )
 
 
-def test_ctrl_c_ends_the_restarts_with_the_best_so_far(monkeypatch):
+def test_ctrl_c_ends_the_restarts_with_the_best_so_far():
     calls = []
 
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
+    def interrupt(iteration, bound):
+        calls.append(iteration)
+        # In the second iteration of the second start.
+        if calls.count(2) == 2:
+            raise KeyboardInterrupt
 
-        def __call__(self, iteration, loss):
-            calls.append(iteration)
-            # In the second iteration of the second start.
-            if calls.count(2) == 2:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
     with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(inducing_init="k-means", verbose=1, n_restarts=50).fit(X, Y)
+        m = model(inducing_init="k-means", solver=LBFGS(n_restarts=50, callback=interrupt)).fit(X, Y)
     assert m.lower_bound_ == model(inducing_init="k-means").fit(X, Y).lower_bound_
     assert calls.count(2) == 2
 
@@ -105,77 +101,48 @@ def test_points_are_placed_anew_only_where_the_kernel_can_learn():
     assert auto.lower_bound_ == first.lower_bound_
 
 
-def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
+class Quick(LBFGS):
+    """Places inducing points anew after a few iterations."""
+
+    rules = replace(LBFGS.rules, stage=20)
+
+
+def test_an_interrupted_fit_keeps_the_best_of_both_places():
     """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
-    monkeypatch.setattr("skevgp.fitting.strategy._STAGE", 20)
-    placed, calls = learning._placed, []
+    seen = []
 
-    def all_at_one_place(values, *arguments):
-        moved = placed(values, *arguments)
-        calls.append(1)
-        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
+    def interrupt(iteration, bound):
+        seen.append(iteration)
+        if iteration == 21:
+            raise KeyboardInterrupt
 
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
-
-        def __call__(self, iteration, loss):
-            if calls:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", all_at_one_place)
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
-    with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(verbose=1, tol=1e-9).fit(X, Y)
+    with pytest.warns(ConvergenceWarning, match="interrupted after"):
+        m = model(solver=Quick(callback=interrupt), tol=1e-9).fit(X, Y)
     with pytest.warns(ConvergenceWarning, match="still rising"):
         before = model(max_iter=20, tol=1e-9).fit(X, Y)
-    assert m.lower_bound_ == pytest.approx(before.lower_bound_, abs=1e-6)
-    assert m.n_iter_ == 20
-
-
-def test_ctrl_c_while_points_are_placed_keeps_the_fit(monkeypatch):
-    def interrupted(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", interrupted)
-    with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m = model().fit(X, Y)
-    assert m.lower_bound_ > 0.0
-
-
-def test_bad_places_do_not_cost_the_bound(monkeypatch):
-    placed = learning._placed
-
-    def all_at_one_place(values, *arguments):
-        moved = placed(values, *arguments)
-        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", all_at_one_place)
-    monkeypatch.setattr("skevgp.fitting.strategy._STAGE", 15)
-    m = model().fit(X, Y)
-    assert m.lower_bound_ > model(inducing_init="k-means").fit(X, Y).lower_bound_ - 1.0
+    assert seen[-1] == 21
+    assert m.lower_bound_ >= before.lower_bound_ - 1e-6
 
 
 @pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
-def test_points_stay_where_they_have_a_reason_to(monkeypatch, why):
-    warm = model(warm_start=True, inducing_init="k-means", n_inducing=20).fit(X, Y)
-
-    def never(*arguments):
-        raise AssertionError("placed anew")
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", never)
-    fits = {
-        "warm start": lambda: warm.set_params(inducing_init="auto").fit(X, Y),
-        "as many points as rows": lambda: model(n_inducing=80, tol=1.0).fit(X, Y),
-        "few iterations": lambda: model(max_iter=100, tol=1.0).fit(X, Y),
-        "Adam": lambda: model(solver="adam", max_iter=150).fit(X, Y),
-        "own points": lambda: model(inducing_init=Z).fit(X, Y),
-    }
-    fits[why]()
+def test_points_stay_where_they_have_a_reason_to(why):
+    """The same fit as from clusters, or from the user's points, which are not placed anew."""
+    arguments = {
+        "warm start": {"n_inducing": 20, "warm_start": True},
+        "as many points as rows": {"n_inducing": 80, "tol": 1.0},
+        "few iterations": {"max_iter": 100, "tol": 1.0},
+        "Adam": {"solver": "adam", "max_iter": 150},
+        "own points": {"inducing_init": Z},
+    }[why]
+    stay, auto = (model(**{"inducing_init": init, **arguments}) for init in ("k-means", "auto"))
+    if why == "warm start":
+        stay.fit(X, Y)
+        auto.set_params(inducing_init="k-means").fit(X, Y).set_params(inducing_init="auto")
+    assert auto.fit(X, Y).lower_bound_ == stay.fit(X, Y).lower_bound_
 
 
 def test_random_state_draws_mini_batches():
-    arguments = {"solver": "adam", "max_iter": 120, "batch_size": 10, "inducing_init": Z}
+    arguments = {"solver": Adam(batch_size=10), "max_iter": 120, "inducing_init": Z}
     bounds = {model(random_state=seed, **arguments).fit(X, Y).lower_bound_ for seed in (0, 1)}
     assert len(bounds) == 2
 
@@ -221,7 +188,9 @@ def test_a_fit_goes_on_from_the_inducing_points_of_another():
 def test_restarts_leave_given_points_alone():
     fixed = RBF([1.0, 1.0], "fixed")
     noise = WhiteKernel(1e-4, "fixed")
-    once, often = (model(inducing_init=Z, kernel=fixed + noise, n_restarts=n).fit(X, Y[:, 0]) for n in (0, 2))
+    once, often = (
+        model(inducing_init=Z, kernel=fixed + noise, solver=LBFGS(n_restarts=n)).fit(X, Y[:, 0]) for n in (0, 2)
+    )
     # There is nothing else to start from: all fits are the same.
     np.testing.assert_array_equal(often.inducing_points_, once.inducing_points_)
 

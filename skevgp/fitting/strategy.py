@@ -194,10 +194,10 @@ class Strategy:
             or not self.table["hyperparameters"].free.any()
         ):
             return (yield from self._once(values))
-        first = yield from self._unless_collapsed(values, stage)
-        best = better(first, (yield Attempt(self.place(first.values), 2 * stage, first)))
+        first, until = (yield from self._unless_collapsed(values, stage)), min(2 * stage, self.max_iter)
+        best = better(first, (yield Attempt(self.place(first.values), until, first)))
         if not first.converged:
-            best = better(best, (yield Attempt(first.values, 2 * stage, first)))
+            best = better(best, (yield Attempt(first.values, until, first)))
         if not best.converged and best.n_iter < self.max_iter:
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))
         return best

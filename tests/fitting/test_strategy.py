@@ -1,0 +1,240 @@
+"""The decisions of a fit, one by one: which start comes next, given how the fits before it ended."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skevgp._progress import Monitor
+from skevgp.fitting.strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
+from skevgp.optimizers.parameters import Parameter, ParameterTable
+
+RULES = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
+PLACES = np.arange(4.0).reshape(1, 2, 2)
+
+
+def table(noise_fixed=False, kernel_fixed=False):
+    return ParameterTable(
+        [
+            Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
+            Parameter("signal", np.ones(2), "log", 1e-3, 1e3),
+            Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
+            Parameter("inducing_points", PLACES),
+        ]
+    )
+
+
+def strategy(**changes):
+    own = {"table": table(), "max_iter": 1000, "n_restarts": 0, "scatter": np.ones(2), **changes}
+    return Strategy(own.pop("rules", RULES), **own)
+
+
+def place(values):
+    return values | {"inducing_points": values["inducing_points"] + 10.0}
+
+
+def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True):
+    """How a fit from a start may have ended: the hyperparameters say after how many iterations."""
+    n_iter = attempt.until if n_iter is None else n_iter
+    return Fit(attempt.values | {"noise": np.full(2, noise)}, bound, [0.0] * n_iter, converged)
+
+
+def drive(strategy, *results):
+    """The attempts that a strategy makes when fits end with these (bound, options); the fit that it returns."""
+    attempts, made, results = strategy.attempts(), [], list(results)
+    attempt = next(attempts)
+    while True:
+        made.append(attempt)
+        bound, options = results.pop(0)
+        try:
+            attempt = attempts.send(ended(attempt, bound, **options))
+        except StopIteration as done:
+            assert not results
+            return made, done.value
+
+
+GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}
+
+
+def test_a_good_fit_is_left_alone():
+    made, best = drive(strategy(), (5.0, GOOD))
+    assert [attempt.until for attempt in made] == [1000]
+    np.testing.assert_allclose(made[0].values["hyperparameters"], [2.0, 3.0])
+    assert best.bound == 5.0
+
+
+def test_a_collapsed_fit_starts_again_elsewhere_until_one_learns():
+    made, best = drive(strategy(), (5.0, COLLAPSED), (4.0, COLLAPSED), (9.0, GOOD))
+    np.testing.assert_allclose(made[1].values["hyperparameters"], [1.0, 1.5])
+    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
+    np.testing.assert_allclose(made[2].values["hyperparameters"], [4.0, 6.0])
+    np.testing.assert_allclose(made[2].values["noise"], 1e-2)
+    assert best.bound == 9.0
+
+
+def test_one_output_that_collapsed_is_enough():
+    own = strategy()
+    fit = Fit({"noise": np.array([1e-4, 0.95])}, 5.0)
+    assert own.collapsed(fit)
+    assert not own.collapsed(replace(fit, values={"noise": np.array([1e-4, 0.85])}))
+
+
+def test_when_nothing_learns_the_best_bound_is_kept():
+    made, best = drive(strategy(), (5.0, COLLAPSED), (7.0, COLLAPSED), (6.0, COLLAPSED))
+    assert len(made) == 3
+    assert best.bound == 7.0
+
+
+def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
+    below = strategy(alone=6.0)
+    assert len(drive(below, (5.0, GOOD), (8.0, GOOD))[0]) == 2
+    assert len(drive(below, (5.0, UNFINISHED))[0]) == 1
+
+
+@pytest.mark.parametrize("why", ["noise is fixed", "no iterations"])
+def test_other_starts_need_a_noise_that_moves(why):
+    own = strategy(table=table(noise_fixed=True)) if why == "noise is fixed" else strategy(max_iter=0)
+    assert len(drive(own, (5.0, COLLAPSED))[0]) == 1
+
+
+def test_where_the_kernel_may_interpolate_a_high_noise_is_tried_too():
+    made, best = drive(strategy(interpolates=True), (5.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    assert best.bound == 6.0
+    # And points, as many as rows, stay.
+    assert len(drive(strategy(interpolates=True, place=place), (5.0, GOOD), (4.0, GOOD))[0]) == 2
+
+
+def test_points_are_placed_anew_and_the_better_of_both_fits_goes_on():
+    made, best = drive(strategy(place=place), (5.0, UNFINISHED), (7.0, UNFINISHED), (6.0, UNFINISHED), (9.0, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200, 200, 1000]
+    np.testing.assert_array_equal(made[1].values["inducing_points"], PLACES + 10.0)
+    np.testing.assert_array_equal(made[2].values["inducing_points"], PLACES)
+    np.testing.assert_array_equal(made[3].values["inducing_points"], PLACES + 10.0)
+    assert made[1].after is made[2].after
+    assert made[1].after.bound == 5.0
+    assert made[3].after.bound == 7.0
+    assert best.bound == 9.0
+
+
+def test_bad_places_do_not_cost_the_bound():
+    made, best = drive(strategy(place=place), (5.0, UNFINISHED), (1.0, UNFINISHED), (6.0, UNFINISHED), (9.0, GOOD))
+    np.testing.assert_array_equal(made[3].values["inducing_points"], PLACES)
+    assert best.bound == 9.0
+
+
+def test_a_first_stage_that_has_ended_is_not_prolonged():
+    made, best = drive(strategy(place=place), (5.0, GOOD), (4.0, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200]
+    assert best.bound == 5.0
+
+
+def test_stages_end_with_max_iter():
+    made, _ = drive(strategy(place=place, max_iter=110), (5.0, UNFINISHED), (7.0, UNFINISHED), (6.0, UNFINISHED))
+    assert [attempt.until for attempt in made] == [100, 110, 110]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"max_iter": 100}, {"table": table(kernel_fixed=True)}, {"rules": replace(RULES, stage=None)}, {}]
+)
+def test_points_stay_where_there_is_no_second_stage(changes):
+    own = strategy(place=None if changes == {} else place, **changes)
+    assert len(drive(own, (5.0, UNFINISHED))[0]) == 1
+
+
+def test_restarts_are_drawn_and_the_best_of_all_is_kept():
+    first = table().values_at_start()
+    drawn_values = iter([first | {"noise": np.full(2, 0.1)}, first | {"noise": np.full(2, 0.2)}])
+    own = strategy(n_restarts=2, restart=lambda: next(drawn_values))
+    made, best = drive(own, (5.0, GOOD), (8.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    np.testing.assert_allclose(made[2].values["noise"], 0.2)
+    assert best.bound == 8.0
+
+
+def test_a_restart_is_staged_on_its_own():
+    own = strategy(n_restarts=1, place=place, restart=table().values_at_start)
+    made, best = drive(own, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD), (3.5, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200, 100, 200]
+    # It goes on from the restart's first stage, though the fit before it was better.
+    assert made[3].after.bound == 3.0
+    assert best.bound == 5.0
+
+
+def test_a_warm_start_whose_points_have_moved_is_not_placed_anew():
+    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
+    made, _ = drive(strategy(warm=warm, place=place), (5.0, UNFINISHED))
+    np.testing.assert_array_equal(made[0].values["inducing_points"], PLACES + 1.0)
+    np.testing.assert_allclose(made[0].values["noise"], 0.3)
+
+
+def test_a_warm_start_that_leads_nowhere_is_left_for_a_cold_one():
+    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
+    own = strategy(warm=warm, rules=replace(RULES, other_starts=()))
+    made, best = drive(own, (5.0, COLLAPSED), (4.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
+    assert best.bound == 5.0
+
+
+def test_of_equal_fits_the_later_is_kept_and_any_is_better_than_none():
+    first, second = Fit({}, 1.0), Fit({}, 1.0)
+    assert better(first, second) is second
+    assert better(None, Fit({}, -np.inf)).bound == -np.inf
+    assert better(first, Fit({}, -np.inf)) is first
+
+
+def test_drawn_values_stay_within_limits_and_leave_what_is_fixed():
+    own, rng = table(kernel_fixed=True), np.random.RandomState(0)
+    values = [drawn(own, RULES, rng) for _ in range(50)]
+    noise = np.array([value["noise"] for value in values])
+    assert noise.min() >= 1e-4 / 30.0 * (1 - 1e-9)
+    assert noise.max() <= 1e-4 * 30.0 * (1 + 1e-9)
+    assert noise.max() / noise.min() > 30.0
+    np.testing.assert_allclose([value["hyperparameters"] for value in values], [[2.0, 3.0]] * 50)
+
+
+class Told:
+    """A task whose fits end as told; Ctrl-C after so many."""
+
+    def __init__(self, strategy, bounds, stop_after=None):
+        self.strategy, self.monitor, self.made = strategy, Monitor(), []
+        self._bounds, self._stop_after = iter(bounds), stop_after
+
+    def minimise(self, attempt):
+        self.made.append(attempt)
+        if len(self.made) == self._stop_after:
+            self.monitor.stop()
+        return ended(attempt, next(self._bounds))
+
+
+def test_search_does_what_the_strategy_says_and_keeps_the_best():
+    own = strategy(n_restarts=2, restart=table().values_at_start)
+    task = Told(own, [1.0, 3.0, 2.0])
+    assert search(task).bound == 3.0
+    assert len(task.made) == 3
+    assert all(isinstance(attempt, Attempt) for attempt in task.made)
+
+
+def test_ctrl_c_ends_the_search_with_the_best_so_far():
+    own = strategy(n_restarts=9, restart=table().values_at_start)
+    task = Told(own, [4.0, 3.0, 9.0], stop_after=2)
+    assert search(task).bound == 4.0
+    assert len(task.made) == 2
+
+
+def test_ctrl_c_while_points_are_placed_keeps_the_fit():
+    def interrupted(values):
+        raise KeyboardInterrupt
+
+    task = Told(strategy(place=interrupted), [4.0])
+    assert search(task).bound == 4.0
+    assert task.monitor.stopped
+
+
+def test_ctrl_c_before_any_fit_is_an_interrupt():
+    class Interrupted(Told):
+        def minimise(self, attempt):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(Interrupted(strategy(), []))
