@@ -17,6 +17,8 @@ from skevgp import EVGPRegressor
 from skevgp.rows import dask as _dask
 
 pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     # A few iterations are enough to compare.

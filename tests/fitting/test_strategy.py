@@ -25,6 +25,8 @@ def model(**arguments):
 # --- n_restarts ------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_restarts_keep_the_best_bound(sharing):
     once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
@@ -42,6 +44,8 @@ def test_restarts_serve_adam_too():
     assert often.lower_bound_ >= once.lower_bound_
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
     fits = [model(sharing=sharing, n_restarts=2, n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
@@ -50,6 +54,7 @@ def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
         np.testing.assert_array_equal(other.inducing_points_, fits[0].inducing_points_)
 
 
+@pytest.mark.slow
 def test_restarts_stay_inside_the_users_bounds():
     kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
     m = model(kernel=kernel, n_restarts=3).fit(X, Y[:, 0])
@@ -156,6 +161,7 @@ def test_bad_places_do_not_cost_the_bound(monkeypatch):
     assert m.lower_bound_ > model(inducing_init="k-means").fit(X, Y).lower_bound_ - 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
 def test_points_stay_where_they_have_a_reason_to(monkeypatch, why):
     warm = model(warm_start=True, inducing_init="k-means", n_inducing=20).fit(X, Y)
@@ -218,6 +224,7 @@ def test_a_fit_goes_on_from_the_inducing_points_of_another():
     assert again.lower_bound_ > first.lower_bound_ - 10.0
 
 
+@pytest.mark.slow
 def test_restarts_leave_given_points_alone():
     fixed = RBF([1.0, 1.0], "fixed")
     noise = WhiteKernel(1e-4, "fixed")
@@ -273,6 +280,7 @@ def test_noise_that_is_noise_is_not_a_failure():
         model(kernel=RBF() + WhiteKernel(1.0, "fixed")).fit(X, Y)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_targets_far_from_their_prior_mean_are_told(sharing):
     with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
@@ -321,6 +329,7 @@ def test_a_kernel_that_explains_less_than_noise_is_tried_from_other_starts():
     assert model.lower_bound_ > -0.5 * 60 * (np.log(2 * np.pi * np.mean(y**2)) + 1.0)
 
 
+@pytest.mark.slow
 def test_a_warm_start_that_leads_nowhere_is_left():
     cold = model(n_inducing=12).fit(1e3 * X, Y)
     warm = model(n_inducing=12, warm_start=True).fit(X, Y).fit(1e3 * X, Y)
