@@ -188,7 +188,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns
         -------
-        self : object
+        self : BayesianMLPRegressor
+            Fitted.
 
         Raises
         ------
@@ -216,6 +217,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool, default=False
@@ -226,6 +228,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
         std : ndarray of the same shape
             If ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
@@ -265,15 +268,18 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
         n_samples : int, default=1
             How many functions.
         random_state : int, RandomState instance or None, default=0
+            Draws weights and noise.
         include_noise : bool, default=True
             Whether samples are of y, with the learned noise, or of the noise-free function.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows.
         """
         X = self._validated(X)
         check_integer(n_samples, "n_samples", minimum=1)

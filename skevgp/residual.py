@@ -92,12 +92,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         X : array-like of shape (n_samples, n_features)
             A data frame stays one for the regressor.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets in the units of their base columns.
         **params : dict
             For the regressor's ``fit``, such as ``sample_weight``; with metadata routing what it requests of them.
 
         Returns
         -------
-        self : object
+        self : ResidualRegressor
+            Fitted.
 
         Raises
         ------
@@ -115,13 +117,16 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            New rows, with the columns of the first call.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Their targets.
         **params : dict
             For the regressor's ``partial_fit``.
 
         Returns
         -------
-        self : object
+        self : ResidualRegressor
+            Fitted.
 
         Raises
         ------
@@ -137,12 +142,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
         **params : dict
             For the regressor's ``predict``, such as ``return_std``, ``return_cov`` and ``include_noise``.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
         std or cov : ndarray
             If the regressor was asked for them: as it returns them.
         """
@@ -160,15 +167,18 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
         n_samples : int, default=1
             How many functions.
         random_state : int, RandomState instance or None, default=0
+            Draws the functions.
         **params : dict
             For the regressor's ``sample_y``.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows, base columns included.
         """
         check_is_fitted(self)
         seen, array = self._validated(X)
@@ -176,11 +186,12 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         return samples + array[:, self.base_].reshape(*samples.shape[:-1], 1)
 
     def get_metadata_routing(self) -> MetadataRouter:
-        """What scikit-learn's metadata routing needs to know.
+        """Tell scikit-learn's metadata routing which methods pass what on.
 
         Returns
         -------
         routing : MetadataRouter
+            From `fit`, `partial_fit` and `predict` to those of the regressor.
         """
         mapping = MethodMapping()
         for method in ("fit", "partial_fit", "predict"):

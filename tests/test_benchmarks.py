@@ -9,6 +9,8 @@ from .conftest import read
 pytestmark = pytest.mark.usefixtures("benchmarks")
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_against_peers(run_script, tmp_path):
     output = tmp_path / "peers.csv"
     arguments = ("--quick", "--models", "RES-VGP", "--sharing", "none", "--output", output)
@@ -85,6 +87,8 @@ def test_the_curve_is_the_sum_of_the_best_bounds_so_far():
     assert watch.deadline(0) == pytest.approx(50.0, abs=1.0)
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_evaluation_cost(run_script, tmp_path):
     output = tmp_path / "cost.csv"
     run_script("evaluation_cost.py", "--quick", "--repeats", "3", "--cores", "1", "2", "--output", output)

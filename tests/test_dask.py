@@ -18,6 +18,8 @@ from skevgp.rows import dask as _dask
 from skevgp.solvers import Adam
 
 pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     # A few iterations are enough to compare.

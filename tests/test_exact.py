@@ -104,6 +104,7 @@ def test_with_features_it_is_a_gaussian_process_with_their_covariance():
     np.testing.assert_allclose(actual_cov, cov, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_the_likelihood_bounds_every_sparse_models_bound():
     exact = EGPRegressor(TREND).fit(X, Y)
     for m in (5, 20, 50):
@@ -242,6 +243,7 @@ def test_nearly_noise_free_data_are_fitted(noise):
     assert (std < 1e-3).all()
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize(
     "nasty",

@@ -46,6 +46,8 @@ def nasty(seed):
     return X, Y, arguments
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(80))
 def test_finite_data_never_fail(seed):
     X, Y, arguments = nasty(seed)

@@ -49,7 +49,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
         Returns
         -------
-        self : object
+        self : RobotTransformer
+            Fitted.
 
         Raises
         ------
@@ -83,11 +84,12 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
 
         Returns
         -------
         H : ndarray of shape (n_samples, n_features_out)
-            h(x) of each row.
+            The features h(x) of each row.
         """
         if not hasattr(self, "n_features_in_"):
             check_is_fitted(self)
@@ -95,7 +97,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         return self._features(rows)
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
-        """Names of the features.
+        """Name the features.
 
         Parameters
         ----------
@@ -105,6 +107,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Returns
         -------
         names : ndarray of str of shape (n_features_out,)
+            One per column of what `transform` returns.
         """
         check_is_fitted(self)
         if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
@@ -141,7 +144,7 @@ class RobotMap(RobotTransformer):
 
     @available_if(_has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Prior mean and standard deviation of the weights β.
+        """Give the prior of the weights β.
 
         Parameters
         ----------
@@ -151,6 +154,7 @@ class RobotMap(RobotTransformer):
         Returns
         -------
         mean, scale : ndarray of shape (n_outputs, n_features_out)
+            Means and standard deviations.
 
         Raises
         ------

@@ -95,7 +95,9 @@ class LearningCurveDisplay:
         estimator : regressor
             Not fitted itself.
         X : array-like of shape (n_samples, n_features)
+            All training rows.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Their targets.
         X_test, y_test : array-like
             What every fit is tested on; columns like those of X and y.
         sizes : array-like of shape (n_sizes,)
@@ -168,7 +170,8 @@ class LearningCurveDisplay:
 
         Returns
         -------
-        self : object
+        self : LearningCurveDisplay
+            With ``ax_`` and ``figure_``.
 
         Raises
         ------

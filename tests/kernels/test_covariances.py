@@ -298,6 +298,7 @@ def model_with(kernel, shared=True, **sizes):
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "shared"),
     [*((name, True) for name in KERNELS if name != "constant"), ("matern 5/2", False), ("nested", False)],

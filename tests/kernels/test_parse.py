@@ -361,6 +361,8 @@ def test_a_warm_start_takes_over_hyperparameters_of_the_same_kernel_only():
     assert model.kernel_.k2.get_params()["lengthscale"] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("name", TREES)
 def test_nasty_data_are_fitted(name, scale):
