@@ -234,9 +234,10 @@ class EVGPRegressor(ExplicitGaussianProcess):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one. Memory-mapped arrays of
-            float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
-            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
+            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
+            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode. Memory-mapped
+            arrays of float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see
+            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
             ``dask.distributed.Client`` chunks are read anew at each pass.)
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
