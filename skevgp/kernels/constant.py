@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, sum_of_rows
+from .covariances import Covariance, CovarianceAt, PerRow, Pull, no_columns, sum_of_rows
 
 
 @dataclass(frozen=True)
@@ -15,6 +15,7 @@ class Constant(Covariance):
     """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter log c."""
 
     n_hyperparameters = 1
+    preparations = (no_columns,)
 
     @classmethod
     def of(cls, kernel: Any, n_columns: int) -> Constant:
@@ -22,21 +23,21 @@ class Constant(Covariance):
         return cls()
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
-        return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points)
+        return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points.shape)
 
 
 class ConstantAt(CovarianceAt):
     """A `Constant` with its value put in."""
 
-    def __init__(self, constant: float, inducing_points: np.ndarray):
-        self.constant, self.inducing_points = constant, inducing_points
+    def __init__(self, constant: float, shape: tuple[int, ...]):
+        self.constant, self.shape = constant, shape
 
     def matrix(self) -> np.ndarray:
-        return np.full((len(self.inducing_points),) * 2, self.constant)
+        return np.full((self.shape[0],) * 2, self.constant)
 
     def cross(self, prepared: np.ndarray) -> np.ndarray:
         # One number that looks like a matrix.
-        return np.broadcast_to(self.constant, (len(self.inducing_points), prepared.shape[1]))
+        return np.broadcast_to(self.constant, (self.shape[0], len(prepared)))
 
     def diagonal(self, prepared: np.ndarray) -> float:
         return self.constant
@@ -46,9 +47,9 @@ class ConstantAt(CovarianceAt):
 
     def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
         def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
-            return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, prepared.shape[1]))])
+            return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, len(prepared)))])
 
         return self.cross(prepared), pull
 
     def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return total + self.constant * K_bar.sum(), np.zeros_like(self.inducing_points)
+        return total + self.constant * K_bar.sum(), np.zeros(self.shape)

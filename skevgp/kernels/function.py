@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from typing import Any, Self
 
 import autograd.numpy as anp
@@ -13,7 +13,7 @@ import numpy as np
 from autograd import make_jvp, make_vjp
 from sklearn.gaussian_process import kernels as sk
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums
+from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums, as_they_are
 
 # k(x, x) of this many rows is the diagonal of one matrix, where the user has no function for it: fewer calls of the
 # user's function against fewer numbers that are thrown away.
@@ -248,15 +248,12 @@ class Function(Covariance):
         Of the hyperparameters.
     diagonal : callable, default=None
         diagonal(X, **hyperparameters) -> (len(X),), in autograd.numpy.
-    centre : ndarray of shape (d,), default=None
-        What has been subtracted from the inputs.
     """
 
     function: Callable[..., Any]
     names: tuple[str, ...]
     diagonal: Callable[..., Any] | None = None
-    centre: np.ndarray | None = field(default=None, compare=False)
-    stationary = False
+    preparations = (as_they_are,)
 
     @classmethod
     def of(cls, kernel: FunctionKernel, n_columns: int) -> Function:
@@ -266,9 +263,6 @@ class Function(Covariance):
     @property
     def n_hyperparameters(self) -> int:
         return len(self.names)
-
-    def seen_from(self, centre: np.ndarray) -> Function:
-        return replace(self, centre=centre)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> FunctionAt:
         return FunctionAt(self, hyperparameters, inducing_points)
@@ -327,17 +321,15 @@ class FunctionAt(CovarianceAt):
 
     def __init__(self, covariance: Function, hyperparameters: np.ndarray, inducing_points: np.ndarray):
         self.covariance, self.hyperparameters, self.inducing_points = covariance, hyperparameters, inducing_points
-        self._centre = 0.0 if covariance.centre is None else covariance.centre
-        self._points = inducing_points + self._centre
 
     def matrix(self) -> np.ndarray:
-        return self._number(self.covariance.values(self.hyperparameters, self._points, self._points))
+        return self._number(self.covariance.values(self.hyperparameters, self.inducing_points, self.inducing_points))
 
     def cross(self, prepared: np.ndarray) -> np.ndarray:
-        return self._number(self.covariance.values(self.hyperparameters, self._points, self._rows(prepared)))
+        return self._number(self.covariance.values(self.hyperparameters, self.inducing_points, prepared))
 
     def diagonal(self, prepared: np.ndarray) -> np.ndarray:
-        return self._number(self.covariance.diagonal_values(self.hyperparameters, self._rows(prepared)))
+        return self._number(self.covariance.diagonal_values(self.hyperparameters, prepared))
 
     def start_pullback(self) -> Sums:
         return Sums((np.zeros_like(self.hyperparameters), np.zeros_like(self.inducing_points)))
@@ -350,28 +342,24 @@ class FunctionAt(CovarianceAt):
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         hyper_bar, points_bar = self.covariance.pulled_back(
-            lambda at: self.covariance.values(at[0], at[1], at[1]), (self.hyperparameters, self._points), K_bar
+            lambda at: self.covariance.values(at[0], at[1], at[1]), (self.hyperparameters, self.inducing_points), K_bar
         )
         return total[0] + hyper_bar, total[1] + points_bar
 
     def _pull(self, prepared: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-        X, covariance = self._rows(prepared), self.covariance
+        covariance = self.covariance
         cross_bar = covariance.pulled_back(
-            lambda at: covariance.values(at[0], at[1], X), (self.hyperparameters, self._points), U_bar
+            lambda at: covariance.values(at[0], at[1], prepared), (self.hyperparameters, self.inducing_points), U_bar
         )
         if not covariance.names:
             return Sums(cross_bar)
         # Autograd warns of a diagonal that does not depend on the hyperparameters, as are many: it shall seem to.
         hyper_bar = covariance.pulled_back(
-            lambda hyper: covariance.diagonal_values(hyper, X) + 0.0 * hyper[0],
+            lambda hyper: covariance.diagonal_values(hyper, prepared) + 0.0 * hyper[0],
             self.hyperparameters,
-            np.broadcast_to(diagonal_bar, len(X)),
+            np.broadcast_to(diagonal_bar, len(prepared)),
         )
         return Sums((cross_bar[0] + hyper_bar, cross_bar[1]))
-
-    def _rows(self, prepared: np.ndarray) -> np.ndarray:
-        d = self.inducing_points.shape[1]
-        return np.ascontiguousarray((prepared[:d].T) + self._centre)
 
     @staticmethod
     def _number(found: Any) -> np.ndarray:

@@ -2,17 +2,18 @@
 
 With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each is a profile φ of the exponent E = -½ r², which for a block of rows is one
 matrix product: E is linear in [x, 1, x²]. So is the way back: with W = Ū φ'(E), all gradients follow from W [x, 1, x²].
+There x is centred: r² is a small difference of squares that would be large far from 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums
+from .covariances import CentredSquares, Covariance, CovarianceAt, PerRow, Pull, Sums
 from .profiles import (
     LARGEST_NU,
     Derivatives,
@@ -45,35 +46,45 @@ class Stationary(Covariance):
         d.
     isotropic : bool, default=False
         Whether one lengthscale serves all columns.
+    rows : CentredSquares
+        What is computed once of rows.
     """
 
     profile: Profile
     n_columns: int
     isotropic: bool = False
+    rows: CentredSquares = field(default=CentredSquares(), compare=False)
 
     @property
     def n_hyperparameters(self) -> int:
         return self.profile.n_parameters + (1 if self.isotropic else self.n_columns)
 
+    @property
+    def preparations(self) -> tuple[CentredSquares]:
+        return (self.rows,)
+
+    def centred(self, centre: np.ndarray) -> Stationary:
+        return replace(self, rows=CentredSquares(tuple(centre.tolist())))
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
-        return StationaryAt(self.profile, hyperparameters, inducing_points)
+        return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
 
 
 class StationaryAt(CovarianceAt):
-    """A `Stationary` with hyperparameters and inducing points (m, d) put in."""
+    """A `Stationary` with hyperparameters and centred inducing points (m, d) put in."""
 
-    def __init__(self, profile: Profile, hyperparameters: np.ndarray, inducing_points: np.ndarray):
+    def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
         lengthscales = np.exp(hyperparameters[profile.n_parameters :])
         self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.lengthscales = np.broadcast_to(lengthscales, inducing_points.shape[1:])
-        self.isotropic = len(lengthscales) < inducing_points.shape[1]
-        self.inducing_points = inducing_points
+        self.lengthscales = np.broadcast_to(lengthscales, points.shape[1:])
+        self.isotropic = len(lengthscales) < points.shape[1]
+        self.points = points
         precision = self.lengthscales**-2.0
         self._exponent = np.hstack(
             [
-                inducing_points * precision,
-                -0.5 * (inducing_points**2 @ precision)[:, np.newaxis],
-                np.broadcast_to(-0.5 * precision, inducing_points.shape),
+                points * precision,
+                -0.5 * (points**2 @ precision)[:, np.newaxis],
+                np.broadcast_to(-0.5 * precision, points.shape),
             ]
         )
 
@@ -98,7 +109,7 @@ class StationaryAt(CovarianceAt):
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rows, own = total
-        size = -2.0 * float(self._exponent[:, self.inducing_points.shape[1]].min())
+        size = -2.0 * float(self._exponent[:, self.points.shape[1]].min())
         slopes, others = self._derivatives(self._exponents_within(), size, self.matrix())
         own = own + np.array([np.vdot(K_bar, other) for other in others])
         length_bar, Z_bar = self._geometry_bar(rows, K_bar * slopes)
@@ -106,7 +117,7 @@ class StationaryAt(CovarianceAt):
 
     def _geometry_bar(self, rows: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in log ℓ and X_m, from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
-        Z, d = self.inducing_points, self.inducing_points.shape[1]
+        Z, d = self.points, self.points.shape[1]
         WX, W, WXX = rows[:, :d], rows[:, d, np.newaxis], rows[:, d + 1 :]
         row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
@@ -117,7 +128,7 @@ class StationaryAt(CovarianceAt):
         return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision
 
     def _exponents_within(self) -> np.ndarray:
-        scaled = self.inducing_points / self.lengthscales
+        scaled = self.points / self.lengthscales
         return -0.5 * cdist(scaled, scaled, "sqeuclidean")
 
     def _exponents(self, prepared: np.ndarray) -> tuple[np.ndarray, float]:
@@ -129,7 +140,7 @@ class StationaryAt(CovarianceAt):
         d = len(prepared) // 2
         size = -float((self._exponent[0, d + 1 :] @ prepared[d + 1 :]).min() + self._exponent[:, d].min())
         i, j = np.nonzero(-_NEAR * size < E)
-        differences = (prepared[:d, j].T - self.inducing_points[i]) / self.lengthscales
+        differences = (prepared[:d, j].T - self.points[i]) / self.lengthscales
         E[i, j] = -0.5 * np.einsum("pd,pd->p", differences, differences)
         return E, size
 
@@ -140,7 +151,7 @@ class StationaryAt(CovarianceAt):
         return slopes, others
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class SquaredExponential(Stationary):
     """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9, 5.1).
 
@@ -150,13 +161,14 @@ class SquaredExponential(Stationary):
         d.
     isotropic : bool, default=False
         Whether one lengthscale serves all columns.
+    rows : CentredSquares
+        What is computed once of rows.
     """
 
-    def __init__(self, n_columns: int, isotropic: bool = False):
-        super().__init__(Exponential(), n_columns, isotropic)
+    profile: Profile = field(default=Exponential(), init=False)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
-        return SquaredExponentialAt(self.profile, hyperparameters, inducing_points)
+        return SquaredExponentialAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
 
 
 class SquaredExponentialAt(StationaryAt):
