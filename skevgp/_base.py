@@ -58,10 +58,10 @@ class Fitted(Protocol):
 
     @property
     def frame(self) -> Frame:
-        """Where centre, target_mean, units and prior are."""
+        """Where target_mean, units and prior are."""
 
     def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+        """The posterior of all outputs, in the user's units but for target_mean."""
 
     def bounds(self, name: str, output: int) -> np.ndarray:
         """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
@@ -242,11 +242,10 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return (given if hasattr(given, "iloc") else X), X, y
 
     def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's centred inputs and the features of rows."""
+        """The kernel's inputs and the features of rows."""
         array = np.asarray(X[rows], dtype=np.float64)
         given = array if given is X else _safe_indexing(given, rows)
-        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
-        return inputs - self._fitted.frame.centre, features
+        return map_rows(given, array, self.feature_map_, self.kernel_map_)
 
     def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
         """The rows through the maps."""

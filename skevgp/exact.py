@@ -179,7 +179,7 @@ class EGPRegressor(ExplicitGaussianProcess):
             self._fitted = ExactFit.fit(
                 frame,
                 frame.rows(problem.source),
-                spec.covariance.seen_from(frame.centre),
+                spec.covariance.centred(frame.centre),
                 spec.starts,
                 problem.vague,
                 ExactOptions(self.max_iter, self.tol, self.n_restarts),

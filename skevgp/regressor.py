@@ -46,12 +46,11 @@ class EVGPRegressor(ExplicitGaussianProcess):
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
         it. None has no explicit features.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct,
-        `skevgp.kernels.FunctionKernel`, sums and products of these; a WhiteKernel as a term of the outermost sum sets
-        the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant factor is the signal variance,
-        which each output has of its own; if there is none, one is put in front, with its start and bounds from the
-        data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`. None is an RBF with a
-        length scale per column, all starts and bounds taken from the data.
+        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
+        a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
+        factor is the signal variance, which each output has of its own; if there is none, one is put in front, with its
+        start and bounds from the data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`.
+        None is an RBF with a length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
@@ -348,11 +347,11 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self._fitted = FittedOutputs.fit(
             frame,
             frame.rows(problem.source),
-            spec.covariance.seen_from(frame.centre),
+            spec.covariance.centred(frame.centre),
             spec.starts,
             self.sharing,
             self.posterior,
-            self._placement(frame.centre),
+            self._placement(len(frame.centre)),
             options,
             check_random_state(self.random_state),
             effective_n_jobs(self.n_jobs),
@@ -361,25 +360,25 @@ class EVGPRegressor(ExplicitGaussianProcess):
         )
         self._set_attributes()
 
-    def _placement(self, centre: np.ndarray) -> Placement:
-        """How inducing points start, for inputs from which ``centre`` is subtracted."""
+    def _placement(self, n_columns: int) -> Placement:
+        """How inducing points start."""
         if isinstance(self.inducing_init, str):
             return Placement(cast(Literal["auto", "k-means", "greedy"], self.inducing_init), self.n_inducing)
         points = as_floats(self.inducing_init, "inducing_init")
-        if points.ndim != 2 or len(points) == 0 or points.shape[1] != len(centre):
+        if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
             raise ValueError(
-                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {len(centre)}): points in "
+                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {n_columns}): points in "
                 f"the space of kernel_map; got the shape {points.shape}."
             )
         if not np.isfinite(points).all():
             raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
         check_magnitude(points, "inducing_init")
-        return Placement(points - centre, len(points))
+        return Placement(points, len(points))
 
     def _set_attributes(self) -> None:
         self._set_common_attributes()
         fitted = self._fitted
-        points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
+        points = np.array([group.points for group in self._posterior.inducing])
         self.inducing_points_ = points[0] if fitted.sharing == "all" else points
         self.lower_bound_ = fitted.lower_bound
         self.loss_curve_ = fitted.loss_curve

@@ -130,7 +130,7 @@ class ExactFit:
         return cls(frame, model, table, best, " ".join(part for part in advice if part))
 
     def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+        """The posterior of all outputs, in the user's units but for target_mean."""
         return self.frame.posterior([self.model.posterior(self.table.values(self.minimum.x))])
 
     @property

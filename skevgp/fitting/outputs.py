@@ -136,6 +136,7 @@ class FittedOutputs:
                 FIRST_NOISE[options.solver],
                 kernel.n_hyperparameters,
                 variance,
+                frame.centre,
             )
 
         # The kernel starts alike in all models and without regard to the points, which may depend on it.
@@ -192,7 +193,7 @@ class FittedOutputs:
         return replace(self, learned=tuple(learned))
 
     def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+        """The posterior of all outputs, in the user's units but for target_mean."""
         return self.frame.posterior([one.posterior for one in self.learned])
 
     @property
@@ -247,7 +248,7 @@ class FittedOutputs:
         if len(frame.centre) != len(self.frame.centre):
             return {}
         outputs, values = self.outputs[index], self.learned[index].values
-        points = values["inducing_points"] + self.frame.centre - frame.centre
+        points = values["inducing_points"]
         lowest, highest = rows.inputs.lowest, rows.inputs.highest
         if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
             return {}

@@ -113,8 +113,9 @@ def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
 
 
 def spread_of(inputs: Moments) -> np.ndarray:
-    """The root mean square (d,) of each centred column; 1 where the column is constant."""
-    return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
+    """The standard deviation (d,) of each column; 1 where the column is constant."""
+    deviation = np.sqrt(inputs.variance)
+    return np.where(deviation > _SMALLEST_UNIT, deviation, 1.0)
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
@@ -183,7 +184,7 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     if not (rows.inputs.variance > _SMALLEST_UNIT**2).any():
         return np.zeros(len(rows.scatter()), dtype=bool)
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs, residuals = some.inputs / spread_of(rows.inputs), some.targets
+    inputs, residuals = (some.inputs - rows.inputs.mean) / spread_of(rows.inputs), some.targets
     if len(inputs) < 2:
         return np.zeros(residuals.shape[1], dtype=bool)
     _, nearest = cKDTree(inputs).query(inputs, 2)
@@ -200,6 +201,7 @@ def starting_table(
     first_noise: float,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
+    centre: np.ndarray | float = 0.0,
 ) -> ParameterTable:
     """The parameters of a sparse model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -221,6 +223,8 @@ def starting_table(
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
         Of k̃(x, x), with the hyperparameters where they start.
+    centre : ndarray of shape (d,), default=0.0
+        Amid the kernel's inputs.
 
     Returns
     -------
@@ -254,7 +258,7 @@ def starting_table(
                 _NOISE_BOUNDS[1] * o,
                 target_unit**2,
             ),
-            Parameter("inducing_points", inducing_points, unit=spread),
+            Parameter("inducing_points", inducing_points, unit=spread, origin=centre),
         ]
     )
 

@@ -16,12 +16,12 @@ from .start import features_alone, unit_of
 
 @dataclass(frozen=True)
 class Frame:
-    """What is subtracted from and divided out of the data before inference.
+    """What is subtracted from and divided out of the targets before inference, and where the inputs are.
 
     Attributes
     ----------
     centre : ndarray of shape (d,)
-        Subtracted from the kernel's inputs.
+        Amid the kernel's inputs.
     target_mean : ndarray of shape (o,)
         Subtracted from y; part of the model (0 unless y is normalised).
     target_unit : ndarray of shape (o,)
@@ -48,15 +48,15 @@ class Frame:
         """The frame of a training set, from its rows, moments of its columns, and the prior (o, p) of its weights."""
         reference, left_over = features_alone(source, target_mean, coef_mean, coef_scale)
         prior = CoefficientPrior(coef_mean, coef_scale, reference)
-        # The mean of equal numbers may round; what is left must then be 0, not a column of tiny numbers.
+        # The mean of equal numbers may round; what differs from it must then be 0, not a column of tiny numbers.
         constant = inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
         centre = np.where(constant, inputs.lowest, inputs.mean)
         return cls(centre, target_mean, unit_of(left_over, targets.largest), prior)
 
     def to_internal(self, raw: RawRows) -> RawRows:
-        """Centred inputs, features, and what the reference leaves of the targets, in its own units."""
+        """Inputs, features, and what the reference leaves of the targets, in its own units."""
         left_over = raw.targets - self.target_mean - raw.features @ self.prior.offset.T
-        return RawRows(raw.inputs - self.centre, raw.features, left_over / self.target_unit)
+        return RawRows(raw.inputs, raw.features, left_over / self.target_unit)
 
     def rows(self, source: Source) -> Rows:
         """Rows in internal units."""
@@ -72,7 +72,7 @@ class Frame:
         return float(np.log(self.target_unit[outputs]).sum())
 
     def posterior(self, parts: Sequence[Posterior]) -> Posterior:
-        """Posteriors of consecutive outputs in internal units -> one in the user's, but for centre and target_mean."""
+        """Posteriors of consecutive outputs in internal units -> one in the user's, but for target_mean."""
         inducing, first = [], 0
         for part in parts:
             for group in part.inducing:

@@ -24,7 +24,7 @@ class InducingSet:
     hyperparameters : ndarray of shape (n_hyper,)
         Of k̃.
     points : ndarray of shape (m, d)
-        In the kernel's (centred) inputs.
+        In the kernel's inputs.
     L_inv : ndarray of shape (m, m)
         Inverse of the Cholesky factor of k̃(X_m, X_m).
     outputs : slice

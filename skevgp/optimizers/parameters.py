@@ -20,13 +20,15 @@ class Parameter:
     start : ndarray
         First value, in the parameter's own units; its shape is the parameter's.
     transform : {"identity", "log"}
-        The optimiser moves ``value / unit`` or ``log(value)``.
+        The optimiser moves ``(value - origin) / unit`` or ``log(value)``.
     lower, upper : ndarray or float
         Bounds of the value, broadcast to its shape.
     unit : ndarray or float
         Size of a typical change, for ``"identity"``.
     fixed : bool or ndarray of bool
         Whether it stays where it starts; an array of its shape says so of each entry.
+    origin : ndarray or float
+        The value whose coordinate is 0, for ``"identity"``.
     """
 
     name: str
@@ -36,6 +38,7 @@ class Parameter:
     upper: np.ndarray | float = np.inf
     unit: np.ndarray | float = 1.0
     fixed: bool | np.ndarray = False
+    origin: np.ndarray | float = 0.0
 
     @property
     def free(self) -> np.ndarray:
@@ -48,7 +51,7 @@ class Parameter:
         if self.transform == "log":
             with np.errstate(divide="ignore"):
                 return np.log(np.maximum(value, 0.0)).ravel()
-        return (value / self.unit).ravel()
+        return ((value - self.origin) / self.unit).ravel()
 
     def value_bounds(self) -> np.ndarray:
         """Bounds of each entry, (size, 2), in the parameter's own units."""
@@ -57,7 +60,7 @@ class Parameter:
 
     def value(self, coordinate: np.ndarray) -> np.ndarray:
         """The value at a coordinate of the parameter's shape."""
-        return np.exp(coordinate) if self.transform == "log" else coordinate * self.unit
+        return np.exp(coordinate) if self.transform == "log" else self.origin + coordinate * self.unit
 
 
 def _shape(values: dict[str, np.ndarray], name: str) -> tuple[int, ...] | None:

@@ -1,4 +1,4 @@
-"""The rows of a data set in internal units, in which every number is of order one."""
+"""The rows of a data set as the inference sees them: residuals in place of targets, of order one."""
 
 from __future__ import annotations
 
@@ -64,8 +64,7 @@ class Rows:
     source : Source
         In the user's units.
     to_internal : callable
-        From there to centred inputs and to residuals (in place of targets): y minus the reference linear part, in
-        units of its own size.
+        From there to residuals in place of targets: y minus the reference linear part, in units of its own size.
     columns : slice
         The outputs that count.
     share : float
@@ -86,7 +85,7 @@ class Rows:
 
     @property
     def inputs(self) -> Moments:
-        """Of the centred inputs' columns."""
+        """Of the inputs' columns."""
         return self._moments[0]
 
     @property

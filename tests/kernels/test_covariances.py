@@ -67,7 +67,7 @@ KERNELS = {**SIMPLE, **COMPOSITE}
 def parsed(kernel, centre=None):
     """k̃ of a kernel that shall not lose its outermost constant, and its log hyperparameters."""
     spec = parse_kernel(sk.ConstantKernel() * kernel, 2)
-    covariance = spec.covariance if centre is None else spec.covariance.seen_from(centre)
+    covariance = spec.covariance if centre is None else spec.covariance.centred(centre)
     return covariance, np.log(spec.starts.hyperparameters.value)
 
 
@@ -287,7 +287,7 @@ def model_with(kernel, shared=True, **sizes):
     # Inputs as an estimator hands them over: centred, the covariance told so.
     centre = rows.inputs.mean(axis=0) + np.array([0.5, -0.3])
     spec = parse_kernel(sk.ConstantKernel() * kernel, 2)
-    covariance = spec.covariance.seen_from(centre)
+    covariance = spec.covariance.centred(centre)
     first = spec.starts.hyperparameters.value
     points = table["inducing_points"].start - centre
     rows = ArrayRows(rows.inputs - centre, rows.features, rows.residuals)

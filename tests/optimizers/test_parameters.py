@@ -40,6 +40,14 @@ def test_a_change_of_one_unit_moves_the_coordinate_by_one():
     np.testing.assert_allclose(table().values(flat)["points"][0, 0], [2.0, 5.0])
 
 
+def test_coordinates_far_from_zero_are_of_order_one_around_their_origin():
+    first = 1e8 + np.array([0.5, -0.25])
+    far = ParameterTable([Parameter("points", first, unit=2.0, origin=1e8)])
+    np.testing.assert_array_equal(far.start(), [0.25, -0.125])
+    np.testing.assert_array_equal(far.values(far.start())["points"], first)
+    np.testing.assert_array_equal(far.values(far.start() + 1.0)["points"], first + 2.0)
+
+
 def test_warm_starts_take_over_only_what_fits():
     again = table().started_at(
         {"length": np.array([0.7, 0.8]), "noise": np.array([9.0]), "points": np.zeros((2, 3, 2))}
