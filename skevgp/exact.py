@@ -17,7 +17,7 @@ from sklearn.utils import check_random_state
 from ._base import ExplicitGaussianProcess
 from ._progress import Progress
 from ._validation import unchanged_if_it_fails
-from .inference.exact import ExactFit, ExactOptions
+from .fitting.exact import ExactFit, ExactOptions
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 
