@@ -21,15 +21,15 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import harness
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
+import harness
+import internals
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
-from skevgp.inference import model as sparse_model
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
 COLUMNS = ["part", "case", "variant", "seed", "outcome", "bound_per_row", "gain_per_row", "error", "noise_share"]
@@ -203,12 +203,8 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
 
 def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict[str, Any]:
     """`fit` with another relative jitter of k(X_m, X_m)."""
-    before = sparse_model.JITTER
-    sparse_model.JITTER = jitter
-    try:
+    with internals.fixed_jitter(jitter):
         return fit(data, seed, **arguments)
-    finally:
-        sparse_model.JITTER = before
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:
