@@ -177,10 +177,15 @@ CURVES = (
 QUICK = tuple(replace(curve, above=0, sizes=SIZES[curve.varied][:3]) for curve in CURVES)
 
 
+def two_digits(value: float) -> str:
+    """After the point; a zero has no sign, which would be one of rounding."""
+    return f"{round(value, 2) + 0.0:.2f}"
+
+
 def exponent_text(values: tuple[float, float, float]) -> str:
     """The fitted one and, between neighbouring sizes, the least and the largest."""
-    fitted, least, largest = values
-    return f"{fitted:.2f} ({least:.2f} to {largest:.2f})"
+    fitted, least, largest = map(two_digits, values)
+    return f"{fitted} ({least} to {largest})"
 
 
 def paragraphs(curves: tuple[Curve, ...], rows: list[Row], quick: bool = False) -> list[str]:
@@ -311,7 +316,7 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
                 color=colour,
                 markersize=4,
                 markerfacecolor="white" if dotted else colour,
-                label=f"{curve.label}: {curve.exponent(rows)[0]:.2f}",
+                label=f"{curve.label}: {two_digits(curve.exponent(rows)[0])}",
             )
             corner = np.maximum(corner, [sizes[-1], values.max()])
         axes.set_xscale("log")
