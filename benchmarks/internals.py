@@ -51,8 +51,9 @@ def _problem(
     groups = (slice(0, n_outputs),) if sharing == "all" else each
     model, rows = SparseModel(SquaredExponential(d), units.internal_prior(), posterior, groups), units.rows(source)
     points = np.repeat(rng.randn(1, m, d), len(groups), axis=0)
-    starts, noise = Starts(Start(), Start(), Start()), SOLVERS[solver].rules.first_noise
-    table = starting_table(rows.inputs, points, units.target_unit, starts, rows.scatter(), noise, d)
+    starts, rules = Starts(Start(), Start(), Start()), SOLVERS[solver].rules
+    noise = rules.first_noise, rules.lowest_noise
+    table = starting_table(rows.inputs, points, units.target_unit, starts, rows.scatter(), *noise, d)
     return model, table, rows
 
 

@@ -69,7 +69,7 @@ def test_without_iterations_there_is_nothing_to_restart():
 def test_ctrl_c_ends_the_restarts_with_the_best_so_far():
     calls = []
 
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         calls.append(iteration)
         # In the second iteration of the second start.
         if calls.count(2) == 2:
@@ -111,7 +111,7 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places():
     """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
     seen = []
 
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         seen.append(iteration)
         if iteration == 21:
             raise KeyboardInterrupt
