@@ -277,7 +277,7 @@ class Function(Covariance):
         """
         # The optimiser looks at what is not finite.
         with np.errstate(all="ignore"):
-            found = self.function(X, Z, **self._arguments(hyperparameters))
+            found = self.function(_own(X), _own(Z), **self._arguments(hyperparameters))
         return self._checked(self.function, found, (len(X), len(Z)))
 
     def diagonal_values(self, hyperparameters: Any, X: Any) -> Any:
@@ -286,7 +286,7 @@ class Function(Covariance):
             chunks: Iterator[Any] = (X[first : first + _CHUNK] for first in range(0, len(X), _CHUNK))
             return anp.concatenate([anp.diag(self.values(hyperparameters, chunk, chunk)) for chunk in chunks])
         with np.errstate(all="ignore"):
-            found = self.diagonal(X, **self._arguments(hyperparameters))
+            found = self.diagonal(_own(X), **self._arguments(hyperparameters))
         return self._checked(self.diagonal, found, (len(X),))
 
     def pulled_back(self, function: Callable[[Any], Any], argument: Any, bar: np.ndarray) -> Any:
@@ -364,6 +364,11 @@ class FunctionAt(CovarianceAt):
     @staticmethod
     def _number(found: Any) -> np.ndarray:
         return np.asarray(found, dtype=float)
+
+
+def _own(rows: Any) -> Any:
+    """A copy of rows, which may be the user's data: a function of his may change what it gets."""
+    return rows.copy() if isinstance(rows, np.ndarray) else rows
 
 
 def name_of(function: Callable[..., Any]) -> str:
