@@ -88,10 +88,12 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         deep : bool, default=True
+            Whether the hyperparameters are among them.
 
         Returns
         -------
         params : dict
+            Each by its name.
         """
         params = super().get_params(deep=False)
         return {**params, **self._values()} if deep else params
@@ -101,11 +103,13 @@ class FunctionKernel(sk.Kernel):
 
         Parameters
         ----------
-        params : dict
+        **params : dict
+            Each by its name.
 
         Returns
         -------
         self : object
+            This kernel.
         """
         names = self._defaults()
         super().set_params(**{name: value for name, value in params.items() if name not in names})
@@ -129,6 +133,7 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         covariance : Function
+            Of the hyperparameters' logarithms.
         """
         return Function(self.function, tuple(self._values()), self.diagonal)
 
@@ -170,10 +175,12 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         X : array-like of shape (n, d)
+            The rows.
 
         Returns
         -------
         diagonal : ndarray of shape (n,)
+            One number of each row.
         """
         return np.asarray(self.covariance().diagonal_values(self._log_values(), np.atleast_2d(X)), dtype=float)
 
@@ -183,6 +190,7 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         stationary : bool
+            False.
         """
         return False
 
