@@ -30,6 +30,7 @@ import internals
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.solvers import LBFGS
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
 COLUMNS = ["part", "case", "variant", "seed", "outcome", "bound_per_row", "gain_per_row", "error", "noise_share"]
@@ -245,7 +246,7 @@ def jobs(part: str, quick: bool, restarts: int, rows: list[dict[str, Any]]) -> I
         for noise in (NOISES[1:2] if quick else NOISES)
     ]
     variants: dict[str, dict[str, Any]] = {
-        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"n_restarts": restarts}},
+        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"solver": LBFGS(n_restarts=restarts)}},
         "inducing": {"k-means": {"inducing_init": "k-means"}, "greedy": {"inducing_init": "greedy"}},
     }[part]
     for variant, arguments in variants.items():

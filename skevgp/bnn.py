@@ -9,14 +9,14 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._progress import Progress
+from ._progress import monitor_of
 from ._shapes import like_y
+from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .network.model import VariationalNetwork
 from .network.training import Scaling, Training, train
@@ -175,7 +175,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.random_state = random_state
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=True)
+    @fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit the distribution of the weights, the biases and the noise.
 
@@ -188,7 +188,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns
         -------
-        self : object
+        self : BayesianMLPRegressor
+            Fitted.
 
         Raises
         ------
@@ -216,6 +217,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool, default=False
@@ -226,6 +228,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
         std : ndarray of the same shape
             If ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
@@ -265,15 +268,18 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
         n_samples : int, default=1
             How many functions.
         random_state : int, RandomState instance or None, default=0
+            Draws weights and noise.
         include_noise : bool, default=True
             Whether samples are of y, with the learned noise, or of the noise-free function.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows.
         """
         X = self._validated(X)
         check_integer(n_samples, "n_samples", minimum=1)
@@ -301,6 +307,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start = network.start(rng)
         if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
             scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
+        monitor = monitor_of(self.verbose)
         training = train(
             network,
             start,
@@ -313,14 +320,14 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             learning_rate=self.learning_rate_init,
             tol=self.tol,
             patience=self.n_iter_no_change,
-            report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
+            monitor=monitor.seen_as(shift=scaling.log_unit),
         )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
         self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
         self._set_attributes()
-        return self._how_it_ended(training, max_iter)
+        return self._how_it_ended(training, max_iter, monitor.stopped)
 
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
@@ -329,7 +336,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for values, name in ((X, "X"), (targets, "y")):
             check_magnitude(values, name)
             check_not_vanishing(np.abs(values).max(axis=0), name)
-        self._single_output = y.ndim == 1
         return X, targets
 
     def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
@@ -349,8 +355,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
 
-    def _how_it_ended(self, training: Training, max_iter: int) -> str:
-        if training.minimum.interrupted:
+    def _how_it_ended(self, training: Training, max_iter: int, interrupted: bool) -> str:
+        if interrupted:
             return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
         if not training.minimum.converged:
             return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
@@ -368,7 +374,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.intercepts_ = [layer.bias for layer in layers]
         self.X_mean_ = self._scaling.x_mean.copy()
         noise = np.exp(log_noise)
-        self.noise_variance_ = float(noise[0]) if self._single_output else noise
+        self.noise_variance_ = float(noise[0]) if len(noise) == 1 else noise
         self.n_parameters_ = self._network.n_parameters
 
     @property

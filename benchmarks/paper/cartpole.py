@@ -25,6 +25,7 @@ from harness import PALETTE, Row, column, figure_of, pyplot, save_picture
 from paper import results_table
 from paper.models import Fit, fitted_row
 from paper.results_table_report import PAPER
+from skevgp.solvers import Adam
 
 MODELS = ("EVGP-IFG", "EVGP-IF")
 ADAM, LBFGS, DEFAULTS = "Adam", "L-BFGS", "skevgp's defaults"
@@ -32,7 +33,7 @@ ADAM, LBFGS, DEFAULTS = "Adam", "L-BFGS", "skevgp's defaults"
 
 def adam(**options: Any) -> dict[str, Any]:
     """Parameters of a regressor whose Adam has these options."""
-    return {"solver": "adam", **options}
+    return {"solver": Adam(**options)}
 
 
 # What differs from the paper's setting (Adam, diagonal posterior, inducing points per output).

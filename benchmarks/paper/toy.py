@@ -36,6 +36,7 @@ from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import fetch_snelson, make_toy
 from skevgp.metrics import negative_log_predictive_density
 from skevgp.plotting import PosteriorDisplay
+from skevgp.solvers import LBFGS
 
 MODELS = ("GP", "VGP", "EGP", "EVGP")
 # Of each sparse model, the exact one that it approximates.
@@ -95,12 +96,12 @@ def build(cell: Cell) -> RegressorMixin:
     if cell.model == "EGP":
         return EGPRegressor(PolynomialFeatures(1), n_restarts=n_restarts, random_state=seed)
     features = PolynomialFeatures(1) if cell.model == "EVGP" else None
-    return EVGPRegressor(features, n_inducing=N_INDUCING, n_restarts=n_restarts, random_state=seed)
+    return EVGPRegressor(features, n_inducing=N_INDUCING, solver=LBFGS(n_restarts=n_restarts), random_state=seed)
 
 
 def line_of(model: RegressorMixin) -> np.ndarray:
     """Intercept and slope of the explicit part, each with its standard deviation; zeros without features."""
-    if np.size(getattr(model, "coef_", ())) == 0:
+    if not hasattr(model, "coef_"):
         return np.zeros((2, 2))
     return np.column_stack([model.coef_, model.coef_std_])
 

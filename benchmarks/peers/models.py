@@ -13,6 +13,7 @@ are given in the units of the targets as they were.
 from __future__ import annotations
 
 import sys
+import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -29,11 +30,21 @@ from peers.jobs import Fitted, Job, Result, Scaled, TimeUpError, Watch
 
 
 def fit_skevgp(job: Job, watch: Watch) -> Fitted:
-    from internals import bounds_on_the_way
     from skevgp import EVGPRegressor
+    from skevgp.solvers import LBFGS
 
-    def record(model: int, bound: float) -> None:
-        watch.record(model, bound)
+    tasks: dict[int, tuple[int, Any]] = {}
+    here = threading.local()
+
+    class Recorded(LBFGS):
+        """Outputs that share nothing are fitted in threads, of which each is at one task at a time."""
+
+        def run(self, task: Any, attempt: Any) -> Any:
+            here.model, _ = tasks.setdefault(id(task), (len(tasks), task))
+            return super().run(task, attempt)
+
+    def record(iteration: int, bound: float) -> None:
+        watch.record(here.model, bound)
         if watch.seconds > watch.time_limit:
             raise KeyboardInterrupt  # as a user would end a fit early
 
@@ -42,10 +53,10 @@ def fit_skevgp(job: Job, watch: Watch) -> Fitted:
         sharing=job.sharing,
         max_iter=job.max_iter or None,
         n_jobs=-1,
+        solver=Recorded(callback=record),
         random_state=job.seed,
-        verbose=2,
     )
-    with bounds_on_the_way(record), warnings.catch_warnings(record=True) as caught:
+    with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         model.fit(job.X, job.Y)
     messages = " ".join(str(warning.message) for warning in caught)

@@ -8,8 +8,8 @@ from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
-from sklearn.utils._param_validation import Interval, StrOptions
 
+from .._sklearn import Interval, StrOptions
 from ..robots import GravityTerm, Layout, get_system, layout_of, load_robot
 from ..robots.loading import Robot, joint_axes
 from .robot_map import RobotMap, indices_of

@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._progress import Monitor
 from .._validation import LARGEST
 from ..optimizers.adam import adam, is_flat
-from ..optimizers.lbfgs import Minimum, Report
+from ..optimizers.minimum import Minimum
 from .model import Layer, VariationalNetwork
 
 # A column whose entries differ by so many rounding errors is constant.
@@ -124,7 +125,7 @@ def train(
     learning_rate: float,
     tol: float,
     patience: int,
-    report: Report | None = None,
+    monitor: Monitor | None = None,
 ) -> Training:
     """Adam on mini-batches of freshly shuffled rows.
 
@@ -140,7 +141,7 @@ def train(
     max_iter : int
         Epochs at most.
     batch_size : int
-    learning_rate, tol, report
+    learning_rate, tol, monitor
         As in `adam`.
     patience : int
         Epochs without a gain of ``tol`` on the rows held back after which training ends.
@@ -167,7 +168,7 @@ def train(
         watch = _EarlyStopping(
             lambda theta: network.expected_log_likelihood(theta, *others, draws), steps, tol, patience
         )
-    minimum = adam(objective, start, network.bounds(), max_iter * steps, learning_rate, tol, report, stop=watch)
+    minimum = adam(objective, start, network.limits(), max_iter * steps, learning_rate, tol, monitor, stop=watch)
     losses = np.array(minimum.loss_curve)
     return Training(
         minimum.x if watch is None or watch.theta is None else watch.theta,

@@ -21,6 +21,7 @@ class CoefficientDisplay:
     names : sequence of str
         Of the weights.
     mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
+        Means and standard deviations of the weights, after the fit and before it.
 
     Attributes
     ----------
@@ -75,6 +76,7 @@ class CoefficientDisplay:
         Returns
         -------
         display : CoefficientDisplay
+            Drawn, with ``ax_`` and ``figure_``.
 
         Raises
         ------
@@ -84,9 +86,9 @@ class CoefficientDisplay:
             If matplotlib is not installed; the message gives the pip command.
         """
         check_is_fitted(estimator)
-        n_outputs, width = np.atleast_2d(estimator.coef_).shape
-        if width == 0:
+        if not hasattr(estimator, "coef_"):
             raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
+        n_outputs, width = np.atleast_2d(estimator.coef_).shape
         check_output(output, n_outputs)
         try:
             names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
@@ -115,7 +117,8 @@ class CoefficientDisplay:
 
         Returns
         -------
-        self : object
+        self : CoefficientDisplay
+            With ``ax_`` and ``figure_``.
 
         Raises
         ------

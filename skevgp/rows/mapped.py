@@ -6,8 +6,8 @@ from threading import Lock
 from typing import Any
 
 import numpy as np
-from sklearn.utils import _safe_indexing
 
+from .._sklearn import safe_indexing
 from .maps import MAP_ROWS, apply_map
 from .source import RawRows
 
@@ -51,7 +51,7 @@ class MappedRows:
     def _through_maps(self, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""
         X = np.asarray(self.X[rows], dtype=np.float64)
-        given = X if self.given is self.X else _safe_indexing(self.given, rows)
+        given = X if self.given is self.X else safe_indexing(self.given, rows)
         mapped = map_rows(given, X, self.feature_map, self.kernel_map)
         widths = mapped[0].shape[1], mapped[1].shape[1]
         if self._widths not in (None, widths):

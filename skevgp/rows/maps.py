@@ -7,9 +7,10 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 from sklearn.base import clone
+from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
-from sklearn.utils import _safe_indexing
 
+from .._sklearn import safe_indexing
 from .._validation import LARGEST, as_floats, check_magnitude
 
 # Rows that a map sees at once.
@@ -38,6 +39,8 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
 
 def fresh_map(feature_map: Any, name: str) -> Any:
     """A clone of a transformer, or a TypeError that names it."""
+    if isinstance(feature_map, Kernel):
+        raise TypeError(f"{name}={feature_map!r} is a kernel: give it as kernel=.")
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
     try:
@@ -69,7 +72,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
-        rows = X if n_rows <= MAP_ROWS else _safe_indexing(X, slice(first, first + MAP_ROWS))
+        rows = X if n_rows <= MAP_ROWS else safe_indexing(X, slice(first, first + MAP_ROWS))
         values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")

@@ -5,7 +5,7 @@ import csv
 import numpy as np
 import pytest
 
-from skevgp.inference import model
+from skevgp.inference import statistics
 
 
 @pytest.fixture
@@ -51,9 +51,9 @@ def test_it_reports_what_fails(robustness, monkeypatch):
 
 def test_a_fixed_jitter_is_put_back(robustness):
     data = robustness.nasty(1)
-    before = model.JITTER
+    before = statistics.JITTER
     coarse = robustness.fixed_jitter(data, 0, 1e-4, max_iter=0)
-    assert before == model.JITTER
+    assert before == statistics.JITTER
     assert coarse["bound_per_row"] != robustness.fit(data, 0, max_iter=0)["bound_per_row"]
 
 

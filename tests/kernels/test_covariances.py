@@ -6,10 +6,9 @@ import pytest
 from autograd import grad
 from sklearn.gaussian_process import kernels as sk
 
-from skevgp.fitting.start import checked_variance, spread_of, starting_table
-from skevgp.inference.elbo import ElboObjective
+from skevgp.fitting.start import checked_variance, starting_table
 from skevgp.inference.model import SparseModel
-from skevgp.inference.objectives import BoundObjective
+from skevgp.inference.objectives import BoundObjective, ElboObjective
 from skevgp.kernels import FunctionKernel
 from skevgp.kernels.covariances import Sums
 from skevgp.kernels.parse import Start, Starts, parse_kernel
@@ -67,7 +66,7 @@ KERNELS = {**SIMPLE, **COMPOSITE}
 def parsed(kernel, centre=None):
     """k̃ of a kernel that shall not lose its outermost constant, and its log hyperparameters."""
     spec = parse_kernel(sk.ConstantKernel() * kernel, 2)
-    covariance = spec.covariance if centre is None else spec.covariance.seen_from(centre)
+    covariance = spec.covariance if centre is None else spec.covariance.centred(centre)
     return covariance, np.log(spec.starts.hyperparameters.value)
 
 
@@ -287,17 +286,19 @@ def model_with(kernel, shared=True, **sizes):
     # Inputs as an estimator hands them over: centred, the covariance told so.
     centre = rows.inputs.mean(axis=0) + np.array([0.5, -0.3])
     spec = parse_kernel(sk.ConstantKernel() * kernel, 2)
-    covariance = spec.covariance.seen_from(centre)
+    covariance = spec.covariance.centred(centre)
     first = spec.starts.hyperparameters.value
     points = table["inducing_points"].start - centre
     rows = ArrayRows(rows.inputs - centre, rows.features, rows.residuals)
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
     variance = checked_variance(covariance, first, points[0])
-    spread = spread_of(Moments.of(rows.inputs))
-    table = starting_table(spread, points, np.ones(2), starts, np.ones(2), 1e-2, covariance.n_hyperparameters, variance)
+    table = starting_table(
+        Moments.of(rows.inputs), points, np.ones(2), starts, np.ones(2), 1e-2, covariance.n_hyperparameters, variance
+    )
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("name", "shared"),
     [*((name, True) for name in KERNELS if name != "constant"), ("matern 5/2", False), ("nested", False)],

@@ -23,8 +23,9 @@ from sklearn.gaussian_process.kernels import (
 
 from skevgp import EVGPRegressor
 from skevgp.kernels import FunctionKernel
-from skevgp.kernels.covariances import Constant, Product, Sum
-from skevgp.kernels.covariances import DotProduct as DotProductCovariance
+from skevgp.kernels.constant import Constant
+from skevgp.kernels.covariances import Product, Sum
+from skevgp.kernels.dot_product import DotProduct as DotProductCovariance
 from skevgp.kernels.parse import parse_kernel
 from skevgp.kernels.stationary import SquaredExponential
 
@@ -360,6 +361,8 @@ def test_a_warm_start_takes_over_hyperparameters_of_the_same_kernel_only():
     assert model.kernel_.k2.get_params()["lengthscale"] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("name", TREES)
 def test_nasty_data_are_fitted(name, scale):

@@ -180,6 +180,6 @@ def test_rows_of_zeros_have_a_finite_gradient():
 
 def test_the_start_is_within_the_bounds():
     for network in NETWORKS:
-        theta, (lower, upper) = network.start(np.random.default_rng(0)), network.bounds()
+        theta, (lower, upper) = network.start(np.random.default_rng(0)), network.limits()
         assert (lower < theta).all()
         assert (theta < upper).all()

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -5,11 +7,13 @@ from numpy.testing import assert_array_equal
 from scipy.sparse import csr_array, issparse
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import FeatureUnion, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 from sklearn.utils.validation import check_is_fitted
 
+from skevgp.kernels import FunctionKernel
 from skevgp.rows import maps as _maps
 from skevgp.rows.maps import apply_map, fit_map
 
@@ -67,6 +71,13 @@ def test_a_map_is_fitted_with_the_very_input():
 def test_what_is_no_transformer_is_a_type_error(name, no_map):
     with pytest.raises(TypeError, match=f"{name} must be None or a transformer instance with fit and transform; got"):
         fit_map(no_map, X, Y, name)
+
+
+@pytest.mark.parametrize("name", ["feature_map", "kernel_map"])
+@pytest.mark.parametrize("kernel", [RBF(2.0), ConstantKernel() * RBF(), FunctionKernel(np.dot)], ids=str)
+def test_a_kernel_in_place_of_a_map_is_sent_where_it_belongs(name, kernel):
+    with pytest.raises(TypeError, match=f"^{re.escape(f'{name}={kernel!r} is a kernel: give it as kernel=.')}$"):
+        fit_map(kernel, X, Y, name)
 
 
 def test_values_are_what_the_map_makes():

@@ -11,6 +11,7 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor
 from skevgp.metrics import containing_ratios
+from skevgp.solvers import LBFGS
 
 # A few iterations are enough.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -163,19 +164,14 @@ def test_it_pickles_and_clones():
 
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
-def test_ctrl_c_leaves_it_out(monkeypatch, sharing):
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
+def test_ctrl_c_leaves_it_out(sharing):
+    def interrupt(iteration, bound):
+        if iteration == 3:
+            raise KeyboardInterrupt
 
-        def __call__(self, iteration, loss):
-            if iteration == 3:
-                raise KeyboardInterrupt
-
-    def not_now(*arguments):
-        raise AssertionError
-
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
-    monkeypatch.setattr("skevgp.fitting.strategy.calibrated_noise", not_now)
-    with pytest.warns(ConvergenceWarning, match="interrupted after 3 iterations"):
-        model(verbose=1, sharing=sharing, noise_cv=5).fit(X, Y)
+    noise = []
+    for noise_cv in (None, 5):
+        with pytest.warns(ConvergenceWarning, match="interrupted after 3 iterations"):
+            m = model(sharing=sharing, noise_cv=noise_cv, solver=LBFGS(callback=interrupt)).fit(X, Y)
+        noise.append(m.noise_variance_)
+    np.testing.assert_array_equal(*noise)

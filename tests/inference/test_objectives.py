@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from autograd import grad, value_and_grad
 
-from skevgp.inference.elbo import ElboObjective
-from skevgp.inference.objectives import BoundObjective
+from skevgp.inference.bounds import optimal_posterior
+from skevgp.inference.objectives import BoundObjective, ElboObjective
 from skevgp.inference.statistics import SufficientStatistics
 from skevgp.rows.blocks import Batch
 
@@ -55,7 +55,7 @@ def traced_loss(elbo, family, block, linear):
         c = table.coordinates(x)
         parts, roots, log_dets = [], [], []
         for i in range(o):
-            Z = c["inducing_points"][i % len(c["inducing_points"])] * table["inducing_points"].unit
+            Z = table["inducing_points"].value(c["inducing_points"][i % len(c["inducing_points"])])
             L, V = whitened(anp.exp(c["hyperparameters"]), Z, X)
             parts.append((V @ V.T, V @ block.features, V @ block.residuals, anp.sum(1.0 - anp.sum(V**2, axis=0))))
             root, log_det = traced_root(elbo, family, c["spread"][i], L, i)
@@ -161,13 +161,13 @@ def test_elbo_agrees_with_the_papers_formula_in_plain_autograd(family, shared):
     model, rows, table = problem(family, shared, n=30, m=4, p=2)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 30))
     size, m = 6, 4
-    unit, mean_unit = table["inducing_points"].unit, elbo.table["mean"].unit
+    mean_unit = elbo.table["mean"].unit
 
     def loss(x):
         c = elbo.table.coordinates(x)
         total = 0.0
         for i in range(len(model.prior.scale)):
-            Z = c["inducing_points"][i % len(c["inducing_points"])] * unit
+            Z = table["inducing_points"].value(c["inducing_points"][i % len(c["inducing_points"])])
             L, V = whitened(anp.exp(c["hyperparameters"]), Z, rows.inputs)
             s2, noise = anp.exp(c["signal"][i]), anp.exp(c["noise"][i])
             mean = c["mean"][i] * mean_unit[i]
@@ -206,13 +206,14 @@ def test_the_solution_is_what_was_evaluated():
     model, rows, table = problem("diagonal", shared=False)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 17))
     x, blocks = away_from_the_start(elbo), rows.blocks(model.kernel, 17)
-    bound, posterior, _ = elbo.solution(x)
+    bound, predictor = elbo.solution(x)
     np.testing.assert_allclose(bound, -elbo.evaluate(x, blocks)[0] * 60, rtol=1e-12)
     values = elbo.table.values(x)
-    np.testing.assert_array_equal(np.array(posterior.mean), values["mean"])
-    # In the coordinates f_m / s = L v the covariance is diagonal.
-    for o, group in enumerate(posterior.inducing):
-        root = posterior.root[o][:, :6] @ np.linalg.inv(group.L_inv).T
+    for o, group in enumerate(predictor.groups):
+        s, scale = np.sqrt(values["signal"][o]), model.prior.scale[o]
+        np.testing.assert_allclose(group.mean[0], values["mean"][o] * np.append(np.full(6, s), scale), rtol=1e-12)
+        # In the coordinates f_m = s L v the covariance is diagonal.
+        root = group.root[0][:, :6] @ group.whitening.L.T / s
         np.testing.assert_allclose(root.T @ root, np.diag(np.exp(values["spread"][o, :6])), atol=1e-10)
 
 
@@ -235,11 +236,11 @@ def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
     np.testing.assert_allclose(loss, expected, rtol=1e-8)
     assert relative_error(gradient, expected_gradient) < 1e-8
     values = table.values(x)
-    _, posterior = model.at_optimum(values, model.statistics(values, blocks))
-    for mean, best in zip(elbo.family.means(values), posterior.mean, strict=True):
-        np.testing.assert_allclose(mean, best, rtol=1e-8, atol=1e-8 * np.abs(best).max())
-    for root, best in zip(elbo.family.roots(values, []), posterior.root, strict=True):
-        np.testing.assert_allclose(root.T @ root, best.T @ best, rtol=1e-8, atol=1e-8)
+    optima = [optimal_posterior(g, o) for g in model.groups_on(values, blocks) for o in range(len(g.signal))]
+    for mean, best in zip(elbo.family.means(values), optima, strict=True):
+        np.testing.assert_allclose(mean, best.mean, rtol=1e-8, atol=1e-8 * np.abs(best.mean).max())
+    for root, best in zip(elbo.family.roots(values, []), optima, strict=True):
+        np.testing.assert_allclose(root.T @ root, best.root_inv.T @ best.root_inv, rtol=1e-8, atol=1e-8)
 
 
 def test_a_natural_gradient_goes_a_share_of_the_way():
