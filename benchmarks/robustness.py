@@ -204,8 +204,7 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
 
 def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict[str, Any]:
     """`fit` with another relative jitter of k(X_m, X_m)."""
-    with internals.fixed_jitter(jitter):
-        return fit(data, seed, **arguments)
+    return fit(data, seed, solver=internals.with_jitter(jitter), **arguments)
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:
@@ -246,7 +245,7 @@ def jobs(part: str, quick: bool, restarts: int, rows: list[dict[str, Any]]) -> I
         for noise in (NOISES[1:2] if quick else NOISES)
     ]
     variants: dict[str, dict[str, Any]] = {
-        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"solver": LBFGS(n_restarts=restarts)}},
+        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"solver": LBFGS(restarts)}},
         "inducing": {"k-means": {"inducing_init": "k-means"}, "greedy": {"inducing_init": "greedy"}},
     }[part]
     for variant, arguments in variants.items():

@@ -18,18 +18,25 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
 from ._shapes import like_y
-from ._sklearn import Interval, StrOptions, safe_indexing
-from ._validation import check_integer, check_magnitude, check_not_vanishing, is_plain
+from ._sklearn import Interval, StrOptions
+from ._validation import (
+    FLOATS,
+    check_integer,
+    check_magnitude,
+    check_not_vanishing,
+    is_frame,
+    is_plain,
+    validate_frame,
+    words_of,
+)
 from .fitting.units import Units
 from .inference.posterior import Predictor
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from .rows.mapped import MappedRows, map_rows
-from .rows.maps import fit_map
+from .rows.maps import fit_map, take_rows
 from .rows.source import LocalSource, Source, moments_of_rows
 
-# float32 is not copied as a whole: pieces of it become float64.
-_DTYPES = [np.float64, np.float32]
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
 _VAGUE = 1e3
 
@@ -258,29 +265,47 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
 
-    def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
-        """X as the maps shall see it (a data frame stays one), X and y as arrays."""
+    def _validated(self, X: Any, *y: Any, reset: bool = False) -> tuple[Any, Any, np.ndarray]:
+        """X as the maps see it (a data frame stays one), X as the kernel sees it without a map, and y as an array.
+
+        A data frame may hold what is no number if there is a ``kernel_map``: then only the maps see it, and what they
+        return is checked. To predict, y is left out.
+        """
+        given = X
         if is_dask(X):
             validate_data(self, X, reset=reset, skip_check_array=True)
-            X, y = (X, np.empty(0)) if y is None and not reset else aligned(X, y)
-            return X, X, y
-        given = X
-        if y is None and not reset:
-            X, y = validate_data(self, X, reset=False, dtype=_DTYPES), np.empty(0)
+            X, target = aligned(X, *y) if y else (X, np.empty(0))
+            return X, X, target
+        if is_frame(X) and (self.kernel_map if reset else self.kernel_map_) is not None:
+            target = validate_frame(self, X, *y, reset=reset)
         else:
-            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=_DTYPES)
-            y = y if y.dtype.kind == "f" else np.asarray(y, dtype=np.float64)
-        check_magnitude(X, "X")
-        check_magnitude(y, "y")
-        return (given if hasattr(given, "iloc") else X), X, y
+            X, target = self._numbers(X, *y, reset=reset)
+        check_magnitude(target, "y")
+        return (given if is_frame(given) else X), X, target
 
-    def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]:
+        """X and y as arrays of numbers."""
+        options = {"multi_output": True, "y_numeric": True} if y else {}
+        try:
+            validated = validate_data(self, X, *y, reset=reset, dtype=FLOATS, **options)
+        except ValueError as error:
+            if is_frame(X) and (words := words_of(X)):
+                raise ValueError(
+                    f"The columns {words} of X are not numbers, but with kernel_map=None the kernel sees all columns: "
+                    "give a kernel_map that encodes them or leaves them out."
+                ) from error
+            raise
+        X, target = validated if y else (validated, np.empty(0))
+        check_magnitude(X, "X")
+        return X, target if target.dtype.kind == "f" else np.asarray(target, dtype=np.float64)
+
+    def _inputs_and_features(self, given: Any, X: Any, rows: slice) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""
-        array = np.asarray(X[rows], dtype=np.float64)
-        given = array if given is X else safe_indexing(given, rows)
+        array = take_rows(X, rows)
+        given = array if given is X else take_rows(given, rows)
         return map_rows(given, array, self.feature_map_, self.kernel_map_)
 
-    def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
+    def _source(self, given: Any, X: Any, y: np.ndarray) -> Source:
         """The rows through the maps."""
         if is_dask(X):
             return DaskSource(X, y, self.feature_map_, self.kernel_map_)
@@ -293,7 +318,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         first = 0 if self._single_output else slice(None)
         for name, attribute in vars(ExplicitGaussianProcess).items():
             if isinstance(attribute, _OfWeights):
-                vars(self).pop(name, None)
+                self.__dict__.pop(name, None)
         if self.feature_map_ is not None:
             mean, covariance = self._predictor.coefficients()
             self.coef_, self.coef_cov_ = mean[first], covariance[first]

@@ -5,10 +5,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from copy import copy
 from threading import Event
 
-# Called once per iteration, with its number (from 1) and the loss.
-Report = Callable[[int, float], object]
+# Called once per iteration, with its number (from 1), the loss, and the columns of y that it is of.
+Report = Callable[[int, float, range], object]
 
 
 class Monitor:
@@ -20,14 +21,17 @@ class Monitor:
     Parameters
     ----------
     report : callable, default=None
-        report(iteration, loss), once per iteration.
+        report(iteration, loss, outputs), once per iteration.
     """
 
     def __init__(self, report: Report | None = None):
         self._report = report
         self._stop = Event()
+        self._n_before, self._factor, self._shift, self._outputs = 0, 1.0, 0.0, range(0)
 
-    def seen_as(self, n_before: int = 0, factor: float = 1.0, shift: float = 0.0) -> Monitor:
+    def seen_as(
+        self, n_before: int = 0, factor: float = 1.0, shift: float = 0.0, outputs: range | None = None
+    ) -> Monitor:
         """The same monitor for a part of the fit: after so many iterations, its loss in other units.
 
         Parameters
@@ -36,11 +40,14 @@ class Monitor:
             Iterations before the part's first.
         factor, shift : float, default=1, 0
             The part's loss, times ``factor`` plus ``shift``, is the loss of the whole.
+        outputs : range, default=None
+            The columns of y that the part is of, if it knows better.
         """
-        part, whole = Monitor(), self._report
-        part._stop = self._stop
-        if whole is not None:
-            part._report = lambda number, loss: whole(n_before + number, factor * loss + shift)
+        part = copy(self)
+        part._n_before += n_before
+        part._shift += shift * self._factor
+        part._factor *= factor
+        part._outputs = self._outputs if outputs is None else outputs
         return part
 
     def iteration(self, number: int, loss: float) -> None:
@@ -48,7 +55,7 @@ class Monitor:
         if self.stopped:
             raise KeyboardInterrupt
         if self._report is not None:
-            self._report(number, loss)
+            self._report(self._n_before + number, self._factor * loss + self._shift, self._outputs)
 
     @property
     def stopped(self) -> bool:
@@ -80,7 +87,7 @@ class Progress:
         self._verbose = verbose
         self._start = self._last = time.monotonic()
 
-    def __call__(self, iteration: int, loss: float) -> None:
+    def __call__(self, iteration: int, loss: float, outputs: range) -> None:
         now = time.monotonic()
         if iteration > 1 and self._verbose < 2 and now - self._last < 1.0:
             return
@@ -88,15 +95,15 @@ class Progress:
         print(f"iteration {iteration:6d}   bound {-loss:16.3f}   {now - self._start:8.1f} s")
 
 
-def monitor_of(verbose: int, callback: Callable[[int, float], object] | None = None) -> Monitor:
-    """The monitor of a fit that prints as ``verbose`` says, and tells the user's callback(iteration, bound)."""
+def monitor_of(verbose: int, callback: Report | None = None) -> Monitor:
+    """The monitor of a fit that prints as ``verbose`` says, and tells the user's callback(iteration, bound, outputs)."""
     progress = Progress(verbose) if verbose else None
     if callback is None:
         return Monitor(progress)
 
-    def report(iteration: int, loss: float) -> None:
+    def report(iteration: int, loss: float, outputs: range) -> None:
         if progress is not None:
-            progress(iteration, loss)
-        callback(iteration, -loss)
+            progress(iteration, loss, outputs)
+        callback(iteration, -loss, outputs)
 
     return Monitor(report)

@@ -19,7 +19,7 @@ from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .network.model import VariationalNetwork
-from .network.training import Scaling, Training, train
+from .network.training import Scaling, train
 from .rows.threads import single_threaded_libraries
 
 # Without max_iter: so many epochs, or more if they make fewer steps than this.
@@ -327,7 +327,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
         self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
         self._set_attributes()
-        return self._how_it_ended(training, max_iter, monitor.stopped)
+        return training.how_it_ended(max_iter, self.tol, monitor.stopped)
 
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
@@ -354,18 +354,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
-
-    def _how_it_ended(self, training: Training, max_iter: int, interrupted: bool) -> str:
-        if interrupted:
-            return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
-        if not training.minimum.converged:
-            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
-        if training.still_falling:
-            return (
-                f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
-                f"purpose with a larger tol (now {self.tol})."
-            )
-        return ""
 
     def _set_attributes(self) -> None:
         layers, log_noise = self._scaling.to_users(*self._network.split(self._theta))

@@ -159,7 +159,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one.
+            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
+            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
 

@@ -41,12 +41,11 @@ class EVGPRegressor(ExplicitGaussianProcess):
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
         it. None has no explicit features.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct,
-        `skevgp.kernels.FunctionKernel`, sums and products of these; a WhiteKernel as a term of the outermost sum sets
-        the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant factor is the signal variance,
-        which each output has of its own; if there is none, one is put in front, with its start and bounds from the
-        data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`. None is an RBF with a
-        length scale per column, all starts and bounds taken from the data.
+        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
+        a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
+        factor is the signal variance, which each output has of its own; if there is none, one is put in front, with its
+        start and bounds from the data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`.
+        None is an RBF with a length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
@@ -234,9 +233,10 @@ class EVGPRegressor(ExplicitGaussianProcess):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one. Memory-mapped arrays of
-            float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
-            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
+            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
+            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode. Memory-mapped
+            arrays of float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see
+            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
             ``dask.distributed.Client`` chunks are read anew at each pass.)
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.

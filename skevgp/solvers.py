@@ -16,7 +16,8 @@ from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
 from .optimizers.adam import adam
 from .optimizers.lbfgs import lbfgs
-from .optimizers.minimum import Minimum
+from .optimizers.minimum import Minimum, Objective
+from .optimizers.parameters import ParameterTable
 
 __all__ = ["LBFGS", "Adam"]
 
@@ -25,7 +26,7 @@ _ROUNDING = 1e-8
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
 
-Callback = Callable[[int, float], object]
+Callback = Callable[[int, float, range], object]
 
 
 class LBFGS(BaseEstimator):
@@ -38,8 +39,9 @@ class LBFGS(BaseEstimator):
         ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
         start. Each takes the time of a fit.
     callback : callable, default=None
-        callback(iteration, lower_bound), once per iteration: of each model, where outputs share nothing. A
-        KeyboardInterrupt that it raises ends the fit with the best parameters so far.
+        callback(iteration, lower_bound, outputs), once per iteration; ``outputs`` is the range of y's columns that the
+        bound is of: where outputs share nothing, each has fits of its own. A KeyboardInterrupt that it raises ends the
+        fit with the best parameters so far.
 
     Attributes
     ----------
@@ -55,7 +57,7 @@ class LBFGS(BaseEstimator):
     >>> from skevgp.solvers import LBFGS
     >>> X, y = make_toy(random_state=0, return_X_y=True)
     >>> bounds = []
-    >>> solver = LBFGS(callback=lambda iteration, bound: bounds.append(bound))
+    >>> solver = LBFGS(callback=lambda iteration, bound, outputs: bounds.append(bound))
     >>> model = EVGPRegressor(n_inducing=10, solver=solver, random_state=0).fit(X, y)
     >>> len(bounds) >= model.n_iter_
     True
@@ -80,8 +82,26 @@ class LBFGS(BaseEstimator):
         Parameters
         ----------
         posterior : {"full", "diagonal"}
+            What the solver is to be used with.
         """
         _check_common(self)
+
+    def objective(self, task: SparseTask, table: ParameterTable) -> Objective:
+        """Make what is minimised; a subclass may look at each evaluation.
+
+        Parameters
+        ----------
+        task : SparseTask
+            The model and its rows.
+        table : ParameterTable
+            Its parameters.
+
+        Returns
+        -------
+        objective : callable
+            x -> (minus the bound per row, its gradient).
+        """
+        return BoundObjective(task.model, table, task.blocks)
 
     def run(self, task: SparseTask, attempt: Attempt) -> Fit:
         """Go from one start; called by the fit.
@@ -89,17 +109,19 @@ class LBFGS(BaseEstimator):
         Parameters
         ----------
         task : SparseTask
+            What is fitted.
         attempt : Attempt
+            The start.
 
         Returns
         -------
         fit : Fit
+            Where it ended.
         """
         table = task.table.started_at(attempt.values)
-        objective = BoundObjective(task.model, table, task.blocks)
         spent, n_rows = len(attempt.loss_curve), len(task.rows)
         minimum = lbfgs(
-            objective,
+            self.objective(task, table),
             table.start(),
             table.limits(),
             attempt.until - spent,
@@ -130,7 +152,7 @@ class Adam(BaseEstimator):
     n_restarts : int, default=0
         As of `LBFGS`.
     callback : callable, default=None
-        callback(step, lower_bound), once per step, with a mini-batch's estimate; as of `LBFGS`.
+        callback(step, lower_bound, outputs), once per step, with a mini-batch's estimate; as of `LBFGS`.
 
     Attributes
     ----------
@@ -179,6 +201,7 @@ class Adam(BaseEstimator):
         Parameters
         ----------
         posterior : {"full", "diagonal"}
+            What the solver is to be used with.
         """
         _check_common(self)
         check_integer(self.batch_size, "batch_size of Adam", minimum=1)
@@ -194,11 +217,14 @@ class Adam(BaseEstimator):
         Parameters
         ----------
         task : SparseTask
+            What is fitted.
         attempt : Attempt
+            The start.
 
         Returns
         -------
         fit : Fit
+            Where it ended.
         """
         n_rows, table = len(task.rows), task.table.started_at(attempt.values)
         elbo = ElboObjective(task.model, table, task.blocks, _NATURAL_RATES if self.natural_gradient else None)

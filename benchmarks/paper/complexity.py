@@ -93,7 +93,7 @@ def bound(cell: Cell) -> Iterator[Callable[[], object]]:
 def adam_step(cell: Cell) -> Iterator[Callable[[], object]]:
     """() -> one step in the paper's setting, over all parameters."""
     size = (cell.n_rows, cell.n_inducing, N_COLUMNS, cell.n_outputs)
-    yield internals.adam_step(*size, BATCH, sharing=PAPER["sharing"], posterior=PAPER["posterior"])
+    yield internals.adam_step(*size, BATCH)
 
 
 @contextmanager

@@ -13,7 +13,6 @@ are given in the units of the targets as they were.
 from __future__ import annotations
 
 import sys
-import threading
 import time
 import warnings
 from collections.abc import Callable
@@ -33,18 +32,8 @@ def fit_skevgp(job: Job, watch: Watch) -> Fitted:
     from skevgp import EVGPRegressor
     from skevgp.solvers import LBFGS
 
-    tasks: dict[int, tuple[int, Any]] = {}
-    here = threading.local()
-
-    class Recorded(LBFGS):
-        """Outputs that share nothing are fitted in threads, of which each is at one task at a time."""
-
-        def run(self, task: Any, attempt: Any) -> Any:
-            here.model, _ = tasks.setdefault(id(task), (len(tasks), task))
-            return super().run(task, attempt)
-
-    def record(iteration: int, bound: float) -> None:
-        watch.record(here.model, bound)
+    def record(iteration: int, bound: float, outputs: range) -> None:
+        watch.record(outputs.start, bound)
         if watch.seconds > watch.time_limit:
             raise KeyboardInterrupt  # as a user would end a fit early
 
@@ -53,8 +42,8 @@ def fit_skevgp(job: Job, watch: Watch) -> Fitted:
         sharing=job.sharing,
         max_iter=job.max_iter or None,
         n_jobs=-1,
-        solver=Recorded(callback=record),
         random_state=job.seed,
+        solver=LBFGS(callback=record),
     )
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")

@@ -1,9 +1,8 @@
 """Time and memory as the number of rows grows: a memory-mapped file on one and two threads, and Dask on two workers.
 
 Each cell is a fresh process: a fit of a few iterations to 8 columns with 100 inducing points, from which the median
-time of an iteration (of the bound and its gradient there is mostly one evaluation in it) and the peak of the memory
-above what the process had before the fit (data and imported packages) are taken. A cell that is in the CSV already is
-not run again.
+time of an evaluation (bound and gradient) and the peak of the memory above what the process had before the fit (data
+and imported packages) are taken. A cell that is in the CSV already is not run again.
 
     python benchmarks/speed/scaling.py                 # up to a million rows, about 5 minutes
     python benchmarks/speed/scaling.py --quick         # up to 10,000 rows
@@ -25,8 +24,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 import numpy as np
 
 import harness
+from internals import TimedLBFGS
 from skevgp import EVGPRegressor
-from skevgp.solvers import LBFGS
 
 ENGINES = ("1 thread", "2 threads", "Dask, 2 workers")
 N_COLUMNS, N_INDUCING, CHUNK = 8, 100, 50_000
@@ -98,10 +97,12 @@ def run(cell: Cell) -> dict[str, Any]:
         X, y = lazy(paths[0], (N_COLUMNS,)), lazy(paths[1], ())
 
     n_jobs = 2 if engine.startswith("2") else 1
-    ticks: list[float] = []
-    solver = LBFGS(callback=lambda iteration, bound: ticks.append(time.perf_counter()))
+    solver = TimedLBFGS()
     model = EVGPRegressor(n_inducing=N_INDUCING, solver=solver, max_iter=max_iter, n_jobs=n_jobs, random_state=0)
-    with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
+    with (
+        warnings.catch_warnings(record=True) as caught,
+        harness.peak_memory() as memory,
+    ):
         warnings.simplefilter("always")
         start = time.perf_counter()
         model.fit(X, y)
@@ -114,8 +115,8 @@ def run(cell: Cell) -> dict[str, Any]:
     where = harness.provenance()
     return {
         **{"n_rows": n_rows, "n_columns": N_COLUMNS, "n_inducing": N_INDUCING, "engine": engine, "max_iter": max_iter},
-        "evaluation_seconds": np.median(np.diff(ticks)),
-        "n_evaluations": len(ticks) - 1,
+        "evaluation_seconds": np.median(solver.seconds_),
+        "n_evaluations": len(solver.seconds_),
         "fit_seconds": fit_seconds,
         "memory_mb": memory(),
         "data_mb": 8e-6 * n_rows * (N_COLUMNS + 1),

@@ -236,7 +236,9 @@ def plan(
         shift = len(rows) * units.log_unit(outputs)
         tasks.append(
             SparseTask(
-                SparseModel(kernel, units.internal_prior().outputs(outputs), request.family, groups),
+                SparseModel(
+                    kernel, units.internal_prior().outputs(outputs), request.family, groups, solver.rules.jitter
+                ),
                 rows.outputs(outputs, share),
                 table,
                 placement,
@@ -245,7 +247,7 @@ def plan(
                 request.tol,
                 request.noise_cv,
                 seed,
-                monitor.seen_as(shift=shift),
+                monitor.seen_as(shift=shift, outputs=range(outputs.start, outputs.stop)),
                 None if warm is None else table.started_at(warm).values_at_start(),
             )
         )

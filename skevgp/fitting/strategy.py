@@ -18,6 +18,7 @@ import numpy as np
 from .._progress import Monitor
 from ..inference.model import Values
 from ..inference.posterior import Predictor
+from ..inference.statistics import JITTER
 from ..optimizers.parameters import ParameterTable
 
 
@@ -30,6 +31,8 @@ class Rules:
     first_noise : float
         Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
         keeps L-BFGS out of the optimum where the noise explains everything.
+    jitter : float
+        Of k(X_m, X_m), relative to the signal variance.
     collapsed : float
         An output counts as not learned when noise comes to explain this share of what the features leave over.
     other_starts : tuple of (float, float)
@@ -46,6 +49,7 @@ class Rules:
     """
 
     first_noise: float
+    jitter: float = JITTER
     collapsed: float = 0.9
     other_starts: tuple[tuple[float, float], ...] = ()
     interpolates: float = 1.5

@@ -10,7 +10,7 @@ import numpy as np
 from ..rows.blocks import Blocks
 from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances
 from .posterior import Predictor, PredictorGroup
-from .statistics import Kernel, SufficientStatistics, Whitening, collect
+from .statistics import JITTER, Kernel, SufficientStatistics, Whitening, collect
 
 # Of ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``, the values of the model's parameters.
 Values = dict[str, np.ndarray]
@@ -29,17 +29,20 @@ class SparseModel:
     family : {"full", "diagonal"}
     groups : tuple of slice
         The outputs that each set of inducing points serves.
+    jitter : float, default=1e-12
+        Of k(X_m, X_m), relative to its diagonal.
     """
 
     kernel: Kernel
     prior: CoefficientPrior
     family: PosteriorFamily
     groups: tuple[slice, ...]
+    jitter: float = JITTER
 
     def whitenings(self, values: Values) -> Iterator[Whitening]:
         """Of each set of inducing points."""
         for points in values["inducing_points"]:
-            yield Whitening.of(self.kernel, values["hyperparameters"], points)
+            yield Whitening.of(self.kernel, values["hyperparameters"], points, self.jitter)
 
     def groups_on(self, values: Values, rows: Blocks) -> Iterator[Group]:
         """Each group with the statistics of some rows: a pass over them for each, when it is asked for."""

@@ -74,10 +74,12 @@ class Whitening:
     L_inv: np.ndarray
 
     @classmethod
-    def of(cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> Whitening:
+    def of(
+        cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray, jitter: float = JITTER
+    ) -> Whitening:
         """At hyperparameters (n_hyper,) and inducing points (m, d)."""
         covariance = kernel.at(np.log(hyperparameters), inducing_points)
-        L = jittered_cholesky(covariance.matrix(), JITTER)
+        L = jittered_cholesky(covariance.matrix(), jitter)
         return cls(covariance, L, triangular_inverse(L))
 
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:

@@ -111,6 +111,19 @@ class Training:
     scores: np.ndarray
     still_falling: bool
 
+    def how_it_ended(self, max_iter: int, tol: float, interrupted: bool) -> str:
+        """What the user should know of how it ended; empty if all is well."""
+        if interrupted:
+            return f"The fit was interrupted in epoch {len(self.losses)}; the best parameters so far are kept."
+        if not self.minimum.converged:
+            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
+        if self.still_falling:
+            return (
+                f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
+                f"purpose with a larger tol (now {tol})."
+            )
+        return ""
+
 
 def train(
     network: VariationalNetwork,

@@ -11,7 +11,7 @@ from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
 
 from .._sklearn import safe_indexing
-from .._validation import LARGEST, as_floats, check_magnitude
+from .._validation import LARGEST, as_floats, check_magnitude, is_frame
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
@@ -49,6 +49,14 @@ def fresh_map(feature_map: Any, name: str) -> Any:
         raise TypeError(f"{name}={feature_map!r} cannot be cloned: {error}") from error
 
 
+def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
+    """Some rows as the maps see them: of a data frame as one, of an array in float64."""
+    if not is_frame(X):
+        return np.asarray(X[rows], dtype=np.float64)
+    # A slice of a pyarrow table must end within it.
+    return safe_indexing(X, slice(*rows.indices(len(X))) if isinstance(rows, slice) else rows)
+
+
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     """What a fitted map makes of rows, block by block.
 
@@ -72,7 +80,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
-        rows = X if n_rows <= MAP_ROWS else safe_indexing(X, slice(first, first + MAP_ROWS))
+        rows = X if n_rows <= MAP_ROWS else take_rows(X, slice(first, first + MAP_ROWS))
         values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
@@ -116,7 +124,7 @@ def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
             f"{called} must return one row per row of X; for {n_rows} rows it returned the shape {values.shape}."
         )
     if not np.isfinite(values).all():
-        raise ValueError(f"{called} returned NaN or infinity for finite rows.")
+        raise ValueError(f"{called} returned NaN or infinity.")
     if values.shape[1] == 0:
         raise ValueError(f"{called} returned no columns.")
     check_magnitude(values, f"What {called} returns")
