@@ -73,10 +73,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Attributes
     ----------
-    coefs_ : list of ndarray of shape (fan_in, fan_out)
-        Means of the weights of each layer, of a network that takes ``X - X_mean_`` and returns y, in their units.
-    coefs_std_ : list of ndarray of shape (fan_in, fan_out)
-        Standard deviations of the weights.
+    coefs_, coefs_std_ : list of ndarray of shape (fan_in, fan_out)
+        Means and standard deviations of each layer's weights, in the units of ``X - X_mean_`` and y.
     intercepts_ : list of ndarray of shape (fan_out,)
         Biases of each layer.
     X_mean_ : ndarray of shape (n_features,)
@@ -101,9 +99,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     Notes
     -----
-    The mean-field posterior knows no correlations between weights: its predicted standard deviations are too small far
-    from the data. Weights that the data do not need return to their prior; with few rows and much noise that may be all
-    of them.
+    Weights are independent, a mean field: far from the data, predicted standard deviations are too small. Weights that
+    the data do not need return to their prior; with few rows and much noise that may be all of them.
 
     References
     ----------
@@ -194,14 +191,12 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError, TypeError
-            If an argument is out of its range, the data are not finite, or shapes do not fit; the message names the
-            argument, the value and what is allowed.
+            If an argument, the data or their shapes are out of range; the message says what is allowed.
 
         Warns
         -----
         ConvergenceWarning
-            If the loss still fell when the epochs were used up, or Ctrl-C ended them (the best parameters so far are
-            kept). It says what to change.
+            If the loss still fell in the last epoch, or Ctrl-C ended the fit. It says what to change.
         """
         with unchanged_if_it_fails(self), single_threaded_libraries():
             message = self._fit(X, y)
@@ -218,10 +213,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         ----------
         X : array-like of shape (n_samples, n_features)
             Rows with the columns of `fit`.
-        return_std : bool, default=False
-            Whether to return the standard deviation too.
-        return_cov : bool, default=False
-            Whether to return the covariance between rows too.
+        return_std, return_cov : bool, default=False
+            Whether to return the standard deviation, or the covariance between rows, too.
         include_noise : bool, default=True
             Whether they are of y, with the learned noise, or of the noise-free function.
 
