@@ -3,15 +3,16 @@
 import numpy as np
 import pandas as pd
 import pytest
+import skops.io
 from sklearn.base import clone
 from sklearn.compose import make_column_transformer
 from sklearn.feature_selection import RFE, SelectFromModel
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, Kernel
+from sklearn.gaussian_process.kernels import RBF, Kernel, Matern, WhiteKernel
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (40, 2))
@@ -189,6 +190,49 @@ def test_a_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
     columns.pop("b")
     with pytest.raises(ValueError, match="Feature names seen at fit time, yet now missing"):
         m.predict(frame_of(columns))
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+SAVED = [
+    EVGPRegressor(n_inducing=8, max_iter=3, random_state=0),
+    EVGPRegressor(TREND, kernel_map=StandardScaler(), n_inducing=8, max_iter=3, random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver="adam", random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver="adam", natural_gradient=True, random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, posterior="diagonal", sharing="none", random_state=0),
+    EGPRegressor(
+        TREND, 2.0 * RBF([0.5, 0.7], "fixed") + Matern(nu=1.5) + WhiteKernel(0.1), coef_scale=np.inf, max_iter=3
+    ),
+    BayesianMLPRegressor((5,), max_iter=3, random_state=0),
+    ResidualRegressor(EVGPRegressor(n_inducing=8, max_iter=3, random_state=0)),
+]
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("model", SAVED, ids=str)
+@pytest.mark.parametrize("used", [False, True], ids=["fresh", "used"])
+def test_a_model_from_a_skops_file_is_the_model(model, used):
+    fitted = clone(model).fit(X, Y)
+    if used:
+        fitted.predict(X_NEW, return_std=True)
+    file = skops.io.dumps(fitted)
+    trusted = skops.io.get_untrusted_types(data=file)
+    assert all(name.startswith(("skevgp.", "sklearn.")) for name in trusted)
+    loaded = skops.io.loads(file, trusted=trusted)
+    for asked in ("return_std", "return_cov"):
+        expected = fitted.predict(X_NEW, **{asked: True})
+        for actual, part in zip(loaded.predict(X_NEW, **{asked: True}), expected, strict=True):
+            np.testing.assert_array_equal(actual, part)
+
+
+@pytest.mark.parametrize("model", SAVED[:2], ids=str)
+def test_a_model_from_a_skops_file_goes_on(model):
+    fitted = fresh(model, max_iter=0).fit(X, Y)
+    loaded = skops.io.loads(file := skops.io.dumps(fitted), trusted=skops.io.get_untrusted_types(data=file))
+    predictions = [m.partial_fit(X_NEW, Y[:15]).predict(X_NEW) for m in (fitted, loaded)]
+    np.testing.assert_array_equal(*predictions)
+    predictions = [m.set_params(warm_start=True).fit(X, Y).predict(X_NEW) for m in (fitted, loaded)]
+    np.testing.assert_array_equal(*predictions)
 
 
 # --- errors -------------------------------------------------------------------------------------------------------

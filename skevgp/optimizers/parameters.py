@@ -82,7 +82,7 @@ class ParameterTable:
         for parameter in self.parameters:
             free = parameter.free
             if free.any():
-                self._slices[parameter.name] = slice(end, end + free.sum())
+                self._slices[parameter.name] = slice(end, end + int(free.sum()))
                 end += int(free.sum())
                 if not free.all():
                     self._free[parameter.name] = free
