@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -10,13 +11,14 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
 from ._shapes import like_y
+from ._sklearn import Interval, StrOptions
 from ._validation import (
     FLOATS,
     check_integer,
@@ -27,8 +29,8 @@ from ._validation import (
     validate_frame,
     words_of,
 )
-from .fitting.units import Frame
-from .inference.posterior import Posterior
+from .fitting.units import Units
+from .inference.posterior import Predictor
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from .rows.mapped import MappedRows, map_rows
@@ -47,31 +49,38 @@ class Problem:
     ----------
     source : Source
         The rows through the maps.
-    frame : Frame
+    units : Units
     spec : KernelSpec
         With the start of the noise.
     vague : ndarray of shape (o, p)
-        Which weights have an infinite prior scale; in ``frame.prior`` theirs is very wide.
+        Which weights have an infinite prior scale; in ``units.prior`` theirs is very wide.
+    n_columns : int
+        Width of the kernel's inputs.
     """
 
     source: Source
-    frame: Frame
+    units: Units
     spec: KernelSpec
     vague: np.ndarray
+    n_columns: int
 
 
 class Fitted(Protocol):
     """What `ExplicitGaussianProcess` needs of a fit."""
 
     @property
-    def frame(self) -> Frame:
-        """Where centre, target_mean, units and prior are."""
+    def units(self) -> Units:
+        """The units and the prior."""
 
-    def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What the user should know of how the fit ended."""
 
-    def bounds(self, name: str, output: int) -> np.ndarray:
-        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+    def predictor(self) -> Predictor:
+        """Of all outputs, in the user's units."""
+
+    def limits(self, name: str, output: int) -> np.ndarray:
+        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
 
 
 class _OfWeights:
@@ -101,7 +110,6 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
         "normalize_y": ["boolean"],
         "max_iter": [Interval(Integral, 0, None, closed="left")],
-        "n_restarts": [Interval(Integral, 0, None, closed="left")],
         "tol": [Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
         "verbose": ["verbose"],
@@ -152,7 +160,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        if not hasattr(self, "_posterior"):
+        if not hasattr(self, "_predictor"):
             check_is_fitted(self)
         if is_dask(X):
             if return_cov:
@@ -165,17 +173,17 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         array: Any = X
         if not is_plain(self, X):
             given, array, _ = self._validated(X)
-        noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
+        noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
         if return_cov:
-            mean, cov = self._posterior.covariance(*self._inputs_and_features(given, array, slice(None)))
+            mean, cov = self._predictor.covariance(*self._inputs_and_features(given, array, slice(None)))
             cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
-            return like_y(mean + self._fitted.frame.target_mean), like_y(cov)
+            return like_y(mean), like_y(cov)
         means, deviations = [], []
-        size = self._posterior.rows_at_once
+        size = self._predictor.rows_at_once
         for first in range(0, len(array), size):
             rows = self._inputs_and_features(given, array, slice(first, first + size))
-            mean, variance = self._posterior.predict(*rows, return_std)
-            means.append(mean + self._fitted.frame.target_mean)
+            mean, variance = self._predictor.predict(*rows, return_std)
+            means.append(mean)
             if variance is not None:
                 deviations.append(np.sqrt(variance + noise))
         mean = like_y(np.concatenate(means))
@@ -250,12 +258,12 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         vague = np.isinf(scale)
         unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
-        frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
+        units = Units.of(source, targets, target_mean, mean, np.where(vague, unit, scale))
         self._spec = spec
-        return Problem(source, frame, spec, vague)
+        return Problem(source, units, spec, vague, len(inputs.mean))
 
     def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "_posterior")
+        return hasattr(self, "_predictor")
 
     def _validated(self, X: Any, *y: Any, reset: bool = False) -> tuple[Any, Any, np.ndarray]:
         """X as the maps see it (a data frame stays one), X as the kernel sees it without a map, and y as an array.
@@ -292,11 +300,10 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return X, target if target.dtype.kind == "f" else np.asarray(target, dtype=np.float64)
 
     def _inputs_and_features(self, given: Any, X: Any, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's centred inputs and the features of rows."""
+        """The kernel's inputs and the features of rows."""
         array = take_rows(X, rows)
         given = array if given is X else take_rows(given, rows)
-        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
-        return inputs - self._fitted.frame.centre, features
+        return map_rows(given, array, self.feature_map_, self.kernel_map_)
 
     def _source(self, given: Any, X: Any, y: np.ndarray) -> Source:
         """The rows through the maps."""
@@ -306,33 +313,38 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _set_common_attributes(self) -> None:
         """What is known of weights, if there are any, noise and kernel."""
-        fitted, prior = self._fitted, self._fitted.frame.prior
-        self._posterior: Posterior = fitted.posterior()
+        fitted, prior = self._fitted, self._fitted.units.prior
+        self._predictor: Predictor = fitted.predictor()
         first = 0 if self._single_output else slice(None)
         for name, attribute in vars(ExplicitGaussianProcess).items():
             if isinstance(attribute, _OfWeights):
                 self.__dict__.pop(name, None)
         if self.feature_map_ is not None:
-            mean, covariance = self._posterior.coefficients()
+            mean, covariance = self._predictor.coefficients()
             self.coef_, self.coef_cov_ = mean[first], covariance[first]
             self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
-        self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
+        self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
         kernels = [
             self._spec.to_sklearn(
-                np.exp(group.hyperparameters),
-                fitted.bounds("hyperparameters", o),
-                float(self._posterior.signal[o]),
-                fitted.bounds("signal", o),
+                group.hyperparameters,
+                fitted.limits("hyperparameters", o),
+                float(self._predictor.signal[o]),
+                fitted.limits("signal", o),
             )
-            for group in self._posterior.inducing
+            for group in self._predictor.groups
             for o in range(len(prior.mean))[group.outputs]
         ]
         self.kernel_ = kernels[0] if self._single_output else kernels
 
+    def _warn_of(self, messages: tuple[str, ...]) -> None:
+        """Tell the user of ``fit`` how it ended."""
+        for message in messages:
+            warnings.warn(message, ConvergenceWarning, stacklevel=4)
+
     @property
     def _n_outputs(self) -> int:
-        return len(self._posterior.noise)
+        return len(self._predictor.noise)
 
     @property
     def _single_output(self) -> bool:

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
-from sklearn.utils import _safe_indexing
 
+from ._sklearn import safe_indexing
 from ._validation import as_floats, check_magnitude
 
 # Standard deviation of a weight whose map has no opinion: the feature could explain ten times the target's scatter.
@@ -54,7 +54,7 @@ def resolve_coef_prior(
     shape = wide.shape
     auto_mean, auto_scale = np.zeros(shape), wide
     if feature_map is not None and "auto" in (_word(coef_mean), _word(coef_scale)):
-        first = _safe_indexing(X, slice(0, 1))
+        first = safe_indexing(X, slice(0, 1))
         mean, scale = _map_prior(feature_map, first, shape[0], shape[1])
         auto_mean, auto_scale = mean, np.where(np.isnan(scale), auto_scale, scale)
     mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)
@@ -153,7 +153,7 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
             own = np.arange(feature_map.output_indices_[name].start, feature_map.output_indices_[name].stop)
             weight = _weight(feature_map, name)
             if len(own) and weight != 0.0:
-                yield part, _safe_indexing(first, columns, axis=1), own, weight
+                yield part, safe_indexing(first, columns, axis=1), own, weight
 
 
 def _weight(union: Any, name: str) -> float:

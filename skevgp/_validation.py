@@ -8,8 +8,10 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
-from sklearn.utils import _safe_indexing, check_array, check_consistent_length
+from sklearn.utils import check_array, check_consistent_length
 from sklearn.utils.validation import validate_data
+
+from ._sklearn import safe_indexing
 
 # float32 is not copied as a whole: pieces of it become float64.
 FLOATS = (np.float64, np.float32)
@@ -72,7 +74,7 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
 def words_of(frame: Any) -> list[Any]:
     """The names of the columns of a data frame that are not numbers."""
     names = frame.column_names if hasattr(type(frame), "column_names") else frame.columns  # the first is pyarrow's
-    columns = (_safe_indexing(frame, index, axis=1) for index in range(frame.shape[1]))
+    columns = (safe_indexing(frame, index, axis=1) for index in range(frame.shape[1]))
     return [name for name, column in zip(names, columns, strict=True) if not _are_numbers(column)]
 
 

@@ -9,17 +9,17 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, _fit_context
+from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
-from sklearn.utils._param_validation import Interval, StrOptions
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._progress import Progress
+from ._progress import monitor_of
 from ._shapes import like_y
+from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .network.model import VariationalNetwork
-from .network.training import Scaling, Training, train
+from .network.training import Scaling, train
 from .rows.threads import single_threaded_libraries
 
 # Without max_iter: so many epochs, or more if they make fewer steps than this.
@@ -175,7 +175,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.random_state = random_state
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=True)
+    @fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit the distribution of the weights, the biases and the noise.
 
@@ -188,7 +188,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
         Returns
         -------
-        self : object
+        self : BayesianMLPRegressor
+            Fitted.
 
         Raises
         ------
@@ -216,6 +217,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool, default=False
@@ -226,6 +228,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
         std : ndarray of the same shape
             If ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
@@ -265,15 +268,18 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
         n_samples : int, default=1
             How many functions.
         random_state : int, RandomState instance or None, default=0
+            Draws weights and noise.
         include_noise : bool, default=True
             Whether samples are of y, with the learned noise, or of the noise-free function.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows.
         """
         X = self._validated(X)
         check_integer(n_samples, "n_samples", minimum=1)
@@ -301,6 +307,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start = network.start(rng)
         if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
             scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
+        monitor = monitor_of(self.verbose)
         training = train(
             network,
             start,
@@ -313,14 +320,14 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             learning_rate=self.learning_rate_init,
             tol=self.tol,
             patience=self.n_iter_no_change,
-            report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
+            monitor=monitor.seen_as(shift=scaling.log_unit),
         )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
         self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
         self._set_attributes()
-        return self._how_it_ended(training, max_iter)
+        return training.how_it_ended(max_iter, self.tol, monitor.stopped)
 
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
@@ -347,18 +354,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
-
-    def _how_it_ended(self, training: Training, max_iter: int) -> str:
-        if training.minimum.interrupted:
-            return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
-        if not training.minimum.converged:
-            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
-        if training.still_falling:
-            return (
-                f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
-                f"purpose with a larger tol (now {self.tol})."
-            )
-        return ""
 
     def _set_attributes(self) -> None:
         layers, log_noise = self._scaling.to_users(*self._network.split(self._theta))

@@ -2,24 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Literal, Self
+from numbers import Integral
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import TransformerMixin, _fit_context
-from sklearn.exceptions import ConvergenceWarning
+from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
 from ._base import ExplicitGaussianProcess
-from ._progress import Progress
+from ._progress import monitor_of
+from ._sklearn import Interval, fit_context
 from ._validation import unchanged_if_it_fails
-from .fitting.exact import ExactFit, ExactOptions
+from .fitting.exact import ExactFit, ExactOptions, fit_exact
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
+from .solvers import LBFGS
 
 
 class EGPRegressor(ExplicitGaussianProcess):
@@ -116,6 +116,11 @@ class EGPRegressor(ExplicitGaussianProcess):
     0.96
     """
 
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **ExplicitGaussianProcess._parameter_constraints,
+        "n_restarts": [Interval(Integral, 0, None, closed="left")],
+    }
+
     _fitted: ExactFit
 
     def __init__(
@@ -147,7 +152,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.random_state = random_state
         self.verbose = verbose
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
         """Fit kernel and noise; the posterior is exact.
 
@@ -179,16 +184,16 @@ class EGPRegressor(ExplicitGaussianProcess):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y, allow_vague=True)
-            frame, spec = problem.frame, problem.spec
-            self._fitted = ExactFit.fit(
-                frame,
-                frame.rows(problem.source),
-                spec.covariance.seen_from(frame.centre),
-                spec.starts,
+            rows = problem.units.rows(problem.source)
+            options = ExactOptions(LBFGS.rules, self.max_iter, self.tol, self.n_restarts)
+            self._fitted = fit_exact(
+                problem.units,
+                rows,
+                problem.spec,
                 problem.vague,
-                ExactOptions(self.max_iter, self.tol, self.n_restarts),
+                options,
                 check_random_state(self.random_state),
-                partial(Progress, self.verbose) if self.verbose else None,
+                monitor_of(self.verbose),
             )
             self._set_common_attributes()
             if problem.vague.any():
@@ -196,6 +201,5 @@ class EGPRegressor(ExplicitGaussianProcess):
             self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
-        if self._fitted.message:
-            warnings.warn(self._fitted.message, ConvergenceWarning, stacklevel=3)
+        self._warn_of(self._fitted.messages)
         return self

@@ -9,13 +9,13 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn import get_config
-from sklearn.base import BaseEstimator, MetaEstimatorMixin, RegressorMixin, _fit_context, clone
-from sklearn.utils import Bunch, Tags, _safe_indexing, get_tags
-from sklearn.utils._param_validation import HasMethods
+from sklearn.base import BaseEstimator, MetaEstimatorMixin, RegressorMixin, clone
+from sklearn.utils import Bunch, Tags, get_tags
 from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, process_routing
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
+from ._sklearn import HasMethods, fit_context, safe_indexing
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
 
 
@@ -56,7 +56,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
     References
     ----------
     - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes, section
-      V.
+      IV-B.
 
     Examples
     --------
@@ -81,7 +81,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         self.regressor = regressor
         self.base = base
 
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
         """Fit a clone of the regressor to what y adds to the base columns.
 
@@ -90,12 +90,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         X : array-like of shape (n_samples, n_features)
             A data frame stays one for the regressor; only its base columns need be numbers here.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets in the units of their base columns.
         **params : dict
             For the regressor's ``fit``, such as ``sample_weight``; with metadata routing what it requests of them.
 
         Returns
         -------
-        self : object
+        self : ResidualRegressor
+            Fitted.
 
         Raises
         ------
@@ -106,20 +108,23 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
             return self._fit("fit", X, y, params)
 
     @available_if(_regressor_has("partial_fit"))
-    @_fit_context(prefer_skip_nested_validation=False)
+    @fit_context(prefer_skip_nested_validation=False)
     def partial_fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
         """Go on with some rows, if the regressor can.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            New rows, with the columns of the first call.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Their targets.
         **params : dict
             For the regressor's ``partial_fit``.
 
         Returns
         -------
-        self : object
+        self : ResidualRegressor
+            Fitted.
 
         Raises
         ------
@@ -135,12 +140,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
         **params : dict
             For the regressor's ``predict``, such as ``return_std``, ``return_cov`` and ``include_noise``.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
         std or cov : ndarray
             If the regressor was asked for them: as it returns them.
         """
@@ -158,15 +165,18 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
         n_samples : int, default=1
             How many functions.
         random_state : int, RandomState instance or None, default=0
+            Draws the functions.
         **params : dict
             For the regressor's ``sample_y``.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows, base columns included.
         """
         check_is_fitted(self)
         X = self._validated(X)
@@ -174,11 +184,12 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         return samples + _columns(X, self.base_).reshape(*samples.shape[:-1], 1)
 
     def get_metadata_routing(self) -> MetadataRouter:
-        """What scikit-learn's metadata routing needs to know.
+        """Tell scikit-learn's metadata routing which methods pass what on.
 
         Returns
         -------
         routing : MetadataRouter
+            From `fit`, `partial_fit` and `predict` to those of the regressor.
         """
         mapping = MethodMapping()
         for method in ("fit", "partial_fit", "predict"):
@@ -257,7 +268,7 @@ def _columns(X: Any, indices: np.ndarray) -> np.ndarray:
     if not is_frame(X):
         return X[:, indices]
     columns = np.column_stack(
-        [as_floats(_safe_indexing(X, index, axis=1), f"Column {index} of X, a base,") for index in indices.tolist()]
+        [as_floats(safe_indexing(X, index, axis=1), f"Column {index} of X, a base,") for index in indices.tolist()]
     )
     if not np.isfinite(columns).all():
         raise ValueError("The base columns of X must be finite; they contain NaN or infinity.")

@@ -5,6 +5,9 @@ import pickle
 import signal
 import time
 
+import dask
+import dask.array as da
+import distributed
 import numpy as np
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -12,12 +15,11 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, Stand
 
 from skevgp import EVGPRegressor
 from skevgp.rows import dask as _dask
-
-dask = pytest.importorskip("dask")
-da = pytest.importorskip("dask.array")
-distributed = pytest.importorskip("distributed")
+from skevgp.solvers import Adam
 
 pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.slow,
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     # A few iterations are enough to compare.
@@ -82,7 +84,7 @@ def test_folds_on_two_workers_are_folds_of_arrays(cluster):
 
 
 def test_adam_takes_its_batches_from_the_chunks():
-    parameters = {"solver": "adam", "max_iter": 5, "batch_size": 100}
+    parameters = {"solver": Adam(batch_size=100), "max_iter": 5}
     assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))
 
 

@@ -14,6 +14,7 @@ from skevgp.metrics import prediction_error
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LEARN = EXAMPLES / "plot_learn_dynamics.py"
+pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(autouse=True)

@@ -1,7 +1,12 @@
+"""The architecture: who imports what, and how large a folder, a module and a function may be."""
+
 import ast
 import sys
+from collections import Counter
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
+import grimp
 import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
@@ -10,6 +15,13 @@ import skevgp
 PACKAGE = Path(skevgp.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 REQUIRED = {"autograd", "joblib", "numpy", "scipy", "sklearn", "threadpoolctl"}
+# Where the small sources below are taken to stand.
+HERE = PACKAGE / "rows" / "blocks.py"
+each_module = pytest.mark.parametrize("module", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
+
+
+def parsed(module):
+    return ast.parse(module.read_text(encoding="utf-8"))
 
 
 def imports_at_load(tree):
@@ -43,10 +55,112 @@ def test_a_broken_contract_would_be_seen(monkeypatch, tmp_path, capsys):
     assert "Wrong BROKEN" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda path: str(path.relative_to(PACKAGE)))
+def imports(tree, module):
+    """What a module binds, and the whole name that is bound to it, wherever in the module."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from ((alias.asname or alias.name.partition(".")[0], alias.name) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            folder = module.relative_to(PACKAGE.parent).parts[: -node.level] if node.level else ()
+            source = ".".join([*folder, *filter(None, [node.module])])
+            yield from ((alias.asname or alias.name, f"{source}.{alias.name}") for alias in node.names)
+
+
+def is_private(name):
+    return name.startswith("_") and not name.endswith("__")
+
+
+def private_attributes(tree, bound):
+    """``a._b`` and ``a.b._c`` of names that an import has bound."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and is_private(node.attr):
+            whole = ast.unparse(node)
+            if whole.partition(".")[0] in bound:
+                yield whole
+
+
+def private_names_of_scikit_learn(tree, module):
+    found = [(bound, name) for bound, name in imports(tree, module) if name.partition(".")[0] == "sklearn"]
+    yield from (name for _, name in found if any(map(is_private, name.split("."))))
+    yield from private_attributes(tree, {bound for bound, _ in found})
+
+
+def home(path):
+    """The folder that holds a module, or a module's name."""
+    return path.parent if path.parent.is_dir() else path.parent.parent
+
+
+def private_names_of_other_folders(tree, module):
+    """Functions, classes and constants of the package; its private modules serve their folder and those inside it."""
+
+    def is_kept_from_here(path):
+        is_module = path.is_dir() or path.with_suffix(".py").is_file()
+        serves = module.is_relative_to(home(path)) if is_module else module.parent == home(path)
+        return is_private(path.name) and not serves
+
+    bound = set()
+    for alias, name in imports(tree, module):
+        path = PACKAGE.parent / name.replace(".", "/")
+        inside = [part for part in (path, *path.parents) if part.is_relative_to(PACKAGE)]
+        if inside and home(path) != module.parent:
+            bound.add(alias)
+        if any(map(is_kept_from_here, inside)):
+            yield name
+    yield from private_attributes(tree, bound)
+
+
+def lengths_of_functions(tree):
+    """The lines of each function, nested ones with it, without its docstring."""
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
+            first = node.body[0]
+            told = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) is not None else 0
+            yield node.name, node.end_lineno - node.lineno + 1 - told
+
+
+@each_module
 def test_a_module_loads_required_packages_only(module):
-    imported = set(imports_at_load(ast.parse(module.read_text(encoding="utf-8"))))
-    assert imported <= REQUIRED | sys.stdlib_module_names
+    assert set(imports_at_load(parsed(module))) <= REQUIRED | sys.stdlib_module_names
+
+
+@each_module
+def test_one_module_imports_the_private_names_of_scikit_learn(module):
+    found = set(private_names_of_scikit_learn(parsed(module), module))
+    assert bool(found) == (module == PACKAGE / "_sklearn.py"), found
+
+
+@each_module
+def test_private_names_stay_in_their_folder(module):
+    assert not set(private_names_of_other_folders(parsed(module), module))
+
+
+@each_module
+def test_no_module_is_above_400_lines(module):
+    assert len(module.read_text(encoding="utf-8").splitlines()) <= 400
+
+
+@each_module
+def test_no_function_is_above_60_lines_without_its_docstring(module):
+    assert not {name: length for name, length in lengths_of_functions(parsed(module)) if length > 60}
+
+
+def test_no_folder_has_more_than_9_modules():
+    sizes = Counter(module.parent.relative_to(PACKAGE).as_posix() for module in MODULES if module.stem != "__init__")
+    assert sizes.pop(".") > 0
+    assert not {folder: size for folder, size in sizes.items() if size > 9}
+
+
+def test_the_papers_folder_has_at_most_8_files():
+    assert len(list((PACKAGE / "inference").glob("*.py"))) <= 8
+
+
+def test_no_modules_import_each_other():
+    graph = grimp.build_graph("skevgp", exclude_type_checking_imports=True, cache_dir=None)
+    arrows = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
+    TopologicalSorter(arrows).prepare()
+    assert arrows["skevgp.regressor"]
+    with pytest.raises(CycleError):
+        TopologicalSorter({**arrows, "skevgp._linalg": {"skevgp.regressor"}}).prepare()
 
 
 @pytest.mark.parametrize(
@@ -63,3 +177,45 @@ def test_a_module_loads_required_packages_only(module):
 )
 def test_imports_are_found(source, imported):
     assert set(imports_at_load(ast.parse(source))) == imported
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from sklearn.base import _fit_context, clone", {"sklearn.base._fit_context"}),
+        ("from sklearn.utils._param_validation import Interval", {"sklearn.utils._param_validation.Interval"}),
+        ("def f():\n    import sklearn.utils._indexing as i", {"sklearn.utils._indexing"}),
+        ("from sklearn import utils\nutils._safe_indexing(x)", {"utils._safe_indexing"}),
+        ("import sklearn\nsklearn.base._fit_context", {"sklearn.base._fit_context"}),
+        ("from sklearn.base import clone, __version__\nself._a = clone.b", set()),
+        ("from .._sklearn import fit_context\nfrom numpy import _core", set()),
+    ],
+)
+def test_private_names_of_scikit_learn_are_found(source, found):
+    assert set(private_names_of_scikit_learn(ast.parse(source), HERE)) == found
+
+
+@pytest.mark.parametrize(
+    ("source", "found"),
+    [
+        ("from ..fitting.units import _scale, Frame", {"skevgp.fitting.units._scale"}),
+        ("from skevgp.fitting.units import _scale", {"skevgp.fitting.units._scale"}),
+        ("from .._linalg import _jitter", {"skevgp._linalg._jitter"}),
+        ("from .. import _linalg\n_linalg._jitter", {"_linalg._jitter"}),
+        ("from ..fitting import units as u\nu._scale()", {"u._scale"}),
+        ("def f():\n    from ..plotting import _style", {"skevgp.plotting._style"}),
+        ("from ..plotting._style import axes", {"skevgp.plotting._style.axes"}),
+        ("from .threads import _pool\nfrom . import threads\nthreads._pool", set()),
+        ("from .. import _linalg\nfrom .._linalg import jitter\nfrom .. import __version__", set()),
+        ("import numpy as np\nnp._core", set()),
+    ],
+)
+def test_private_names_of_other_folders_are_found(source, found):
+    assert set(private_names_of_other_folders(ast.parse(source), HERE)) == found
+
+
+def test_lengths_of_functions_are_counted():
+    source = (
+        'def f(\n    a,\n):\n    """Of two\n\n    lines."""\n\n    async def g():\n        return 1\n\n    return g\n'
+    )
+    assert dict(lengths_of_functions(ast.parse(source))) == {"f": 8, "g": 2}

@@ -2,6 +2,7 @@ import sys
 
 import matplotlib as mpl
 import numpy as np
+import pandas as pd
 import pytest
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
@@ -397,8 +398,7 @@ def test_another_score_can_be_drawn():
 
 
 def test_data_frames_stay_data_frames():
-    pandas = pytest.importorskip("pandas")
-    frame = pandas.DataFrame({"place": X[:, 0]})
+    frame = pd.DataFrame({"place": X[:, 0]})
     curve = LearningCurveDisplay.from_estimator(LinearRegression(), frame, Y, frame, Y, sizes=[30], n_runs=1)
     assert curve.scores == pytest.approx(np.array([[prediction_error(Y, LinearRegression().fit(X, Y).predict(X))]]))
 

@@ -3,6 +3,7 @@
 import re
 from pathlib import Path
 
+import dask.array as dask_array
 import numpy as np
 import pytest
 
@@ -10,6 +11,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
+@pytest.mark.slow
 def test_the_toy_and_the_pendulum_run():
     for snippet in SNIPPETS[:2]:
         names = {}
@@ -27,9 +29,10 @@ def test_any_robot_runs():
     assert names["model"].score(names["train"].data, names["train"].target) > 0.99
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
-    dask_array = pytest.importorskip("dask.array")
     files, chunks = SNIPPETS[3:]
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (500, 2))

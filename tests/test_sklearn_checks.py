@@ -6,6 +6,7 @@ from sklearn.utils.estimator_checks import parametrize_with_checks
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
+pytestmark = pytest.mark.slow
 MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.

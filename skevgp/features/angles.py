@@ -59,7 +59,7 @@ class AngleEncoder(RobotTransformer):
     }
 
     def inverse_transform(self, X: ArrayLike) -> np.ndarray:
-        """Angles from their sines and cosines.
+        """Give back the angles of sines and cosines.
 
         Parameters
         ----------

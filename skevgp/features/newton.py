@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import clone
-from sklearn.utils._param_validation import Interval
 
+from .._sklearn import Interval
 from .._validation import as_floats
 from ..robots import Layout
 from ..robots.loading import Robot, named_system, read_once

@@ -7,8 +7,8 @@ from numbers import Real
 from typing import Any, ClassVar
 
 import numpy as np
-from sklearn.utils._param_validation import Interval
 
+from .._sklearn import Interval
 from ..robots import Layout, RigidBody, load_robot
 from ..robots.loading import Robot
 from .robot_map import RobotMap

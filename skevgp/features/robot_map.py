@@ -7,10 +7,11 @@ from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin, _fit_context
+from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.utils.metaestimators import available_if
-from sklearn.utils.validation import _check_feature_names_in, check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 
+from .._sklearn import check_feature_names_in, fit_context
 from .._validation import is_plain
 from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
@@ -35,7 +36,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
-    @_fit_context(prefer_skip_nested_validation=True)
+    @fit_context(prefer_skip_nested_validation=True)
     def fit(self, X: ArrayLike, y: object = None) -> Self:
         """Load the robot and check the columns.
 
@@ -48,7 +49,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
         Returns
         -------
-        self : object
+        self : RobotTransformer
+            Fitted.
 
         Raises
         ------
@@ -82,11 +84,12 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
 
         Returns
         -------
         H : ndarray of shape (n_samples, n_features_out)
-            h(x) of each row.
+            The features h(x) of each row.
         """
         if not hasattr(self, "n_features_in_"):
             check_is_fitted(self)
@@ -94,7 +97,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         return self._features(rows)
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
-        """Names of the features.
+        """Name the features.
 
         Parameters
         ----------
@@ -104,11 +107,12 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Returns
         -------
         names : ndarray of str of shape (n_features_out,)
+            One per column of what `transform` returns.
         """
         check_is_fitted(self)
         if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
             input_features = np.array(self._layout.column_names, dtype=object)
-        return np.array(self._names(_check_feature_names_in(self, input_features)), dtype=object)
+        return np.array(self._names(check_feature_names_in(self, input_features)), dtype=object)
 
     def _prepare(self, robot: Robot | None) -> None:
         """What `fit` keeps of the robot (read) besides the layout; nothing here."""
@@ -140,7 +144,7 @@ class RobotMap(RobotTransformer):
 
     @available_if(_has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Prior mean and standard deviation of the weights β.
+        """Give the prior of the weights β.
 
         Parameters
         ----------
@@ -150,6 +154,7 @@ class RobotMap(RobotTransformer):
         Returns
         -------
         mean, scale : ndarray of shape (n_outputs, n_features_out)
+            Means and standard deviations.
 
         Raises
         ------

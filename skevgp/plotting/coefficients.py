@@ -21,6 +21,7 @@ class CoefficientDisplay:
     names : sequence of str
         Of the weights.
     mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
+        Means and standard deviations of the weights, after the fit and before it.
 
     Attributes
     ----------
@@ -75,6 +76,7 @@ class CoefficientDisplay:
         Returns
         -------
         display : CoefficientDisplay
+            Drawn, with ``ax_`` and ``figure_``.
 
         Raises
         ------
@@ -115,7 +117,8 @@ class CoefficientDisplay:
 
         Returns
         -------
-        self : object
+        self : CoefficientDisplay
+            With ``ax_`` and ``figure_``.
 
         Raises
         ------

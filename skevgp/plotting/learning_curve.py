@@ -8,10 +8,11 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import clone
-from sklearn.utils import _safe_indexing, check_random_state
-from sklearn.utils.validation import _num_samples, check_consistent_length
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_consistent_length
 
 from .._optional import require
+from .._sklearn import num_samples, safe_indexing
 from .._validation import check_integer
 from ..metrics import prediction_error
 from ._style import PALETTE, axes_of
@@ -20,7 +21,7 @@ from ._style import PALETTE, axes_of
 class LearningCurveDisplay:
     """Test score against the number of training rows: the mean of several runs, in a band from lowest to highest.
 
-    The paper's figure of section IV-B. Curves of several models can share axes.
+    The paper's Figure 6. Curves of several models can share axes.
 
     Parameters
     ----------
@@ -94,7 +95,9 @@ class LearningCurveDisplay:
         estimator : regressor
             Not fitted itself.
         X : array-like of shape (n_samples, n_features)
+            All training rows.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Their targets.
         X_test, y_test : array-like
             What every fit is tested on; columns like those of X and y.
         sizes : array-like of shape (n_sizes,)
@@ -130,7 +133,7 @@ class LearningCurveDisplay:
         """
         require("matplotlib.pyplot", "Plotting")  # before the fits, not after them
         check_consistent_length(X, y, groups)
-        groups = np.arange(_num_samples(X)) if groups is None else groups
+        groups = np.arange(num_samples(X)) if groups is None else groups
         labels, group_of_row = np.unique(groups, return_inverse=True)
         steps = np.ravel(sizes).tolist()
         for index, size in enumerate(steps):
@@ -144,7 +147,7 @@ class LearningCurveDisplay:
             place_of_row = rng.permutation(len(labels))[group_of_row]
             for index, size in enumerate(steps):
                 rows = np.flatnonzero(place_of_row < size)
-                fitted = clone(estimator).fit(_safe_indexing(X, rows), _safe_indexing(y, rows))
+                fitted = clone(estimator).fit(safe_indexing(X, rows), safe_indexing(y, rows))
                 n_rows[index, run], scores[index, run] = len(rows), score(y_test, fitted.predict(X_test))
         name = getattr(score, "__name__", "score").replace("_", " ")
         return cls(n_rows.mean(axis=1), scores, name).plot(ax, log_scale=log_scale, label=label, color=color)
@@ -167,7 +170,8 @@ class LearningCurveDisplay:
 
         Returns
         -------
-        self : object
+        self : LearningCurveDisplay
+            With ``ax_`` and ``figure_``.
 
         Raises
         ------

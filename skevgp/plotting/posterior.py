@@ -24,6 +24,7 @@ class PosteriorDisplay:
     x : ndarray of shape (n_samples,)
         Where the predictions are.
     mean, std : ndarray of shape (n_samples,)
+        Predicted there, and how surely.
     y : ndarray of shape (n_samples,), default=None
         Observations at the same places.
     inducing_points : ndarray of shape (m,), default=None
@@ -92,6 +93,7 @@ class PosteriorDisplay:
         estimator : regressor
             Fitted; its ``predict`` takes ``return_std``.
         X : array-like of shape (n_samples, n_features)
+            Rows to predict.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
             Observations at these rows.
         output : int, default=0
@@ -112,6 +114,7 @@ class PosteriorDisplay:
         Returns
         -------
         display : PosteriorDisplay
+            Drawn, with ``ax_`` and ``figure_``.
 
         Raises
         ------
@@ -159,7 +162,8 @@ class PosteriorDisplay:
 
         Returns
         -------
-        self : object
+        self : PosteriorDisplay
+            With ``ax_`` and ``figure_``.
 
         Raises
         ------

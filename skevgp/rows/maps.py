@@ -9,8 +9,8 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
-from sklearn.utils import _safe_indexing
 
+from .._sklearn import safe_indexing
 from .._validation import LARGEST, as_floats, check_magnitude, is_frame
 
 # Rows that a map sees at once.
@@ -54,7 +54,7 @@ def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
     if not is_frame(X):
         return np.asarray(X[rows], dtype=np.float64)
     # A slice of a pyarrow table must end within it.
-    return _safe_indexing(X, slice(*rows.indices(len(X))) if isinstance(rows, slice) else rows)
+    return safe_indexing(X, slice(*rows.indices(len(X))) if isinstance(rows, slice) else rows)
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:

@@ -8,13 +8,10 @@ from numpy.testing import assert_allclose, assert_array_equal
 from skevgp.datasets import ComputedTorqueController, quintic_reference, simulate
 from skevgp.robots import load_robot
 
-STORED = Path(__file__).parents[3] / "shared" / "reference" / "iiwa14_idc.npz"
-with_reference = pytest.mark.skipif(not STORED.is_file(), reason="the stored reference is not there")
-
 
 @pytest.fixture(scope="module")
 def stored():
-    return np.load(STORED)
+    return np.load(Path(__file__).parents[1] / "data" / "iiwa14_computed_torque.npz")
 
 
 def test_a_reference_starts_and_ends_at_rest():
@@ -37,44 +34,40 @@ def test_shapes_of_a_reference():
     assert quintic_reference(np.zeros((3, 2)), np.ones((3, 2)), 1.0, np.zeros(5))[2].shape == (3, 5, 2)
 
 
-@with_reference
 def test_the_reference_equals_the_stored_one(stored):
     q, v, a = quintic_reference(stored["q0"], stored["q1"], 1.0, 0.03 * np.arange(50))
-    assert_allclose(np.concatenate([q, v], axis=-1), stored["smooth03_Zd"], rtol=0, atol=1e-12)
-    assert_allclose(a, stored["smooth03_Ad"], rtol=0, atol=1e-11)
+    assert_allclose(np.concatenate([q, v], axis=-1), stored["smooth_Zd"], rtol=0, atol=1e-12)
+    assert_allclose(a, stored["smooth_Ad"], rtol=0, atol=1e-11)
 
 
-@with_reference
 def test_commands_equal_the_stored_ones_step_by_step(stored):
     controller = ComputedTorqueController("iiwa14", stored["q0"], stored["q1"], duration=1.0)
     for step in range(50):
-        commands = controller(step, stored["smooth03_Z"][:, step]) + stored["noise"][:, step]
-        assert_allclose(commands, stored["smooth03_U"][:, step], rtol=0, atol=1e-8)
-        assert_allclose(controller.integral, stored["smooth03_I"][:, step], rtol=0, atol=1e-9)
+        commands = controller(step, stored["smooth_Z"][:, step]) + stored["noise"][:, step]
+        assert_allclose(commands, stored["smooth_U"][:, step], rtol=0, atol=1e-8)
+        assert_allclose(controller.integral, stored["smooth_I"][:, step], rtol=0, atol=1e-9)
 
 
-@with_reference
 def test_the_closed_loop_equals_the_stored_one(stored):
     controller = ComputedTorqueController("iiwa14", stored["q0"], stored["q1"], duration=1.0)
     Z, U = simulate(
         "iiwa14",
-        stored["smooth03_Z"][:, 0],
+        stored["smooth_Z"][:, 0],
         lambda step, Z: controller(step, Z) + stored["noise"][:, step],
         n_steps=50,
         return_inputs=True,
     )
-    assert_allclose(U, stored["smooth03_Uclip"], rtol=0, atol=1e-8)
-    assert_allclose(Z, stored["smooth03_Z"], rtol=0, atol=1e-8)
+    assert_allclose(U, stored["smooth_U_acted"], rtol=0, atol=1e-8)
+    assert_allclose(Z, stored["smooth_Z"], rtol=0, atol=1e-8)
 
 
-@with_reference
 def test_clamped_commands_equal_the_stored_ones(stored):
-    effort, Z = stored["effort_limit"], stored["step03_Z"]
+    effort, Z = stored["effort_limit"], stored["step_Z"]
     before, after = Z[:, :-1].reshape(-1, 14), Z[:, 1:].reshape(-1, 14)
-    U = stored["step03_U"].reshape(-1, 1, 7)
+    U = stored["step_U"].reshape(-1, 1, 7)
     assert (np.abs(U) > effort).any()
     ends, acted = simulate("iiwa14", before, U, return_inputs=True)
-    assert_array_equal(acted[:, 0], stored["step03_Uclip"].reshape(-1, 7))
+    assert_array_equal(acted[:, 0], stored["step_U_acted"].reshape(-1, 7))
     assert_allclose(ends[:, 1], after, rtol=0, atol=1e-8)
 
 

@@ -13,9 +13,9 @@ from numpy.testing import assert_array_equal
 
 from skevgp.datasets import fetch_snelson, snelson
 
-STORED = Path(__file__).parents[3] / "shared" / "data" / "snelson"
 X, Y, TEST = np.array([2.5, 0.25, 1.0]), np.array([-1.0, 0.125, 3.0]), np.array([-3.0, 10.0])
 FAKE = {"train_inputs": X, "train_outputs": Y, "test_inputs": TEST}
+TRUE_CHECKSUMS = snelson._CHECKSUMS
 
 
 def text(values, end="\n"):
@@ -259,11 +259,9 @@ def test_bad_arguments_are_named(arguments, error, message):
         fetch_snelson(**arguments)
 
 
-@pytest.mark.skipif(not STORED.exists(), reason="the real files are not part of the package")
-def test_the_real_files_are_known(monkeypatch):
-    monkeypatch.undo()
-    toy = fetch_snelson(STORED, download_if_missing=False)
-    assert (toy.data.shape, toy.target.shape, toy.test_data.shape) == ((200, 1), (200,), (301, 1))
-    assert (toy.data[0, 0], toy.data.min(), toy.data.max()) == (5.7007757, 0.059167804, 5.9657729)
-    assert toy.target[0] == 6.0 * -0.4536778 + 3.0 * 5.7007757
-    np.testing.assert_allclose(toy.test_data[:, 0], np.linspace(-3.0, 10.0, 301), rtol=0, atol=1e-6)
+def test_other_numbers_in_the_same_files_are_not_snelsons(monkeypatch, offline, fetch, home):
+    """Against the checksums of the true files, which are not ours to ship."""
+    monkeypatch.setattr(snelson, "_CHECKSUMS", TRUE_CHECKSUMS)
+    put(home, ".dat")
+    with pytest.raises(OSError, match=r"train_inputs\.dat .*are not Snelson's.*expected 8b1ccec3"):
+        fetch()

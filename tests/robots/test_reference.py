@@ -9,13 +9,10 @@ from numpy.testing import assert_allclose
 
 from skevgp.robots import RigidBody, load_robot
 
-STORED = Path(__file__).parents[3] / "shared" / "reference" / "iiwa14.npz"
-pytestmark = pytest.mark.skipif(not STORED.is_file(), reason="the stored reference is not there")
-
 
 @pytest.fixture(scope="module")
 def stored():
-    return np.load(STORED)
+    return np.load(Path(__file__).parents[1] / "data" / "iiwa14.npz")
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,5 @@
 """Rows in files and in memory: the same model, without a copy of the data."""
 
-import os
 import tracemalloc
 from concurrent.futures import ThreadPoolExecutor
 
@@ -14,6 +13,7 @@ from skevgp import EVGPRegressor
 from skevgp.rows.blocks import LocalBlocks, block_rows
 from skevgp.rows.source import LocalSource, Moments, moments_of_rows
 from skevgp.rows.threads import BlockMap, single_threaded_libraries, thread_pool
+from skevgp.solvers import LBFGS
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -70,6 +70,8 @@ def little_memory(monkeypatch):
         monkeypatch.setattr(f"skevgp.{name}", 2**20)
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     n, d = 500_000, 8
@@ -84,6 +86,8 @@ def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     assert peak < 0.9 * mapped[0].nbytes
 
 
+@pytest.mark.slow
+@pytest.mark.slow
 def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
     """Beyond what may be kept, four times the rows need no more memory."""
     peaks = []
@@ -185,7 +189,6 @@ def test_every_row_gets_into_mini_batches_however_many_there_are(monkeypatch):
     assert set(np.concatenate(seen)) == set(range(n))
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
 def test_fits_have_the_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
     rng = np.random.RandomState(0)
@@ -193,7 +196,9 @@ def test_fits_have_the_same_bits_in_any_thread():
     target = np.column_stack([np.sin(rows[:, 0]), rows[:, 1] * rows[:, 2]])
 
     def points(n_jobs):
-        fitted = EVGPRegressor(n_inducing=20, sharing="none", n_restarts=1, max_iter=2, n_jobs=n_jobs, random_state=0)
+        fitted = EVGPRegressor(
+            n_inducing=20, sharing="none", solver=LBFGS(n_restarts=1), max_iter=2, n_jobs=n_jobs, random_state=0
+        )
         return fitted.fit(rows, target).inducing_points_
 
     expected = points(1)
@@ -202,7 +207,6 @@ def test_fits_have_the_same_bits_in_any_thread():
         np.testing.assert_array_equal(other.submit(points, 1).result(), expected)
 
 
-@pytest.mark.skipif((os.cpu_count() or 1) < 2, reason="one core")
 def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     def threads():
         return {library["user_api"]: library["num_threads"] for library in threadpool_info()}

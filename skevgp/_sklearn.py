@@ -1,0 +1,20 @@
+"""What scikit-learn keeps private and an estimator of its kind needs: imported here and nowhere else.
+
+A release that moves one of these names is met in this file. They are the same in scikit-learn 1.6 to 1.9.
+"""
+
+from sklearn.base import _fit_context as fit_context
+from sklearn.utils import _safe_indexing as safe_indexing
+from sklearn.utils._param_validation import HasMethods, Interval, StrOptions
+from sklearn.utils.validation import _check_feature_names_in as check_feature_names_in
+from sklearn.utils.validation import _num_samples as num_samples
+
+__all__ = [
+    "HasMethods",
+    "Interval",
+    "StrOptions",
+    "check_feature_names_in",
+    "fit_context",
+    "num_samples",
+    "safe_indexing",
+]
