@@ -170,7 +170,8 @@ class Strategy:
             best = yield from self._staged(first)
         else:
             # Inducing points that another fit moved have found their places.
-            again = self._staged if np.array_equal(*(v["inducing_points"] for v in (self.warm, first))) else self._once
+            same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
+            again = self._staged if same_points else self._once
             best = yield from again(first | self.warm)
             if self.max_iter > 0 and self.collapsed(best):
                 best = better(best, (yield from self._staged(first)))
