@@ -13,7 +13,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 from ._sklearn import safe_indexing
 from ._validation import as_floats, check_magnitude
 
-# Standard deviation of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
+# Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
 _WIDE = 10.0
 
 

@@ -15,7 +15,7 @@ _PREDICTED_NUMBERS = 2**20
 
 @dataclass(frozen=True)
 class PredictorGroup:
-    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has the mean ``mean @ P`` and the deviation ``root @ P``.
+    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has mean ``mean @ P`` and deviation ``root @ P``.
 
     Attributes
     ----------
