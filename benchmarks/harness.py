@@ -24,9 +24,10 @@ import scipy
 import sklearn
 
 import skevgp
-from skevgp._optional import require
 
 RESULTS = Path(__file__).parent / "results"
+# Okabe & Ito's colours, safe for colour-blind readers; without black and yellow.
+PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
 Row = dict[str, str]  # of a CSV
 
@@ -211,9 +212,9 @@ def run_missing(
         If matplotlib is missing, or the CSV is of another benchmark or version.
     """
     try:
-        require("matplotlib", "The picture")  # before the fits, not after them
+        pyplot()  # before the fits, not after them
     except ImportError as problem:
-        raise SystemExit(str(problem)) from problem
+        raise SystemExit(f"No picture could be drawn ({problem}): pip install matplotlib") from problem
     cells = list(dict.fromkeys(cells))
     names = [field.name for field in dataclasses.fields(cells[0]) if field.compare] if cells else []
     rows = read(output)

@@ -21,15 +21,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import harness
 import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
+import harness
+import internals
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
-from skevgp.inference import model as sparse_model
+from skevgp.solvers import LBFGS
 
 PARTS = ("nasty", "jitter", "seeds", "inducing")
 COLUMNS = ["part", "case", "variant", "seed", "outcome", "bound_per_row", "gain_per_row", "error", "noise_share"]
@@ -203,12 +204,7 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
 
 def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict[str, Any]:
     """`fit` with another relative jitter of k(X_m, X_m)."""
-    before = sparse_model.JITTER
-    sparse_model.JITTER = jitter
-    try:
-        return fit(data, seed, **arguments)
-    finally:
-        sparse_model.JITTER = before
+    return fit(data, seed, solver=internals.with_jitter(jitter), **arguments)
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:
@@ -249,7 +245,7 @@ def jobs(part: str, quick: bool, restarts: int, rows: list[dict[str, Any]]) -> I
         for noise in (NOISES[1:2] if quick else NOISES)
     ]
     variants: dict[str, dict[str, Any]] = {
-        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"n_restarts": restarts}},
+        "seeds": {"n_restarts=0": {}, f"n_restarts={restarts}": {"solver": LBFGS(restarts)}},
         "inducing": {"k-means": {"inducing_init": "k-means"}, "greedy": {"inducing_init": "greedy"}},
     }[part]
     for variant, arguments in variants.items():

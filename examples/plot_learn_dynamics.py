@@ -28,7 +28,7 @@ from skevgp.plotting import CoefficientDisplay
 
 # Inducing points (the paper's Table 2) of VGP and RES-VGP, and of EVGP.
 INDUCING = {"pendulum": (40, 10), "cartpole": (100, 60), "acrobot": (250, 150)}
-# Error, ‖STD‖, CR-1, CR-2, CR-3 and parameters in the paper's Table 3.
+# Error, ‖STD‖, CR-1, CR-2, CR-3 and parameters in the paper's Table 4.
 PAPER = {
     "pendulum": {
         "VGP": (0.343, 0.273, 0.582, 0.841, 0.910, 407),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral, Real
@@ -10,24 +11,32 @@ from typing import Any, ClassVar, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin, TransformerMixin
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
 from ._shapes import like_y
-from ._sklearn import Interval, StrOptions, safe_indexing
-from ._validation import check_integer, check_magnitude, check_not_vanishing, is_plain
-from .fitting.units import Frame
-from .inference.posterior import Posterior
+from ._sklearn import Interval, StrOptions
+from ._validation import (
+    FLOATS,
+    check_integer,
+    check_magnitude,
+    check_not_vanishing,
+    is_frame,
+    is_plain,
+    validate_frame,
+    words_of,
+)
+from .fitting.units import Units
+from .inference.posterior import Predictor
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from .rows.mapped import MappedRows, map_rows
-from .rows.maps import fit_map
+from .rows.maps import fit_map, take_rows
 from .rows.source import LocalSource, Source, moments_of_rows
 
-# float32 is not copied as a whole: pieces of it become float64.
-_DTYPES = [np.float64, np.float32]
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
 _VAGUE = 1e3
 
@@ -40,31 +49,53 @@ class Problem:
     ----------
     source : Source
         The rows through the maps.
-    frame : Frame
+    units : Units
     spec : KernelSpec
         With the start of the noise.
     vague : ndarray of shape (o, p)
-        Which weights have an infinite prior scale; in ``frame.prior`` theirs is very wide.
+        Which weights have an infinite prior scale; in ``units.prior`` theirs is very wide.
+    n_columns : int
+        Width of the kernel's inputs.
     """
 
     source: Source
-    frame: Frame
+    units: Units
     spec: KernelSpec
     vague: np.ndarray
+    n_columns: int
 
 
 class Fitted(Protocol):
     """What `ExplicitGaussianProcess` needs of a fit."""
 
     @property
-    def frame(self) -> Frame:
-        """Where centre, target_mean, units and prior are."""
+    def units(self) -> Units:
+        """The units and the prior."""
 
-    def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What the user should know of how the fit ended."""
 
-    def bounds(self, name: str, output: int) -> np.ndarray:
-        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+    def predictor(self) -> Predictor:
+        """Of all outputs, in the user's units."""
+
+    def limits(self, name: str, output: int) -> np.ndarray:
+        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+
+
+class _OfWeights:
+    """An attribute that a fit sets if there are weights, and an AttributeError that says so if there are none."""
+
+    def __set_name__(self, owner: type, name: str) -> None:
+        self._name = name
+
+    def __get__(self, model: Any, owner: type) -> Any:
+        # Python looks into the instance first.
+        if model is None:
+            return self
+        raise AttributeError(
+            f"{owner.__name__} has {self._name} only after a fit with a feature_map: without one there are no weights."
+        )
 
 
 class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
@@ -79,7 +110,6 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
         "normalize_y": ["boolean"],
         "max_iter": [Interval(Integral, 0, None, closed="left")],
-        "n_restarts": [Interval(Integral, 0, None, closed="left")],
         "tol": [Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
         "verbose": ["verbose"],
@@ -93,9 +123,10 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     noise_variance: float | None
     normalize_y: bool
 
+    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_ = (_OfWeights() for _ in range(5))
+
     _fitted: Fitted
     _spec: KernelSpec
-    _single_output: bool
 
     def predict(
         self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
@@ -124,34 +155,35 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+            If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
+            of the rows of a Dask array.
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        if not hasattr(self, "_posterior"):
+        if not hasattr(self, "_predictor"):
             check_is_fitted(self)
         if is_dask(X):
             if return_cov:
-                raise ValueError("return_cov needs all rows at once: not for Dask arrays.")
+                raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
             X = as_rows(X, "X", known=False)
             self._validated(X)
-            shape = () if self._n_outputs == 1 else (self._n_outputs,)
+            shape = () if self._single_output else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
         given: Any = X
         array: Any = X
         if not is_plain(self, X):
             given, array, _ = self._validated(X)
-        noise = self._posterior.noise if include_noise else np.zeros_like(self._posterior.noise)
+        noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
         if return_cov:
-            mean, cov = self._posterior.covariance(*self._inputs_and_features(given, array, slice(None)))
+            mean, cov = self._predictor.covariance(*self._inputs_and_features(given, array, slice(None)))
             cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
-            return like_y(mean + self._fitted.frame.target_mean), like_y(cov)
+            return like_y(mean), like_y(cov)
         means, deviations = [], []
-        size = self._posterior.rows_at_once
+        size = self._predictor.rows_at_once
         for first in range(0, len(array), size):
             rows = self._inputs_and_features(given, array, slice(first, first + size))
-            mean, variance = self._posterior.predict(*rows, return_std)
-            means.append(mean + self._fitted.frame.target_mean)
+            mean, variance = self._predictor.predict(*rows, return_std)
+            means.append(mean)
             if variance is not None:
                 deviations.append(np.sqrt(variance + noise))
         mean = like_y(np.concatenate(means))
@@ -178,8 +210,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+
+        Raises
+        ------
+        ValueError, TypeError
+            If X does not fit the training data, is not finite or is a Dask array, or ``n_samples`` is not a positive
+            integer.
         """
         check_integer(n_samples, "n_samples", minimum=1)
+        if is_dask(X):
+            raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
         rng = check_random_state(random_state)
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1
@@ -218,64 +258,95 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         vague = np.isinf(scale)
         unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
-        frame = Frame.of(source, inputs, targets, target_mean, mean, np.where(vague, unit, scale))
-        self._spec, self._single_output = spec, y.ndim == 1
-        return Problem(source, frame, spec, vague)
+        units = Units.of(source, targets, target_mean, mean, np.where(vague, unit, scale))
+        self._spec = spec
+        return Problem(source, units, spec, vague, len(inputs.mean))
 
     def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "_posterior")
+        return hasattr(self, "_predictor")
 
-    def _validated(self, X: Any, y: Any = None, reset: bool = False) -> tuple[Any, np.ndarray, np.ndarray]:
-        """X as the maps shall see it (a data frame stays one), X and y as arrays."""
+    def _validated(self, X: Any, *y: Any, reset: bool = False) -> tuple[Any, Any, np.ndarray]:
+        """X as the maps see it (a data frame stays one), X as the kernel sees it without a map, and y as an array.
+
+        A data frame may hold what is no number if there is a ``kernel_map``: then only the maps see it, and what they
+        return is checked. To predict, y is left out.
+        """
+        given = X
         if is_dask(X):
             validate_data(self, X, reset=reset, skip_check_array=True)
-            X, y = (X, np.empty(0)) if y is None and not reset else aligned(X, y)
-            return X, X, y
-        given = X
-        if y is None and not reset:
-            X, y = validate_data(self, X, reset=False, dtype=_DTYPES), np.empty(0)
+            X, target = aligned(X, *y) if y else (X, np.empty(0))
+            return X, X, target
+        if is_frame(X) and (self.kernel_map if reset else self.kernel_map_) is not None:
+            target = validate_frame(self, X, *y, reset=reset)
         else:
-            X, y = validate_data(self, X, y, reset=reset, multi_output=True, y_numeric=True, dtype=_DTYPES)
-            y = y if y.dtype.kind == "f" else np.asarray(y, dtype=np.float64)
+            X, target = self._numbers(X, *y, reset=reset)
+        check_magnitude(target, "y")
+        return (given if is_frame(given) else X), X, target
+
+    def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]:
+        """X and y as arrays of numbers."""
+        options = {"multi_output": True, "y_numeric": True} if y else {}
+        try:
+            validated = validate_data(self, X, *y, reset=reset, dtype=FLOATS, **options)
+        except ValueError as error:
+            if is_frame(X) and (words := words_of(X)):
+                raise ValueError(
+                    f"The columns {words} of X are not numbers, but with kernel_map=None the kernel sees all columns: "
+                    "give a kernel_map that encodes them or leaves them out."
+                ) from error
+            raise
+        X, target = validated if y else (validated, np.empty(0))
         check_magnitude(X, "X")
-        check_magnitude(y, "y")
-        return (given if hasattr(given, "iloc") else X), X, y
+        return X, target if target.dtype.kind == "f" else np.asarray(target, dtype=np.float64)
 
-    def _inputs_and_features(self, given: Any, X: np.ndarray, rows: slice) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's centred inputs and the features of rows."""
-        array = np.asarray(X[rows], dtype=np.float64)
-        given = array if given is X else safe_indexing(given, rows)
-        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
-        return inputs - self._fitted.frame.centre, features
+    def _inputs_and_features(self, given: Any, X: Any, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's inputs and the features of rows."""
+        array = take_rows(X, rows)
+        given = array if given is X else take_rows(given, rows)
+        return map_rows(given, array, self.feature_map_, self.kernel_map_)
 
-    def _source(self, given: Any, X: np.ndarray, y: np.ndarray) -> Source:
+    def _source(self, given: Any, X: Any, y: np.ndarray) -> Source:
         """The rows through the maps."""
         if is_dask(X):
             return DaskSource(X, y, self.feature_map_, self.kernel_map_)
         return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
 
     def _set_common_attributes(self) -> None:
-        """What is known of weights, noise and kernel."""
-        fitted, prior = self._fitted, self._fitted.frame.prior
-        self._posterior: Posterior = fitted.posterior()
+        """What is known of weights, if there are any, noise and kernel."""
+        fitted, prior = self._fitted, self._fitted.units.prior
+        self._predictor: Predictor = fitted.predictor()
         first = 0 if self._single_output else slice(None)
-        mean, covariance = self._posterior.coefficients()
-        self.coef_, self.coef_cov_ = mean[first], covariance[first]
-        self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
-        self.noise_variance_ = float(self._posterior.noise[0]) if self._single_output else self._posterior.noise.copy()
+        for name, attribute in vars(ExplicitGaussianProcess).items():
+            if isinstance(attribute, _OfWeights):
+                self.__dict__.pop(name, None)
+        if self.feature_map_ is not None:
+            mean, covariance = self._predictor.coefficients()
+            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+            self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+        self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
         kernels = [
             self._spec.to_sklearn(
-                np.exp(group.hyperparameters),
-                fitted.bounds("hyperparameters", o),
-                float(self._posterior.signal[o]),
-                fitted.bounds("signal", o),
+                group.hyperparameters,
+                fitted.limits("hyperparameters", o),
+                float(self._predictor.signal[o]),
+                fitted.limits("signal", o),
             )
-            for group in self._posterior.inducing
+            for group in self._predictor.groups
             for o in range(len(prior.mean))[group.outputs]
         ]
         self.kernel_ = kernels[0] if self._single_output else kernels
 
+    def _warn_of(self, messages: tuple[str, ...]) -> None:
+        """Tell the user of ``fit`` how it ended."""
+        for message in messages:
+            warnings.warn(message, ConvergenceWarning, stacklevel=4)
+
     @property
     def _n_outputs(self) -> int:
-        return len(self._posterior.noise)
+        return len(self._predictor.noise)
+
+    @property
+    def _single_output(self) -> bool:
+        """Whether nothing has an axis of outputs: for a y of one column too, as in scikit-learn's GPR."""
+        return self._n_outputs == 1

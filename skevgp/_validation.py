@@ -8,7 +8,13 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from sklearn.utils import check_array, check_consistent_length
+from sklearn.utils.validation import validate_data
 
+from ._sklearn import safe_indexing
+
+# float32 is not copied as a whole: pieces of it become float64.
+FLOATS = (np.float64, np.float32)
 LARGEST = 1e100
 # So many rows can be looked at in one go.
 _FEW_ROWS = 16
@@ -46,6 +52,38 @@ def is_plain(estimator: Any, X: Any) -> bool:
         and not hasattr(estimator, "feature_names_in_")
         and bool(np.abs(X).max() <= LARGEST)  # False if there is a NaN
     )
+
+
+def is_frame(values: Any) -> bool:
+    """Whether it is a data frame: of pandas, polars or (scikit-learn 1.7 or later takes its rows) pyarrow."""
+    return hasattr(type(values), "columns") and hasattr(type(values), "shape")
+
+
+def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
+    """Check names and number of a data frame's columns, not what they hold; return y, if there is one, as floats."""
+    if 0 in X.shape:
+        raise ValueError(f"X is empty: its shape is {X.shape}.")
+    validate_data(estimator, X, *y, reset=reset, skip_check_array=True)
+    if not y:
+        return np.empty(0)
+    target = check_array(as_floats(y[0], "y"), ensure_2d=False, input_name="y", estimator=estimator)
+    check_consistent_length(X, target)
+    return target
+
+
+def words_of(frame: Any) -> list[Any]:
+    """The names of the columns of a data frame that are not numbers."""
+    names = getattr(frame, "column_names", frame.columns)
+    columns = (safe_indexing(frame, index, axis=1) for index in range(frame.shape[1]))
+    return [name for name, column in zip(names, columns, strict=True) if not _are_numbers(column)]
+
+
+def _are_numbers(column: Any) -> bool:
+    try:
+        np.asarray(column, dtype=np.float64)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def check_magnitude(values: np.ndarray, name: str) -> None:

@@ -14,12 +14,12 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._progress import Progress
+from ._progress import monitor_of
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .network.model import VariationalNetwork
-from .network.training import Scaling, Training, train
+from .network.training import Scaling, train
 from .rows.threads import single_threaded_libraries
 
 # Without max_iter: so many epochs, or more if they make fewer steps than this.
@@ -300,6 +300,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start = network.start(rng)
         if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
             scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
+        monitor = monitor_of(self.verbose)
         training = train(
             network,
             start,
@@ -312,14 +313,14 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             learning_rate=self.learning_rate_init,
             tol=self.tol,
             patience=self.n_iter_no_change,
-            report=Progress(self.verbose, scaling.log_unit) if self.verbose else None,
+            monitor=monitor.seen_as(shift=scaling.log_unit),
         )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
         self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
         self._set_attributes()
-        return self._how_it_ended(training, max_iter)
+        return training.how_it_ended(max_iter, self.tol, monitor.stopped)
 
     def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
         """Inputs (n, d) and targets (n, o)."""
@@ -328,7 +329,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         for values, name in ((X, "X"), (targets, "y")):
             check_magnitude(values, name)
             check_not_vanishing(np.abs(values).max(axis=0), name)
-        self._single_output = y.ndim == 1
         return X, targets
 
     def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
@@ -348,18 +348,6 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
         return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
 
-    def _how_it_ended(self, training: Training, max_iter: int) -> str:
-        if training.minimum.interrupted:
-            return f"The fit was interrupted in epoch {len(training.losses)}; the best parameters so far are kept."
-        if not training.minimum.converged:
-            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
-        if training.still_falling:
-            return (
-                f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
-                f"purpose with a larger tol (now {self.tol})."
-            )
-        return ""
-
     def _set_attributes(self) -> None:
         layers, log_noise = self._scaling.to_users(*self._network.split(self._theta))
         self.coefs_ = [layer.mean for layer in layers]
@@ -367,7 +355,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.intercepts_ = [layer.bias for layer in layers]
         self.X_mean_ = self._scaling.x_mean.copy()
         noise = np.exp(log_noise)
-        self.noise_variance_ = float(noise[0]) if self._single_output else noise
+        self.noise_variance_ = float(noise[0]) if len(noise) == 1 else noise
         self.n_parameters_ = self._network.n_parameters
 
     @property

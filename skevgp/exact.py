@@ -2,25 +2,24 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Literal, Self
+from numbers import Integral
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
 from ._base import ExplicitGaussianProcess
-from ._progress import Progress
-from ._sklearn import fit_context
+from ._progress import monitor_of
+from ._sklearn import Interval, fit_context
 from ._validation import unchanged_if_it_fails
-from .fitting.exact import ExactFit, ExactOptions
+from .fitting.exact import ExactFit, ExactOptions, fit_exact
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
+from .solvers import LBFGS
 
 
 class EGPRegressor(ExplicitGaussianProcess):
@@ -68,16 +67,19 @@ class EGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
+        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
+        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
+        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations.
+        Their posterior standard deviations. Only with a ``feature_map``.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances.
+        Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used.
+        The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
@@ -113,6 +115,11 @@ class EGPRegressor(ExplicitGaussianProcess):
     >>> round(model.score(X, y), 2)
     0.96
     """
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        **ExplicitGaussianProcess._parameter_constraints,
+        "n_restarts": [Interval(Integral, 0, None, closed="left")],
+    }
 
     _fitted: ExactFit
 
@@ -152,7 +159,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one.
+            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
+            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
 
@@ -176,22 +184,22 @@ class EGPRegressor(ExplicitGaussianProcess):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y, allow_vague=True)
-            frame, spec = problem.frame, problem.spec
-            self._fitted = ExactFit.fit(
-                frame,
-                frame.rows(problem.source),
-                spec.covariance.seen_from(frame.centre),
-                spec.starts,
+            rows = problem.units.rows(problem.source)
+            options = ExactOptions(LBFGS.rules, self.max_iter, self.tol, self.n_restarts)
+            self._fitted = fit_exact(
+                problem.units,
+                rows,
+                problem.spec,
                 problem.vague,
-                ExactOptions(self.max_iter, self.tol, self.n_restarts),
+                options,
                 check_random_state(self.random_state),
-                partial(Progress, self.verbose) if self.verbose else None,
+                monitor_of(self.verbose),
             )
             self._set_common_attributes()
-            self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
+            if problem.vague.any():
+                self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
             self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
-        if self._fitted.message:
-            warnings.warn(self._fitted.message, ConvergenceWarning, stacklevel=3)
+        self._warn_of(self._fitted.messages)
         return self

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
-from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self, cast
 
@@ -12,20 +10,17 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
 from ._base import ExplicitGaussianProcess
-from ._progress import Progress
+from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
 from .fitting.inducing import Placement
-from .fitting.outputs import FittedOutputs
-from .fitting.strategy import Options
+from .fitting.outputs import FittedOutputs, Request, fit_outputs
 from .rows.threads import single_threaded_libraries
-
-_MAX_ITER = {"lbfgs": 1000, "adam": 16000}
+from .solvers import LBFGS, Adam, resolved
 
 
 class EVGPRegressor(ExplicitGaussianProcess):
@@ -46,12 +41,11 @@ class EVGPRegressor(ExplicitGaussianProcess):
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
         it. None has no explicit features.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct,
-        `skevgp.kernels.FunctionKernel`, sums and products of these; a WhiteKernel as a term of the outermost sum sets
-        the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant factor is the signal variance,
-        which each output has of its own; if there is none, one is put in front, with its start and bounds from the
-        data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`. None is an RBF with a
-        length scale per column, all starts and bounds taken from the data.
+        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
+        a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
+        factor is the signal variance, which each output has of its own; if there is none, one is put in front, with its
+        start and bounds from the data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`.
+        None is an RBF with a length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
     n_inducing : int, default=100
@@ -86,28 +80,18 @@ class EVGPRegressor(ExplicitGaussianProcess):
         takes two passes over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
-    solver : {"lbfgs", "adam"}, default="lbfgs"
+    solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
         L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
-        among them.
+        among them. The strings are the solvers with their defaults; what only one of them understands is said there:
+        ``Adam(batch_size=1000)``, ``LBFGS(n_restarts=2)``, and ``solver__batch_size`` in a grid search.
     max_iter : int, default=None
         The most iterations of L-BFGS or steps of Adam; None means 1000 or 16000. With 0 nothing is optimised: kernel
         and inducing points stay where they start, and q is at its optimum.
-    n_restarts : int, default=0
-        Further fits from other starts, of which the one with the best bound is kept: other inducing points (unless
-        ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
-        start. Each takes the time of a fit.
     tol : float, default=0.01
         In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
         when that no longer gains a hundred times as much. Adam goes over to its last steps, as many as before, when the
         loss stays flat: when its median over the last third of the steps differs from that over the third before by
         less than this, or by no more than chance (mini-batches are noisy, so chance mostly decides).
-    batch_size : int, default=512
-        Rows per step of Adam.
-    learning_rate : float, default=0.1
-        Adam's first step size; it falls to zero along half a cosine: over ``max_iter`` steps, or over the last steps.
-    natural_gradient : bool, default=False
-        Only for ``solver="adam"`` with ``posterior="full"``: whether q moves by natural gradients (Hensman et al.
-        2013), the last one on all rows, so that Adam is left with kernel, noise and inducing points.
     forgetting_factor : float, default=1.0
         What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers
         all of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
@@ -123,18 +107,21 @@ class EVGPRegressor(ExplicitGaussianProcess):
     Attributes
     ----------
     coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights.
+        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
+        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
+        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
+        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
     coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations.
+        Their posterior standard deviations. Only with a ``feature_map``.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances.
+        Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used.
+        The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
-    inducing_points_ : ndarray of shape (m, d) or, unless ``sharing="all"``, (n_outputs, m, d)
+    inducing_points_ : ndarray of shape (m, d) or, for several outputs unless ``sharing="all"``, (n_outputs, m, d)
         In the space of ``kernel_map``.
-    kernel_ : Kernel, or list of Kernel for a y with columns
+    kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
@@ -185,11 +172,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
         "sharing": [StrOptions({"all", "kernel", "none"})],
         "posterior": [StrOptions({"full", "diagonal"})],
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
-        "solver": [StrOptions({"lbfgs", "adam"})],
+        "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
-        "batch_size": [Interval(Integral, 1, None, closed="left")],
-        "learning_rate": [Interval(Real, 0, None, closed="neither")],
-        "natural_gradient": ["boolean"],
         "forgetting_factor": [Interval(Real, 0, 1, closed="right")],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
@@ -212,13 +196,9 @@ class EVGPRegressor(ExplicitGaussianProcess):
         noise_variance: float | None = None,
         noise_cv: int | None = None,
         normalize_y: bool = False,
-        solver: Literal["lbfgs", "adam"] = "lbfgs",
+        solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
-        n_restarts: int = 0,
         tol: float = 0.01,
-        batch_size: int = 512,
-        learning_rate: float = 0.1,
-        natural_gradient: bool = False,
         forgetting_factor: float = 1.0,
         warm_start: bool = False,
         n_jobs: int | None = None,
@@ -239,11 +219,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
-        self.n_restarts = n_restarts
         self.tol = tol
-        self.batch_size = batch_size
-        self.learning_rate = learning_rate
-        self.natural_gradient = natural_gradient
         self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
         self.n_jobs = n_jobs
@@ -257,9 +233,10 @@ class EVGPRegressor(ExplicitGaussianProcess):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a pandas data frame stays one. Memory-mapped arrays of
-            float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see chunks:
-            they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
+            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
+            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode. Memory-mapped
+            arrays of float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see
+            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
             ``dask.distributed.Client`` chunks are read anew at each pass.)
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
@@ -280,10 +257,30 @@ class EVGPRegressor(ExplicitGaussianProcess):
             If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
             kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
         """
+        solver = resolved(self.solver, self.posterior)
         with unchanged_if_it_fails(self), single_threaded_libraries():
-            self._fit(X, y)
-        for message in self._fitted.messages:
-            warnings.warn(message, ConvergenceWarning, stacklevel=3)
+            problem = self._problem(X, y)
+            n_rows = problem.source.n_rows
+            if self.noise_cv is not None and self.noise_cv > n_rows:
+                raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
+            request = Request(
+                problem.source,
+                problem.units,
+                problem.spec,
+                self.sharing,
+                self.posterior,
+                self._placement(problem.n_columns),
+                solver,
+                solver.default_max_iter if self.max_iter is None else self.max_iter,
+                self.tol,
+                self.noise_cv,
+                effective_n_jobs(self.n_jobs),
+            )
+            previous = getattr(self, "_fitted", None) if self.warm_start else None
+            monitor = monitor_of(self.verbose, solver.callback)
+            self._fitted = fit_outputs(request, check_random_state(self.random_state), monitor, previous)
+            self._set_attributes()
+        self._warn_of(self._fitted.messages)
         return self
 
     @fit_context(prefer_skip_nested_validation=False)
@@ -315,72 +312,36 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
         with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
-            frame, n_outputs = self._fitted.frame, 1 if y.ndim == 1 else y.shape[1]
+            n_outputs = 1 if y.ndim == 1 else y.shape[1]
             if n_outputs != self._n_outputs:
                 raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
-            rows = frame.rows(self._source(given, X, y))
-            check_magnitude(rows.residuals.largest, "y, in units of what the first fit left over,")
-            self._fitted = self._fitted.updated(rows, self.forgetting_factor)
+            source = self._source(given, X, y)
+            residuals = self._fitted.units.rows(source).residuals
+            check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
+            self._fitted = self._fitted.updated(source, self.forgetting_factor)
             self._set_attributes()
         return self
 
-    def _fit(self, X: Any, y: Any) -> None:
-        if self.natural_gradient and (self.solver != "adam" or self.posterior != "full"):
-            raise ValueError(
-                'natural_gradient=True needs solver="adam" and posterior="full"; '
-                f"got solver={self.solver!r} and posterior={self.posterior!r}."
-            )
-        problem = self._problem(X, y)
-        n_rows = problem.source.n_rows
-        if self.noise_cv is not None and self.noise_cv > n_rows:
-            raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
-        frame, spec = problem.frame, problem.spec
-        options = Options(
-            self.solver,
-            _MAX_ITER[self.solver] if self.max_iter is None else self.max_iter,
-            self.tol,
-            self.batch_size,
-            self.learning_rate,
-            self.n_restarts,
-            self.natural_gradient,
-            self.noise_cv,
-        )
-        self._fitted = FittedOutputs.fit(
-            frame,
-            frame.rows(problem.source),
-            spec.covariance.seen_from(frame.centre),
-            spec.starts,
-            self.sharing,
-            self.posterior,
-            self._placement(frame.centre),
-            options,
-            check_random_state(self.random_state),
-            effective_n_jobs(self.n_jobs),
-            getattr(self, "_fitted", None) if self.warm_start else None,
-            partial(Progress, self.verbose) if self.verbose else None,
-        )
-        self._set_attributes()
-
-    def _placement(self, centre: np.ndarray) -> Placement:
-        """How inducing points start, for inputs from which ``centre`` is subtracted."""
+    def _placement(self, n_columns: int) -> Placement:
+        """How inducing points start, in the space of ``kernel_map``."""
         if isinstance(self.inducing_init, str):
             return Placement(cast(Literal["auto", "k-means", "greedy"], self.inducing_init), self.n_inducing)
         points = as_floats(self.inducing_init, "inducing_init")
-        if points.ndim != 2 or len(points) == 0 or points.shape[1] != len(centre):
+        if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
             raise ValueError(
-                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {len(centre)}): points in "
+                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {n_columns}): points in "
                 f"the space of kernel_map; got the shape {points.shape}."
             )
         if not np.isfinite(points).all():
             raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
         check_magnitude(points, "inducing_init")
-        return Placement(points - centre, len(points))
+        return Placement(points, len(points))
 
     def _set_attributes(self) -> None:
         self._set_common_attributes()
         fitted = self._fitted
-        points = np.array([group.points for group in self._posterior.inducing]) + fitted.frame.centre
-        self.inducing_points_ = points[0] if fitted.sharing == "all" else points
+        points = np.array([group.points for group in self._predictor.groups])
+        self.inducing_points_ = points[0] if fitted.sharing == "all" or self._single_output else points
         self.lower_bound_ = fitted.lower_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter

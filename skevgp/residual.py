@@ -15,10 +15,8 @@ from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, proces
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._sklearn import HasMethods, fit_context
-from ._validation import as_floats, unchanged_if_it_fails
-
-_DTYPES = [np.float64, np.float32]
+from ._sklearn import HasMethods, fit_context, safe_indexing
+from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
 
 
 def _regressor_has(method: str) -> Callable[[Any], bool]:
@@ -58,7 +56,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
     References
     ----------
     - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes, section
-      V.
+      IV-B.
 
     Examples
     --------
@@ -90,7 +88,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            A data frame stays one for the regressor.
+            A data frame stays one for the regressor; only its base columns need be numbers here.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets in the units of their base columns.
         **params : dict
@@ -154,10 +152,10 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
             If the regressor was asked for them: as it returns them.
         """
         check_is_fitted(self)
-        seen, array = self._validated(X)
-        predicted = self.regressor_.predict(seen, **params)
+        X = self._validated(X)
+        predicted = self.regressor_.predict(X, **params)
         mean, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
-        mean = mean + array[:, self.base_].reshape(mean.shape)
+        mean = mean + _columns(X, self.base_).reshape(mean.shape)
         return (mean, *spread) if spread else mean
 
     @available_if(_regressor_has("sample_y"))
@@ -181,9 +179,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
             Each function at all rows, base columns included.
         """
         check_is_fitted(self)
-        seen, array = self._validated(X)
-        samples = self.regressor_.sample_y(seen, n_samples, random_state, **params)
-        return samples + array[:, self.base_].reshape(*samples.shape[:-1], 1)
+        X = self._validated(X)
+        samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
+        return samples + _columns(X, self.base_).reshape(*samples.shape[:-1], 1)
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.
@@ -214,9 +212,11 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
     def _fit(self, method: str, X: Any, y: Any, params: dict[str, Any]) -> Self:
         """Fit a new clone, or go on with the last."""
         first = method == "fit" or not hasattr(self, "regressor_")
-        given = X
-        X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=_DTYPES)
-        y = y if y.dtype.kind == "f" else as_floats(y, "y")
+        if is_frame(X):
+            y = validate_frame(self, X, y, reset=first)
+        else:
+            X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=FLOATS)
+            y = y if y.dtype.kind == "f" else as_floats(y, "y")
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         if not first and n_outputs != len(self.base_):
             raise ValueError(f"y has {n_outputs} outputs, but the model has {len(self.base_)}.")
@@ -225,16 +225,17 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         routed = {method: params}
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
-        residuals = y - X[:, base].reshape(y.shape)
-        seen = given if hasattr(given, "iloc") else X
-        self.regressor_ = getattr(regressor, method)(seen, residuals, **routed.get(method, {}))
+        residuals = y - _columns(X, base).reshape(y.shape)
+        self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
 
-    def _validated(self, X: Any) -> tuple[Any, np.ndarray]:
-        """X as the regressor shall see it (a data frame stays one), and as an array."""
-        array = validate_data(self, X, reset=False, dtype=_DTYPES)
-        return (X if hasattr(X, "iloc") else array), array
+    def _validated(self, X: Any) -> Any:
+        """X as the regressor shall see it: a data frame stays one, and the regressor looks at what it holds."""
+        if is_frame(X):
+            validate_frame(self, X, reset=False)
+            return X
+        return validate_data(self, X, reset=False, dtype=FLOATS)
 
     def _base(self, n_outputs: int) -> np.ndarray:
         """The index of the column from which each output starts."""
@@ -260,3 +261,15 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         if (base < -self.n_features_in_).any() or (base >= self.n_features_in_).any():
             raise ValueError(f"base={self.base!r} must be below the {self.n_features_in_} columns of X.")
         return base.astype(np.intp) % self.n_features_in_
+
+
+def _columns(X: Any, indices: np.ndarray) -> np.ndarray:
+    """Columns of an array or a data frame as numbers, (n, len(indices))."""
+    if not is_frame(X):
+        return X[:, indices]
+    columns = np.column_stack(
+        [as_floats(safe_indexing(X, index, axis=1), f"Column {index} of X, a base,") for index in indices.tolist()]
+    )
+    if not np.isfinite(columns).all():
+        raise ValueError("The base columns of X must be finite; they contain NaN or infinity.")
+    return columns

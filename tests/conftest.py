@@ -1,11 +1,9 @@
-"""One BLAS thread per worker, since tests run in as many processes as there are cores; and benchmarks as scripts."""
+"""One BLAS thread per worker, since tests run in as many processes as there are cores."""
 
-import csv
 import os
-import runpy
 import signal
-import sys
-from pathlib import Path
+from importlib import import_module
+from importlib.metadata import version
 
 import pytest
 
@@ -14,31 +12,13 @@ for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 # A shell that starts the tests in the background lets them ignore Ctrl-C; those that send it would wait for ever.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-
-@pytest.fixture
-def benchmarks(monkeypatch):
-    """The folder of scripts, which find the modules beside them and draw into files."""
-    folder = Path(__file__).parents[1] / "benchmarks"
-    if not folder.exists():
-        pytest.skip("the benchmarks are not part of the installed package")
-    monkeypatch.syspath_prepend(str(folder))
-    monkeypatch.setenv("MPLBACKEND", "Agg")
-    return folder
+# scikit-learn 1.6 takes no rows of a pyarrow table.
+_SKLEARN = tuple(int(part) for part in version("scikit-learn").split(".")[:2])
+_FRAMES = ["pandas.DataFrame", "polars.DataFrame", *(["pyarrow.table"] if _SKLEARN >= (1, 7) else [])]
 
 
-@pytest.fixture
-def run_script(benchmarks, monkeypatch, capsys):
-    """Run a benchmark with options; gives what it printed."""
-
-    def run(script, *options):
-        monkeypatch.setattr(sys, "argv", [script, *map(str, options)])
-        runpy.run_path(str(benchmarks / script), run_name="__main__")
-        return capsys.readouterr().out
-
-    return run
-
-
-def read(path):
-    """The rows of a CSV."""
-    with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+@pytest.fixture(params=_FRAMES)
+def frame_of(request):
+    """Make a data frame of named columns; of each package in turn."""
+    package, name = request.param.split(".")
+    return getattr(import_module(package), name)

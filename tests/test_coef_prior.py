@@ -4,7 +4,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.compose import make_column_transformer
 from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
-from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp._coef_prior import resolve_coef_prior, wide_scale
 from skevgp.features import InertiaForce, InertiaForceGravity
@@ -96,6 +96,17 @@ def test_a_union_may_pass_columns_through_and_drop_parts():
     mean, scale = resolve(union)
     assert_array_equal(mean, np.hstack([np.zeros((2, 3)), IF_MEAN]))
     assert_allclose(scale, np.hstack([wide(X), IF_SCALE]))
+
+
+def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
+    names = ["theta", "dtheta/dt", "u"]
+    frame = frame_of({"kind": ["x", "y"] * 10} | dict(zip(names, X.T, strict=True)))
+    scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
+    parts = make_column_transformer((OneHotEncoder(), ["kind"]), (scaled, names)).fit(frame)
+    features = parts.transform(frame)
+    mean, scale = resolve_coef_prior("auto", "auto", parts, frame, wide(features))
+    assert_array_equal(mean, np.hstack([np.zeros((2, 2)), IF_MEAN]))
+    assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 
 
 def test_the_weights_of_a_union_are_divided_out():

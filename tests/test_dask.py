@@ -15,6 +15,7 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, Stand
 
 from skevgp import EVGPRegressor
 from skevgp.rows import dask as _dask
+from skevgp.solvers import Adam
 
 pytestmark = [
     pytest.mark.slow,
@@ -83,7 +84,7 @@ def test_folds_on_two_workers_are_folds_of_arrays(cluster):
 
 
 def test_adam_takes_its_batches_from_the_chunks():
-    parameters = {"solver": "adam", "max_iter": 5, "batch_size": 100}
+    parameters = {"solver": Adam(batch_size=100), "max_iter": 5}
     assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))
 
 
@@ -246,6 +247,8 @@ def test_what_needs_all_rows_at_once_says_so():
     (rows,) = chunked(X_NEW, rows=(20, 30))
     with pytest.raises(ValueError, match="return_cov.*Dask"):
         fitted.predict(rows, return_cov=True)
+    with pytest.raises(ValueError, match="^sample_y needs all rows at once: not for Dask arrays"):
+        fitted.sample_y(rows)
     with pytest.raises(ValueError, match="2 features"):
         fitted.predict(da.zeros((5, 3)))
     with pytest.raises(TypeError, match="to_dask_array"):

@@ -10,6 +10,7 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import EVGPRegressor
 from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.solvers import LBFGS, Adam
 
 
 def nasty(seed):
@@ -64,10 +65,10 @@ def test_finite_data_never_fail(seed):
 @pytest.mark.parametrize("seed", range(30))
 def test_finite_data_never_fail_natural_gradients(seed):
     X, Y, arguments = nasty(seed)
-    arguments |= {"solver": "adam", "posterior": "full", "natural_gradient": True}
+    arguments |= {"solver": Adam(batch_size=64, natural_gradient=True), "posterior": "full"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = EVGPRegressor(**arguments, max_iter=30, batch_size=64, random_state=0).fit(X, Y)
+        model = EVGPRegressor(**arguments, max_iter=30, random_state=0).fit(X, Y)
     mean, std = model.predict(np.vstack([X, X + X.std(axis=0)]), return_std=True)
     assert np.isfinite(mean).all()
     assert (std > 0.0).all()
@@ -165,12 +166,13 @@ def test_bad_data(X, y, message):
         ({"n_inducing": 0}, "'n_inducing' parameter .* must be an int in the range"),
         ({"sharing": "some"}, "'sharing' parameter .* must be a str among"),
         ({"posterior": "banded"}, "'posterior' parameter .* must be a str among"),
-        ({"solver": "sgd"}, "'solver' parameter .* must be a str among"),
+        ({"solver": "sgd"}, r"solver must be one of \"lbfgs\", \"adam\", .*LBFGS\(\.\.\.\), .*; got 'sgd'"),
         ({"noise_variance": 0.0}, "'noise_variance' parameter"),
         ({"max_iter": -1}, "'max_iter' parameter"),
         ({"tol": -1.0}, "'tol' parameter"),
-        ({"batch_size": 0}, "'batch_size' parameter"),
-        ({"learning_rate": 0.0}, "'learning_rate' parameter"),
+        ({"solver": Adam(batch_size=0)}, "batch_size of Adam must be at least 1; got 0"),
+        ({"solver": Adam(learning_rate=0.0)}, "learning_rate of Adam must be finite and above 0"),
+        ({"solver": LBFGS(n_restarts=-1)}, "n_restarts of LBFGS must be at least 0; got -1"),
         ({"coef_mean": "prior"}, "'coef_mean' parameter"),
         ({"feature_map": PolynomialFeatures(1), "coef_mean": [1.0, 2.0]}, r"coef_mean must be .* \(1, 4\)"),
         ({"feature_map": PolynomialFeatures(1), "coef_scale": -1.0}, "coef_scale must not be negative"),

@@ -25,7 +25,7 @@ def error(model, data):
 
 def explained_by_the_gp(model):
     """The noise is far below what the features alone leave over: the GP has not collapsed."""
-    return (model.noise_variance_ < 0.1 * model._fitted.frame.target_unit**2).all()
+    return (model.noise_variance_ < 0.1 * model._fitted.units.target_unit**2).all()
 
 
 @pytest.mark.slow

@@ -5,13 +5,14 @@ import pandas as pd
 import pytest
 import sklearn
 from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.compose import make_column_transformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.linear_model import LinearRegression, Ridge, SGDRegressor
 from sklearn.metrics import r2_score
 from sklearn.model_selection import cross_validate
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import StandardScaler
+from sklearn.preprocessing import OneHotEncoder, StandardScaler
 from sklearn.svm import SVR
 from sklearn.utils import get_tags
 
@@ -90,6 +91,27 @@ def test_a_data_frame_stays_one_for_the_regressor():
     assert m.regressor_.predict_given_[0] is frame
     assert m.feature_names_in_.tolist() == NAMES
     assert m.n_features_in_ == 3
+
+
+@pytest.mark.parametrize("base", [["force", "angle"], [2, 2]])
+def test_columns_of_a_frame_other_than_the_base_may_be_words(base, frame_of):
+    columns = dict(zip(NAMES, X.T, strict=True))
+    frame = frame_of(columns | {"kind": np.where(X[:, 0] > 0, "right", "left")})
+    encode = make_column_transformer((OneHotEncoder(drop="if_binary"), ["kind"]))
+    m = ResidualRegressor(make_pipeline(encode, LinearRegression()), base=base).fit(frame, Y)
+    start = X[:, [2, 0] if base[0] == "force" else [2, 2]]
+    sides = (X[:, :1] > 0).astype(float)
+    expected = start + LinearRegression().fit(sides, Y - start).predict(sides)
+    np.testing.assert_allclose(m.predict(frame), expected, atol=1e-12)
+    assert m.feature_names_in_.tolist() == [*NAMES, "kind"]
+
+
+def test_base_columns_of_a_frame_must_be_finite_numbers(frame_of):
+    m = ResidualRegressor(Recorder(), base="angle")
+    with pytest.raises(ValueError, match="Column 0 of X, a base, must be real numbers"):
+        m.fit(frame_of({"angle": ["left"] * 60}), Y[:, 0])
+    with pytest.raises(ValueError, match="base columns of X must be finite; they contain NaN or infinity"):
+        m.fit(frame_of({"angle": np.full(60, np.nan)}), Y[:, 0])
 
 
 @pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])

@@ -63,7 +63,7 @@ def make_dynamics(
     """Simulate a robot: the data sets of section IV-B of the paper, and the like of any robot.
 
     The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs
-    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 2).
+    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 1).
 
     The arm iiwa14 starts at rest, its joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each, along a
     quintic reference and by computed-torque control (gains 100, 20 and 1, held over each step), with noise of standard

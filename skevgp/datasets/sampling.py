@@ -94,7 +94,7 @@ def _random_inputs(state_scale: list[float], input_scale: float, n_trajectories:
     )
 
 
-# Table 2 of the paper, and its section IV-B for iiwa14.
+# Table 1 of the paper, and its section IV-B for iiwa14.
 _PAPER: Mapping[str, RandomInputs | ControlledMoves] = MappingProxyType(
     {
         "pendulum": _random_inputs([np.pi, 0.5], 1.0, 48),

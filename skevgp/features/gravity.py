@@ -1,4 +1,4 @@
-"""Gravity's torque on each link as explicit features, the section on links in 3D of the paper."""
+"""Gravity's torque on each link as explicit features, section III-B of the paper."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ class LinkGravity(GravityMap):
 
     .. math:: (u_x \times R_i^\top g) \cdot u_z, \qquad (u_y \times R_i^\top g) \cdot u_z
 
-    (the paper's section on the IIWA has the first), where :math:`R_i` is the rotation of the link by forward
+    (the paper's section III-B has the first), where :math:`R_i` is the rotation of the link by forward
     kinematics, :math:`g` the gravity vector of the model and :math:`u_z` the joint's axis in its own frame. For a
     prismatic joint there is one feature, gravity along its axis, :math:`u_z \cdot R_i^\top g`. All are in m/s². Where
     the link's centre of mass is, and how heavy it is, the weights have to learn.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from ..inference.bounds import CoefficientPrior
-from ..optimizers.lbfgs import Minimum
+from ..optimizers.minimum import Minimum
 from ..rows.internal import Rows
 from .start import alike_neighbours
 
@@ -15,23 +15,20 @@ _NOTHING_LEARNED = 0.99
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 
-def how_it_ended(minimum: Minimum, max_iter: int, spent: int, tol: float, sparse: bool = True) -> str:
-    """Whether the optimiser ended before it converged, and why.
+def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float, sparse: bool = True) -> str:
+    """Why L-BFGS ended before it converged; nothing if it did.
 
     Parameters
     ----------
     minimum : Minimum
+    n_iter : int
+        Its iterations and those before.
     max_iter : int
-    spent : int
-        Iterations of ``max_iter`` before those of ``minimum``.
     tol : float
         In nats.
     sparse : bool, default=True
         Whether there are inducing points.
     """
-    n_iter = spent + minimum.n_iter
-    if minimum.interrupted:
-        return interrupted(n_iter)
     if minimum.converged:
         return ""
     if n_iter < max_iter:

@@ -23,7 +23,7 @@ so that one pass over the rows in the coordinates (L U)⁻¹ P gives φ on a who
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import accumulate, pairwise
 from operator import add
@@ -31,9 +31,16 @@ from operator import add
 import numpy as np
 from scipy.linalg import block_diag, eigh
 
-from ..inference.bounds import optimal_posterior, projected
-from ..inference.model import SparseModel, Values, log_variances
-from ..inference.statistics import KernelAt, SufficientStatistics, collect
+from ..inference.bounds import (
+    BoundAtOptimum,
+    Group,
+    PosteriorFamily,
+    log_variances,
+    optimal_posterior,
+    projected,
+)
+from ..inference.model import SparseModel, Values
+from ..inference.statistics import SufficientStatistics, collect
 from ..rows.blocks import Block, Blocks
 from ..rows.internal import Rows
 from ..rows.threads import BlockMap
@@ -54,15 +61,15 @@ class _LeftOut:
         P -> coordinates c.
     mean : ndarray of shape (m + p, g)
         c -> mean of the latent function.
-    spread : ndarray of shape (m + p, m + p), or None
-        P -> coordinates of the spread; None if they are c.
+    deviation : ndarray of shape (m + p, m + p), or None
+        P -> independent coordinates of the latent function's deviation; None if they are c.
     variances : ndarray of shape (m + p, g)
-        Squares of the spread's coordinates -> latent variance, but for what the inducing points do not explain.
+        Squares of these coordinates -> latent variance, but for what the inducing points do not explain.
     """
 
     basis: np.ndarray
     mean: np.ndarray
-    spread: np.ndarray | None
+    deviation: np.ndarray | None
     variances: np.ndarray
 
 
@@ -72,34 +79,28 @@ class _Scores:
 
     Attributes
     ----------
-    kernel : KernelAt
-    L_inv : ndarray of shape (m, m)
-    outputs : slice
-        Of the block's residuals.
-    signal : ndarray of shape (o,)
+    group : Group
     grid : ndarray of shape (o, g)
         Noise variances.
     left_out : list of _LeftOut
         One per output.
     """
 
-    kernel: KernelAt
-    L_inv: np.ndarray
-    outputs: slice
-    signal: np.ndarray
+    group: Group
     grid: np.ndarray
     left_out: list[_LeftOut]
 
     def __call__(self, block: Block) -> np.ndarray:
-        V = self.L_inv @ self.kernel.cross(block.prepared)
-        unexplained = np.maximum(self.kernel.diagonal(block.prepared) - np.einsum("ij,ij->j", V, V), 0.0)
+        whitening = self.group.whitening
+        _, V = whitening.project(block.prepared)
+        unexplained = whitening.unexplained(block.prepared, V)
         P = np.vstack([V, block.features.T])
         sums = np.empty(self.grid.shape)
-        for o, (own, r) in enumerate(zip(self.left_out, block.residuals[:, self.outputs].T, strict=True)):
+        for o, (own, r) in enumerate(zip(self.left_out, block.residuals[:, self.group.outputs].T, strict=True)):
             c = own.basis @ P
             error = r[:, np.newaxis] - c.T @ own.mean
-            spread = c if own.spread is None else own.spread @ P
-            latent = (spread * spread).T @ own.variances + self.signal[o] * unexplained[:, np.newaxis]
+            coordinates = c if own.deviation is None else own.deviation @ P
+            latent = (coordinates**2).T @ own.variances + self.group.signal[o] * unexplained[:, np.newaxis]
             sums[o] = (error**2 / (latent + self.grid[o])).sum(axis=0)
         return sums
 
@@ -109,9 +110,8 @@ def calibrated_noise(
     values: Values,
     statistics: list[SufficientStatistics],
     rows: Rows,
-    bounds: np.ndarray,
+    limits: np.ndarray,
     n_folds: int,
-    threads: BlockMap,
 ) -> np.ndarray:
     """The noise variance of each output at which φ first falls to 1, from the lowest that is allowed.
 
@@ -128,11 +128,10 @@ def calibrated_noise(
         Of all rows, for these values.
     rows : Rows
         At least ``n_folds``.
-    bounds : ndarray of shape (o, 2)
+    limits : ndarray of shape (o, 2)
         Of the noise variances.
     n_folds : int
         Blocks of consecutive rows, of nearly equal length; 2 or more.
-    threads : BlockMap
 
     Returns
     -------
@@ -140,43 +139,34 @@ def calibrated_noise(
     """
     edges = np.linspace(0, len(rows), n_folds + 1).astype(int)
     m = values["inducing_points"].shape[1]
-    folds = [rows.part(*ends, 1.0 / n_folds).blocks(model.kernel, m, threads) for ends in pairwise(edges)]
-    noise = np.empty(len(bounds))
-    for own, outputs, (at, L, L_inv) in zip(statistics, model.groups, model.factors(values), strict=True):
-        bound = model.bound(own, outputs, values["signal"], values["noise"], L, L_inv)
+    folds = [rows.part(*ends, 1.0 / n_folds).blocks(model.kernel, m) for ends in pairwise(edges)]
+    noise = np.empty(len(limits))
+    for group in model.groups_of(values, statistics):
+        bound, (low, high) = BoundAtOptimum(group, model.family), limits[group.outputs].T
+        n_rows = group.statistics.n_rows
         # Rows less the trace of I - B⁻¹, the weights that they determine.
-        freedom = [own.n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
-        left_over = bound.residuals().squares / np.maximum(freedom, 1e-6 * own.n_rows)
-        lowest = np.maximum(np.clip(left_over, *bounds[outputs].T), _LOWEST)
-        highest = np.maximum(np.minimum(bounds[outputs, 1], _HIGHEST), lowest)
+        freedom = [n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
+        left_over = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
+        lowest = np.maximum(np.clip(left_over, low, high), _LOWEST)
+        highest = np.maximum(np.minimum(high, _HIGHEST), lowest)
         grid = np.geomspace(lowest, highest, _GRID, axis=1)
-        phi = left_out_scores(model, values, outputs, folds, at, L_inv, grid, threads) / len(rows)
-        noise[outputs] = [_first_root(*pair) for pair in zip(grid, phi, strict=True)]
+        phi = left_out_scores(group, model.family, folds, grid, rows.threads) / len(rows)
+        noise[group.outputs] = [_first_root(*pair) for pair in zip(grid, phi, strict=True)]
     return noise
 
 
 def left_out_scores(
-    model: SparseModel,
-    values: Values,
-    outputs: slice,
-    folds: Sequence[Blocks],
-    kernel: KernelAt,
-    L_inv: np.ndarray,
-    grid: np.ndarray,
-    threads: BlockMap,
+    group: Group, family: PosteriorFamily, folds: Sequence[Blocks], grid: np.ndarray, threads: BlockMap
 ) -> np.ndarray:
     """Σ r² / (latent variance + σ²) over the rows of all folds, each predicted from the other folds.
 
     Parameters
     ----------
-    model : SparseModel
-    values : dict
-    outputs : slice
-        Of one group, o of them.
+    group : Group
+        Of o outputs.
+    family : {"full", "diagonal"}
     folds : sequence of Blocks
         Two or more.
-    kernel, L_inv
-        As in `statistics.collect`, of the group.
     grid : ndarray of shape (o, g)
         Noise variances σ².
     threads : BlockMap
@@ -185,11 +175,12 @@ def left_out_scores(
     -------
     scores : ndarray of shape (o, g)
     """
-    total, grids = np.zeros(grid.shape), list(zip(range(outputs.start, outputs.stop), grid, strict=True))
-    each = [collect(fold, kernel, L_inv) for fold in folds]
+    total, grids = np.zeros(grid.shape), list(enumerate(grid))
+    each = [collect(fold, group.whitening, group.outputs) for fold in folds]
     for fold, others in zip(folds, _sums_of_others(each), strict=True):
-        left_out = list(threads(partial(_without_fold, model, values, others, L_inv), grids))
-        total += fold.sum(_Scores(kernel, L_inv, outputs, values["signal"][outputs], grid, left_out))
+        known = replace(group, statistics=others)
+        left_out = list(threads(partial(_without_fold, known, family), grids))
+        total += fold.sum(_Scores(group, grid, left_out))
     return total
 
 
@@ -201,30 +192,24 @@ def _sums_of_others(each: Sequence[SufficientStatistics]) -> Iterator[Sufficient
     yield before[-1]
 
 
-def _without_fold(
-    model: SparseModel,
-    values: Values,
-    statistics: SufficientStatistics,
-    L_inv: np.ndarray,
-    output: tuple[int, np.ndarray],
-) -> _LeftOut:
+def _without_fold(group: Group, family: PosteriorFamily, output: tuple[int, np.ndarray]) -> _LeftOut:
     """What the statistics of the other folds say of an output, given with its grid (g,) of noise variances."""
     o, grid = output
-    signal, noise, m = values["signal"][o], values["noise"][o], len(L_inv)
-    scale, reference = model.prior.scale[o], model.prior.reference[o]
-    scales, ratio = np.append(np.full(m, np.sqrt(signal)), scale), noise / grid
-    q = optimal_posterior(statistics, o, signal, noise, model.prior)
-    _, Pr = projected(statistics, o, signal, scale)
+    L_inv, m = group.whitening.L_inv, len(group.whitening.L)
+    scale, reference = group.prior.scale[o], group.prior.reference[o]
+    scales, ratio = np.append(np.full(m, np.sqrt(group.signal[o])), scale), group.noise[o] / grid
+    q = optimal_posterior(group, o)
+    _, Pr = projected(group, o)
     eigenvalues, U = eigh(q.root_inv @ q.root_inv.T, overwrite_a=True, check_finite=False)
     to_basis = U.T @ q.root_inv
     precision = _between(np.clip(eigenvalues, 0.0, 1.0), np.ones(len(U)), ratio)
     mean = (np.outer(to_basis @ Pr, 1.0 / grid) - (to_basis[:, m:] @ reference)[:, np.newaxis]) / precision
-    if model.family == "full":
+    if family == "full":
         return _LeftOut(to_basis * scales, mean, None, 1.0 / precision)
     # In the coordinates (f_m, β), whose precisions are the diagonal of that of q.
     at_prior, at_noise = (np.exp(-np.concatenate(log_variances(B, L_inv))) for B in (np.eye(len(U)), q.B))
-    spread = block_diag(L_inv.T, np.eye(len(scale))) * scales
-    return _LeftOut(to_basis * scales, mean, spread, 1.0 / _between(at_prior, at_noise, ratio))
+    deviation = block_diag(L_inv.T, np.eye(len(scale))) * scales
+    return _LeftOut(to_basis * scales, mean, deviation, 1.0 / _between(at_prior, at_noise, ratio))
 
 
 def _between(at_zero: np.ndarray, at_one: np.ndarray, ratio: np.ndarray) -> np.ndarray:

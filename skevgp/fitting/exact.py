@@ -2,22 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
+from .._progress import Monitor
 from ..inference.exact import ExactModel
-from ..inference.posterior import Posterior
-from ..inference.statistics import Kernel
-from ..kernels.parse import Starts
-from ..optimizers.lbfgs import Minimum, Report
+from ..inference.posterior import Predictor
+from ..kernels.parse import KernelSpec
+from ..optimizers.lbfgs import lbfgs
 from ..optimizers.parameters import ParameterTable
 from ..rows.internal import Rows
-from .advice import far_from_prior, how_it_ended, nothing_learned
-from .descent import lbfgs_unless_stuck, moved_start
-from .start import FIRST_NOISE, checked_variance, spread_of, starting_table
-from .units import Frame
+from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
+from .start import checked_variance, column_centre, starting_table
+from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
+from .units import Units
 
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
@@ -29,15 +29,72 @@ class ExactOptions:
 
     Attributes
     ----------
+    rules : Rules
     max_iter : int
     tol : float
         In nats.
     n_restarts : int
     """
 
+    rules: Rules
     max_iter: int
     tol: float
-    n_restarts: int = 0
+    n_restarts: int
+
+
+@dataclass(frozen=True)
+class ExactTask:
+    """An exact model to be fitted: what all attempts have in common.
+
+    Attributes
+    ----------
+    model : ExactModel
+    table : ParameterTable
+    scatter : ndarray of shape (o,)
+        Variance of what the features leave over.
+    options : ExactOptions
+    rng : RandomState
+        Draws the restarts.
+    monitor : Monitor
+    """
+
+    model: ExactModel
+    table: ParameterTable
+    scatter: np.ndarray
+    options: ExactOptions
+    rng: np.random.RandomState
+    monitor: Monitor
+
+    @property
+    def strategy(self) -> Strategy:
+        """From where the model is fitted."""
+        return Strategy(
+            self.options.rules,
+            self.table,
+            self.options.max_iter,
+            self.options.n_restarts,
+            self.scatter,
+            interpolates=True,
+            restart=lambda: drawn(self.table, self.options.rules, self.rng),
+        )
+
+    def minimise(self, attempt: Attempt) -> Fit:
+        """L-BFGS on the log marginal likelihood per row."""
+        n, table = len(self.model.rows.inputs), self.table.started_at(attempt.values)
+
+        def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
+            likelihood, gradient = self.model.log_likelihood(table.values(flat))
+            return -likelihood / n, -table.gradient(gradient) / n
+
+        monitor = self.monitor.seen_as(factor=n)
+        minimum = lbfgs(loss, table.start(), table.limits(), attempt.until, self.options.tol / n, monitor)
+        return Fit(
+            table.values(minimum.x),
+            -n * minimum.loss,
+            [n * value for value in minimum.loss_curve],
+            minimum.converged,
+            how_it_ended(minimum, minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
+        )
 
 
 @dataclass(frozen=True)
@@ -46,150 +103,114 @@ class ExactFit:
 
     Attributes
     ----------
-    frame : Frame
+    units : Units
     model : ExactModel
     table : ParameterTable
-        Where it started, and its bounds.
-    minimum : Minimum
-        In internal units, per row.
-    message : str
-        What the user should know of how it ended; empty if it converged.
+        Where it started, and its limits.
+    fit : Fit
+        In internal units.
+    messages : tuple of str
+        What the user should know of how it ended.
     """
 
-    frame: Frame
+    units: Units
     model: ExactModel
     table: ParameterTable
-    minimum: Minimum
-    message: str
+    fit: Fit
+    messages: tuple[str, ...]
 
-    @classmethod
-    def fit(
-        cls,
-        frame: Frame,
-        rows: Rows,
-        kernel: Kernel,
-        starts: Starts,
-        vague: np.ndarray,
-        options: ExactOptions,
-        rng: np.random.RandomState,
-        reporter: Callable[[float], Report] | None = None,
-    ) -> ExactFit:
-        """Maximise the log marginal likelihood.
+    def predictor(self) -> Predictor:
+        """Of all outputs, in the user's units."""
+        return self.units.predictor([self.model.predictor(self.fit.values)])
 
-        Parameters
-        ----------
-        frame : Frame
-        rows : Rows
-            In internal units.
-        kernel : Kernel
-        starts : Starts
-            What the user says of kernel and noise.
-        vague : ndarray of shape (o, p)
-            Weights with an infinite prior scale.
-        options : ExactOptions
-        rng : RandomState
-            Draws the restarts.
-        reporter : callable, default=None
-            reporter(what to subtract from a loss in internal units) returns the fit's report.
-
-        Returns
-        -------
-        fitted : ExactFit
-
-        Raises
-        ------
-        ValueError
-            If features with vague weights depend on each other, or the kernel does not work.
-        """
-        n = len(rows)
-        everything = rows.some(np.arange(n))
-        _check_independent(everything.features, vague)
-        first, variance = starts.hyperparameters.value, 1.0
-        if first is not None:
-            some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
-            variance = checked_variance(kernel, first, everything.inputs[some])
-        spread = spread_of(rows.inputs)
-        table = starting_table(
-            spread,
-            np.empty((1, 0, len(spread))),
-            frame.target_unit,
-            starts,
-            rows.scatter(),
-            FIRST_NOISE["lbfgs"],
-            kernel.n_hyperparameters,
-            variance,
-        )
-        model = ExactModel(kernel, frame.internal_prior(), vague, everything)
-        shown = None if reporter is None else reporter(_shift(frame, vague, n))
-        report = None if shown is None else lambda iteration, loss: shown(iteration, n * loss)
-        best = _maximise(model, table, rows, options, rng, report)
-        proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
-        advice = [how_it_ended(best, options.max_iter, 0, options.tol, sparse=False), far_from_prior(proper, rows)]
-        if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
-            advice.append(nothing_learned(table.values(best.x)["noise"], rows, sparse=False))
-        return cls(frame, model, table, best, " ".join(part for part in advice if part))
-
-    def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
-        return self.frame.posterior([self.model.posterior(self.table.values(self.minimum.x))])
-
-    @property
+    @cached_property
     def log_marginal_likelihood(self) -> float:
         """In nats, summed over outputs."""
-        outputs = self.model.outputs(self.table.values(self.minimum.x))[1]
-        return sum(output.log_likelihood for output in outputs) - self._shift
+        return self.model.log_likelihood(self.fit.values)[0] - self._shift
 
     @property
     def loss_curve(self) -> np.ndarray:
         """Minus the log marginal likelihood per iteration."""
-        return self._n_rows * np.array(self.minimum.loss_curve) + self._shift
+        return np.array(self.fit.loss_curve) + self._shift
 
-    def bounds(self, name: str, output: int) -> np.ndarray:
-        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
-        bounds = self.table[name].value_bounds()
-        return bounds[[output]] * self.frame.target_unit[output] ** 2 if name == "signal" else bounds
-
-    @property
-    def _n_rows(self) -> int:
-        return len(self.model.rows.inputs)
+    def limits(self, name: str, output: int) -> np.ndarray:
+        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+        limits = self.table[name].value_limits()
+        return limits[[output]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
 
     @property
     def _shift(self) -> float:
-        return _shift(self.frame, self.model.vague, self._n_rows)
+        return log_unit_of_contrasts(self.units, self.model)
 
 
-def _maximise(
-    model: ExactModel,
-    table: ParameterTable,
+def fit_exact(
+    units: Units,
     rows: Rows,
+    spec: KernelSpec,
+    vague: np.ndarray,
     options: ExactOptions,
     rng: np.random.RandomState,
-    report: Report | None,
-) -> Minimum:
-    """L-BFGS on the log marginal likelihood from the table's start, then from others; the best is kept."""
-    n = len(rows)
+    monitor: Monitor,
+) -> ExactFit:
+    """Maximise the log marginal likelihood.
 
-    def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
-        likelihood, gradient = model.log_likelihood(table.values(flat))
-        return -likelihood / n, -table.flat(gradient) / n
+    Parameters
+    ----------
+    units : Units
+    rows : Rows
+        In internal units.
+    spec : KernelSpec
+        What the user says of kernel and noise.
+    vague : ndarray of shape (o, p)
+        Weights with an infinite prior scale.
+    options : ExactOptions
+    rng : RandomState
+        Draws the restarts.
+    monitor : Monitor
+        Told of each iteration's loss, in the user's units.
 
-    def descend(start: ParameterTable) -> Minimum:
-        return lbfgs_unless_stuck(
-            loss, start, rows.scatter(), options.max_iter, options.tol / n, may_interpolate=True, report=report
-        )
+    Returns
+    -------
+    fitted : ExactFit
 
-    best = descend(table)
-    for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
-        if best.interrupted:
-            break
-        other = descend(table.started_at(moved_start(table, rng)))
-        best = other if other.loss < best.loss else replace(best, interrupted=other.interrupted)
-    return best
+    Raises
+    ------
+    ValueError
+        If features with vague weights depend on each other, or the kernel does not work.
+    """
+    n, starts = len(rows), spec.starts
+    everything = rows.some(np.arange(n))
+    _check_independent(everything.features, vague)
+    kernel = spec.covariance.centred(column_centre(rows.inputs))
+    first, variance = starts.hyperparameters.value, 1.0
+    if first is not None:
+        some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
+        variance = checked_variance(kernel, first, everything.inputs[some])
+    table = starting_table(
+        rows.inputs,
+        np.empty((1, 0, everything.inputs.shape[1])),
+        units.target_unit,
+        starts,
+        rows.scatter(),
+        options.rules.first_noise,
+        kernel.n_hyperparameters,
+        variance,
+    )
+    model = ExactModel(kernel, units.internal_prior(), vague, everything)
+    monitor = monitor.seen_as(shift=log_unit_of_contrasts(units, model))
+    best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
+    proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
+    advice = [best.message, far_from_prior(proper, rows)]
+    if options.max_iter > 0 and table["noise"].free.any():
+        advice.append(nothing_learned(best.values["noise"], rows, sparse=False))
+    message = interrupted(best.n_iter) if monitor.stopped else " ".join(part for part in advice if part)
+    return ExactFit(units, model, table, best, (message,) if message else ())
 
 
-def _shift(frame: Frame, vague: np.ndarray, n_rows: int) -> float:
+def log_unit_of_contrasts(units: Units, model: ExactModel) -> float:
     """From internal units to the user's, for a loss of all rows: each contrast has a unit."""
-    return float(((n_rows - vague.sum(axis=1)) * np.log(frame.target_unit)).sum())
+    n_rows = len(model.rows.inputs)
+    return float(((n_rows - model.vague.sum(axis=1)) * np.log(units.target_unit)).sum())
 
 
 def _check_independent(features: np.ndarray, vague: np.ndarray) -> None:

@@ -12,7 +12,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from ..inference.statistics import Kernel
 from ..rows.source import Moments
-from .start import spread_of
+from .start import column_scale
 
 # On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
@@ -58,7 +58,7 @@ class Placement:
         Parameters
         ----------
         inputs : ndarray of shape (n_rows, d)
-            Centred; of all rows, or of ``sample_size`` of them.
+            Of all rows, or of ``sample_size`` of them.
         kernel : Kernel
         hyperparameters : ndarray of shape (n_hyper,)
             As the kernel takes them; only ``"greedy"`` asks the kernel.
@@ -83,15 +83,17 @@ class Placement:
 
 def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
     """k-means, each column scaled to unit standard deviation; fewer points where rows differ by rounding only."""
-    scale = spread_of(Moments.of(inputs))
+    moments = Moments.of(inputs)
+    scale = column_scale(moments)
     with warnings.catch_warnings():
         # Of rows that differ by rounding only: fewer points are then the right answer.
         warnings.simplefilter("ignore", ConvergenceWarning)
-        clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit(inputs / scale)
+        clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit((inputs - moments.mean) / scale)
     # Kept in k-means++'s order, the first ones far apart: sorted, each would almost follow from the one before, and
     # Adam's steps in whitened coordinates would be smaller (its error on the pendulum grew by half).
-    _, first = np.unique(clusters.cluster_centers_, axis=0, return_index=True)
-    return clusters.cluster_centers_[np.sort(first)] * scale
+    centres = moments.mean + clusters.cluster_centers_ * scale
+    _, first = np.unique(centres, axis=0, return_index=True)
+    return centres[np.sort(first)]
 
 
 def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparameters: np.ndarray) -> np.ndarray:
@@ -117,7 +119,8 @@ def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparam
     prepared = kernel.prepare(inputs)
     variance = np.array(np.broadcast_to(kernel.at(hyperparameters, inputs[:1]).diagonal(prepared), len(inputs)))
     enough = _EXHAUSTED * variance.max()
-    scaled = inputs / spread_of(Moments.of(inputs))
+    moments = Moments.of(inputs)
+    scaled = (inputs - moments.mean) / column_scale(moments)
     distance = np.full(len(inputs), np.inf)
     rows, chosen = np.empty((n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
     for count in range(n_inducing):

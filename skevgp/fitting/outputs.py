@@ -1,61 +1,72 @@
-"""Several outputs: which of them share what, fitted together, in the user's units."""
+"""Several outputs: plan which of them share what, run their fits, collect what is kept."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass, replace
-from threading import Event
-from typing import Any, Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
+from .._progress import Monitor
 from ..inference.bounds import PosteriorFamily
-from ..inference.model import SparseModel
-from ..inference.posterior import Posterior
+from ..inference.model import SparseModel, Values
+from ..inference.posterior import Predictor
 from ..inference.statistics import Kernel
-from ..kernels.parse import Starts
-from ..optimizers.lbfgs import Report
+from ..kernels.parse import KernelSpec
 from ..optimizers.parameters import ParameterTable
 from ..rows.internal import Rows
+from ..rows.source import Source
 from ..rows.threads import BlockMap, thread_pool
+from .advice import interrupted
 from .inducing import Placement
-from .start import FIRST_NOISE, checked_variance, spread_of, starting_table
-from .strategy import Learned, Options, learn
-from .units import Frame
+from .sparse import Learned, Solver, SparseTask
+from .start import checked_variance, column_centre, starting_table
+from .strategy import search
+from .units import Units
 
 Sharing = Literal["all", "kernel", "none"]
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 
 
-def _models(sharing: Sharing, kernel: Kernel, frame: Frame, family: PosteriorFamily) -> list[tuple[slice, SparseModel]]:
-    """The independent models and the outputs of each."""
-    prior, n_outputs = frame.internal_prior(), len(frame.target_unit)
-    each = tuple(slice(o, o + 1) for o in range(n_outputs))
-    if sharing == "none":
-        return [(o, SparseModel(kernel, prior.outputs(o), family, (slice(0, 1),))) for o in each]
-    groups = (slice(0, n_outputs),) if sharing == "all" else each
-    return [(slice(0, n_outputs), SparseModel(kernel, prior, family, groups))]
+@dataclass(frozen=True)
+class Request:
+    """What an estimator asks for.
 
+    Attributes
+    ----------
+    source : Source
+        The rows, in the user's units.
+    units : Units
+    spec : KernelSpec
+        What the user says of kernel and noise.
+    sharing : {"all", "kernel", "none"}
+    family : {"full", "diagonal"}
+    placement : Placement
+        Of the inducing points.
+    solver : Solver
+    max_iter : int
+    tol : float
+        In nats.
+    noise_cv : int or None
+        Folds of consecutive rows by which the noise is calibrated.
+    n_threads : int
+        For independent models, or else for blocks of rows.
+    """
 
-def _side_by_side(one: Callable[..., Learned], jobs: list[Any], n_threads: int, stop: Event) -> list[Learned]:
-    """Each job's result; Ctrl-C sets ``stop``, upon which jobs end with what they have."""
-    if n_threads < 2:
-        return [one(*job) for job in jobs]
-    futures: list[Future[Learned]] = []
-    with thread_pool(n_threads) as pool:
-        try:
-            for job in jobs:
-                futures.append(pool.submit(one, *job))
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            if any(future.exception() for future in done):
-                # The error is the result: nobody waits for the others.
-                stop.set()
-                pool.shutdown(wait=False, cancel_futures=True)
-                next(future for future in futures if future in done and future.exception()).result()
-        except KeyboardInterrupt:
-            stop.set()
-            futures += [pool.submit(one, *job) for job in jobs[len(futures) :]]
-        return [future.result() for future in futures]
+    source: Source
+    units: Units
+    spec: KernelSpec
+    sharing: Sharing
+    family: PosteriorFamily
+    placement: Placement
+    solver: Solver
+    max_iter: int
+    tol: float
+    noise_cv: int | None
+    n_threads: int
 
 
 @dataclass(frozen=True)
@@ -64,136 +75,34 @@ class FittedOutputs:
 
     Attributes
     ----------
-    frame : Frame
+    units : Units
     sharing : {"all", "kernel", "none"}
     outputs : tuple of slice
         Of each model.
     tables : tuple of ParameterTable
-        Where each model started, and its bounds.
+        Where each model started, and its limits.
     learned : tuple of Learned
         Each model, in internal units.
+    messages : tuple of str
+        What the user should know of how the fits ended.
     """
 
-    frame: Frame
+    units: Units
     sharing: Sharing
     outputs: tuple[slice, ...]
     tables: tuple[ParameterTable, ...]
     learned: tuple[Learned, ...]
+    messages: tuple[str, ...]
 
-    @classmethod
-    def fit(
-        cls,
-        frame: Frame,
-        rows: Rows,
-        kernel: Kernel,
-        starts: Starts,
-        sharing: Sharing,
-        family: PosteriorFamily,
-        placement: Placement,
-        options: Options,
-        rng: np.random.RandomState,
-        n_threads: int = 1,
-        previous: FittedOutputs | None = None,
-        reporter: Callable[[float], Report] | None = None,
-    ) -> FittedOutputs:
-        """Place inducing points and maximise the bound of each model.
-
-        Parameters
-        ----------
-        frame : Frame
-        rows : Rows
-            In internal units.
-        kernel : Kernel
-        starts : Starts
-            What the user says of kernel and noise.
-        sharing : {"all", "kernel", "none"}
-        family : {"full", "diagonal"}
-        placement : Placement
-            Of the inducing points.
-        options : Options
-        rng : RandomState
-        n_threads : int, default=1
-            For independent models, or else for blocks of rows.
-        previous : FittedOutputs, default=None
-            Start where this one ended, as far as shapes agree.
-        reporter : callable, default=None
-            reporter(what to add to a loss in internal units) returns the model's report.
-
-        Returns
-        -------
-        fitted : FittedOutputs
-        """
-        models = _models(sharing, kernel, frame, family)
-        spread = spread_of(rows.inputs)
-
-        def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
-            return starting_table(
-                spread,
-                points,
-                frame.target_unit[outputs],
-                starts,
-                rows.scatter()[outputs],
-                FIRST_NOISE[options.solver],
-                kernel.n_hyperparameters,
-                variance,
-            )
-
-        # The kernel starts alike in all models and without regard to the points, which may depend on it.
-        alone = table_of(slice(0, 1), np.empty((1, 0, len(spread))))
-        hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
-        points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
-        first = starts.hyperparameters.value
-        variance = 1.0 if first is None else checked_variance(kernel, first, points)
-        tables, colds = [], []
-        for index, (outputs, model) in enumerate(models):
-            table = cold = table_of(outputs, np.repeat(points[np.newaxis], len(model.groups), axis=0), variance)
-            if previous is not None and previous.outputs == tuple(outputs for outputs, _ in models):
-                values = previous._values_in(frame, rows, index)
-                if previous.learned[index].model.kernel != kernel:
-                    # Of another function: its inducing points and noise may serve.
-                    values.pop("hyperparameters", None)
-                    values.pop("signal", None)
-                if isinstance(placement.method, np.ndarray):
-                    values.pop("inducing_points", None)
-                table = table.started_at(values)
-            tables.append(table)
-            colds.append(None if table is cold else cold)
-        # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
-        seed = rng.randint(np.iinfo(np.int32).max)
-        threads, stop = BlockMap(n_threads if len(models) == 1 else 1), Event()
-        options = replace(options, threads=threads)
-        at_once = min(n_threads, len(models))
-
-        def one(outputs: slice, model: SparseModel, table: ParameterTable, cold: ParameterTable | None) -> Learned:
-            inner = reporter(len(rows) * frame.log_unit(outputs)) if reporter else None
-
-            def report(iteration: int, loss: float) -> None:
-                if stop.is_set():
-                    raise KeyboardInterrupt
-                if inner is not None:
-                    inner(iteration, loss)
-
-            own = rows.outputs(outputs, 1.0 / at_once)
-            learned = learn(model, table, own, options, placement, np.random.RandomState(seed), report, cold)
-            if learned.interrupted:
-                stop.set()
-            return learned
-
-        jobs = [(*model, *start) for model, *start in zip(models, tables, colds, strict=True)]
-        try:
-            learned = _side_by_side(one, jobs, at_once, stop)
-        finally:
-            threads.close()
-        return cls(frame, sharing, tuple(outputs for outputs, _ in models), tuple(tables), tuple(learned))
-
-    def updated(self, rows: Rows, weight: float = 1.0) -> FittedOutputs:
-        """Fold new rows, in internal units, into the posteriors; ``weight`` multiplies what is known of the others."""
+    def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
+        """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
+        rows = self.units.rows(source)
         learned = (one.updated(rows.outputs(own), weight) for own, one in zip(self.outputs, self.learned, strict=True))
         return replace(self, learned=tuple(learned))
 
-    def posterior(self) -> Posterior:
-        """The posterior of all outputs, in the user's units but for centre and target_mean."""
-        return self.frame.posterior([one.posterior for one in self.learned])
+    def predictor(self) -> Predictor:
+        """Of all outputs, in the user's units."""
+        return self.units.predictor([one.predictor for one in self.learned])
 
     @property
     def lower_bound(self) -> float:
@@ -202,6 +111,7 @@ class FittedOutputs:
 
     @property
     def n_iter(self) -> int:
+        """Iterations of the longest fit."""
         return max(len(one.loss_curve) for one in self.learned)
 
     @property
@@ -217,44 +127,165 @@ class FittedOutputs:
         """Free parameters of kernels, noise, inducing points and q."""
         total = 0
         for table, one in zip(self.tables, self.learned, strict=True):
-            size = len(one.posterior.mean[0])
+            n_outputs, p = one.model.prior.scale.shape
+            size = one.values["inducing_points"].shape[1] + p
             q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
-            total += table.size + q * len(one.posterior.mean)
+            total += table.size + q * n_outputs
         return total
 
-    @property
-    def messages(self) -> list[str]:
-        """What the user should know of how the fits ended."""
-        if any(one.interrupted for one in self.learned):
-            return [max(self.learned, key=lambda one: (one.interrupted, len(one.loss_curve))).message]
-        return sorted({one.message for one in self.learned if one.message})
-
-    def bounds(self, name: str, output: int) -> np.ndarray:
-        """Bounds (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+    def limits(self, name: str, output: int) -> np.ndarray:
+        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
         index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
-        bounds = self.tables[index][name].value_bounds()
+        limits = self.tables[index][name].value_limits()
         if name == "signal":
-            return bounds[[output - self.outputs[index].start]] * self.frame.target_unit[output] ** 2
-        return bounds
+            return limits[[output - self.outputs[index].start]] * self.units.target_unit[output] ** 2
+        return limits
+
+    def values_in(self, units: Units, rows: Rows, kernel: Kernel, index: int) -> Values:
+        """A model's values in other internal units, as far as they can serve another fit."""
+        one, inputs = self.learned[index], rows.inputs
+        values, points = one.values, one.values["inducing_points"]
+        lowest, highest = inputs.lowest, inputs.highest
+        if points.shape[2] != len(inputs.mean):
+            return {}
+        if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
+            return {}
+        ratio = (self.units.target_unit[self.outputs[index]] / units.target_unit[self.outputs[index]]) ** 2
+        found = {"noise": values["noise"] * ratio, "inducing_points": points}
+        if one.model.kernel == kernel:
+            found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
+        return found
 
     @property
     def _shift(self) -> float:
         """From internal units to the user's, for a loss of all rows."""
-        return self.learned[0].statistics[0].n_rows * self.frame.log_unit(slice(None))
+        return self.learned[0].statistics[0].n_rows * self.units.log_unit(slice(None))
 
-    def _values_in(self, frame: Frame, rows: Rows, index: int) -> dict[str, np.ndarray]:
-        """A model's values in another frame's internal units; none if the inputs are others."""
-        if len(frame.centre) != len(self.frame.centre):
-            return {}
-        outputs, values = self.outputs[index], self.learned[index].values
-        points = values["inducing_points"] + self.frame.centre - frame.centre
-        lowest, highest = rows.inputs.lowest, rows.inputs.highest
-        if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
-            return {}
-        ratio = (self.frame.target_unit[outputs] / frame.target_unit[outputs]) ** 2
-        return {
-            "hyperparameters": values["hyperparameters"],
-            "signal": values["signal"] * ratio,
-            "noise": values["noise"] * ratio,
-            "inducing_points": points,
-        }
+
+def fit_outputs(
+    request: Request, rng: np.random.RandomState, monitor: Monitor, previous: FittedOutputs | None = None
+) -> FittedOutputs:
+    """Place inducing points and maximise the bound of each model.
+
+    Parameters
+    ----------
+    request : Request
+    rng : RandomState
+        Places inducing points, draws mini-batches and restarts.
+    monitor : Monitor
+        Told of each iteration's loss, in the user's units.
+    previous : FittedOutputs, default=None
+        Start where this one ended, as far as shapes agree.
+
+    Returns
+    -------
+    fitted : FittedOutputs
+    """
+    # One model has all threads for its blocks of rows; several have one each.
+    n_models = len(_models(request))
+    at_once = min(request.n_threads, n_models)
+    threads = BlockMap(request.n_threads if n_models == 1 else 1)
+    try:
+        tasks = plan(request, rng, monitor, threads, previous)
+        learned = _side_by_side(_fit_one, tasks, at_once, monitor)
+    finally:
+        threads.close()
+    messages = sorted({one.message for one in learned if one.message})
+    if monitor.stopped:
+        messages = [interrupted(max(len(one.loss_curve) for one in learned))]
+    outputs = tuple(outputs for outputs, _ in _models(request))
+    tables = tuple(task.table for task in tasks)
+    return FittedOutputs(request.units, request.sharing, outputs, tables, tuple(learned), tuple(messages))
+
+
+def plan(
+    request: Request,
+    rng: np.random.RandomState,
+    monitor: Monitor,
+    threads: BlockMap,
+    previous: FittedOutputs | None = None,
+) -> list[SparseTask]:
+    """The models to be fitted, each with its rows and where it starts; arguments as of `fit_outputs`."""
+    units, placement, starts, solver = request.units, request.placement, request.spec.starts, request.solver
+    models = _models(request)
+    rows = units.rows(request.source, threads)
+    kernel = request.spec.covariance.centred(column_centre(rows.inputs))
+
+    def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
+        unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
+        n_hyper, first_noise = kernel.n_hyperparameters, solver.rules.first_noise
+        return starting_table(rows.inputs, points, unit, starts, scatter, first_noise, n_hyper, variance)
+
+    # The kernel starts alike in all models and without regard to the points, which may depend on it.
+    alone = table_of(slice(0, 1), np.empty((1, 0, len(rows.inputs.mean))))
+    hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
+    points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
+    first = starts.hyperparameters.value
+    variance = 1.0 if first is None else checked_variance(kernel, first, points)
+    # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
+    seed = rng.randint(np.iinfo(np.int32).max)
+    goes_on = previous is not None and previous.outputs == tuple(outputs for outputs, _ in models)
+    share, tasks = 1.0 / min(request.n_threads, len(models)), []
+    for index, (outputs, groups) in enumerate(models):
+        warm: Values | None = None
+        if goes_on and previous is not None:
+            warm = previous.values_in(units, rows, kernel, index)
+            if isinstance(placement.method, np.ndarray):
+                warm.pop("inducing_points", None)
+        table = table_of(outputs, np.repeat(points[np.newaxis], len(groups), axis=0), variance)
+        shift = len(rows) * units.log_unit(outputs)
+        tasks.append(
+            SparseTask(
+                SparseModel(
+                    kernel, units.internal_prior().outputs(outputs), request.family, groups, solver.rules.jitter
+                ),
+                rows.outputs(outputs, share),
+                table,
+                placement,
+                solver,
+                request.max_iter,
+                request.tol,
+                request.noise_cv,
+                seed,
+                monitor.seen_as(shift=shift, outputs=range(outputs.start, outputs.stop)),
+                None if warm is None else table.started_at(warm).values_at_start(),
+            )
+        )
+    return tasks
+
+
+def _models(request: Request) -> list[tuple[slice, tuple[slice, ...]]]:
+    """The outputs of each independent model, and of these the outputs of each set of inducing points."""
+    n_outputs = len(request.units.target_unit)
+    each = tuple(slice(o, o + 1) for o in range(n_outputs))
+    if request.sharing == "none":
+        return [(outputs, (slice(0, 1),)) for outputs in each]
+    return [(slice(0, n_outputs), (slice(0, n_outputs),) if request.sharing == "all" else each)]
+
+
+def _fit_one(task: SparseTask) -> Learned:
+    # A copy, with which the blocks of rows are forgotten.
+    task = replace(task)
+    return Learned.of(task, search(task))
+
+
+def _side_by_side(one: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int, monitor: Monitor) -> list[Result]:
+    """Each job's result; Ctrl-C stops the monitor, upon which jobs end with what they have."""
+    results: list[Result] = []
+    if n_threads < 2:
+        for job in jobs:
+            results.append(one(job))
+        return results
+    futures: list[Future[Result]] = []
+    with thread_pool(n_threads) as pool:
+        with monitor.keeping_the_best():
+            for job in jobs:
+                futures.append(pool.submit(one, job))
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+            if any(future.exception() for future in done):
+                # The error is the result: nobody waits for the others.
+                monitor.stop()
+                pool.shutdown(wait=False, cancel_futures=True)
+                next(future for future in futures if future in done and future.exception()).result()
+        futures += [pool.submit(one, job) for job in jobs[len(futures) :]]
+        return [future.result() for future in futures]

@@ -1,4 +1,4 @@
-"""Where a fit starts: what the features alone explain, and the first value and bounds of each parameter."""
+"""Where a fit starts: what the features alone explain, and the first value and limits of each parameter."""
 
 from __future__ import annotations
 
@@ -18,13 +18,11 @@ from ..rows.source import Moments, RawRows, Source
 # Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
 # all strangers, whatever the number of columns.
 _LENGTHSCALE = 0.6
-_LENGTHSCALE_BOUNDS = 1e-2, 1e4
+_LENGTHSCALE_LIMITS = 1e-2, 1e4
 
-# In units of the variance that the features alone leave over. A low first noise keeps L-BFGS out of the optimum where
-# the noise explains everything; Adam, whose steps do not grow with the gradient, starts nearer to the data's scatter.
-FIRST_NOISE = {"lbfgs": 1e-4, "adam": 1e-2}
+# In units of the variance that the features alone leave over.
 # Below 1e-10 of it, rounding in k(x, x) - |v|² (about 1e-16 times the condition of L, 1e6) outweighs the noise.
-_NOISE_BOUNDS = 1e-10, 1e2
+_NOISE_LIMITS = 1e-10, 1e2
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
 _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
@@ -32,7 +30,7 @@ _SMALLEST_UNIT = 1e-140
 _NEIGHBOUR_SAMPLE = 2000
 # A function that varies by more than ten times the data's scatter would do so outside of them only: without an upper
 # bound L-BFGS makes long waves of huge height from small ones (on the cartpole, Errors outside the data of 50).
-_SIGNAL_BOUNDS = 1e-8, 1e2
+_SIGNAL_LIMITS = 1e-8, 1e2
 
 
 @dataclass(frozen=True)
@@ -112,9 +110,20 @@ def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
     return np.where(unit > 0.0, np.maximum(unit, _SMALLEST_UNIT), 1.0)
 
 
-def spread_of(inputs: Moments) -> np.ndarray:
-    """The root mean square (d,) of each centred column; 1 where the column is constant."""
-    return np.where(inputs.rms > _SMALLEST_UNIT, inputs.rms, 1.0)
+def column_centre(inputs: Moments) -> np.ndarray:
+    """The mean (d,) of each column, or the constant itself: what is left of it is then 0, not rounding errors."""
+    return np.where(_constant(inputs), inputs.lowest, inputs.mean)
+
+
+def column_scale(inputs: Moments) -> np.ndarray:
+    """The standard deviation (d,) of each column; 1 where the column is constant but for rounding."""
+    scale = np.sqrt(inputs.variance)
+    return np.where(_constant(inputs) | (scale <= _SMALLEST_UNIT), 1.0, scale)
+
+
+def _constant(inputs: Moments) -> np.ndarray:
+    """Whether the entries (d,) of a column differ by a few rounding errors only."""
+    return inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
@@ -180,10 +189,10 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     -------
     alike : ndarray of shape (o,)
     """
-    if not (rows.inputs.variance > _SMALLEST_UNIT**2).any():
+    if _constant(rows.inputs).all():
         return np.zeros(len(rows.scatter()), dtype=bool)
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs, residuals = some.inputs / spread_of(rows.inputs), some.targets
+    inputs, residuals = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs), some.targets
     if len(inputs) < 2:
         return np.zeros(residuals.shape[1], dtype=bool)
     _, nearest = cKDTree(inputs).query(inputs, 2)
@@ -192,7 +201,7 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
 
 
 def starting_table(
-    spread: np.ndarray,
+    inputs: Moments,
     inducing_points: np.ndarray,
     target_unit: np.ndarray,
     starts: Starts,
@@ -201,12 +210,12 @@ def starting_table(
     n_hyperparameters: int,
     mean_variance: float = 1.0,
 ) -> ParameterTable:
-    """The parameters of a sparse model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
+    """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
     Parameters
     ----------
-    spread : ndarray of shape (d,)
-        Of the kernel's inputs: `spread_of`.
+    inputs : Moments
+        Of the kernel's d columns.
     inducing_points : ndarray of shape (g, m, d)
         One set per group of outputs.
     target_unit : ndarray of shape (o,)
@@ -227,34 +236,39 @@ def starting_table(
     table : ParameterTable
         With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
     """
-    o = np.ones(len(target_unit))
-    typical = spread if n_hyperparameters > 1 else np.sqrt(np.mean(spread**2, keepdims=True))
-    root_d = np.sqrt(len(spread))
-    lower, upper = _LENGTHSCALE_BOUNDS
-    lengthscales = _LENGTHSCALE * root_d * typical
+    o, scale = np.ones(len(target_unit)), column_scale(inputs)
+    typical = scale if n_hyperparameters > 1 else np.sqrt(np.mean(scale**2, keepdims=True))
+    root_d = np.sqrt(len(scale))
+    lower, upper = _LENGTHSCALE_LIMITS
+    first = starts.hyperparameters.value
     signal = o / mean_variance
     return ParameterTable(
         [
             parameter_of(
                 starts.hyperparameters,
                 "hyperparameters",
-                lengthscales if starts.hyperparameters.value is None else starts.hyperparameters.value,
+                _LENGTHSCALE * root_d * typical if first is None else first,
                 lower * typical,
                 upper * root_d * typical,
                 1.0,
             ),
             parameter_of(
-                starts.signal, "signal", signal, _SIGNAL_BOUNDS[0] * signal, _SIGNAL_BOUNDS[1] * signal, target_unit**2
+                starts.signal,
+                "signal",
+                signal,
+                _SIGNAL_LIMITS[0] * signal,
+                _SIGNAL_LIMITS[1] * signal,
+                target_unit**2,
             ),
             parameter_of(
                 starts.noise,
                 "noise",
                 first_noise * scatter,
-                np.maximum(_NOISE_BOUNDS[0] * scatter, _LOWEST_NOISE),
-                _NOISE_BOUNDS[1] * o,
+                np.maximum(_NOISE_LIMITS[0] * scatter, _LOWEST_NOISE),
+                _NOISE_LIMITS[1] * o,
                 target_unit**2,
             ),
-            Parameter("inducing_points", inducing_points, unit=spread),
+            Parameter("inducing_points", inducing_points, unit=scale, origin=column_centre(inputs)),
         ]
     )
 
@@ -270,7 +284,7 @@ def parameter_of(
         What the user says, in his units.
     name : str
     default, lower, upper : ndarray of the parameter's shape
-        Start and bounds, in internal units, where the user says nothing; a start is put inside the bounds.
+        Start and limits, in internal units, where the user says nothing; a start is put inside the limits.
     unit : ndarray or float
         The user's values are divided by it.
     """

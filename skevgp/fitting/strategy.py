@@ -1,370 +1,278 @@
-"""Fit one sparse model: optimise, look at what came out, try again if it got stuck."""
+"""From which starts a model is fitted, one after the other, and which of the fits is kept.
+
+A fit may end where the noise explains everything, or with inducing points where nothing happens: one start is not
+enough. `Strategy.attempts` names the next start given how those before ended, and `search` does what it says:
+``for attempt in attempts: best = better(best, minimise(attempt))``. ARCHITECTURE.md has a table of the rules, what each
+prevents, and the test that fails without it.
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from collections.abc import Callable, Generator
+from contextlib import suppress
+from dataclasses import dataclass, field
+from typing import Protocol
 
 import numpy as np
 
-from .._linalg import NotPositiveDefiniteError
-from ..inference.bounds import features_alone_bound
-from ..inference.elbo import ElboObjective
-from ..inference.model import SparseModel, Values
-from ..inference.objectives import BoundObjective
-from ..inference.posterior import Posterior
-from ..inference.statistics import SufficientStatistics
-from ..optimizers.adam import adam
-from ..optimizers.lbfgs import Report
+from .._progress import Monitor
+from ..inference.model import Values
+from ..inference.posterior import Predictor
+from ..inference.statistics import JITTER
 from ..optimizers.parameters import ParameterTable
-from ..rows.internal import Rows
-from ..rows.threads import BlockMap
-from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
-from .calibration import calibrated_noise
-from .descent import interpolates, lbfgs_unless_stuck, moved_start, stuck
-from .inducing import Placement
-
-# Iterations after which inducing points are placed anew, and so many again until it shows whether that was better. By
-# then lengthscales tell which columns matter; with 50 or 300 the bounds are about as good.
-_STAGE = 100
-# Relative size of the rounding errors in a bound on all rows.
-_ROUNDING = 1e-8
-# Length of the natural gradients' steps for q: the first, and the least.
-_NATURAL_RATES = 0.3, 0.02
 
 
 @dataclass(frozen=True)
-class Options:
-    """How to optimise.
+class Rules:
+    """What the strategy goes by: a property of the solver.
 
     Attributes
     ----------
-    solver : {"lbfgs", "adam"}
-    max_iter : int
-    tol : float
-        In nats.
-    batch_size : int
-    learning_rate : float
-    n_restarts : int
-        Further fits from other starts.
-    natural_gradient : bool
-        Of Adam with the full family: q moves by natural gradients.
-    noise_cv : int, optional
-        Folds of consecutive rows by which the noise is calibrated.
-    threads : BlockMap
-    spent : int
-        Iterations of ``max_iter`` that were used up before.
+    first_noise : float
+        Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
+        keeps L-BFGS out of the optimum where the noise explains everything.
+    jitter : float
+        Of k(X_m, X_m), relative to the signal variance.
+    collapsed : float
+        An output counts as not learned when noise comes to explain this share of what the features leave over.
+    other_starts : tuple of (float, float)
+        Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
+    interpolates : float
+        With so many times as many inducing points as rows, or more, the kernel may explain every row by itself.
+    much_noise : float, optional
+        Such fits, which cost little, start from a noise so many times higher too: a low one may lead to that plateau.
+    stage : int, optional
+        Iterations after which inducing points are placed anew, and so many again until it shows whether that was
+        better. None leaves them.
+    restart_factors : dict
+        A restart multiplies the first values by numbers between 1 / factor and the factor, drawn log-uniformly.
     """
 
-    solver: Literal["lbfgs", "adam"]
-    max_iter: int
-    tol: float
-    batch_size: int
-    learning_rate: float
-    n_restarts: int = 0
-    natural_gradient: bool = False
-    noise_cv: int | None = None
-    threads: BlockMap = field(default_factory=BlockMap)
-    spent: int = 0
+    first_noise: float
+    jitter: float = JITTER
+    collapsed: float = 0.9
+    other_starts: tuple[tuple[float, float], ...] = ()
+    interpolates: float = 1.5
+    much_noise: float | None = None
+    stage: int | None = None
+    restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
 
 @dataclass(frozen=True)
-class Learned:
-    """A fitted sparse model.
+class Fit:
+    """Where an optimiser ended.
 
     Attributes
     ----------
-    model : SparseModel
     values : dict
-        Of ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``, in internal units.
+        Of the model's parameters, in internal units.
     bound : float
-        In nats, of the residuals in internal units.
-    posterior : Posterior
-        In internal units.
-    statistics : list of SufficientStatistics
-        At ``values``, one for each set of inducing points.
+        In nats, in internal units; -inf if it could not be computed.
     loss_curve : list of float
-        Minus the bound per iteration.
+        Minus the bound per iteration, those of the fits it went on from first.
+    converged : bool
     message : str
-        What the user should know of how the fit ended; empty if it converged.
-    interrupted : bool
-        Whether Ctrl-C ended it.
+        What the user should know of how it ended; empty if it converged.
+    predictor : Predictor, optional
+        If q is not at its optimum for the values.
     """
 
-    model: SparseModel
     values: Values
     bound: float
-    posterior: Posterior
-    statistics: list[SufficientStatistics]
-    loss_curve: list[float]
-    message: str
-    interrupted: bool = False
+    loss_curve: list[float] = field(default_factory=list)
+    converged: bool = True
+    message: str = ""
+    predictor: Predictor | None = None
 
-    def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
-        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far.
-
-        ``weight`` multiplies the log likelihood of the earlier rows.
-        """
-        n_inducing = self.values["inducing_points"].shape[1]
-        new = self.model.statistics(self.values, rows.blocks(self.model.kernel, n_inducing))
-        statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        return replace(self, statistics=statistics).at_optimum()
-
-    def calibrated(self, table: ParameterTable, rows: Rows, n_folds: int, threads: BlockMap) -> Learned:
-        """The noise that is free from cross-validation, and q at its optimum for it."""
-        free = table["noise"].free
-        if not free.any():
-            return self
-        bounds = table["noise"].value_bounds()
-        noise = calibrated_noise(self.model, self.values, self.statistics, rows, bounds, n_folds, threads)
-        return replace(self, values=self.values | {"noise": np.where(free, noise, self.values["noise"])}).at_optimum()
-
-    def at_optimum(self) -> Learned:
-        """With q at its optimum for values and statistics, and the bound there."""
-        bound, posterior = self.model.at_optimum(self.values, self.statistics)
-        return replace(self, bound=bound, posterior=posterior)
+    @property
+    def n_iter(self) -> int:
+        return len(self.loss_curve)
 
 
-def learn(
-    model: SparseModel,
-    table: ParameterTable,
-    rows: Rows,
-    options: Options,
-    placement: Placement,
-    rng: np.random.RandomState,
-    report: Report | None = None,
-    cold: ParameterTable | None = None,
-) -> Learned:
-    """Maximise the bound from the table's starts, then from others; the best is kept.
+@dataclass(frozen=True)
+class Attempt:
+    """A start.
 
-    Parameters
+    Attributes
     ----------
-    model : SparseModel
-    table : ParameterTable
-        Of `start.starting_table`.
-    rows : Rows
-        In internal units.
-    options : Options
-    placement : Placement
-        Of the inducing points of other starts.
-    rng : RandomState
-        Draws the mini-batches and the other starts.
-    report : callable, default=None
-        report(iteration, minus the bound), once per iteration.
-    cold : ParameterTable, default=None
-        If the table starts where another fit ended: the start without it, for when that leads nowhere.
-
-    Returns
-    -------
-    learned : Learned
+    values : dict
+        First values of the parameters that are free.
+    until : int
+        The most iterations, those of ``after`` among them.
+    after : Fit, optional
+        The fit that it goes on from.
     """
-    if cold is not None and not np.array_equal(table["inducing_points"].start, cold["inducing_points"].start):
-        # Inducing points of another fit have found their places.
-        best = _learn_once(model, table, rows, options, rng, report)
-    else:
-        best = _learn_placing(model, table, rows, options, placement, rng, report)
-    if cold is not None and not best.interrupted and options.max_iter > 0:
-        alone = features_alone_bound(best.statistics[0], model.prior)
-        bound = np.inf if best.message else best.bound
-        if stuck(best.values["noise"], bound, rows.scatter(), alone):
-            best = _better(best, _learn_placing(model, cold, rows, options, placement, rng, report))
-    for _ in range(options.n_restarts if options.max_iter > 0 and table.size > 0 else 0):
-        if best.interrupted:
-            break
-        start = _other_start(model, table, rows, placement, rng)
-        other = _learn_placing(model, start, rows, options, placement, rng, report)
-        best = _better(best, other)
-    advice = [best.message, far_from_prior(model.prior, rows)]
-    if not best.interrupted and options.max_iter > 0 and table["noise"].free.any():
-        advice.append(nothing_learned(best.values["noise"], rows))
-    best = replace(best, message=" ".join(part for part in advice if part))
-    if options.noise_cv is None or best.interrupted:
+
+    values: Values
+    until: int
+    after: Fit | None = None
+
+    @property
+    def loss_curve(self) -> list[float]:
+        """Of the iterations before its first."""
+        return [] if self.after is None else self.after.loss_curve
+
+
+# Yields a start, is sent how the fit from there ended, and returns the best.
+Attempts = Generator[Attempt, Fit, Fit]
+
+
+def better(best: Fit | None, fit: Fit) -> Fit:
+    """The fit with the higher bound; of equals the later, which may have gone on from the other."""
+    return fit if best is None or fit.bound >= best.bound else best
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """The decisions: from where a fit starts, given how the fits before it ended.
+
+    Attributes
+    ----------
+    rules : Rules
+    table : ParameterTable
+        With first values and limits.
+    max_iter : int
+        Of each restart.
+    n_restarts : int
+    scatter : ndarray of shape (o,)
+        Variance of what the features leave over.
+    alone : float
+        The bound of the features without a Gaussian process.
+    interpolates : bool
+        Whether there are about as many inducing points as rows.
+    place : callable, optional
+        Values -> the same values with inducing points placed anew under their kernel; None leaves them.
+    restart : callable, optional
+        () -> first values drawn at random.
+    warm : dict, optional
+        First values from another fit.
+    """
+
+    rules: Rules
+    table: ParameterTable
+    max_iter: int
+    n_restarts: int
+    scatter: np.ndarray
+    alone: float = -np.inf
+    interpolates: bool = False
+    place: Callable[[Values], Values] | None = None
+    restart: Callable[[], Values] | None = None
+    warm: Values | None = None
+
+    def attempts(self) -> Attempts:
+        """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
+        first = self.table.values_at_start()
+        if self.warm is None:
+            best = yield from self._staged(first)
+        else:
+            # Inducing points that another fit moved have found their places.
+            again = self._staged if np.array_equal(*(v["inducing_points"] for v in (self.warm, first))) else self._once
+            best = yield from again(first | self.warm)
+            if self.max_iter > 0 and self.collapsed(best):
+                best = better(best, (yield from self._staged(first)))
+        if self.restart is not None and self.max_iter > 0 and self.table.size > 0:
+            for _ in range(self.n_restarts):
+                best = better(best, (yield from self._staged(self.restart())))
         return best
-    return best.calibrated(table, rows, options.noise_cv, options.threads)
+
+    def collapsed(self, fit: Fit) -> bool:
+        """Whether noise came to explain everything, or the kernel explains less than nothing would."""
+        if (fit.values["noise"] > self.rules.collapsed * self.scatter).any():
+            return True
+        # What has not ended yet may still be below.
+        return fit.converged and fit.bound < self.alone
+
+    def _staged(self, values: Values) -> Attempts:
+        """A fit whose inducing points are placed anew under the kernel that the first iterations learned.
+
+        (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
+        columns matter, and L-BFGS moves points a little, not across the data. A stage later the better of the two, the
+        fit from the new places and that which went on from the old ones, goes on.
+        """
+        stage = self.rules.stage
+        if (
+            self.place is None
+            or stage is None
+            or self.max_iter <= stage
+            or self.interpolates
+            or not self.table["hyperparameters"].free.any()
+        ):
+            return (yield from self._once(values))
+        first, until = (yield from self._unless_collapsed(values, stage)), min(2 * stage, self.max_iter)
+        best = better(first, (yield Attempt(self.place(first.values), until, first)))
+        if not first.converged:
+            best = better(best, (yield Attempt(first.values, until, first)))
+        if not best.converged and best.n_iter < self.max_iter:
+            best = better(best, (yield Attempt(best.values, self.max_iter, best)))
+        return best
+
+    def _once(self, values: Values) -> Attempts:
+        return (yield from self._unless_collapsed(values, self.max_iter))
+
+    def _unless_collapsed(self, values: Values, until: int) -> Attempts:
+        """A fit from these values; from other starts too where it may have ended in a bad optimum."""
+        best = yield Attempt(values, until)
+        if until == 0 or not self.table["noise"].free.any():
+            return best
+        if self.interpolates and self.rules.much_noise is not None:
+            best = better(best, (yield Attempt(moved(values, 1.0, self.rules.much_noise), until)))
+        for factors in self.rules.other_starts:
+            if not self.collapsed(best):
+                break
+            best = better(best, (yield Attempt(moved(values, *factors), until)))
+        return best
 
 
-def _better(best: Learned, other: Learned) -> Learned:
-    if other.bound > best.bound:
-        return other
-    return replace(best, interrupted=True, message=other.message) if other.interrupted else best
+def moved(values: Values, length_factor: float, noise_factor: float) -> Values:
+    """The same values with other hyperparameters and another noise."""
+    return values | {
+        "hyperparameters": length_factor * values["hyperparameters"],
+        "noise": noise_factor * values["noise"],
+    }
 
 
-def _other_start(
-    model: SparseModel, table: ParameterTable, rows: Rows, placement: Placement, rng: np.random.RandomState
-) -> ParameterTable:
-    """The same table with kernel, noise and inducing points elsewhere, within their bounds."""
-    return table.started_at(_placed(moved_start(table, rng), model, rows, placement, rng))
+def drawn(table: ParameterTable, rules: Rules, rng: np.random.RandomState) -> Values:
+    """The table's first values with kernel and noise elsewhere, within their limits."""
+    coordinates = table.coordinates(table.start())
+    for name, factor in rules.restart_factors.items():
+        reach = np.log(factor)
+        coordinates[name] = coordinates[name] + rng.uniform(-reach, reach, coordinates[name].shape)
+    return table.values(np.clip(table.flat(coordinates), *table.limits()))
 
 
-def _placed(values: Values, model: SparseModel, rows: Rows, placement: Placement, rng: np.random.RandomState) -> Values:
-    """The same values with inducing points placed under their kernel, alike for all groups.
+class Task(Protocol):
+    """A model to be fitted."""
 
-    Where clusters coincide there are fewer: the table then keeps those that it has.
+    @property
+    def strategy(self) -> Strategy:
+        """From where."""
+
+    @property
+    def monitor(self) -> Monitor:
+        """Told of each iteration."""
+
+    def minimise(self, attempt: Attempt) -> Fit:
+        """An optimiser's way from a start."""
+
+
+def search(task: Task) -> Fit:
+    """The best of all fits that the strategy asks for; after Ctrl-C, of those so far.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        If there is none yet.
     """
-    inputs = rows.sample(placement.sample_size, rng).inputs
-    points = placement.points(inputs, model.kernel, np.log(values["hyperparameters"]), rng)
-    return values | {"inducing_points": np.repeat(points[np.newaxis], len(model.groups), axis=0)}
-
-
-def _learn_placing(
-    model: SparseModel,
-    table: ParameterTable,
-    rows: Rows,
-    options: Options,
-    placement: Placement,
-    rng: np.random.RandomState,
-    report: Report | None = None,
-) -> Learned:
-    """`_learn_once`, with inducing points placed anew under the kernel that the first iterations learned.
-
-    (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
-    columns matter, and L-BFGS moves points a little, not across the data. A stage later the better of the two, the
-    fit from the new places and that which went on from the old ones, goes on. With Adam, and with about as many points
-    as rows, points stay.
-    """
-    anew, n_inducing = placement.anew, table["inducing_points"].start.shape[1]
-    if (
-        anew is None
-        or options.solver != "lbfgs"
-        or options.max_iter <= _STAGE
-        or interpolates(n_inducing, len(rows))
-        or not table["hyperparameters"].free.any()
-    ):
-        return _learn_once(model, table, rows, options, rng, report)
-
-    def go_on(learned: Learned, values: Values, until: int) -> Learned:
-        spent = len(learned.loss_curve)
-        part = replace(options, max_iter=min(until, options.max_iter), spent=spent)
-        later = None if report is None else lambda iteration, loss: report(spent + iteration, loss)
-        more = _learn_once(model, table.started_at(values), rows, part, rng, later)
-        return replace(more, loss_curve=learned.loss_curve + more.loss_curve)
-
-    first = _learn_once(model, table, rows, replace(options, max_iter=_STAGE), rng, report)
-    if first.interrupted:
-        return first
-    try:
-        values = _placed(first.values, model, rows, anew, rng)
-    except KeyboardInterrupt:
-        return replace(first, interrupted=True, message=interrupted(len(first.loss_curve)))
-    best = _better(first, go_on(first, values, 2 * _STAGE))
-    # Without a message it has converged.
-    if first.message and not best.interrupted:
-        best = _better(best, go_on(first, first.values, 2 * _STAGE))
-    unfinished = best.message and not best.interrupted and len(best.loss_curve) < options.max_iter
-    return go_on(best, best.values, options.max_iter) if unfinished else best
-
-
-def _learn_once(
-    model: SparseModel,
-    table: ParameterTable,
-    rows: Rows,
-    options: Options,
-    rng: np.random.RandomState,
-    report: Report | None = None,
-) -> Learned:
-    """Maximise the bound from the table's starts.
-
-    Parameters
-    ----------
-    model : SparseModel
-    table : ParameterTable
-        Of `start.starting_table`.
-    rows : Rows
-        In internal units.
-    options : Options
-    rng : RandomState
-        Draws the mini-batches.
-    report : callable, default=None
-        report(iteration, minus the bound), once per iteration.
-
-    Returns
-    -------
-    learned : Learned
-    """
-    n_rows = len(rows)
-    per_row = None if report is None else lambda iteration, loss: report(iteration, n_rows * loss)
-    if options.solver == "adam":
-        return _by_adam(model, table, rows, options, rng, per_row)
-    return _by_lbfgs(model, table, rows, options, per_row)
-
-
-def _by_adam(
-    model: SparseModel,
-    table: ParameterTable,
-    rows: Rows,
-    options: Options,
-    rng: np.random.RandomState,
-    report: Report | None,
-) -> Learned:
-    """Adam over all parameters, or over all but q; ``report`` is per row."""
-    n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
-    blocks = rows.blocks(model.kernel, n_inducing, options.threads)
-    elbo = ElboObjective(model, table, blocks, _NATURAL_RATES if options.natural_gradient else None)
-    start = elbo.table.start()
-    minimum = adam(
-        elbo.minibatch(rows.batches(model.kernel, options.batch_size, rng)),
-        start,
-        elbo.table.bounds(),
-        options.max_iter,
-        options.learning_rate,
-        options.tol / n_rows,
-        report,
-        elbo.pace,
-    )
-    # A mini-batch's loss does not tell which point is best: the bound on all rows does.
-    x, (bound, posterior, statistics) = start, elbo.solution(start)
-    first, reached = bound, bound if minimum.n_iter == 0 else -np.inf
-    for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
-        try:
-            solution = elbo.solution(other)
-        except NotPositiveDefiniteError:
-            continue
-        reached = max(reached, solution[0])
-        if solution[0] >= bound:
-            x, (bound, posterior, statistics) = other, solution
-    message = how_it_ended(minimum, options.max_iter, options.spent, options.tol)
-    fell = not reached >= first - max(options.tol, _ROUNDING * abs(first))
-    if fell and minimum.converged:
-        message = (
-            f"Adam ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters are "
-            "kept. Raise max_iter (steps become small only towards the end) or batch_size, or lower learning_rate (now "
-            f"{options.learning_rate})."
-        )
-    elif not minimum.interrupted and not minimum.converged:
-        message = (
-            f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
-            f"(now {options.learning_rate}), or raise batch_size (now {options.batch_size})."
-        )
-    values = {parameter.name: elbo.table.values(x)[parameter.name] for parameter in table.parameters}
-    curve = [n_rows * loss for loss in minimum.loss_curve]
-    return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
-
-
-def _by_lbfgs(
-    model: SparseModel,
-    table: ParameterTable,
-    rows: Rows,
-    options: Options,
-    report: Report | None,
-) -> Learned:
-    """L-BFGS over all parameters but q, which stays at its optimum; ``report`` is per row."""
-    n_rows, n_inducing = len(rows), table["inducing_points"].start.shape[1]
-    objective = BoundObjective(model, table, rows.blocks(model.kernel, n_inducing, options.threads))
-    minimum = lbfgs_unless_stuck(
-        objective,
-        table,
-        rows.scatter(),
-        options.max_iter - options.spent,
-        options.tol / n_rows,
-        alone=features_alone_bound(objective.blocks.linear, model.prior) / n_rows,
-        one_start=options.spent > 0,
-        may_interpolate=interpolates(n_inducing, n_rows),
-        report=report,
-    )
-    values = table.values(minimum.x)
-    statistics = model.statistics(values, objective.blocks)
-    bound, posterior = model.at_optimum(values, statistics)
-    bound = -minimum.loss * n_rows if np.isfinite(minimum.loss) else bound
-    curve = [n_rows * loss for loss in minimum.loss_curve]
-    message = how_it_ended(minimum, options.max_iter, options.spent, options.tol)
-    return Learned(model, values, bound, posterior, statistics, curve, message, minimum.interrupted)
+    best: Fit | None = None
+    attempts = task.strategy.attempts()
+    with task.monitor.keeping_the_best(), suppress(StopIteration):
+        attempt = next(attempts)
+        while True:
+            fit = task.minimise(attempt)
+            best = better(best, fit)
+            if task.monitor.stopped:
+                break
+            attempt = attempts.send(fit)
+    if best is None:
+        raise KeyboardInterrupt
+    return best

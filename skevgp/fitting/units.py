@@ -1,4 +1,4 @@
-"""Between the user's units and the internal ones, in which every number is of order one."""
+"""Between the user's units and the internal ones, in which every residual is of order one."""
 
 from __future__ import annotations
 
@@ -8,20 +8,19 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..inference.bounds import CoefficientPrior
-from ..inference.posterior import Posterior
+from ..inference.posterior import Predictor
 from ..rows.internal import Rows
 from ..rows.source import Moments, RawRows, Source
+from ..rows.threads import BlockMap
 from .start import features_alone, unit_of
 
 
 @dataclass(frozen=True)
-class Frame:
-    """What is subtracted from and divided out of the data before inference.
+class Units:
+    """What is subtracted from and divided out of the targets before inference.
 
     Attributes
     ----------
-    centre : ndarray of shape (d,)
-        Subtracted from the kernel's inputs.
     target_mean : ndarray of shape (o,)
         Subtracted from y; part of the model (0 unless y is normalised).
     target_unit : ndarray of shape (o,)
@@ -30,7 +29,6 @@ class Frame:
         In the user's units.
     """
 
-    centre: np.ndarray
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
@@ -39,28 +37,24 @@ class Frame:
     def of(
         cls,
         source: Source,
-        inputs: Moments,
         targets: Moments,
         target_mean: np.ndarray,
         coef_mean: np.ndarray,
         coef_scale: np.ndarray,
-    ) -> Frame:
-        """The frame of a training set, from its rows, moments of its columns, and the prior (o, p) of its weights."""
+    ) -> Units:
+        """The units of a training set, from its rows, its targets' moments, and the prior (o, p) of its weights."""
         reference, left_over = features_alone(source, target_mean, coef_mean, coef_scale)
         prior = CoefficientPrior(coef_mean, coef_scale, reference)
-        # The mean of equal numbers may round; what is left must then be 0, not a column of tiny numbers.
-        constant = inputs.highest - inputs.lowest <= 8.0 * np.finfo(float).eps * inputs.largest
-        centre = np.where(constant, inputs.lowest, inputs.mean)
-        return cls(centre, target_mean, unit_of(left_over, targets.largest), prior)
+        return cls(target_mean, unit_of(left_over, targets.largest), prior)
 
     def to_internal(self, raw: RawRows) -> RawRows:
-        """Centred inputs, features, and what the reference leaves of the targets, in its own units."""
+        """The same inputs and features, and what the reference leaves of the targets, in its own units."""
         left_over = raw.targets - self.target_mean - raw.features @ self.prior.offset.T
-        return RawRows(raw.inputs - self.centre, raw.features, left_over / self.target_unit)
+        return replace(raw, targets=left_over / self.target_unit)
 
-    def rows(self, source: Source) -> Rows:
+    def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
         """Rows in internal units."""
-        return Rows(source, self.to_internal)
+        return Rows(source, self.to_internal, threads=BlockMap() if threads is None else threads)
 
     def internal_prior(self) -> CoefficientPrior:
         """The prior for residuals in units of ``target_unit``."""
@@ -71,20 +65,6 @@ class Frame:
         """What one row of some outputs adds to the loss on the way to the user's units."""
         return float(np.log(self.target_unit[outputs]).sum())
 
-    def posterior(self, parts: Sequence[Posterior]) -> Posterior:
-        """Posteriors of consecutive outputs in internal units -> one in the user's, but for centre and target_mean."""
-        inducing, first = [], 0
-        for part in parts:
-            for group in part.inducing:
-                width = group.outputs.stop - group.outputs.start
-                inducing.append(replace(group, outputs=slice(first, first + width)))
-                first += width
-        return Posterior(
-            parts[0].kernel,
-            tuple(inducing),
-            np.concatenate([part.signal for part in parts]) * self.target_unit**2,
-            np.concatenate([part.noise for part in parts]) * self.target_unit**2,
-            self.prior,
-            tuple(mean for part in parts for mean in part.mean),
-            tuple(root for part in parts for root in part.root),
-        )
+    def predictor(self, parts: Sequence[Predictor]) -> Predictor:
+        """Predictors of consecutive outputs in internal units -> one in the user's."""
+        return Predictor.joined(parts, self.target_unit, self.prior.offset, self.target_mean)

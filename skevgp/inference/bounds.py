@@ -12,13 +12,13 @@ sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..rows.blocks import LinearStatistics
-from .statistics import SufficientStatistics
+from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening
 
 PosteriorFamily = Literal["full", "diagonal"]
 
@@ -68,34 +68,34 @@ class WhitenedPosterior:
 
 
 @dataclass(frozen=True)
-class Residuals:
-    """What the posterior mean leaves over, e = r - P mean, summed over rows.
+class Group:
+    """One set of inducing points and the outputs that it serves, at one point of the parameters.
 
     Attributes
     ----------
-    squares : ndarray of shape (o,)
-        eᵀe of each output.
-    VE : ndarray of shape (m, o)
-        V e of each output.
+    outputs : slice
+        Which of the model's outputs, o of them.
+    whitening : Whitening
+        Of the m inducing points.
+    statistics : SufficientStatistics
+        Of these outputs.
+    signal, noise : ndarray of shape (o,)
+        s² and σ².
+    prior : CoefficientPrior
+        Of these outputs, with p features.
     """
 
-    squares: np.ndarray
-    VE: np.ndarray
+    outputs: slice
+    whitening: Whitening
+    statistics: SufficientStatistics
+    signal: np.ndarray
+    noise: np.ndarray
+    prior: CoefficientPrior
 
 
-@dataclass(frozen=True)
-class StatisticsGradient:
-    """Gradients of a bound in the statistics of these names, and in L; ``VE`` multiplies V e, not V r."""
-
-    VV: np.ndarray
-    VH: np.ndarray
-    VE: np.ndarray
-    unexplained: float
-    L: np.ndarray
-
-
-def projected(statistics: SufficientStatistics, index: int, signal: float, scale: np.ndarray) -> tuple[Any, Any]:
-    """PᵀP (m + p, m + p) and Pᵀr (m + p,) of one output."""
+def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
+    """PᵀP (m + p, m + p) and Pᵀr (m + p,) of a group's output."""
+    statistics, signal, scale = group.statistics, group.signal[index], group.prior.scale[index]
     m, s = len(statistics.VV), np.sqrt(signal)
     size = m + len(scale)
     PP, Pr = np.empty((size, size)), np.empty(size)
@@ -109,35 +109,20 @@ def projected(statistics: SufficientStatistics, index: int, signal: float, scale
     return PP, Pr
 
 
-def optimal_posterior(
-    statistics: SufficientStatistics, index: int, signal: float, noise: float, prior: CoefficientPrior
-) -> WhitenedPosterior:
-    """The posterior of ω of one output given the kernel (Titsias 2009, eq. 10, with explicit features).
-
-    Parameters
-    ----------
-    statistics : SufficientStatistics
-    index : int
-        The output.
-    signal, noise : float
-        s² and σ².
-    prior : CoefficientPrior
-
-    Returns
-    -------
-    posterior : WhitenedPosterior
+def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
+    """The posterior of ω of a group's output given the kernel (Titsias 2009, eq. 10, with explicit features).
 
     Raises
     ------
     NotPositiveDefiniteError
         If the sums are not finite.
     """
-    m = len(statistics.VV)
-    B, g = projected(statistics, index, signal, prior.scale[index])
+    m, noise = len(group.statistics.VV), group.noise[index]
+    B, g = projected(group, index)
     B /= noise
     diagonal_of(B)[...] += 1.0
     g /= noise
-    g[m:] -= prior.reference[index]
+    g[m:] -= group.prior.reference[index]
     root = jittered_cholesky(B)
     root_inv = triangular_inverse(root)
     return WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g))
@@ -156,26 +141,22 @@ class BoundAtOptimum:
 
         bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v|²)/σ²].
 
-    With e summed row by row (`pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives the same
-    sums as differences of the statistics.
+    With e summed row by row (`statistics.pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives
+    the same sums as differences of the statistics.
 
     Parameters
     ----------
-    statistics : SufficientStatistics
-        With m inducing points, p features and o outputs.
-    signal, noise : ndarray of shape (o,)
-        s² and σ².
-    prior : CoefficientPrior
-    family : {"full", "diagonal"}, default="full"
-    L, L_inv : ndarray of shape (m, m)
-        Cholesky factor of k̃(X_m, X_m) and its inverse; only the diagonal family needs them.
+    group : Group
+    family : {"full", "diagonal"}
 
     Attributes
     ----------
     posteriors : list of WhitenedPosterior
         One per output.
-    fitted : ndarray of shape (m + p, o)
-        e = r - [V; Hᵀ]ᵀ fitted.
+    weights : ndarray of shape (m + p, o)
+        e = r - [V; Hᵀ]ᵀ weights.
+    gradient : StatisticsGradient
+        Of the bound.
 
     Raises
     ------
@@ -183,20 +164,12 @@ class BoundAtOptimum:
         If the sums are not finite.
     """
 
-    def __init__(
-        self,
-        statistics: SufficientStatistics,
-        signal: np.ndarray,
-        noise: np.ndarray,
-        prior: CoefficientPrior,
-        family: PosteriorFamily = "full",
-        L: np.ndarray | None = None,
-        L_inv: np.ndarray | None = None,
-    ):
+    def __init__(self, group: Group, family: PosteriorFamily):
+        statistics, signal, noise, prior = group.statistics, group.signal, group.noise, group.prior
         m, p = statistics.VH.shape
-        self.statistics, self.signal, self.noise, self.prior = statistics, signal, noise, prior
+        self.group = group
         self.posteriors: list[WhitenedPosterior] = []
-        self.fitted = np.empty((m + p, len(signal)))
+        self.weights = np.empty((m + p, len(signal)))
         self.gradient = StatisticsGradient(
             np.zeros((m, m)),
             np.zeros((m, p)),
@@ -208,9 +181,9 @@ class BoundAtOptimum:
         self._value, self._log_signal, self._log_noise = np.empty((3, len(signal)))
         for o, (s2, sigma2) in enumerate(zip(signal, noise, strict=True)):
             s, scale = np.sqrt(s2), prior.scale[o]
-            q = optimal_posterior(statistics, o, s2, sigma2, prior)
+            q = optimal_posterior(group, o)
             self.posteriors.append(q)
-            self.fitted[:m, o], self.fitted[m:, o] = s * q.mean[:m], scale * q.mean[m:]
+            self.weights[:m, o], self.weights[m:, o] = s * q.mean[:m], scale * q.mean[m:]
             log_det = 2.0 * float(np.log(diagonal_of(q.root)).sum())
             penalty = float(q.mean @ q.mean)
             if p:
@@ -219,9 +192,7 @@ class BoundAtOptimum:
             value = -0.5 * (statistics.n_rows * (LOG_2PI + np.log(sigma2)) + log_det + penalty + unexplained)
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
-                assert L is not None
-                assert L_inv is not None
-                gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det, B_bar, L, L_inv)
+                gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det, B_bar, group.whitening)
                 value -= gap
                 B_bar -= gap_B_bar
                 self.gradient.L[...] -= gap_L_bar
@@ -238,8 +209,8 @@ class BoundAtOptimum:
 
     def residuals(self) -> Residuals:
         """eᵀe and V e from the statistics: good while the signal is not above about 1e4 times the noise."""
-        statistics, m = self.statistics, len(self.statistics.VV)
-        f, b = self.fitted[:m], self.fitted[m:]
+        statistics, m = self.group.statistics, len(self.group.statistics.VV)
+        f, b = self.weights[:m], self.weights[m:]
         VE = statistics.VR - statistics.VV @ f - statistics.VH @ b
         HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
         squares = statistics.RR - ((statistics.VR + VE) * f).sum(axis=0) - ((statistics.HR + HE) * b).sum(axis=0)
@@ -247,12 +218,13 @@ class BoundAtOptimum:
 
     def value(self, residuals: Residuals) -> float:
         """The bound, in nats."""
-        return float((self._value - 0.5 * residuals.squares / self.noise).sum())
+        return float((self._value - 0.5 * residuals.squares / self.group.noise).sum())
 
-    def log_gradients(self, residuals: Residuals) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients (o,) in log s² and log σ²."""
-        from_mean = 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
-        return self._log_signal + from_mean, self._log_noise + 0.5 * residuals.squares / self.noise
+    def finish(self, residuals: Residuals) -> tuple[float, dict[str, np.ndarray]]:
+        """The bound, and its gradients (o,) in log s² and log σ²."""
+        signal = self._log_signal + 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
+        noise = self._log_noise + 0.5 * residuals.squares / self.group.noise
+        return self.value(residuals), {"signal": signal, "noise": noise}
 
 
 def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: CoefficientPrior) -> float:
@@ -261,21 +233,40 @@ def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: C
     if prior.scale.shape[1] == 0:
         return float(-0.5 * sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)).sum())
     o, p = prior.scale.shape
-    nothing = SufficientStatistics(
-        sums.n_rows, np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0
+    empty = np.zeros((0, 0))
+    statistics = SufficientStatistics(
+        sums.n_rows, empty, np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0
     )
-    bound = BoundAtOptimum(nothing, np.ones(o), noise, prior)
+    bound = BoundAtOptimum(
+        Group(slice(0, o), Whitening(None, empty, empty), statistics, np.ones(o), noise, prior), "full"
+    )
     return bound.value(bound.residuals())
 
 
+def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
+    m = len(L_inv)
+    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
+    return -np.log(precision), -np.log(np.diagonal(B)[m:])
+
+
+def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
+    """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
+    m = len(L_inv)
+    root = np.zeros((m + len(log_w), m + len(log_w)))
+    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
+    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
+    return root
+
+
 def _diagonal_gap(
-    q: WhitenedPosterior, log_det: float, log_det_bar: np.ndarray, L: np.ndarray, L_inv: np.ndarray
+    q: WhitenedPosterior, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
 ) -> tuple[float, np.ndarray, np.ndarray]:
     """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and L; ``log_det_bar`` is -½ B⁻¹.
 
     In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
     """
-    m = len(L)
+    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
     B_vv = q.B[:m, :m]
     precision = L_inv.T @ B_vv @ L_inv
     f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(q.B)[m:]

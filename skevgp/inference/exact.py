@@ -27,8 +27,8 @@ from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangu
 from ..rows.source import RawRows
 from .bounds import LOG_2PI, CoefficientPrior
 from .model import Values
-from .posterior import InducingSet, Posterior
-from .statistics import Kernel
+from .posterior import Predictor, PredictorGroup
+from .statistics import Kernel, Whitening
 
 
 class OutputGivenKernel:
@@ -103,12 +103,12 @@ class OutputGivenKernel:
         P *= 0.5 * self.signal
         return P, 0.5 * (squares - n + explained) - noise_bar, noise_bar
 
-    def posterior(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """L⁻¹ (n, n), and of ω = (v, w): its mean (n + p,) and a root (max(p, 1), n + p) of its covariance."""
+    def posterior(self) -> tuple[np.ndarray, np.ndarray]:
+        """Of ω = (v, w): its mean (n + p,) and a root (max(p, 1), n + p) of its covariance."""
         root = np.zeros((1, len(self.L)))
         if len(self.R):
             root = np.hstack([-(self.W @ self.R_inv).T, self.R_inv.T])
-        return self.L_inv, np.concatenate([self.left_over, self.w]), root
+        return np.concatenate([self.left_over, self.w]), root
 
 
 @dataclass(frozen=True)
@@ -160,12 +160,22 @@ class ExactModel:
         gradient["hyperparameters"], _ = at.finish_pullback(at.start_pullback(), K_bar)
         return total, gradient
 
-    def posterior(self, values: Values) -> Posterior:
+    def predictor(self, values: Values) -> Predictor:
         """In internal units; the rows are its inducing points."""
-        _, outputs = self.outputs(values)
-        L_inv, mean, root = zip(*(output.posterior() for output in outputs), strict=True)
-        hyperparameters = np.log(values["hyperparameters"])
-        sets = tuple(
-            InducingSet(hyperparameters, self.rows.inputs, own, slice(o, o + 1)) for o, own in enumerate(L_inv)
-        )
-        return Posterior(self.kernel, sets, values["signal"], values["noise"], self.prior, mean, root)
+        at, outputs = self.outputs(values)
+        groups = []
+        for o, output in enumerate(outputs):
+            own, (mean, root) = slice(o, o + 1), output.posterior()
+            groups.append(
+                PredictorGroup.of(
+                    own,
+                    values["hyperparameters"],
+                    self.rows.inputs,
+                    Whitening(at, output.L, output.L_inv),
+                    values["signal"][own],
+                    self.prior.scale[own],
+                    [mean],
+                    [root],
+                )
+            )
+        return Predictor(self.kernel, tuple(groups), values["noise"], self.prior.offset, np.zeros(len(groups)))

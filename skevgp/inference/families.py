@@ -2,7 +2,7 @@
 
 Per output q(ω) = N(mean, S), in the whitened coordinates of `bounds`. Its spread enters the loss (the paper's eq. elbo)
 through ½ [Tr((I + σ⁻² PᵀP) S) - log|S|], P = [s Vᵀ, H diag(c)]. The rows of a mini-batch count N/n times: the same as
-a noise variance of σ² n/N, which is what ``noise`` is in this module.
+a noise variance of σ² n/N, which is what a group's ``noise`` is in this module.
 """
 
 from __future__ import annotations
@@ -15,33 +15,7 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..optimizers.parameters import Parameter
-from .bounds import CoefficientPrior, WhitenedPosterior, projected
-from .model import Values, diagonal_root, log_variances
-from .statistics import SufficientStatistics
-
-
-@dataclass(frozen=True)
-class Group:
-    """One set of inducing points at one point of the parameters: the rows' statistics, and the outputs it serves.
-
-    Attributes
-    ----------
-    outputs : slice
-    statistics : SufficientStatistics
-        Of these outputs.
-    signal, noise : ndarray of shape (o,)
-    prior : CoefficientPrior
-        Of these outputs.
-    L, L_inv : ndarray of shape (m, m)
-    """
-
-    outputs: slice
-    statistics: SufficientStatistics
-    signal: np.ndarray
-    noise: np.ndarray
-    prior: CoefficientPrior
-    L: np.ndarray
-    L_inv: np.ndarray
+from .bounds import Group, WhitenedPosterior, diagonal_root, log_variances, projected
 
 
 @dataclass
@@ -72,6 +46,9 @@ class SpreadTerms:
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
         VV, VH, L = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
         return cls(0.0, VV, VH, L, np.zeros(o), np.zeros(o), np.zeros((o, k)))
+
+
+Values = dict[str, np.ndarray]
 
 
 class Family(Protocol):
@@ -123,7 +100,7 @@ class DiagonalFamily:
         return list(values["mean"])
 
     def terms(self, values: Values, group: Group) -> SpreadTerms:
-        statistics, L_inv, m = group.statistics, group.L_inv, len(group.L)
+        statistics, L_inv, m = group.statistics, group.whitening.L_inv, len(group.whitening.L)
         log_variance = values["spread"][group.outputs]
         variance = np.exp(log_variance)
         d = variance[:, :m]
@@ -139,7 +116,7 @@ class DiagonalFamily:
         weighted, total = (ratio * d).sum(axis=0), d.sum(axis=0)
         LD = L_inv * weighted
         L_bar = -(L_inv.T @ (VVL * weighted + L_inv * total) @ L_inv.T)
-        diagonal = np.diagonal(group.L)
+        diagonal = np.diagonal(group.whitening.L)
         diagonal_of(L_bar)[...] += len(d) / diagonal
         value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * np.log(diagonal).sum()
         return SpreadTerms(
@@ -179,7 +156,7 @@ def _add_covariance(
     penalty : float
         Tr(S) - log|S|.
     """
-    m, s = len(group.L), np.sqrt(group.signal[o])
+    m, s = len(group.whitening.L), np.sqrt(group.signal[o])
     terms.value += 0.5 * (float(rows.sum()) + penalty)
     terms.VV += (0.5 * group.signal[o] / group.noise[o]) * S_v[:, :m]
     terms.VH += (s / group.noise[o]) * S_v[:, m:] * group.prior.scale[o]
@@ -224,7 +201,7 @@ class FullFamily:
             output = group.outputs.start + o
             T = self._triangular(coordinates)
             R = self._start[output] @ T
-            PP, _ = projected(group.statistics, o, group.signal[o], group.prior.scale[o])
+            PP, _ = projected(group, o)
             PPR = PP @ R
             PPR /= group.noise[o]
             log_det = self._start_log_det[output] + 2.0 * coordinates[:size].sum()
@@ -285,9 +262,9 @@ class NaturalFamily:
 
     def mean(self, values: Values, group: Group) -> np.ndarray:
         """Move the state of a group's outputs by a step, and return their means."""
-        m = len(group.L)
+        m = len(group.whitening.L)
         for o, output in enumerate(range(group.outputs.start, group.outputs.stop)):
-            PP, Pr = projected(group.statistics, o, group.signal[o], group.prior.scale[o])
+            PP, Pr = projected(group, o)
             precision, shift = self.precision[output], self.shift[output]
             PP *= self.rate / group.noise[o]
             diagonal_of(PP)[...] += self.rate
@@ -311,7 +288,7 @@ class NaturalFamily:
         for o, output in enumerate(range(group.outputs.start, group.outputs.stop)):
             root_inv = self._root_inv[output]
             S = symmetric_inverse(root_inv)
-            PP, _ = projected(group.statistics, o, group.signal[o], group.prior.scale[o])
+            PP, _ = projected(group, o)
             rows = np.einsum("ij,ij->i", PP, S) / group.noise[o]
             log_det = 2.0 * np.log(np.diagonal(root_inv)).sum()
             _add_covariance(terms, o, group, S[:m], rows, float(np.trace(S)) - log_det)

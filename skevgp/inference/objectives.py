@@ -1,15 +1,74 @@
-"""What L-BFGS minimises: θ -> (loss, gradient). (Adam: `elbo`.)"""
+"""The two functions that are minimised: minus the bound at the optimum of q, and the paper's loss of mini-batches."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterator
+from functools import partial
+from typing import Protocol
+
 import numpy as np
 
-from .._linalg import cholesky_pullback
 from ..optimizers.parameters import ParameterTable
 from ..rows.blocks import Blocks
-from .bounds import Residuals
-from .model import SparseModel
-from .statistics import collect, pull_back
+from .bounds import LOG_2PI, BoundAtOptimum, Group
+from .families import DiagonalFamily, Family, FullFamily, NaturalFamily
+from .model import SparseModel, Values
+from .posterior import Predictor
+from .statistics import Residuals, StatisticsGradient, pull_back
+
+
+class Terms(Protocol):
+    """A scalar of a group of outputs, as far as the statistics of the rows decide it."""
+
+    @property
+    def weights(self) -> np.ndarray:
+        """(m + p, o): the mean of q leaves e = r - [V; Hᵀ]ᵀ weights of each row."""
+
+    @property
+    def gradient(self) -> StatisticsGradient:
+        """Of the scalar."""
+
+    def finish(self, residuals: Residuals) -> tuple[float, Values]:
+        """The scalar, and its gradients in what belongs to the group's outputs: (o, ...) each, by parameter."""
+
+
+def evaluate(
+    model: SparseModel, values: Values, rows: Blocks, terms_of: Callable[[Group], Terms]
+) -> tuple[float, Values]:
+    """A scalar of the model and some rows, summed over outputs, and its gradient: two passes for each set of points.
+
+    Parameters
+    ----------
+    model : SparseModel
+    values : dict
+    rows : Blocks
+    terms_of : callable
+        What the scalar is, given a group's statistics.
+
+    Returns
+    -------
+    total : float
+    gradient : dict
+        In the values; in the logarithms of hyperparameters, signal and noise.
+
+    Raises
+    ------
+    NotPositiveDefiniteError
+        If a matrix is not finite.
+    """
+    total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
+    for index, group in enumerate(model.groups_on(values, rows)):
+        terms = terms_of(group)
+        (hyper_bar, Z_bar), residuals = pull_back(
+            rows, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
+        )
+        value, own = terms.finish(residuals)
+        total += value
+        gradient["hyperparameters"] += hyper_bar
+        gradient["inducing_points"][index] += Z_bar
+        for name, bar in own.items():
+            gradient[name][group.outputs] = bar
+    return total, gradient
 
 
 class BoundObjective:
@@ -24,37 +83,135 @@ class BoundObjective:
 
     def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
         self.model, self.table, self.blocks = model, table, blocks
+        self._terms_of = partial(BoundAtOptimum, family=model.family)
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        values, model = self.table.values(flat), self.model
-        units = self.table["inducing_points"].unit
-        total, n_rows = 0.0, self.blocks.linear.n_rows
-        gradient = {name: np.zeros_like(value) for name, value in values.items()}
-        for index, (outputs, (at, L, L_inv)) in enumerate(zip(model.groups, model.factors(values), strict=True)):
-            statistics = collect(self.blocks, at, L_inv)
-            bound = model.bound(statistics, outputs, values["signal"], values["noise"], L, L_inv)
-            bar = bound.gradient
-            rows_bar, L_bar, squares, VE = pull_back(
-                self.blocks,
-                at,
-                L_inv,
-                statistics,
-                bar.VV,
-                bar.VH,
-                self._all_outputs(bar.VE, outputs),
-                bar.unexplained,
-                self._all_outputs(bound.fitted, outputs),
-            )
-            residuals = Residuals(squares[outputs], VE[:, outputs])
-            hyper_bar, Z_bar = at.finish_pullback(rows_bar, cholesky_pullback(L, L_inv, L_bar + bar.L))
-            total += bound.value(residuals)
-            gradient["hyperparameters"] += hyper_bar
-            gradient["inducing_points"][index] += Z_bar * units
-            gradient["signal"][outputs], gradient["noise"][outputs] = bound.log_gradients(residuals)
-        return -total / n_rows, -self.table.flat(gradient) / n_rows
+        bound, gradient = evaluate(self.model, self.table.values(flat), self.blocks, self._terms_of)
+        n_rows = self.blocks.linear.n_rows
+        return -bound / n_rows, -self.table.gradient(gradient) / n_rows
 
-    def _all_outputs(self, part: np.ndarray, outputs: slice) -> np.ndarray:
-        """Columns of some outputs (., o_group) -> of all (., o), with zeros for the others."""
-        whole = np.zeros((len(part), len(self.model.prior.mean)))
-        whole[:, outputs] = part
-        return whole
+
+class ElboObjective:
+    """(θ, q) -> the paper's loss (its eq. elbo) of a mini-batch (its appendix C), per row, and its gradient.
+
+    Parameters
+    ----------
+    model : SparseModel
+    table : ParameterTable
+        Of the parameters without q.
+    blocks : Blocks
+        All rows.
+    natural_rates : (float, float), default=None
+        If given, q (of the full family) moves by natural gradients of these lengths, the first and the least, and is no
+        part of θ.
+
+    Attributes
+    ----------
+    table : ParameterTable
+        Of all that an optimiser moves.
+    """
+
+    def __init__(
+        self,
+        model: SparseModel,
+        table: ParameterTable,
+        blocks: Blocks,
+        natural_rates: tuple[float, float] | None = None,
+    ):
+        self.model, self.blocks, self.n_rows = model, blocks, blocks.linear.n_rows
+        start = table.values_at_start()
+        optima, factors = [], []
+        for group in model.groups_on(start, blocks):
+            of_group = BoundAtOptimum(group, model.family).posteriors
+            optima += of_group
+            factors += [group.whitening.L_inv] * len(of_group)
+        self.natural = None if natural_rates is None else NaturalFamily(optima, *natural_rates)
+        self.family: Family
+        if self.natural is not None:
+            self.family = self.natural
+        else:
+            self.family = FullFamily(optima) if model.family == "full" else DiagonalFamily(optima, factors)
+        # A step of w should move the prediction as much as a step of v does.
+        reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH) / self.n_rows)
+        m = start["inducing_points"].shape[1]
+        unit = np.hstack([np.ones((len(reach), m)), 1.0 / np.where(reach > 0.0, reach, 1.0)])
+        self.table = ParameterTable([*table.parameters, *self.family.parameters(unit)])
+
+    def minibatch(self, batches: Iterator[Blocks]) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
+        """X -> (loss, gradient) of the next batch, per row of the whole data."""
+        return lambda x: self.evaluate(x, next(batches))
+
+    def pace(self, share: float) -> None:
+        """Told the size of Adam's next step as a share of its first, shorten the natural gradients as much."""
+        if self.natural is not None:
+            self.natural.pace(share)
+
+    def evaluate(self, x: np.ndarray, rows: Blocks) -> tuple[float, np.ndarray]:
+        """The loss of some rows that stand for all, per row, and its gradient (size,); x is of the same size."""
+        values = self.table.values(x)
+        # Rows that count N/n times: a noise variance of σ² n/N.
+        counted = values | {"noise": values["noise"] * (rows.linear.n_rows / self.n_rows)}
+        loss, gradient = evaluate(self.model, counted, rows, lambda group: _ElboTerms(self, values, group))
+        loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
+        return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
+
+    def solution(self, x: np.ndarray) -> tuple[float, Predictor]:
+        """The bound on all rows and the predictor at a point.
+
+        A q that moves by natural gradients takes a last one, of length 1, on all rows: to its optimum.
+        """
+        values = self.table.values(x)
+        if self.natural is not None:
+            self.natural.forget()
+        bound = -self.evaluate(x, self.blocks)[0] * self.n_rows
+        L_inv = [
+            whitening.L_inv
+            for outputs, whitening in zip(self.model.groups, self.model.whitenings(values), strict=True)
+            for _ in range(outputs.start, outputs.stop)
+        ]
+        return bound, self.model.predictor(values, self.family.means(values), self.family.roots(values, L_inv))
+
+
+class _ElboTerms:
+    """The paper's loss of a group of outputs.
+
+    q's mean is whitened (a = s L v); its spread is as its family says. With e = r - P mean, summed row by row, and with
+    the rows of a batch counted N/n times (in the group's noise), the loss of each output is
+
+        ½ [N log 2πσ² + (eᵀe + s² Σ(k̃ - |v|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`;
+
+    the first term, with the noise as it is, is added for all outputs at once.
+    """
+
+    def __init__(self, elbo: ElboObjective, values: Values, group: Group):
+        self._group, self._n_rows, m = group, elbo.n_rows, len(group.whitening.L)
+        self._mean = elbo.family.mean(values, group)
+        self._spread = elbo.family.terms(values, group)
+        self._has_parameters = "mean" in values
+        f, b = np.sqrt(group.signal) * self._mean[:, :m].T, (group.prior.scale * self._mean[:, m:]).T
+        self.weights = np.vstack([f, b])
+        self._ratio = group.signal / group.noise
+        self.gradient = StatisticsGradient(
+            self._spread.VV, self._spread.VH, -f / group.noise, 0.5 * self._ratio.sum(), self._spread.L
+        )
+
+    def finish(self, residuals: Residuals) -> tuple[float, Values]:
+        """The loss, and its gradients (o, ...) in log s², log σ² and the parameters of q."""
+        group, statistics, spread, m = self._group, self._group.statistics, self._spread, len(self._group.whitening.L)
+        f, b = self.weights[:m], self.weights[m:]
+        shift = self._mean.copy()
+        shift[:, m:] += group.prior.reference
+        unexplained = self._ratio * statistics.unexplained
+        data = residuals.squares / group.noise + unexplained
+        loss = 0.5 * float(data.sum() + np.vdot(shift, shift) - shift.size) + spread.value
+        from_mean = 0.5 * np.einsum("mo,mo->o", f, residuals.VE) / group.noise
+        gradient = {
+            "signal": 0.5 * unexplained - from_mean + spread.log_signal,
+            "noise": 0.5 * (self._n_rows - data) + spread.log_noise,
+        }
+        if self._has_parameters:
+            HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
+            shift[:, :m] -= (residuals.VE * (np.sqrt(group.signal) / group.noise)).T
+            shift[:, m:] -= (HE / group.noise).T * group.prior.scale
+            gradient |= {"mean": shift, "spread": spread.spread}
+        return loss, gradient

@@ -1,77 +1,140 @@
-"""The fitted model: mean, variance, covariance and coefficients, in the user's units."""
+"""The fitted model, frozen: all that predictions need, and nothing else."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from functools import cached_property
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .bounds import CoefficientPrior
-from .statistics import Kernel, KernelAt
+from .statistics import Kernel, Whitening
 
 # Of the spread of all outputs at once.
 _PREDICTED_NUMBERS = 2**20
 
 
 @dataclass(frozen=True)
-class InducingSet:
-    """Inducing points, the covariance that they belong to, and the outputs that they serve.
+class PredictorGroup:
+    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has the mean ``mean @ P`` and the spread ``root @ P``.
 
     Attributes
     ----------
+    outputs : slice
+        o of them.
     hyperparameters : ndarray of shape (n_hyper,)
         Of k̃.
     points : ndarray of shape (m, d)
-        In the kernel's (centred) inputs.
-    L_inv : ndarray of shape (m, m)
-        Inverse of the Cholesky factor of k̃(X_m, X_m).
-    outputs : slice
+    whitening : Whitening
+        Of k̃ at the points.
+    signal : ndarray of shape (o,)
+        s².
+    mean : ndarray of shape (o, m + p)
+    root : ndarray of shape (o, k, m + p)
+        The variance of g(x) is |root @ P|² and what the points leave of s² k̃(x, x); k is m + p, or less in the exact
+        model.
     """
 
+    outputs: slice
     hyperparameters: np.ndarray
     points: np.ndarray
-    L_inv: np.ndarray
-    outputs: slice
+    whitening: Whitening
+    signal: np.ndarray
+    mean: np.ndarray
+    root: np.ndarray
+
+    @classmethod
+    def of(
+        cls,
+        outputs: slice,
+        hyperparameters: np.ndarray,
+        points: np.ndarray,
+        whitening: Whitening,
+        signal: np.ndarray,
+        scale: np.ndarray,
+        mean: Sequence[np.ndarray],
+        root: Sequence[np.ndarray],
+    ) -> PredictorGroup:
+        """From q(ω) of each output, ω = (v, w) whitened as in `bounds`, with the prior's scales (o, p)."""
+        s = np.broadcast_to(np.sqrt(signal)[:, np.newaxis], (len(signal), len(points)))
+        # [s; c] turns [V; Hᵀ] into Pᵀ of each output.
+        scales = np.hstack([s, scale])
+        return cls(
+            outputs,
+            hyperparameters,
+            points,
+            whitening,
+            signal,
+            np.array(mean) * scales,
+            np.array(root) * scales[:, np.newaxis],
+        )
+
+    def scaled(self, factor: np.ndarray) -> PredictorGroup:
+        """The same group for outputs in other units: y times ``factor`` (o,)."""
+        by = factor[:, np.newaxis]
+        return replace(self, signal=self.signal * factor**2, mean=self.mean * by, root=self.root * by[:, np.newaxis])
+
+    def project(self, prepared: object, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""
+        m = len(self.points)
+        P = np.empty((m + features.shape[1], len(features)))
+        _, V = self.whitening.project(prepared, out=P[:m])
+        P[m:] = features.T
+        return P, self.whitening.unexplained(prepared, V)
 
 
 @dataclass(frozen=True)
-class Posterior:
-    """q(ω) of each output, ω = (v, w) whitened as in `bounds`, and what turns it into predictions.
+class Predictor:
+    """Mean, variance and covariance of the noise-free g(x), and the weights (the paper's eq. prediction, with C free).
 
     Attributes
     ----------
     kernel : Kernel
         k̃.
-    inducing : tuple of InducingSet
-    signal, noise : ndarray of shape (o,)
-        s² and σ².
-    prior : CoefficientPrior
-    mean : tuple of o ndarrays of shape (m + p,)
-        E[ω].
-    root : tuple of o ndarrays of shape (m + p, m + p)
-        R with Cov[ω] = Rᵀ R; of lower rank in the exact model.
+    groups : tuple of PredictorGroup
+        Of all outputs, in their order.
+    noise : ndarray of shape (o,)
+        σ².
+    offset : ndarray of shape (o, p)
+        What the groups' weights of features are added to.
+    intercept : ndarray of shape (o,)
+        What is added to the mean.
     """
 
     kernel: Kernel
-    inducing: tuple[InducingSet, ...]
-    signal: np.ndarray
+    groups: tuple[PredictorGroup, ...]
     noise: np.ndarray
-    prior: CoefficientPrior
-    mean: tuple[np.ndarray, ...]
-    root: tuple[np.ndarray, ...]
+    offset: np.ndarray
+    intercept: np.ndarray
 
-    @cached_property
+    @classmethod
+    def joined(
+        cls, parts: Sequence[Predictor], unit: np.ndarray, offset: np.ndarray, intercept: np.ndarray
+    ) -> Predictor:
+        """Predictors of consecutive outputs as one, each output times ``unit``, with another offset and intercept."""
+        groups, first = [], 0
+        for part in parts:
+            for group in part.groups:
+                outputs = slice(first, first + len(group.signal))
+                groups.append(replace(group.scaled(unit[outputs]), outputs=outputs))
+                first = outputs.stop
+        noise = np.concatenate([part.noise for part in parts]) * unit**2
+        return cls(parts[0].kernel, tuple(groups), noise, offset, intercept)
+
+    @property
     def rows_at_once(self) -> int:
         """How many rows to predict at once, so that memory stays small and products are large."""
-        stacked = sum(len(mean) for mean in self.mean)
+        stacked = sum(group.mean.size for group in self.groups)
         return int(np.clip(_PREDICTED_NUMBERS // stacked, 256, 4096))
+
+    @property
+    def signal(self) -> np.ndarray:
+        """s² of each output, (o,)."""
+        return np.concatenate([group.signal for group in self.groups])
 
     def predict(
         self, inputs: np.ndarray, features: np.ndarray, return_variance: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Mean and variance of the noise-free g(x) (the paper's eq. prediction, with C free).
+        """Mean and variance of the noise-free g(x).
 
         Parameters
         ----------
@@ -87,95 +150,42 @@ class Posterior:
         variance : ndarray of shape (n, o), or None
         """
         prepared, means, variances = self.kernel.prepare(inputs), [], []
-        for group in self._groups:
+        for group in self.groups:
             P, unexplained = group.project(prepared, features)
             means.append((group.mean @ P).T)
             if return_variance:
-                spread = group.root @ P
+                o, k, size = group.root.shape
+                spread = group.root.reshape(o * k, size) @ P
                 np.multiply(spread, spread, out=spread)
-                squares = spread.reshape(len(group.mean), group.rank, len(inputs)).sum(axis=1)
-                variances.append((np.outer(group.signal, np.maximum(unexplained, 0.0)) + squares).T)
+                squares = spread.reshape(o, k, len(inputs)).sum(axis=1)
+                variances.append((np.outer(group.signal, unexplained) + squares).T)
         mean = _side_by_side(means)
-        mean += features @ self.prior.offset.T
+        mean += features @ self.offset.T
+        mean += self.intercept
         return mean, _side_by_side(variances) if return_variance else None
 
     def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o)."""
         mean, _ = self.predict(inputs, features)
         covariance, prepared = [], self.kernel.prepare(inputs)
-        for group, own in zip(self._groups, self.inducing, strict=True):
+        for group in self.groups:
             P, _ = group.project(prepared, features)
-            V = P[: len(own.points)]
-            unexplained = self.kernel.at(own.hyperparameters, inputs).matrix() - V.T @ V
-            for signal, root in zip(group.signal, np.split(group.root, len(group.mean)), strict=True):
+            V = P[: len(group.points)]
+            unexplained = self.kernel.at(np.log(group.hyperparameters), inputs).matrix() - V.T @ V
+            for signal, root in zip(group.signal, group.root, strict=True):
                 spread = root @ P
                 covariance.append(signal * unexplained + spread.T @ spread)
         return mean, np.stack(covariance, axis=2)
 
-    @cached_property
-    def _groups(self) -> tuple[_Group, ...]:
-        """What does not depend on the rows, computed once: a control loop predicts one row at a time."""
-        groups = []
-        for own in self.inducing:
-            outputs = range(len(self.signal))[own.outputs]
-            m = len(own.points)
-            # [s; c] turns [V; Hᵀ] into Pᵀ of each output.
-            scales = [np.append(np.full(m, np.sqrt(self.signal[o])), self.prior.scale[o]) for o in outputs]
-            groups.append(
-                _Group(
-                    self.kernel.at(own.hyperparameters, own.points),
-                    own.L_inv,
-                    self.signal[own.outputs],
-                    np.array([self.mean[o] * scale for o, scale in zip(outputs, scales, strict=True)]),
-                    np.vstack([self.root[o] * scale for o, scale in zip(outputs, scales, strict=True)]),
-                )
-            )
-        return tuple(groups)
-
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
-        p = self.prior.scale.shape[1]
-        mean, covariance = self.prior.offset.copy(), np.empty((len(self.signal), p, p))
-        for o, (omega, root) in enumerate(zip(self.mean, self.root, strict=True)):
-            first = len(omega) - p
-            mean[o] += self.prior.scale[o] * omega[first:]
-            spread = root[:, first:] * self.prior.scale[o]
-            covariance[o] = spread.T @ spread
-        return mean, covariance
-
-
-@dataclass(frozen=True)
-class _Group:
-    """Outputs that share inducing points, ready to predict: g(x) has the mean ``mean @ P`` and the spread ``root @ P``.
-
-    Attributes
-    ----------
-    kernel : KernelAt
-    L_inv : ndarray of shape (m, m)
-    signal : ndarray of shape (o,)
-    mean : ndarray of shape (o, m + p)
-    root : ndarray of shape (o (m + p), m + p)
-        Of one output above the other.
-    """
-
-    kernel: KernelAt
-    L_inv: np.ndarray
-    signal: np.ndarray
-    mean: np.ndarray
-    root: np.ndarray
-
-    @property
-    def rank(self) -> int:
-        """Rows of ``root`` per output."""
-        return len(self.root) // len(self.mean)
-
-    def project(self, prepared: Any, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""
-        m = len(self.L_inv)
-        P = np.empty((m + features.shape[1], len(features)))
-        V = np.matmul(self.L_inv, self.kernel.cross(prepared), out=P[:m])
-        P[m:] = features.T
-        return P, self.kernel.diagonal(prepared) - np.einsum("mn,mn->n", V, V)
+        mean, covariance = self.offset.copy(), []
+        for group in self.groups:
+            m = len(group.points)
+            mean[group.outputs] += group.mean[:, m:]
+            spread = group.root[:, :, m:]
+            covariance.append(spread.transpose(0, 2, 1) @ spread)
+        return mean, np.concatenate(covariance)
 
 
 def _side_by_side(columns: list[np.ndarray]) -> np.ndarray:

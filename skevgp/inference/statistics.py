@@ -1,4 +1,4 @@
-"""One pass over the rows: the sufficient statistics of a sparse GP with explicit features, and their pull-back.
+"""Two passes over the rows: the sufficient statistics of a sparse GP with explicit features, and their pull-back.
 
 Everything the model learns from the data goes through a few sums over rows (Titsias 2009 with
 explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened inside each block, V = L⁻¹ k(X_m, X),
@@ -14,8 +14,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._linalg import diagonal_of
+from .._linalg import cholesky_pullback, diagonal_of, jittered_cholesky, triangular_inverse
 from ..rows.blocks import Block, Blocks
+
+# Relative to the signal variance. k(X_m, X_m) from exact differences is accurate to about m times 1e-16.
+JITTER = 1e-12
 
 
 class KernelAt(Protocol):
@@ -52,6 +55,45 @@ class Kernel(Protocol):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> KernelAt:
         """The covariance with hyperparameters (n_hyper,) and inducing points (m, d) put in."""
+
+
+@dataclass(frozen=True)
+class Whitening:
+    """K = k(X_m, X_m) = L Lᵀ at one set of inducing points, and what it makes of rows: V = L⁻¹ k(X_m, X).
+
+    Attributes
+    ----------
+    covariance : KernelAt
+        With m inducing points.
+    L, L_inv : ndarray of shape (m, m)
+        Lower Cholesky factor of K (with a jitter), and its inverse.
+    """
+
+    covariance: Any
+    L: np.ndarray
+    L_inv: np.ndarray
+
+    @classmethod
+    def of(
+        cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray, jitter: float = JITTER
+    ) -> Whitening:
+        """At hyperparameters (n_hyper,) and inducing points (m, d)."""
+        covariance = kernel.at(np.log(hyperparameters), inducing_points)
+        L = jittered_cholesky(covariance.matrix(), jitter)
+        return cls(covariance, L, triangular_inverse(L))
+
+    def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""
+        U = self.covariance.cross(prepared)
+        return U, np.matmul(self.L_inv, U, out=out)
+
+    def unexplained(self, prepared: Any, V: np.ndarray) -> np.ndarray:
+        """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0."""
+        return np.maximum(self.covariance.diagonal(prepared) - np.einsum("mn,mn->n", V, V), 0.0)
+
+    def pull_back(self, rows_bar: Any, L_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients in the hyperparameters (their logarithms) and X_m, given those in the rows (`pull_back`) and L."""
+        return self.covariance.finish_pullback(rows_bar, cholesky_pullback(self.L, self.L_inv, L_bar))
 
 
 @dataclass(frozen=True)
@@ -94,37 +136,49 @@ class SufficientStatistics:
         """Each sum times ``factor``: a past that fades."""
         return SufficientStatistics(*(factor * getattr(self, name) for name in self._fields()))
 
-    def outputs(self, columns: slice) -> SufficientStatistics:
-        """The statistics of some of the outputs."""
-        return SufficientStatistics(
-            self.n_rows,
-            self.VV,
-            self.VH,
-            self.VR[:, columns],
-            self.HH,
-            self.HR[:, columns],
-            self.RR[columns],
-            self.unexplained,
-        )
-
     @classmethod
     def _fields(cls) -> Iterable[str]:
         return cls.__dataclass_fields__
 
 
 @dataclass(frozen=True)
+class StatisticsGradient:
+    """Gradients of a scalar in the statistics of these names, and in L; ``VE`` multiplies V e, not V r."""
+
+    VV: np.ndarray
+    VH: np.ndarray
+    VE: np.ndarray
+    unexplained: float
+    L: np.ndarray
+
+
+@dataclass(frozen=True)
+class Residuals:
+    """What the mean of q leaves over, e = r - [V; Hᵀ]ᵀ weights, summed over rows.
+
+    Attributes
+    ----------
+    squares : ndarray of shape (o,)
+        eᵀe of each output.
+    VE : ndarray of shape (m, o)
+        V e of each output.
+    """
+
+    squares: np.ndarray
+    VE: np.ndarray
+
+
+@dataclass(frozen=True)
 class _FirstPass:
     """Block -> V Vᵀ, V [H, r] and Σ max(k(x, x) - |v|², 0)."""
 
-    kernel: KernelAt
-    L_inv: np.ndarray
+    whitening: Whitening
+    outputs: slice
 
     def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray, float]:
-        U = self.kernel.cross(block.prepared)
-        V = self.L_inv @ U
-        block.kept = (self.L_inv, U, V) if block.may_keep else None
-        unexplained = self.kernel.diagonal(block.prepared) - np.einsum("ij,ij->j", V, V)
-        return V @ V.T, V @ block.linear, np.maximum(unexplained, 0.0).sum()
+        U, V = self.whitening.project(block.prepared)
+        block.kept = (self.whitening, U, V) if block.may_keep else None
+        return V @ V.T, V @ block.linear_of(self.outputs), self.whitening.unexplained(block.prepared, V).sum()
 
 
 @dataclass(frozen=True)
@@ -134,96 +188,98 @@ class _SecondPass:
     Ū = (L⁻ᵀ symmetric) V + (L⁻ᵀ linear_bar) [H, e]ᵀ: the m-sized products came first.
     """
 
-    kernel: KernelAt
-    L_inv: np.ndarray
+    whitening: Whitening
+    outputs: slice
     from_whitened: np.ndarray
     from_linear: np.ndarray
     unexplained_bar: float
-    fitted: np.ndarray | None
+    weights: np.ndarray
 
     def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
-        if block.kept is not None and block.kept[0] is self.L_inv:
+        if block.kept is not None and block.kept[0] is self.whitening:
             _, U, V = block.kept
         else:
-            U = self.kernel.cross(block.prepared)
-            V = self.L_inv @ U
-        linear, p, m = block.linear, block.n_features, len(V)
-        if self.fitted is not None:
-            linear = linear.copy()
-            linear[:, p:] -= V.T @ self.fitted[:m]
-            linear[:, p:] -= block.features @ self.fitted[m:]
+            U, V = self.whitening.project(block.prepared)
+        linear, p, m = block.linear_of(self.outputs).copy(), block.n_features, len(V)
         e = linear[:, p:]
+        e -= V.T @ self.weights[:m]
+        e -= block.features @ self.weights[m:]
         U_bar = self.from_whitened @ V
         U_bar += self.from_linear @ linear.T
-        rows_bar = self.kernel.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
+        rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
         return rows_bar, np.einsum("no,no->o", e, e), V @ e
 
 
-def collect(rows: Blocks, kernel: KernelAt, L_inv: np.ndarray) -> SufficientStatistics:
+def collect(rows: Blocks, whitening: Whitening, outputs: slice) -> SufficientStatistics:
     """First pass over the rows.
 
     Parameters
     ----------
     rows : Blocks
-    kernel : KernelAt
-        With m inducing points.
-    L_inv : ndarray of shape (m, m)
-        Inverse of the lower Cholesky factor of k(X_m, X_m).
+    whitening : Whitening
+    outputs : slice
+        Which of the rows' outputs count.
 
     Returns
     -------
     statistics : SufficientStatistics
     """
     linear = rows.linear
-    VV, VL, unexplained = rows.sum(_FirstPass(kernel, L_inv))
+    VV, VL, unexplained = rows.sum(_FirstPass(whitening, outputs))
     p = len(linear.HH)
     return SufficientStatistics(
-        linear.n_rows, VV, VL[:, :p], VL[:, p:], linear.HH, linear.HR, linear.RR, float(unexplained)
+        linear.n_rows,
+        VV,
+        VL[:, :p],
+        VL[:, p:],
+        linear.HH,
+        linear.HR[:, outputs],
+        linear.RR[outputs],
+        float(unexplained),
     )
 
 
 def pull_back(
     rows: Blocks,
-    kernel: KernelAt,
-    L_inv: np.ndarray,
+    whitening: Whitening,
+    outputs: slice,
     statistics: SufficientStatistics,
-    VV_bar: np.ndarray,
-    VH_bar: np.ndarray,
-    VR_bar: np.ndarray,
-    unexplained_bar: float,
-    fitted: np.ndarray | None = None,
-) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray]:
-    """Second pass over the rows: gradients of a scalar in the statistics -> in the kernel's rows and in L.
+    gradient: StatisticsGradient,
+    weights: np.ndarray,
+) -> tuple[tuple[np.ndarray, np.ndarray], Residuals]:
+    """Second pass over the rows: gradients of a scalar in the statistics -> in the hyperparameters and X_m.
 
-    With Ḡ the given gradients, V̄ = (Ḡ_VV + Ḡ_VVᵀ - 2 ḡ_unexplained I) V + Ḡ_VH Hᵀ + Ḡ_VR rᵀ, Ū = L⁻ᵀ V̄ and
-    L̄ = -tril(L⁻ᵀ V̄ Vᵀ), where V̄ Vᵀ comes from the sums. (The clipping of the unexplained variance acts only at
+    With Ḡ the given gradients, V̄ = (Ḡ_VV + Ḡ_VVᵀ - 2 ḡ_unexplained I) V + Ḡ_VH Hᵀ + Ḡ_VE eᵀ, Ū = L⁻ᵀ V̄ and
+    L̄ = Ḡ_L - tril(L⁻ᵀ V̄ Vᵀ), where V̄ Vᵀ comes from the sums. (The clipping of the unexplained variance acts only at
     the level of rounding and is left out.)
 
     Parameters
     ----------
-    rows, kernel, L_inv
+    rows, whitening, outputs
         As in `collect`.
     statistics : SufficientStatistics
         What `collect` returned.
-    VV_bar, VH_bar, VR_bar, unexplained_bar
-        Gradients in the statistics of these names, of the same shapes.
-    fitted : ndarray of shape (m + p, o), default=None
-        If given, e = r - [V; Hᵀ]ᵀ fitted, computed row by row, takes the place of r.
+    gradient : StatisticsGradient
+    weights : ndarray of shape (m + p, o)
+        e = r - [V; Hᵀ]ᵀ weights, computed row by row: no digits cancel at any signal-to-noise ratio.
 
     Returns
     -------
-    rows_bar : object
-        For `KernelAt.finish_pullback`.
-    L_bar : ndarray of shape (m, m)
-        Lower triangular.
-    squares : ndarray of shape (o,)
-        eᵀe, or rᵀr.
-    VE : ndarray of shape (m, o)
-        V e, or V r.
+    gradients : (ndarray of shape (n_hyper,), ndarray of shape (m, d))
+        In the logarithms of the hyperparameters, and in X_m.
+    residuals : Residuals
     """
-    symmetric = VV_bar + VV_bar.T
-    diagonal_of(symmetric)[...] -= 2.0 * unexplained_bar
-    from_whitened, from_linear = L_inv.T @ symmetric, L_inv.T @ np.hstack([VH_bar, VR_bar])
-    rows_bar, squares, VE = rows.sum(_SecondPass(kernel, L_inv, from_whitened, from_linear, unexplained_bar, fitted))
-    VbarV = symmetric @ statistics.VV + VH_bar @ statistics.VH.T + VR_bar @ VE.T
-    return rows_bar, -np.tril(L_inv.T @ VbarV), squares, VE
+    L_inv = whitening.L_inv
+    symmetric = gradient.VV + gradient.VV.T
+    diagonal_of(symmetric)[...] -= 2.0 * gradient.unexplained
+    second = _SecondPass(
+        whitening,
+        outputs,
+        L_inv.T @ symmetric,
+        L_inv.T @ np.hstack([gradient.VH, gradient.VE]),
+        gradient.unexplained,
+        weights,
+    )
+    rows_bar, squares, VE = rows.sum(second)
+    VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
+    return whitening.pull_back(rows_bar, gradient.L - np.tril(L_inv.T @ VbarV)), Residuals(squares, VE)

@@ -1,5 +1,8 @@
 """Covariance functions: scikit-learn's kernels, and a user's own."""
 
-from .function_kernel import FunctionKernel
+from .function import FunctionKernel
+from .parse import WORKING
 
 __all__ = ["FunctionKernel"]
+
+__doc__ = f"{__doc__}\n\nThe argument ``kernel`` of the regressors takes {WORKING}.\n"

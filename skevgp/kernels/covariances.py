@@ -1,22 +1,25 @@
-"""Covariance functions with gradients: what they have in common, the simple ones, and sums and products.
+"""Covariance functions with gradients: what they have in common, and their sums and products.
 
-Gradients follow the sum and product rules; each part has its own, written by hand. All parts of a covariance see the
-same prepared rows, [x, 1, x²], which depend on no parameter.
+Inputs and inducing points are in the user's coordinates. A covariance of differences subtracts a centre from both, so
+that large coordinates cost it no digits. Gradients follow the sum and product rules; each part has its own, written by
+hand.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
-from functools import reduce
-from operator import add, mul
+from dataclasses import dataclass, replace
+from functools import cached_property, reduce
+from operator import add, itemgetter, mul
 from typing import Any
 
 import numpy as np
 
 # A derivative per row of k(x, x): an array (n,), or one number for all rows.
 PerRow = np.ndarray | float
+# Rows (n, d) -> what a covariance needs of them, which depends on no parameter.
+Preparation = Callable[[np.ndarray], Any]
 # Takes gradients in k(X_m, X) (which it may overwrite) and in each k(x, x); returns what a block adds to the sum.
 Pull = Callable[[np.ndarray, PerRow], Any]
 
@@ -35,20 +38,53 @@ def sum_of_rows(per_row: PerRow, n_rows: int) -> float:
     return float(np.sum(per_row)) if np.ndim(per_row) else float(per_row) * n_rows
 
 
+def no_columns(inputs: np.ndarray) -> np.ndarray:
+    """How many rows there are, as the length of an array that takes no memory."""
+    return np.empty((len(inputs), 0))
+
+
+def as_they_are(inputs: np.ndarray) -> np.ndarray:
+    """The rows themselves."""
+    return np.ascontiguousarray(inputs)
+
+
+@dataclass(frozen=True)
+class CentredSquares:
+    """Rows -> [x - c, 1, (x - c)²] as columns, (2 d + 1, n).
+
+    Parameters
+    ----------
+    centre : tuple of d floats, default=()
+        c; 0 if there are none.
+    """
+
+    centre: tuple[float, ...] = ()
+
+    def __call__(self, inputs: np.ndarray) -> np.ndarray:
+        x = self.centred(inputs)
+        return np.ascontiguousarray(np.hstack([x, np.ones((len(x), 1)), x**2]).T)
+
+    def centred(self, points: np.ndarray) -> np.ndarray:
+        """X - c."""
+        return points - self._centre
+
+    @cached_property
+    def _centre(self) -> np.ndarray | float:
+        return np.array(self.centre) if self.centre else 0.0
+
+
 class CovarianceAt(ABC):
     """A covariance with its hyperparameters and inducing points put in; see `statistics.KernelAt`."""
-
-    inducing_points: np.ndarray
 
     @abstractmethod
     def matrix(self) -> np.ndarray:
         """k(X_m, X_m) of shape (m, m), from exact differences."""
 
     @abstractmethod
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
+    def cross(self, prepared: Any) -> np.ndarray:
         """k(X_m, X) of shape (m, n)."""
 
-    def diagonal(self, prepared: np.ndarray) -> PerRow:
+    def diagonal(self, prepared: Any) -> PerRow:
         """k(x, x) of each row, (n,), or one number for all."""
         return 1.0
 
@@ -57,10 +93,10 @@ class CovarianceAt(ABC):
         """An empty sum."""
 
     @abstractmethod
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+    def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
         """k(X_m, X), and the function that pulls gradients back through it."""
 
-    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
+    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
         """What one block adds to the sum, given gradients in k(X_m, X) and in each k(x, x)."""
         return self.linearised(prepared)[1](U_bar, diagonal_bar)
 
@@ -72,7 +108,7 @@ class CovarianceAt(ABC):
 class Covariance(ABC):
     """A covariance k̃ with positive hyperparameters, which the inference sees as their logarithms.
 
-    Two are equal if they are the same function of hyperparameters and inputs, wherever the inputs are centred.
+    Two are equal if they are the same function of hyperparameters and inputs, whatever is subtracted on the way.
     """
 
     @property
@@ -81,120 +117,22 @@ class Covariance(ABC):
         """How many hyperparameters there are."""
 
     @property
-    def stationary(self) -> bool:
-        """Whether it depends on differences of inputs only."""
-        return True
+    @abstractmethod
+    def preparations(self) -> tuple[Preparation, ...]:
+        """What is computed once of rows; parts of a combination share what equal ones compute."""
 
-    def prepare(self, inputs: np.ndarray) -> np.ndarray:
-        """[x, 1, x²] of each row as columns, (2 d + 1, n)."""
-        return np.ascontiguousarray(np.hstack([inputs, np.ones((len(inputs), 1)), inputs**2]).T)
+    def prepare(self, inputs: np.ndarray) -> Any:
+        """What `CovarianceAt` needs of rows (n, d): what the preparation computes, or a tuple if there are several."""
+        only, *others = self.preparations
+        return tuple(each(inputs) for each in (only, *others)) if others else only(inputs)
 
-    def seen_from(self, centre: np.ndarray) -> Covariance:
-        """The same covariance for inputs from which ``centre`` (d,) has been subtracted."""
+    def centred(self, centre: np.ndarray) -> Covariance:
+        """The same covariance, exact for inputs near ``centre`` (d,), however far from 0 that is."""
         return self
 
     @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
         """The covariance with log hyperparameters (n_hyper,) and inducing points (m, d) put in."""
-
-
-# --- simple covariances ------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True)
-class Constant(Covariance):
-    """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter log c."""
-
-    n_hyperparameters = 1
-
-    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
-        return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points)
-
-
-class ConstantAt(CovarianceAt):
-    """A `Constant` with its value put in."""
-
-    def __init__(self, constant: float, inducing_points: np.ndarray):
-        self.constant, self.inducing_points = constant, inducing_points
-
-    def matrix(self) -> np.ndarray:
-        return np.full((len(self.inducing_points),) * 2, self.constant)
-
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
-        # One number that looks like a matrix.
-        return np.broadcast_to(self.constant, (len(self.inducing_points), prepared.shape[1]))
-
-    def diagonal(self, prepared: np.ndarray) -> float:
-        return self.constant
-
-    def start_pullback(self) -> np.ndarray:
-        return np.zeros(1)
-
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
-            return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, prepared.shape[1]))])
-
-        return self.cross(prepared), pull
-
-    def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return total + self.constant * K_bar.sum(), np.zeros_like(self.inducing_points)
-
-
-@dataclass(frozen=True)
-class DotProduct(Covariance):
-    """k̃(x, x') = σ₀² + xᵀx' (Rasmussen & Williams 2006, section 4.2.2). Hyperparameter log σ₀.
-
-    Parameters
-    ----------
-    centre : ndarray of shape (d,), default=None
-        What has been subtracted from the inputs.
-    """
-
-    centre: np.ndarray | None = field(default=None, compare=False)
-    n_hyperparameters = 1
-    stationary = False
-
-    def seen_from(self, centre: np.ndarray) -> DotProduct:
-        return replace(self, centre=centre)
-
-    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> DotProductAt:
-        centre = np.zeros(inducing_points.shape[1]) if self.centre is None else self.centre
-        return DotProductAt(float(np.exp(2.0 * hyperparameters[0])), inducing_points, centre)
-
-
-class DotProductAt(CovarianceAt):
-    """A `DotProduct` with σ₀² and inducing points put in."""
-
-    def __init__(self, bias: float, inducing_points: np.ndarray, centre: np.ndarray):
-        self.bias, self.inducing_points, self.centre = bias, inducing_points, centre
-        self._points = inducing_points + centre
-        self._linear = np.hstack([self._points, (self._points @ centre + bias)[:, np.newaxis]])
-
-    def matrix(self) -> np.ndarray:
-        return self._points @ self._points.T + self.bias
-
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
-        return self._linear @ prepared[: len(self.centre) + 1]
-
-    def diagonal(self, prepared: np.ndarray) -> np.ndarray:
-        x = prepared[: len(self.centre)] + self.centre[:, np.newaxis]
-        return np.einsum("dn,dn->n", x, x) + self.bias
-
-    def start_pullback(self) -> Sums:
-        return Sums((np.zeros_like(self._linear), 0.0))
-
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-            return Sums((U_bar @ prepared[: len(self.centre) + 1].T, sum_of_rows(diagonal_bar, prepared.shape[1])))
-
-        return self.cross(prepared), pull
-
-    def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        rows, from_diagonal = total
-        n_bar = rows[:, -1]
-        bias_bar = n_bar.sum() + from_diagonal + K_bar.sum()
-        points_bar = rows[:, :-1] + np.outer(n_bar, self.centre) + 2.0 * K_bar @ self._points
-        return np.array([2.0 * self.bias * bias_bar]), points_bar
 
 
 # --- sums and products -------------------------------------------------------------------------------------------
@@ -217,16 +155,36 @@ class _Combination(Covariance):
         return sum(part.n_hyperparameters for part in self.parts)
 
     @property
-    def stationary(self) -> bool:
-        return all(part.stationary for part in self.parts)
+    def preparations(self) -> tuple[Preparation, ...]:
+        return tuple(dict.fromkeys(each for part in self.parts for each in part.preparations))
 
-    def seen_from(self, centre: np.ndarray) -> _Combination:
-        return replace(self, parts=tuple(part.seen_from(centre) for part in self.parts))
+    def centred(self, centre: np.ndarray) -> _Combination:
+        return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
-    def _parts_at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> list[CovarianceAt]:
+    def _parts_at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> list[_Part]:
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
-        own = np.split(hyperparameters, ends)
-        return [part.at(values, inducing_points) for part, values in zip(self.parts, own, strict=True)]
+        own, given = np.split(hyperparameters, ends), self.preparations
+        return [
+            _Part(part.at(values, inducing_points), _choice(part.preparations, given))
+            for part, values in zip(self.parts, own, strict=True)
+        ]
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part put in, and which of the combination's prepared rows are its own."""
+
+    at: CovarianceAt
+    own: Callable[[Any], Any]
+
+
+def _choice(wanted: tuple[Preparation, ...], given: tuple[Preparation, ...]) -> Callable[[Any], Any]:
+    """From what some preparations computed to what some of them did, as `Covariance.prepare` returns it."""
+    return _all_of_it if wanted == given else itemgetter(*(given.index(each) for each in wanted))
+
+
+def _all_of_it(prepared: Any) -> Any:
+    return prepared
 
 
 class Sum(_Combination):
@@ -244,14 +202,18 @@ class Product(_Combination):
 
 
 class _CombinationAt(CovarianceAt):
-    def __init__(self, parts: list[CovarianceAt]):
-        self.parts, self.inducing_points = parts, parts[0].inducing_points
+    def __init__(self, parts: list[_Part]):
+        self.parts = parts
 
     def start_pullback(self) -> Sums:
-        return Sums(part.start_pullback() for part in self.parts)
+        return Sums(part.at.start_pullback() for part in self.parts)
+
+    def _linearised(self, prepared: Any) -> tuple[Sequence[np.ndarray], Sequence[Pull]]:
+        values, pulls = zip(*(part.at.linearised(part.own(prepared)) for part in self.parts), strict=True)
+        return values, pulls
 
     def _finish(self, total: Sums, K_bars: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        gradients = [part.finish_pullback(*own) for part, *own in zip(self.parts, total, K_bars, strict=True)]
+        gradients = [part.at.finish_pullback(*own) for part, *own in zip(self.parts, total, K_bars, strict=True)]
         return np.concatenate([hyper_bar for hyper_bar, _ in gradients]), reduce(add, (Z_bar for _, Z_bar in gradients))
 
 
@@ -259,16 +221,16 @@ class SumAt(_CombinationAt):
     """A `Sum` with hyperparameters and inducing points put in."""
 
     def matrix(self) -> np.ndarray:
-        return reduce(add, (part.matrix() for part in self.parts))
+        return reduce(add, (part.at.matrix() for part in self.parts))
 
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
-        return reduce(add, (part.cross(prepared) for part in self.parts))
+    def cross(self, prepared: Any) -> np.ndarray:
+        return reduce(add, (part.at.cross(part.own(prepared)) for part in self.parts))
 
-    def diagonal(self, prepared: np.ndarray) -> PerRow:
-        return reduce(add, (part.diagonal(prepared) for part in self.parts))
+    def diagonal(self, prepared: Any) -> PerRow:
+        return reduce(add, (part.at.diagonal(part.own(prepared)) for part in self.parts))
 
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        values, pulls = zip(*(part.linearised(prepared) for part in self.parts), strict=True)
+    def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
+        values, pulls = self._linearised(prepared)
 
         def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
             # Each part may overwrite what it gets; the last one may have the original.
@@ -285,19 +247,19 @@ class ProductAt(_CombinationAt):
     """A `Product` with hyperparameters and inducing points put in."""
 
     def matrix(self) -> np.ndarray:
-        return reduce(mul, (part.matrix() for part in self.parts))
+        return reduce(mul, (part.at.matrix() for part in self.parts))
 
-    def cross(self, prepared: np.ndarray) -> np.ndarray:
-        return reduce(mul, (part.cross(prepared) for part in self.parts))
+    def cross(self, prepared: Any) -> np.ndarray:
+        return reduce(mul, (part.at.cross(part.own(prepared)) for part in self.parts))
 
-    def diagonal(self, prepared: np.ndarray) -> PerRow:
-        return reduce(mul, (part.diagonal(prepared) for part in self.parts))
+    def diagonal(self, prepared: Any) -> PerRow:
+        return reduce(mul, (part.at.diagonal(part.own(prepared)) for part in self.parts))
 
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        values, pulls = zip(*(part.linearised(prepared) for part in self.parts), strict=True)
+    def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
+        values, pulls = self._linearised(prepared)
 
         def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-            diagonals = [part.diagonal(prepared) for part in self.parts]
+            diagonals = [part.at.diagonal(part.own(prepared)) for part in self.parts]
             return Sums(
                 part(bar, own)
                 for part, bar, own in zip(
@@ -308,7 +270,7 @@ class ProductAt(_CombinationAt):
         return reduce(mul, values), pull
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        return self._finish(total, _times_others(K_bar, [part.matrix() for part in self.parts]))
+        return self._finish(total, _times_others(K_bar, [part.at.matrix() for part in self.parts]))
 
 
 def _times_others(bar: Any, values: Sequence[Any]) -> list[Any]:

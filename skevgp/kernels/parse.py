@@ -11,32 +11,30 @@ import numpy as np
 from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 
-from .covariances import Constant, Covariance, DotProduct, Product, Sum
-from .function_kernel import FunctionKernel
-from .stationary import (
-    LARGEST_NU,
-    ExpSineSquared,
-    Matern,
-    Matern12,
-    Matern32,
-    Matern52,
-    Profile,
-    RationalQuadratic,
-    SquaredExponential,
-    Stationary,
+from . import stationary
+from .constant import Constant
+from .covariances import Covariance, Product, Sum
+from .dot_product import DotProduct
+from .function import Function, FunctionKernel
+from .stationary import SquaredExponential
+
+# What works: a kernel's type -> its covariance on so many columns, with the kernel's hyperparameters in its order.
+BUILDERS: dict[type[sk.Kernel], Callable[[Any, int], Covariance]] = {
+    sk.ConstantKernel: Constant.of,
+    sk.RBF: stationary.squared_exponential,
+    sk.Matern: stationary.matern,
+    sk.RationalQuadratic: stationary.rational_quadratic,
+    sk.ExpSineSquared: stationary.exp_sine_squared,
+    sk.DotProduct: DotProduct.of,
+    FunctionKernel: Function.of,
+}
+# The same for people.
+WORKING = (
+    f"{', '.join(kind.__name__ for kind in BUILDERS)}, sums and products of these, and a WhiteKernel as one of the "
+    "terms of the outermost sum"
 )
-
-__all__ = ["FunctionKernel"]
-
 # Their squares neither vanish nor overflow.
 SMALLEST, LARGEST = 1e-100, 1e100
-
-WORKING = (
-    "ConstantKernel, RBF, Matern, RationalQuadratic, ExpSineSquared, DotProduct, FunctionKernel, sums and products of "
-    "these, and a WhiteKernel as one of the terms of the outermost sum"
-)
-
-_MATERN: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
 
 
 @dataclass(frozen=True)
@@ -237,29 +235,9 @@ def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -
 
 def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
     kind = type(kernel)
-    if kind is sk.ConstantKernel:
-        return Constant()
-    if kind is sk.DotProduct:
-        return DotProduct()
-    if kind is sk.RationalQuadratic:
-        return Stationary(RationalQuadratic(), n_columns, isotropic=True)
-    if kind is sk.ExpSineSquared:
-        return Stationary(ExpSineSquared(), n_columns, isotropic=True)
-    if kind is FunctionKernel:
-        return kernel.covariance()
-    if kind not in (sk.RBF, sk.Matern):
+    if kind not in BUILDERS:
         raise ValueError(f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {WORKING}.")
-
-    if kernel.anisotropic and len(kernel.length_scale) != n_columns:
-        raise ValueError(
-            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
-            "give one length scale, or one per column."
-        )
-    if kind is sk.RBF or kernel.nu == np.inf:
-        return SquaredExponential(n_columns, isotropic=not kernel.anisotropic)
-    if not 0.0 < kernel.nu <= LARGEST_NU:
-        raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
-    return Stationary(_MATERN.get(kernel.nu, Matern(float(kernel.nu))), n_columns, isotropic=not kernel.anisotropic)
+    return BUILDERS[kind](kernel, n_columns)
 
 
 def _operands(kernel: Any, operator: Any) -> Iterator[Any]:

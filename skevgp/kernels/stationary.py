@@ -2,228 +2,36 @@
 
 With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each is a profile φ of the exponent E = -½ r², which for a block of rows is one
 matrix product: E is linear in [x, 1, x²]. So is the way back: with W = Ū φ'(E), all gradients follow from W [x, 1, x²].
+There x is centred: r² is a small difference of squares that would be large far from 0.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, Protocol
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 from scipy.spatial.distance import cdist
-from scipy.special import gammaln, kve
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums
+from .covariances import CentredSquares, Covariance, CovarianceAt, PerRow, Pull, Sums
+from .profiles import (
+    LARGEST_NU,
+    Derivatives,
+    Exponential,
+    ExpSineSquared,
+    Matern,
+    Matern12,
+    Matern32,
+    Matern52,
+    Profile,
+    RationalQuadratic,
+)
 
 # In units of the largest |x/ℓ|² + |z/ℓ|²: the matrix product leaves r² only 8 digits below this, ...
 _NEAR = 1e-8
 # ... and (x - x') / r only 8 below this: there a profile that is not smooth at r = 0 counts as flat.
 _COINCIDENT = 1e-16
-# Of a Matérn covariance by Bessel functions, which overflow beyond it (it is then almost a squared exponential).
-LARGEST_NU = 150.0
-
-Derivatives = tuple[np.ndarray, list[np.ndarray]]
-
-
-class Profile(Protocol):
-    """φ(E); parameters of its own come before the lengthscales in the vector of hyperparameters, as logarithms."""
-
-    n_parameters: int
-
-    @property
-    def smooth(self) -> bool:
-        """Whether φ'(E) is finite at E = 0."""
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """φ(E)."""
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        """φ'(E), and the derivative in the logarithm of each parameter; ``value`` is φ(E), which saves exponentials."""
-
-
-@dataclass(frozen=True)
-class Exponential:
-    """φ = exp(E): the squared exponential (Rasmussen & Williams 2006, eq. 4.9)."""
-
-    n_parameters = 0
-    smooth = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(E)
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        return value, []
-
-
-@dataclass(frozen=True)
-class Matern12:
-    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
-
-    n_parameters = 0
-    smooth = False
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(-np.sqrt(-2.0 * E))
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
-
-
-@dataclass(frozen=True)
-class Matern32:
-    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-6.0 * E)
-        decay = np.exp(-t)
-        t += 1.0
-        t *= decay
-        return t
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-6.0 * E)
-        t += 1.0
-        np.divide(value, t, out=t)
-        t *= 3.0
-        return t, []
-
-
-@dataclass(frozen=True)
-class Matern52:
-    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
-
-    n_parameters = 0
-    smooth = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        t = np.sqrt(-10.0 * E)
-        decay = np.exp(-t)
-        decay *= self._polynomial(E, t)
-        return decay
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        t = np.sqrt(-10.0 * E)
-        polynomial = self._polynomial(E, t)
-        t += 1.0
-        t *= 5.0 / 3.0
-        t *= value
-        t /= polynomial
-        return t, []
-
-    @staticmethod
-    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
-        polynomial = (-10.0 / 3.0) * E
-        polynomial += t
-        polynomial += 1.0
-        return polynomial
-
-
-@dataclass(frozen=True)
-class Matern:
-    """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r (Rasmussen & Williams 2006, eq. 4.14).
-
-    Its derivative follows from d/dt [t^ν K_ν(t)] = -t^ν K_(ν-1)(t) (DLMF 10.29.4).
-
-    Parameters
-    ----------
-    nu : float
-        At most `LARGEST_NU`.
-    """
-
-    nu: float
-    n_parameters = 0
-
-    @property
-    def smooth(self) -> bool:
-        return self.nu > 1.0
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return self._bessel(E, self.nu, 1.0)
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        slope = self._bessel(E, self.nu - 1.0, 0.5 / (self.nu - 1.0) if self.smooth else 0.0)
-        slope *= 2.0 * self.nu
-        return slope, []
-
-    def _bessel(self, E: np.ndarray, order: float, at_zero: float) -> np.ndarray:
-        """2^(1-ν) / Γ(ν) t^order K_order(t), by logarithms: its factors overflow before it does."""
-        t = np.sqrt(-4.0 * self.nu * E)
-        positive = np.maximum(t, 1e-150)
-        # Beyond 1e3, exp(-t) is 0 and K need not be known.
-        with np.errstate(all="ignore"):
-            log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
-        factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
-        found = np.exp(factor + order * np.log(positive) + log_bessel - positive)
-        overflow = np.isinf(log_bessel) | (t == 0.0)
-        found[overflow] = at_zero * self._near_zero(t[overflow], order)
-        return found
-
-    @staticmethod
-    def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
-        """t^order K_order(t) over its value at 0, where K overflows: the first terms of DLMF 10.27.4 with 10.25.2."""
-        term = total = np.ones_like(t)
-        for k in range(1, min(int(order), 20)):
-            term = term * (0.25 * t**2) / (k * (k - order))
-            total = total + term
-        return total
-
-
-@dataclass(frozen=True)
-class RationalQuadratic:
-    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter log α."""
-
-    n_parameters = 1
-    smooth = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        alpha = np.exp(parameters[0])
-        log = np.log1p(self._ratio(E, alpha))
-        log *= -alpha
-        return np.exp(log, out=log)
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        alpha = np.exp(parameters[0])
-        ratio = self._ratio(E, alpha)
-        from_alpha = ratio / (1.0 + ratio)
-        from_alpha -= np.log1p(ratio)
-        from_alpha *= value
-        from_alpha *= alpha
-        ratio += 1.0
-        return np.divide(value, ratio, out=ratio), [from_alpha]
-
-    @staticmethod
-    def _ratio(E: np.ndarray, alpha: float) -> np.ndarray:
-        """r² / 2α, kept finite."""
-        with np.errstate(over="ignore"):
-            ratio = E / -alpha
-        return np.minimum(ratio, 1e300, out=ratio)
-
-
-@dataclass(frozen=True)
-class ExpSineSquared:
-    """φ = exp(-2 sin²(π r) / ℓ²), r = |x - x'| / period (Rasmussen & Williams 2006, eq. 4.31). Parameter log ℓ."""
-
-    n_parameters = 1
-    smooth = True
-
-    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        return np.exp(-2.0 * self._squared(np.sqrt(-2.0 * E), parameters))
-
-    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        r = np.sqrt(-2.0 * E)
-        # d sin²(π r) / dE = -π sin(2π r) / r, finite at r = 0.
-        slope = np.sinc(2.0 * r)
-        slope *= value
-        slope *= (2.0 * np.pi * np.exp(-parameters[0])) ** 2
-        return slope, [4.0 * self._squared(r, parameters) * value]
-
-    @staticmethod
-    def _squared(r: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """sin²(π r) / ℓ²."""
-        return (np.sin(np.pi * r) * np.exp(-parameters[0])) ** 2
+_MATERN: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
 
 
 @dataclass(frozen=True)
@@ -238,35 +46,45 @@ class Stationary(Covariance):
         d.
     isotropic : bool, default=False
         Whether one lengthscale serves all columns.
+    rows : CentredSquares
+        What is computed once of rows.
     """
 
     profile: Profile
     n_columns: int
     isotropic: bool = False
+    rows: CentredSquares = field(default=CentredSquares(), compare=False)
 
     @property
     def n_hyperparameters(self) -> int:
         return self.profile.n_parameters + (1 if self.isotropic else self.n_columns)
 
+    @property
+    def preparations(self) -> tuple[CentredSquares]:
+        return (self.rows,)
+
+    def centred(self, centre: np.ndarray) -> Stationary:
+        return replace(self, rows=CentredSquares(tuple(centre.tolist())))
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
-        return StationaryAt(self.profile, hyperparameters, inducing_points)
+        return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
 
 
 class StationaryAt(CovarianceAt):
-    """A `Stationary` with hyperparameters and inducing points (m, d) put in."""
+    """A `Stationary` with hyperparameters and centred inducing points (m, d) put in."""
 
-    def __init__(self, profile: Profile, hyperparameters: np.ndarray, inducing_points: np.ndarray):
+    def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
         lengthscales = np.exp(hyperparameters[profile.n_parameters :])
         self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.lengthscales = np.broadcast_to(lengthscales, inducing_points.shape[1:])
-        self.isotropic = len(lengthscales) < inducing_points.shape[1]
-        self.inducing_points = inducing_points
+        self.lengthscales = np.broadcast_to(lengthscales, points.shape[1:])
+        self.isotropic = len(lengthscales) < points.shape[1]
+        self.points = points
         precision = self.lengthscales**-2.0
         self._exponent = np.hstack(
             [
-                inducing_points * precision,
-                -0.5 * (inducing_points**2 @ precision)[:, np.newaxis],
-                np.broadcast_to(-0.5 * precision, inducing_points.shape),
+                points * precision,
+                -0.5 * (points**2 @ precision)[:, np.newaxis],
+                np.broadcast_to(-0.5 * precision, points.shape),
             ]
         )
 
@@ -291,7 +109,7 @@ class StationaryAt(CovarianceAt):
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         rows, own = total
-        size = -2.0 * float(self._exponent[:, self.inducing_points.shape[1]].min())
+        size = -2.0 * float(self._exponent[:, self.points.shape[1]].min())
         slopes, others = self._derivatives(self._exponents_within(), size, self.matrix())
         own = own + np.array([np.vdot(K_bar, other) for other in others])
         length_bar, Z_bar = self._geometry_bar(rows, K_bar * slopes)
@@ -299,7 +117,7 @@ class StationaryAt(CovarianceAt):
 
     def _geometry_bar(self, rows: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in log ℓ and X_m, from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
-        Z, d = self.inducing_points, self.inducing_points.shape[1]
+        Z, d = self.points, self.points.shape[1]
         WX, W, WXX = rows[:, :d], rows[:, d, np.newaxis], rows[:, d + 1 :]
         row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
@@ -310,7 +128,7 @@ class StationaryAt(CovarianceAt):
         return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision
 
     def _exponents_within(self) -> np.ndarray:
-        scaled = self.inducing_points / self.lengthscales
+        scaled = self.points / self.lengthscales
         return -0.5 * cdist(scaled, scaled, "sqeuclidean")
 
     def _exponents(self, prepared: np.ndarray) -> tuple[np.ndarray, float]:
@@ -322,7 +140,7 @@ class StationaryAt(CovarianceAt):
         d = len(prepared) // 2
         size = -float((self._exponent[0, d + 1 :] @ prepared[d + 1 :]).min() + self._exponent[:, d].min())
         i, j = np.nonzero(-_NEAR * size < E)
-        differences = (prepared[:d, j].T - self.inducing_points[i]) / self.lengthscales
+        differences = (prepared[:d, j].T - self.points[i]) / self.lengthscales
         E[i, j] = -0.5 * np.einsum("pd,pd->p", differences, differences)
         return E, size
 
@@ -333,7 +151,7 @@ class StationaryAt(CovarianceAt):
         return slopes, others
 
 
-@dataclass(frozen=True, init=False)
+@dataclass(frozen=True)
 class SquaredExponential(Stationary):
     """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9, 5.1).
 
@@ -343,13 +161,14 @@ class SquaredExponential(Stationary):
         d.
     isotropic : bool, default=False
         Whether one lengthscale serves all columns.
+    rows : CentredSquares
+        What is computed once of rows.
     """
 
-    def __init__(self, n_columns: int, isotropic: bool = False):
-        super().__init__(Exponential(), n_columns, isotropic)
+    profile: Profile = field(default=Exponential(), init=False)
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SquaredExponentialAt:
-        return SquaredExponentialAt(self.profile, hyperparameters, inducing_points)
+        return SquaredExponentialAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
 
 
 class SquaredExponentialAt(StationaryAt):
@@ -370,3 +189,41 @@ class SquaredExponentialAt(StationaryAt):
 
     def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._geometry_bar(total, K_bar * self.matrix())
+
+
+# --- from scikit-learn's kernels ---------------------------------------------------------------------------------
+
+
+def squared_exponential(kernel: Any, n_columns: int) -> SquaredExponential:
+    """The covariance of an RBF (or of a Matern with nu = inf)."""
+    return SquaredExponential(n_columns, one_lengthscale(kernel, n_columns))
+
+
+def matern(kernel: Any, n_columns: int) -> Stationary:
+    """The covariance of a Matern."""
+    if kernel.nu == np.inf:
+        return squared_exponential(kernel, n_columns)
+    if not 0.0 < kernel.nu <= LARGEST_NU:
+        raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
+    profile = _MATERN.get(kernel.nu, Matern(float(kernel.nu)))
+    return Stationary(profile, n_columns, one_lengthscale(kernel, n_columns))
+
+
+def rational_quadratic(kernel: Any, n_columns: int) -> Stationary:
+    """The covariance of a RationalQuadratic."""
+    return Stationary(RationalQuadratic(), n_columns, isotropic=True)
+
+
+def exp_sine_squared(kernel: Any, n_columns: int) -> Stationary:
+    """The covariance of an ExpSineSquared, whose periodicity is the lengthscale."""
+    return Stationary(ExpSineSquared(), n_columns, isotropic=True)
+
+
+def one_lengthscale(kernel: Any, n_columns: int) -> bool:
+    """Whether a kernel has one lengthscale for all columns; an error if it has neither one nor one per column."""
+    if kernel.anisotropic and len(kernel.length_scale) != n_columns:
+        raise ValueError(
+            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
+            "give one length scale, or one per column."
+        )
+    return not kernel.anisotropic

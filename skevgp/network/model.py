@@ -71,14 +71,14 @@ class VariationalNetwork:
         means, log_stds = self._matrices(vector[:n]), self._matrices(vector[n : 2 * n])
         return [Layer(*parts) for parts in zip(means, log_stds, biases, strict=True)], log_noise
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Of the flat vector, far from anything sensible."""
         both = []
         for k in range(2):
-            bound = np.full(self.n_parameters, (-np.inf, np.inf)[k])
-            bound[self.n_weights : 2 * self.n_weights] = self._prior_log_std + _LOG_STD[k]
-            self.split(bound)[1][:] = _LOG_NOISE[k]
-            both.append(bound)
+            limit = np.full(self.n_parameters, (-np.inf, np.inf)[k])
+            limit[self.n_weights : 2 * self.n_weights] = self._prior_log_std + _LOG_STD[k]
+            self.split(limit)[1][:] = _LOG_NOISE[k]
+            both.append(limit)
         return both[0], both[1]
 
     def start(self, rng: np.random.Generator) -> np.ndarray:

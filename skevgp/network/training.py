@@ -7,9 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._progress import Monitor
 from .._validation import LARGEST
 from ..optimizers.adam import adam, is_flat
-from ..optimizers.lbfgs import Minimum, Report
+from ..optimizers.minimum import Minimum
 from .model import Layer, VariationalNetwork
 
 # A column whose entries differ by so many rounding errors is constant.
@@ -110,6 +111,19 @@ class Training:
     scores: np.ndarray
     still_falling: bool
 
+    def how_it_ended(self, max_iter: int, tol: float, interrupted: bool) -> str:
+        """What the user should know of how it ended; empty if all is well."""
+        if interrupted:
+            return f"The fit was interrupted in epoch {len(self.losses)}; the best parameters so far are kept."
+        if not self.minimum.converged:
+            return "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
+        if self.still_falling:
+            return (
+                f"The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on "
+                f"purpose with a larger tol (now {tol})."
+            )
+        return ""
+
 
 def train(
     network: VariationalNetwork,
@@ -124,7 +138,7 @@ def train(
     learning_rate: float,
     tol: float,
     patience: int,
-    report: Report | None = None,
+    monitor: Monitor | None = None,
 ) -> Training:
     """Adam on mini-batches of freshly shuffled rows.
 
@@ -140,7 +154,7 @@ def train(
     max_iter : int
         Epochs at most.
     batch_size : int
-    learning_rate, tol, report
+    learning_rate, tol, monitor
         As in `adam`.
     patience : int
         Epochs without a gain of ``tol`` on the rows held back after which training ends.
@@ -167,7 +181,7 @@ def train(
         watch = _EarlyStopping(
             lambda theta: network.expected_log_likelihood(theta, *others, draws), steps, tol, patience
         )
-    minimum = adam(objective, start, network.bounds(), max_iter * steps, learning_rate, tol, report, stop=watch)
+    minimum = adam(objective, start, network.limits(), max_iter * steps, learning_rate, tol, monitor, stop=watch)
     losses = np.array(minimum.loss_curve)
     return Training(
         minimum.x if watch is None or watch.theta is None else watch.theta,

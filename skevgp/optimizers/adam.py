@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
-from .lbfgs import Minimum, Objective, Report
+from .._progress import Monitor
+from .minimum import Limits, Minimum, Objective
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
 # A plateau is looked for this often, and not before so many steps.
@@ -18,11 +20,11 @@ _WINDOW, _FEWEST = 50, 1500
 def adam(
     objective: Objective,
     start: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
+    limits: Limits,
     max_iter: int,
     learning_rate: float,
     tol: float = 0.0,
-    report: Report | None = None,
+    monitor: Monitor | None = None,
     pace: Callable[[float], None] | None = None,
     stop: Callable[[np.ndarray], bool] | None = None,
 ) -> Minimum:
@@ -38,16 +40,16 @@ def adam(
     ----------
     objective : callable
         x -> (loss, gradient), of the next mini-batch at each call.
-    start, bounds
-        As in `optimize.lbfgs`; steps are clipped to the bounds.
+    start, limits
+        As in `lbfgs`; steps are clipped to the limits.
     max_iter : int
         The most steps.
     learning_rate : float
         The first step size.
     tol : float, default=0.0
         In units of the loss.
-    report : callable, default=None
-        report(iteration, loss), once per step.
+    monitor : Monitor, default=None
+        Told of each step.
     pace : callable, default=None
         pace(share), before each step: its size as a share of the first.
     stop : callable, default=None
@@ -59,11 +61,12 @@ def adam(
         ``x`` is the last point, or, if the loss did not stay finite or Ctrl-C ended the steps, the best point kept on
         the way, judged by the median loss of the steps before it; ``others`` has that point anyway.
     """
-    x = np.clip(start, *bounds)
+    monitor = Monitor() if monitor is None else monitor
+    x = np.clip(start, *limits)
     minimum, best = Minimum(x, np.inf), _BestSoFar(x)
     first, second = np.zeros_like(x), np.zeros_like(x)
     since, until, highest, flat_from = 0, max_iter, 1.0, 0
-    try:
+    with monitor.keeping_the_best(), suppress(NotPositiveDefiniteError):
         while minimum.n_iter < until:
             share = 0.5 * highest * (1.0 + np.cos(np.pi * (minimum.n_iter - since) / (until - since)))
             if pace is not None:
@@ -77,9 +80,8 @@ def adam(
             first += (1.0 - _DECAY_FIRST) * (gradient - first)
             second += (1.0 - _DECAY_SECOND) * (gradient**2 - second)
             scale = np.sqrt(second / (1.0 - _DECAY_SECOND**t)) + _EPSILON
-            x = np.clip(x - learning_rate * share / (1.0 - _DECAY_FIRST**t) * first / scale, *bounds)
-            if report is not None:
-                report(t, loss)
+            x = np.clip(x - learning_rate * share / (1.0 - _DECAY_FIRST**t) * first / scale, *limits)
+            monitor.iteration(t, loss)
             if t % _WINDOW == 0 and t >= 3 * _WINDOW:
                 flat_from = (flat_from or t) if is_flat(np.array(minimum.loss_curve), tol) else 0
                 if flat_from > 0 and t >= _FEWEST and t - flat_from >= t // 3 and 2 * t < until:
@@ -87,10 +89,6 @@ def adam(
             if stop is not None and stop(x):
                 until = t
         minimum.converged = minimum.n_iter == until
-    except NotPositiveDefiniteError:
-        pass
-    except KeyboardInterrupt:
-        minimum.interrupted = True
     minimum.others = (best.point(),)
     minimum.x = x if minimum.converged else best.point()
     return minimum

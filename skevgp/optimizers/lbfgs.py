@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
-
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
 from .._linalg import NotPositiveDefiniteError
-
-Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
-# report(iteration, loss): called once per iteration.
-Report = Callable[[int, float], None]
+from .._progress import Monitor
+from .minimum import Limits, Minimum, Objective
 
 _MAX_RESTARTS = 10
 _PATIENCE = 3
@@ -20,37 +15,6 @@ _PATIENCE = 3
 _HAIR = 1e-10
 # A fresh start is worth another when it lowers the loss by this many times the tolerance.
 _WORTH = 100.0
-
-
-@dataclass
-class Minimum:
-    """What an optimiser found.
-
-    Attributes
-    ----------
-    x : ndarray
-        The best point seen.
-    loss : float
-        Its value.
-    loss_curve : list of float
-        The loss per iteration.
-    converged : bool
-    interrupted : bool
-        Whether Ctrl-C ended it.
-    others : tuple of ndarray
-        Where losses are noisy: points that may be better.
-    """
-
-    x: np.ndarray
-    loss: float
-    loss_curve: list[float] = field(default_factory=list)
-    converged: bool = False
-    interrupted: bool = False
-    others: tuple[np.ndarray, ...] = ()
-
-    @property
-    def n_iter(self) -> int:
-        return len(self.loss_curve)
 
 
 class _Guarded:
@@ -74,10 +38,10 @@ class _Guarded:
         return loss, gradient
 
 
-def _nudged(guarded: _Guarded, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, float]:
+def _nudged(guarded: _Guarded, limits: Limits) -> tuple[np.ndarray, float]:
     """A point next to the best with a middling loss, and how much the loss scatters there: its rounding error."""
     rng, best = np.random.RandomState(0), guarded.x
-    points = [np.clip(best + _HAIR * np.maximum(np.abs(best), 1.0) * rng.randn(len(best)), *bounds) for _ in range(5)]
+    points = [np.clip(best + _HAIR * np.maximum(np.abs(best), 1.0) * rng.randn(len(best)), *limits) for _ in range(5)]
     losses = np.array([guarded(point)[0] for point in points])
     return points[int(np.argsort(losses)[2])], float(losses.std())
 
@@ -85,10 +49,10 @@ def _nudged(guarded: _Guarded, bounds: tuple[np.ndarray, np.ndarray]) -> tuple[n
 def lbfgs(
     objective: Objective,
     start: np.ndarray,
-    bounds: tuple[np.ndarray, np.ndarray],
+    limits: Limits,
     max_iter: int,
     tol: float,
-    report: Report | None = None,
+    monitor: Monitor | None = None,
 ) -> Minimum:
     """L-BFGS-B (SciPy), started anew from the best point when it stalls or a line search fails.
 
@@ -97,18 +61,19 @@ def lbfgs(
     objective : callable
         x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
     start : ndarray of shape (size,)
-    bounds : (lower, upper), each of shape (size,)
+    limits : (lower, upper), each of shape (size,)
     max_iter : int
         Iterations in all.
     tol : float
         Start anew when each of three iterations in a row lowers the loss by less than this; stop when that no longer
         lowers it by a hundred times as much.
-    report : callable, default=None
+    monitor : Monitor, default=None
 
     Returns
     -------
     minimum : Minimum
     """
+    monitor = Monitor() if monitor is None else monitor
     guarded = _Guarded(objective, start)
     minimum = Minimum(start, np.inf)
     stalled = 0
@@ -119,13 +84,12 @@ def lbfgs(
         loss = float(intermediate_result.fun)
         before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
         minimum.loss_curve.append(loss)
-        if report is not None:
-            report(minimum.n_iter, loss)
+        monitor.iteration(minimum.n_iter, loss)
         stalled = stalled + 1 if before - loss < tol else 0
         if stalled >= _PATIENCE:
             raise StopIteration
 
-    try:
+    with monitor.keeping_the_best():
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
@@ -140,7 +104,7 @@ def lbfgs(
                 x,
                 jac=True,
                 method="L-BFGS-B",
-                bounds=np.column_stack(bounds),
+                bounds=np.column_stack(limits),
                 callback=callback,
                 options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": 0.0, "gtol": 1e-9},
             )
@@ -149,9 +113,7 @@ def lbfgs(
             # It stalled, or a line search failed: either it is done, or memory and rounding errors led it astray.
             # Start anew a hair away, where the loss is not what rounding made of it here, until that gains no more.
             minimum.converged = before - guarded.loss <= enough
-            x, rounding = _nudged(guarded, bounds)
+            x, rounding = _nudged(guarded, limits)
             enough = max(_WORTH * tol, 2.0 * rounding)
-    except KeyboardInterrupt:
-        minimum.interrupted = True
     minimum.x, minimum.loss = guarded.x, guarded.loss
     return minimum

@@ -1,4 +1,4 @@
-"""Named parameters <-> one flat vector of coordinates, with transforms and bounds."""
+"""Named parameters <-> one flat vector of coordinates, with transforms and limits."""
 
 from __future__ import annotations
 
@@ -20,11 +20,13 @@ class Parameter:
     start : ndarray
         First value, in the parameter's own units; its shape is the parameter's.
     transform : {"identity", "log"}
-        The optimiser moves ``value / unit`` or ``log(value)``.
+        The optimiser moves ``(value - origin) / unit`` or ``log(value)``.
     lower, upper : ndarray or float
-        Bounds of the value, broadcast to its shape.
+        Limits of the value, broadcast to its shape.
     unit : ndarray or float
         Size of a typical change, for ``"identity"``.
+    origin : ndarray or float
+        A typical value, for ``"identity"``.
     fixed : bool or ndarray of bool
         Whether it stays where it starts; an array of its shape says so of each entry.
     """
@@ -35,6 +37,7 @@ class Parameter:
     lower: np.ndarray | float = -np.inf
     upper: np.ndarray | float = np.inf
     unit: np.ndarray | float = 1.0
+    origin: np.ndarray | float = 0.0
     fixed: bool | np.ndarray = False
 
     @property
@@ -48,16 +51,16 @@ class Parameter:
         if self.transform == "log":
             with np.errstate(divide="ignore"):
                 return np.log(np.maximum(value, 0.0)).ravel()
-        return (value / self.unit).ravel()
+        return ((value - self.origin) / self.unit).ravel()
 
-    def value_bounds(self) -> np.ndarray:
-        """Bounds of each entry, (size, 2), in the parameter's own units."""
-        bounds = np.broadcast_to(self.lower, self.start.shape), np.broadcast_to(self.upper, self.start.shape)
-        return np.column_stack([np.ravel(bound) for bound in bounds])
+    def value_limits(self) -> np.ndarray:
+        """Limits of each entry, (size, 2), in the parameter's own units."""
+        limits = np.broadcast_to(self.lower, self.start.shape), np.broadcast_to(self.upper, self.start.shape)
+        return np.column_stack([np.ravel(limit) for limit in limits])
 
     def value(self, coordinate: np.ndarray) -> np.ndarray:
         """The value at a coordinate of the parameter's shape."""
-        return np.exp(coordinate) if self.transform == "log" else coordinate * self.unit
+        return np.exp(coordinate) if self.transform == "log" else self.origin + coordinate * self.unit
 
 
 def _shape(values: dict[str, np.ndarray], name: str) -> tuple[int, ...] | None:
@@ -82,7 +85,7 @@ class ParameterTable:
         for parameter in self.parameters:
             free = parameter.free
             if free.any():
-                self._slices[parameter.name] = slice(end, end + free.sum())
+                self._slices[parameter.name] = slice(end, end + int(free.sum()))
                 end += int(free.sum())
                 if not free.all():
                     self._free[parameter.name] = free
@@ -103,12 +106,16 @@ class ParameterTable:
         )
 
     def start(self) -> np.ndarray:
-        """The flat vector (size,) of the starts, put inside their bounds."""
+        """The flat vector (size,) of the starts, put inside their limits."""
         flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})
-        return np.clip(flat, *self.bounds())
+        return np.clip(flat, *self.limits())
 
-    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds (size,) of the flat vector."""
+    def values_at_start(self) -> dict[str, np.ndarray]:
+        """The values by name where the optimiser starts."""
+        return self.values(self.start())
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limits (size,) of the flat vector."""
         lower = self.flat({parameter.name: parameter.coordinate(parameter.lower) for parameter in self.parameters})
         upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
         return lower, upper
@@ -135,8 +142,14 @@ class ParameterTable:
         coordinates = self.coordinates(flat)
         return {parameter.name: parameter.value(coordinates[parameter.name]) for parameter in self.parameters}
 
+    def gradient(self, bars: dict[str, np.ndarray]) -> np.ndarray:
+        """The flat gradient (size,), from those in the values, or in their logarithms where these are what moves."""
+        return self.flat(
+            {own.name: bars[own.name] * (own.unit if own.transform == "identity" else 1.0) for own in self.parameters}
+        )
+
     def flat(self, parts: dict[str, np.ndarray]) -> np.ndarray:
-        """Join the free parameters' parts (coordinates or gradients) into a vector (size,)."""
+        """Join the free parameters' parts (coordinates or gradients in them) into a vector (size,)."""
         if not self._slices:
             return np.empty(0)
         return np.concatenate(

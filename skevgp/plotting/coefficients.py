@@ -86,9 +86,9 @@ class CoefficientDisplay:
             If matplotlib is not installed; the message gives the pip command.
         """
         check_is_fitted(estimator)
-        n_outputs, width = np.atleast_2d(estimator.coef_).shape
-        if width == 0:
+        if not hasattr(estimator, "coef_"):
             raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
+        n_outputs, width = np.atleast_2d(estimator.coef_).shape
         check_output(output, n_outputs)
         try:
             names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]

@@ -21,7 +21,7 @@ from ._style import PALETTE, axes_of
 class LearningCurveDisplay:
     """Test score against the number of training rows: the mean of several runs, in a band from lowest to highest.
 
-    The paper's figure of section IV-B. Curves of several models can share axes.
+    The paper's Figure 6. Curves of several models can share axes.
 
     Parameters
     ----------

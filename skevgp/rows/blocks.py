@@ -42,7 +42,7 @@ class Block:
         p.
     may_keep : bool
         Whether there is room for ``kept``.
-    kept : (L_inv, k(X_m, X), V) or None
+    kept : (whitening, k(X_m, X), V) or None
         What the first pass left for the second.
     """
 
@@ -50,7 +50,7 @@ class Block:
     linear: np.ndarray
     n_features: int
     may_keep: bool = False
-    kept: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    kept: tuple[Any, np.ndarray, np.ndarray] | None = None
 
     @property
     def features(self) -> np.ndarray:
@@ -59,6 +59,13 @@ class Block:
     @property
     def residuals(self) -> np.ndarray:
         return self.linear[:, self.n_features :]
+
+    def linear_of(self, outputs: slice) -> np.ndarray:
+        """h(x), then r of some outputs, (n, p + their number); no copy if they are all."""
+        residuals = self.residuals[:, outputs]
+        if residuals.shape[1] == self.linear.shape[1] - self.n_features:
+            return self.linear
+        return np.hstack([self.features, residuals])
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""The rows of a data set in internal units, in which every number is of order one."""
+"""The rows of a data set as the inference sees them: residuals in place of targets, of order one."""
 
 from __future__ import annotations
 
@@ -64,18 +64,20 @@ class Rows:
     source : Source
         In the user's units.
     to_internal : callable
-        From there to centred inputs and to residuals (in place of targets): y minus the reference linear part, in
-        units of its own size.
+        From there to residuals in place of targets: y minus the reference linear part, in units of its own size.
     columns : slice
         The outputs that count.
     share : float
         Of the memory for blocks, for one of several fits at once.
+    threads : BlockMap
+        What blocks are worked on by.
     """
 
     source: Source
     to_internal: ToInternal
     columns: slice = field(default_factory=lambda: slice(None))
     share: float = 1.0
+    threads: BlockMap = field(default_factory=BlockMap)
 
     def __len__(self) -> int:
         return self.source.n_rows
@@ -86,7 +88,7 @@ class Rows:
 
     @property
     def inputs(self) -> Moments:
-        """Of the centred inputs' columns."""
+        """Of the inputs' columns."""
         return self._moments[0]
 
     @property
@@ -111,10 +113,10 @@ class Rows:
             chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
         return self.some(chosen)
 
-    def blocks(self, kernel: Preparer, n_inducing: int, threads: BlockMap | None = None) -> Blocks:
+    def blocks(self, kernel: Preparer, n_inducing: int) -> Blocks:
         """The rows as blocks for a kernel with so many inducing points."""
         make = MakeBlock(kernel, self.to_internal, self.columns)
-        return self.source.blocks(make, n_inducing, BlockMap() if threads is None else threads, self.share)
+        return self.source.blocks(make, n_inducing, self.threads, self.share)
 
     def batches(self, kernel: Preparer, size: int, rng: np.random.RandomState) -> Iterator[Batch]:
         """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""

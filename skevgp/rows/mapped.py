@@ -7,8 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from .._sklearn import safe_indexing
-from .maps import MAP_ROWS, apply_map
+from .maps import MAP_ROWS, apply_map, take_rows
 from .source import RawRows
 
 # What the maps make of all rows is kept if it fits in so many bytes; else they are applied anew at each pass.
@@ -23,12 +22,13 @@ class MappedRows:
     given : array-like of shape (n, n_columns)
         What the maps see: X as the user gave it if it is a data frame, else X.
     X : ndarray of shape (n, n_columns)
+        What the kernel sees; where it has a map, the data frame itself will do.
     y : ndarray of shape (n, o)
     feature_map, kernel_map : transformer or None
         Fitted.
     """
 
-    def __init__(self, given: Any, X: np.ndarray, y: np.ndarray, feature_map: Any, kernel_map: Any):
+    def __init__(self, given: Any, X: Any, y: np.ndarray, feature_map: Any, kernel_map: Any):
         self.given, self.X, self.y = given, X, y
         self.feature_map, self.kernel_map = feature_map, kernel_map
         self._mapped: tuple[np.ndarray, np.ndarray] | None = None
@@ -50,8 +50,8 @@ class MappedRows:
 
     def _through_maps(self, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""
-        X = np.asarray(self.X[rows], dtype=np.float64)
-        given = X if self.given is self.X else safe_indexing(self.given, rows)
+        X = take_rows(self.X, rows)
+        given = X if self.given is self.X else take_rows(self.given, rows)
         mapped = map_rows(given, X, self.feature_map, self.kernel_map)
         widths = mapped[0].shape[1], mapped[1].shape[1]
         if self._widths not in (None, widths):
@@ -69,7 +69,7 @@ class MappedRows:
         vars(self).update(state, _lock=Lock())
 
 
-def map_rows(given: Any, X: np.ndarray, feature_map: Any, kernel_map: Any) -> tuple[np.ndarray, np.ndarray]:
+def map_rows(given: Any, X: Any, feature_map: Any, kernel_map: Any) -> tuple[np.ndarray, np.ndarray]:
     """The kernel's inputs and the features of rows X; the maps see ``given``."""
     inputs = X if kernel_map is None else apply_map(kernel_map, given, "kernel_map")
     features = np.empty((len(X), 0)) if feature_map is None else apply_map(feature_map, given, "feature_map")

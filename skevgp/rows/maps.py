@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 from sklearn.base import clone
+from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
 
 from .._sklearn import safe_indexing
-from .._validation import LARGEST, as_floats, check_magnitude
+from .._validation import LARGEST, as_floats, check_magnitude, is_frame
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
@@ -38,12 +39,22 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
 
 def fresh_map(feature_map: Any, name: str) -> Any:
     """A clone of a transformer, or a TypeError that names it."""
+    if isinstance(feature_map, Kernel):
+        raise TypeError(f"{name}={feature_map!r} is a kernel: give it as kernel=.")
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
         raise TypeError(f"{name} must be None or a transformer instance with fit and transform; got {feature_map!r}.")
     try:
         return clone(feature_map)
     except TypeError as error:
         raise TypeError(f"{name}={feature_map!r} cannot be cloned: {error}") from error
+
+
+def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
+    """Some rows as the maps see them: of a data frame as one, of an array in float64."""
+    if not is_frame(X):
+        return np.asarray(X[rows], dtype=np.float64)
+    # A slice of a pyarrow table must end within it.
+    return safe_indexing(X, slice(*rows.indices(len(X))) if isinstance(rows, slice) else rows)
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
@@ -69,7 +80,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
-        rows = X if n_rows <= MAP_ROWS else safe_indexing(X, slice(first, first + MAP_ROWS))
+        rows = X if n_rows <= MAP_ROWS else take_rows(X, slice(first, first + MAP_ROWS))
         values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
@@ -113,7 +124,7 @@ def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
             f"{called} must return one row per row of X; for {n_rows} rows it returned the shape {values.shape}."
         )
     if not np.isfinite(values).all():
-        raise ValueError(f"{called} returned NaN or infinity for finite rows.")
+        raise ValueError(f"{called} returned NaN or infinity.")
     if values.shape[1] == 0:
         raise ValueError(f"{called} returned no columns.")
     check_magnitude(values, f"What {called} returns")

@@ -15,9 +15,10 @@ from skevgp.rows.threads import BlockMap
 from ..oracle import ArrayRows, problem, relative_error, whitened
 
 
-def rows_of(rows):
+def rows_of(rows, threads=None):
     """Rows whose internal units are the user's."""
-    return Rows(LocalSource.of(rows.inputs, rows.features, rows.residuals), lambda raw: raw)
+    source = LocalSource.of(rows.inputs, rows.features, rows.residuals)
+    return Rows(source, lambda raw: raw, threads=threads or BlockMap())
 
 
 def edges_of(n, n_folds):
@@ -55,18 +56,18 @@ def refitted_scores(model, values, rows, o, noise, n_folds):
 
 def scores(model, values, rows, grid, n_folds, threads=None):
     """`left_out_scores` of all outputs, (o, g)."""
-    edges, found = edges_of(len(rows), n_folds), []
+    edges = edges_of(len(rows), n_folds)
     folds = [rows_of(rows).part(*ends, 1.0).blocks(model.kernel, 6) for ends in pairwise(edges)]
-    for outputs, (at, _, L_inv) in zip(model.groups, model.factors(values), strict=True):
-        found.append(left_out_scores(model, values, outputs, folds, at, L_inv, grid[outputs], threads or BlockMap()))
+    groups = model.groups_on(values, rows_of(rows).blocks(model.kernel, 6))
+    found = [left_out_scores(own, model.family, folds, grid[own.outputs], threads or BlockMap()) for own in groups]
     return np.concatenate(found)
 
 
 def calibrated(model, values, rows, n_folds, bounds=(1e-10, 1e2), threads=None):
-    rows = rows_of(rows)
+    rows = rows_of(rows, threads)
     statistics = model.statistics(values, rows.blocks(model.kernel, 6))
     bounds = np.tile(bounds, (len(values["noise"]), 1))
-    return calibrated_noise(model, values, statistics, rows, bounds, n_folds, threads or BlockMap())
+    return calibrated_noise(model, values, statistics, rows, bounds, n_folds)
 
 
 @pytest.mark.parametrize(("features", "n_folds"), [(3, 2), (0, 7), (3, 60)])
@@ -132,7 +133,7 @@ def test_folds_that_know_nothing_of_each_other_do_not_lower_the_noise_below_what
     values = {"hyperparameters": np.ones(1), "signal": np.ones(1), "noise": np.full(1, 0.01), "inducing_points": Z}
     rows = Rows(LocalSource.of(X, np.empty((200, 0)), r), lambda raw: raw)
     statistics = model.statistics(values, rows.blocks(model.kernel, 4))
-    noise = calibrated_noise(model, values, statistics, rows, np.array([[1e-10, 1e2]]), 2, BlockMap())
+    noise = calibrated_noise(model, values, statistics, rows, np.array([[1e-10, 1e2]]), 2)
     np.testing.assert_allclose(noise, 0.01, rtol=0.2)
 
 

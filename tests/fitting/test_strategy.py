@@ -1,348 +1,240 @@
-"""Where fits start, how often, and what they say when they end badly."""
+"""The decisions of a fit, one by one: which start comes next, given how the fits before it ended."""
 
-import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared, WhiteKernel
-from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import EVGPRegressor
-from skevgp.fitting import strategy as learning
+from skevgp._progress import Monitor
+from skevgp.fitting.strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
+from skevgp.optimizers.parameters import Parameter, ParameterTable
 
-RNG = np.random.RandomState(0)
-X = RNG.uniform(-2, 2, (120, 2))
-Y = np.column_stack([np.sin(3 * X[:, 0]) * X[:, 1], np.cos(2 * X[:, 1])]) + 0.01 * RNG.randn(120, 2)
-Z = RNG.uniform(-2, 2, (7, 2))
+RULES = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
+PLACES = np.arange(4.0).reshape(1, 2, 2)
 
 
-def model(**arguments):
-    return EVGPRegressor(**{"n_inducing": 8, "random_state": 0, "tol": 0.1, **arguments})
-
-
-# --- n_restarts ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
-def test_restarts_keep_the_best_bound(sharing):
-    once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
-    often = model(sharing=sharing, inducing_init="k-means", n_restarts=3).fit(X, Y)
-    assert often.lower_bound_ >= once.lower_bound_
-    # Not all from the same place: the eight points leave several optima, of which the first is not the best.
-    assert often.lower_bound_ > once.lower_bound_ + 1e-3
-    assert -often.loss_curve_[-1] == pytest.approx(often.lower_bound_, abs=0.1)
-    assert len(often.loss_curve_) == often.n_iter_
-
-
-def test_restarts_serve_adam_too():
-    arguments = {"solver": "adam", "max_iter": 200, "batch_size": 120}
-    once, often = model(**arguments).fit(X, Y), model(n_restarts=2, **arguments).fit(X, Y)
-    assert often.lower_bound_ >= once.lower_bound_
-
-
-@pytest.mark.slow
-@pytest.mark.slow
-@pytest.mark.parametrize("sharing", ["all", "none"])
-def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
-    fits = [model(sharing=sharing, n_restarts=2, n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
-    for other in fits[1:]:
-        assert other.lower_bound_ == fits[0].lower_bound_
-        np.testing.assert_array_equal(other.inducing_points_, fits[0].inducing_points_)
-
-
-@pytest.mark.slow
-def test_restarts_stay_inside_the_users_bounds():
-    kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
-    m = model(kernel=kernel, n_restarts=3).fit(X, Y[:, 0])
-    lengthscales = m.kernel_.k2.length_scale
-    assert 0.9 - 1e-9 <= lengthscales[0] <= 1.1 + 1e-9
-    assert 0.2 - 1e-9 <= lengthscales[1] <= 5.0 + 1e-9
-    assert 5e-5 * (1 - 1e-9) <= m.noise_variance_ <= 2e-4 * (1 + 1e-9)
-
-
-def test_without_iterations_there_is_nothing_to_restart():
-    np.testing.assert_array_equal(
-        model(max_iter=0, n_restarts=5).fit(X, Y).inducing_points_, model(max_iter=0).fit(X, Y).inducing_points_
+def table(noise_fixed=False, kernel_fixed=False):
+    return ParameterTable(
+        [
+            Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
+            Parameter("signal", np.ones(2), "log", 1e-3, 1e3),
+            Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
+            Parameter("inducing_points", PLACES),
+        ]
     )
 
 
-def test_ctrl_c_ends_the_restarts_with_the_best_so_far(monkeypatch):
-    calls = []
-
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
-
-        def __call__(self, iteration, loss):
-            calls.append(iteration)
-            # In the second iteration of the second start.
-            if calls.count(2) == 2:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
-    with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(inducing_init="k-means", verbose=1, n_restarts=50).fit(X, Y)
-    assert m.lower_bound_ == model(inducing_init="k-means").fit(X, Y).lower_bound_
-    assert calls.count(2) == 2
+def strategy(**changes):
+    own = {"table": table(), "max_iter": 1000, "n_restarts": 0, "scatter": np.ones(2), **changes}
+    return Strategy(own.pop("rules", RULES), **own)
 
 
-# --- inducing_init -----------------------------------------------------------------------------------------------
+def place(values):
+    return values | {"inducing_points": values["inducing_points"] + 10.0}
 
 
-def test_placing_points_anew_finds_the_columns_that_matter():
-    """Among ten columns the target knows one: clusters spread over all of them, the learned kernel does not."""
-    rng = np.random.RandomState(0)
-    x = rng.uniform(-3.0, 3.0, (400, 10))
-    y = np.sin(3.0 * x[:, 0]) + 0.01 * rng.randn(400)
-    first, auto = (model(n_inducing=16, inducing_init=init).fit(x, y) for init in ("k-means", "auto"))
-    assert auto.lower_bound_ > first.lower_bound_ + 10.0
-    assert auto.n_iter_ == len(auto.loss_curve_)
-    assert auto.lower_bound_ == pytest.approx(-auto.loss_curve_[-1], abs=1e-3)
+def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True):
+    """How a fit from a start may have ended: the hyperparameters say after how many iterations."""
+    n_iter = attempt.until if n_iter is None else n_iter
+    return Fit(attempt.values | {"noise": np.full(2, noise)}, bound, [0.0] * n_iter, converged)
 
 
-def test_points_are_placed_anew_only_where_the_kernel_can_learn():
-    fixed = ConstantKernel(1.0) * RBF(1.0, "fixed")
-    first, auto = (model(kernel=fixed, inducing_init=init).fit(X, Y) for init in ("k-means", "auto"))
-    assert auto.lower_bound_ == first.lower_bound_
+def drive(strategy, *results):
+    """The attempts that a strategy makes when fits end with these (bound, options); the fit that it returns."""
+    attempts, made, results = strategy.attempts(), [], list(results)
+    attempt = next(attempts)
+    while True:
+        made.append(attempt)
+        bound, options = results.pop(0)
+        try:
+            attempt = attempts.send(ended(attempt, bound, **options))
+        except StopIteration as done:
+            assert not results
+            return made, done.value
 
 
-def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
-    """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
-    monkeypatch.setattr("skevgp.fitting.strategy._STAGE", 20)
-    placed, calls = learning._placed, []
-
-    def all_at_one_place(values, *arguments):
-        moved = placed(values, *arguments)
-        calls.append(1)
-        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
-
-    class Interrupt:
-        def __init__(self, verbose, shift):
-            pass
-
-        def __call__(self, iteration, loss):
-            if calls:
-                raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", all_at_one_place)
-    monkeypatch.setattr("skevgp.regressor.Progress", Interrupt)
-    with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(verbose=1, tol=1e-9).fit(X, Y)
-    with pytest.warns(ConvergenceWarning, match="still rising"):
-        before = model(max_iter=20, tol=1e-9).fit(X, Y)
-    assert m.lower_bound_ == pytest.approx(before.lower_bound_, abs=1e-6)
-    assert m.n_iter_ == 20
+GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}
 
 
-def test_ctrl_c_while_points_are_placed_keeps_the_fit(monkeypatch):
-    def interrupted(*arguments):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", interrupted)
-    with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m = model().fit(X, Y)
-    assert m.lower_bound_ > 0.0
+def test_a_good_fit_is_left_alone():
+    made, best = drive(strategy(), (5.0, GOOD))
+    assert [attempt.until for attempt in made] == [1000]
+    np.testing.assert_allclose(made[0].values["hyperparameters"], [2.0, 3.0])
+    assert best.bound == 5.0
 
 
-def test_bad_places_do_not_cost_the_bound(monkeypatch):
-    placed = learning._placed
-
-    def all_at_one_place(values, *arguments):
-        moved = placed(values, *arguments)
-        return moved | {"inducing_points": np.full_like(moved["inducing_points"], 1.9)}
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", all_at_one_place)
-    monkeypatch.setattr("skevgp.fitting.strategy._STAGE", 15)
-    m = model().fit(X, Y)
-    assert m.lower_bound_ > model(inducing_init="k-means").fit(X, Y).lower_bound_ - 1.0
+def test_a_collapsed_fit_starts_again_elsewhere_until_one_learns():
+    made, best = drive(strategy(), (5.0, COLLAPSED), (4.0, COLLAPSED), (9.0, GOOD))
+    np.testing.assert_allclose(made[1].values["hyperparameters"], [1.0, 1.5])
+    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
+    np.testing.assert_allclose(made[2].values["hyperparameters"], [4.0, 6.0])
+    np.testing.assert_allclose(made[2].values["noise"], 1e-2)
+    assert best.bound == 9.0
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
-def test_points_stay_where_they_have_a_reason_to(monkeypatch, why):
-    warm = model(warm_start=True, inducing_init="k-means", n_inducing=20).fit(X, Y)
-
-    def never(*arguments):
-        raise AssertionError("placed anew")
-
-    monkeypatch.setattr("skevgp.fitting.strategy._placed", never)
-    fits = {
-        "warm start": lambda: warm.set_params(inducing_init="auto").fit(X, Y),
-        "as many points as rows": lambda: model(n_inducing=80, tol=1.0).fit(X, Y),
-        "few iterations": lambda: model(max_iter=100, tol=1.0).fit(X, Y),
-        "Adam": lambda: model(solver="adam", max_iter=150).fit(X, Y),
-        "own points": lambda: model(inducing_init=Z).fit(X, Y),
-    }
-    fits[why]()
+def test_one_output_that_collapsed_is_enough():
+    own = strategy()
+    fit = Fit({"noise": np.array([1e-4, 0.95])}, 5.0)
+    assert own.collapsed(fit)
+    assert not own.collapsed(replace(fit, values={"noise": np.array([1e-4, 0.85])}))
 
 
-def test_random_state_draws_mini_batches():
-    arguments = {"solver": "adam", "max_iter": 120, "batch_size": 10, "inducing_init": Z}
-    bounds = {model(random_state=seed, **arguments).fit(X, Y).lower_bound_ for seed in (0, 1)}
-    assert len(bounds) == 2
+def test_when_nothing_learns_the_best_bound_is_kept():
+    made, best = drive(strategy(), (5.0, COLLAPSED), (7.0, COLLAPSED), (6.0, COLLAPSED))
+    assert len(made) == 3
+    assert best.bound == 7.0
 
 
-def test_max_iter_counts_all_iterations(capsys):
-    with pytest.warns(ConvergenceWarning, match="max_iter=110 iterations"):
-        m = model(max_iter=110, tol=1e-12, verbose=2, n_inducing=20).fit(X, Y)
-    assert m.n_iter_ == 110
-    assert capsys.readouterr().out.splitlines()[-1].startswith("iteration    110")
+def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
+    below = strategy(alone=6.0)
+    assert len(drive(below, (5.0, GOOD), (8.0, GOOD))[0]) == 2
+    assert len(drive(below, (5.0, UNFINISHED))[0]) == 1
 
 
-def test_greedy_points_are_rows_and_reproducible():
-    greedy = model(inducing_init="greedy", max_iter=0).fit(X, Y)
-    assert greedy.inducing_points_.shape == (8, 2)
-    rows = {tuple(row) for row in np.round(X, 9)}
-    assert all(tuple(point) in rows for point in np.round(greedy.inducing_points_, 9))
-    again = clone(greedy).fit(X, Y)
-    np.testing.assert_array_equal(again.inducing_points_, greedy.inducing_points_)
+@pytest.mark.parametrize("why", ["noise is fixed", "no iterations"])
+def test_other_starts_need_a_noise_that_moves(why):
+    own = strategy(table=table(noise_fixed=True)) if why == "noise is fixed" else strategy(max_iter=0)
+    assert len(drive(own, (5.0, COLLAPSED))[0]) == 1
 
 
-def test_given_points_replace_n_inducing_and_stay_without_iterations():
-    m = model(inducing_init=Z, max_iter=0).fit(X, Y)
-    np.testing.assert_allclose(m.inducing_points_, Z, atol=1e-14)
-    np.testing.assert_allclose(
-        model(inducing_init=Z.tolist(), sharing="kernel", max_iter=0).fit(X, Y).inducing_points_, [Z, Z], atol=1e-14
-    )
-    assert model(inducing_init=Z).fit(X, Y).lower_bound_ > m.lower_bound_
+def test_where_the_kernel_may_interpolate_a_high_noise_is_tried_too():
+    made, best = drive(strategy(interpolates=True), (5.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    assert best.bound == 6.0
+    # And points, as many as rows, stay.
+    assert len(drive(strategy(interpolates=True, place=place), (5.0, GOOD), (4.0, GOOD))[0]) == 2
 
 
-def test_given_points_are_in_the_space_of_kernel_map():
-    double = FunctionTransformer(lambda X: np.column_stack([2.0 * X, X[:, 0] * X[:, 1]]))
-    points = double.transform(Z)
-    m = model(kernel_map=double, inducing_init=points, max_iter=0).fit(X, Y)
-    np.testing.assert_allclose(m.inducing_points_, points, atol=1e-14)
+def test_points_are_placed_anew_and_the_better_of_both_fits_goes_on():
+    made, best = drive(strategy(place=place), (5.0, UNFINISHED), (7.0, UNFINISHED), (6.0, UNFINISHED), (9.0, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200, 200, 1000]
+    np.testing.assert_array_equal(made[1].values["inducing_points"], PLACES + 10.0)
+    np.testing.assert_array_equal(made[2].values["inducing_points"], PLACES)
+    np.testing.assert_array_equal(made[3].values["inducing_points"], PLACES + 10.0)
+    assert made[1].after is made[2].after
+    assert made[1].after.bound == 5.0
+    assert made[3].after.bound == 7.0
+    assert best.bound == 9.0
 
 
-def test_a_fit_goes_on_from_the_inducing_points_of_another():
-    first = model().fit(X, Y)
-    again = model(inducing_init=first.inducing_points_).fit(X, Y)
-    assert again.lower_bound_ > first.lower_bound_ - 10.0
+def test_bad_places_do_not_cost_the_bound():
+    made, best = drive(strategy(place=place), (5.0, UNFINISHED), (1.0, UNFINISHED), (6.0, UNFINISHED), (9.0, GOOD))
+    np.testing.assert_array_equal(made[3].values["inducing_points"], PLACES)
+    assert best.bound == 9.0
 
 
-@pytest.mark.slow
-def test_restarts_leave_given_points_alone():
-    fixed = RBF([1.0, 1.0], "fixed")
-    noise = WhiteKernel(1e-4, "fixed")
-    once, often = (model(inducing_init=Z, kernel=fixed + noise, n_restarts=n).fit(X, Y[:, 0]) for n in (0, 2))
-    # There is nothing else to start from: all fits are the same.
-    np.testing.assert_array_equal(often.inducing_points_, once.inducing_points_)
+def test_a_first_stage_that_has_ended_is_not_prolonged():
+    made, best = drive(strategy(place=place), (5.0, GOOD), (4.0, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200]
+    assert best.bound == 5.0
 
 
-@pytest.mark.parametrize("posterior", ["full", "diagonal"])
-def test_copies_among_given_points_do_no_harm(posterior):
-    m = model(inducing_init=np.repeat(Z[:4], 3, axis=0), posterior=posterior).fit(X, Y)
-    mean, std = m.predict(X, return_std=True)
-    assert np.isfinite(mean).all()
-    assert (std > 0).all()
+def test_stages_end_with_max_iter():
+    made, _ = drive(strategy(place=place, max_iter=110), (5.0, UNFINISHED), (7.0, UNFINISHED), (6.0, UNFINISHED))
+    assert [attempt.until for attempt in made] == [100, 110, 110]
 
 
 @pytest.mark.parametrize(
-    ("init", "message"),
-    [
-        (np.ones((4, 3)), r"inducing_init must be .* shape \(m, 2\).* got the shape \(4, 3\)"),
-        (np.ones(2), r"got the shape \(2,\)"),
-        (np.empty((0, 2)), r"got the shape \(0, 2\)"),
-        ([[1.0, np.nan]], "inducing_init must be finite"),
-        ([["a", "b"]], "inducing_init must be real numbers"),
-        ([[1e200, 0.0]], "inducing_init must not exceed"),
-        ("random", "'inducing_init' parameter"),
-    ],
+    "changes", [{"max_iter": 100}, {"table": table(kernel_fixed=True)}, {"rules": replace(RULES, stage=None)}, {}]
 )
-def test_bad_inducing_points(init, message):
-    with pytest.raises(ValueError, match=message):
-        model(inducing_init=init).fit(X, Y)
+def test_points_stay_where_there_is_no_second_stage(changes):
+    own = strategy(place=None if changes == {} else place, **changes)
+    assert len(drive(own, (5.0, UNFINISHED))[0]) == 1
 
 
-# --- what a fit says when it ends badly --------------------------------------------------------------------------
+def test_restarts_are_drawn_and_the_best_of_all_is_kept():
+    first = table().values_at_start()
+    drawn_values = iter([first | {"noise": np.full(2, 0.1)}, first | {"noise": np.full(2, 0.2)}])
+    own = strategy(n_restarts=2, restart=lambda: next(drawn_values))
+    made, best = drive(own, (5.0, GOOD), (8.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    np.testing.assert_allclose(made[2].values["noise"], 0.2)
+    assert best.bound == 8.0
 
 
-def test_noise_that_explains_what_a_kernel_could_is_told():
-    """One inducing point cannot follow forty waves, whatever the start."""
-    x = np.linspace(0, 1, 2000)[:, np.newaxis]
-    y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(2000)])
-    with pytest.warns(ConvergenceWarning, match=r"noise explains everything .* of 1 of 2 outputs .* Raise n_inducing"):
-        model(n_inducing=1).fit(x, y)
+def test_a_restart_is_staged_on_its_own():
+    own = strategy(n_restarts=1, place=place, restart=table().values_at_start)
+    made, best = drive(own, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD), (3.5, GOOD))
+    assert [attempt.until for attempt in made] == [100, 200, 100, 200]
+    # It goes on from the restart's first stage, though the fit before it was better.
+    assert made[3].after.bound == 3.0
+    assert best.bound == 5.0
 
 
-def test_noise_that_is_noise_is_not_a_failure():
-    noise = np.random.RandomState(1).randn(len(X), 2)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        m = model().fit(X, noise)
-        assert (m.noise_variance_ > 0.8 * noise.var(axis=0)).all()
-        model(feature_map=PolynomialFeatures(1)).fit(X, X + noise)
-        # The user wants it so.
-        model(kernel=RBF() + WhiteKernel(1.0, "fixed")).fit(X, Y)
+def test_a_warm_start_whose_points_have_moved_is_not_placed_anew():
+    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
+    made, _ = drive(strategy(warm=warm, place=place), (5.0, UNFINISHED))
+    np.testing.assert_array_equal(made[0].values["inducing_points"], PLACES + 1.0)
+    np.testing.assert_allclose(made[0].values["noise"], 0.3)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("sharing", ["all", "none"])
-def test_targets_far_from_their_prior_mean_are_told(sharing):
-    with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
-        model(sharing=sharing).fit(X, Y + [0.0, 1e6])
-    with pytest.warns(ConvergenceWarning, match="raise coef_scale"):
-        model(feature_map=PolynomialFeatures(1), tol=1.0, sharing=sharing).fit(X, Y + 1e6)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        assert model(n_inducing=30, normalize_y=True).fit(X, Y + 1e6).score(X, Y + 1e6) > 0.99
-        wide = model(n_inducing=30, feature_map=PolynomialFeatures(1), coef_scale=1e8).fit(X, Y + 1e6)
-        assert wide.score(X, Y + 1e6) > 0.99
+def test_a_warm_start_that_leads_nowhere_is_left_for_a_cold_one():
+    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
+    own = strategy(warm=warm, rules=replace(RULES, other_starts=()))
+    made, best = drive(own, (5.0, COLLAPSED), (4.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
+    assert best.bound == 5.0
 
 
-def test_targets_whose_squares_vanish_are_refused():
-    with pytest.raises(ValueError, match=r"y must be 0 or exceed 1e-140 in size; a column's largest value is 1.*e-150"):
-        model().fit(X, 1e-150 * Y)
-    assert model().fit(X, np.zeros(len(X))).predict(X) == pytest.approx(np.zeros(len(X)))
+def test_of_equal_fits_the_later_is_kept_and_any_is_better_than_none():
+    first, second = Fit({}, 1.0), Fit({}, 1.0)
+    assert better(first, second) is second
+    assert better(None, Fit({}, -np.inf)).bound == -np.inf
+    assert better(first, Fit({}, -np.inf)) is first
 
 
-def test_nothing_moves_without_iterations_even_if_the_noise_explains_everything():
-    X = np.random.RandomState(0).randn(200, 1)
-    kernel = ConstantKernel(1e-6) * RBF(0.7) + WhiteKernel(2.0)
-    model = EVGPRegressor(kernel=kernel, n_inducing=5, max_iter=0, random_state=0)
-    model.fit(X, np.random.RandomState(1).randn(200))
-    assert model.kernel_.k2.length_scale == pytest.approx(0.7)
-    assert model.noise_variance_ == pytest.approx(2.0)
+def test_drawn_values_stay_within_limits_and_leave_what_is_fixed():
+    own, rng = table(kernel_fixed=True), np.random.RandomState(0)
+    values = [drawn(own, RULES, rng) for _ in range(50)]
+    noise = np.array([value["noise"] for value in values])
+    assert noise.min() >= 1e-4 / 30.0 * (1 - 1e-9)
+    assert noise.max() <= 1e-4 * 30.0 * (1 + 1e-9)
+    assert noise.max() / noise.min() > 30.0
+    np.testing.assert_allclose([value["hyperparameters"] for value in values], [[2.0, 3.0]] * 50)
 
 
-@pytest.mark.parametrize("seed", [0, 1, 2])
-def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
-    """From a low first noise alone, such fits end on a plateau on which the kernel explains every row by itself."""
-    rng = np.random.RandomState(seed)
-    X = rng.uniform(-2, 2, (60, 3))
-    y = np.sin(2 * X[:, 0]) + 0.3 * X.sum(axis=1) + 0.1 * rng.randn(60)
-    model = EVGPRegressor(random_state=0).fit(X, y)
-    fewer = EVGPRegressor(n_inducing=50, noise_variance=0.05, random_state=0).fit(X, y)
-    assert model.lower_bound_ > fewer.lower_bound_ - 1.0
-    assert 1e-3 < model.noise_variance_ < 0.1
+class Told:
+    """A task whose fits end as told; Ctrl-C after so many."""
+
+    def __init__(self, strategy, bounds, stop_after=None):
+        self.strategy, self.monitor, self.made = strategy, Monitor(), []
+        self._bounds, self._stop_after = iter(bounds), stop_after
+
+    def minimise(self, attempt):
+        self.made.append(attempt)
+        if len(self.made) == self._stop_after:
+            self.monitor.stop()
+        return ended(attempt, next(self._bounds))
 
 
-def test_a_kernel_that_explains_less_than_noise_is_tried_from_other_starts():
-    rng = np.random.RandomState(0)
-    X = np.sort(rng.uniform(-2, 2, (60, 1)), axis=0)
-    y = np.sin(2 * X[:, 0]) + 0.3 * X[:, 0] + 0.1 * rng.randn(60)
-    model = EVGPRegressor(kernel=ExpSineSquared(), n_inducing=60, random_state=0).fit(X, y)
-    assert model.lower_bound_ > -0.5 * 60 * (np.log(2 * np.pi * np.mean(y**2)) + 1.0)
+def test_search_does_what_the_strategy_says_and_keeps_the_best():
+    own = strategy(n_restarts=2, restart=table().values_at_start)
+    task = Told(own, [1.0, 3.0, 2.0])
+    assert search(task).bound == 3.0
+    assert len(task.made) == 3
+    assert all(isinstance(attempt, Attempt) for attempt in task.made)
 
 
-@pytest.mark.slow
-def test_a_warm_start_that_leads_nowhere_is_left():
-    cold = model(n_inducing=12).fit(1e3 * X, Y)
-    warm = model(n_inducing=12, warm_start=True).fit(X, Y).fit(1e3 * X, Y)
-    assert warm.lower_bound_ > cold.lower_bound_ - 0.02 * abs(cold.lower_bound_)
+def test_ctrl_c_ends_the_search_with_the_best_so_far():
+    own = strategy(n_restarts=9, restart=table().values_at_start)
+    task = Told(own, [4.0, 3.0, 9.0], stop_after=2)
+    assert search(task).bound == 4.0
+    assert len(task.made) == 2
 
 
-def test_given_points_win_over_those_of_a_warm_start():
-    m = model(warm_start=True, max_iter=0, inducing_init=X[:5]).fit(X, Y)
-    m.set_params(inducing_init=X[5:10]).fit(X, Y)
-    np.testing.assert_allclose(m.inducing_points_, X[5:10], atol=1e-12)
+def test_ctrl_c_while_points_are_placed_keeps_the_fit():
+    def interrupted(values):
+        raise KeyboardInterrupt
+
+    task = Told(strategy(place=interrupted), [4.0])
+    assert search(task).bound == 4.0
+    assert task.monitor.stopped
 
 
-def test_alike_rows_teach_nothing_and_nobody_is_told_to_raise_n_inducing():
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        EVGPRegressor(random_state=0).fit(np.ones((80, 2)), RNG.randn(80))
+def test_ctrl_c_before_any_fit_is_an_interrupt():
+    class Interrupted(Told):
+        def minimise(self, attempt):
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(Interrupted(strategy(), []))

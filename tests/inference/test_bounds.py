@@ -7,6 +7,7 @@ from skevgp._linalg import NotPositiveDefiniteError
 from skevgp.inference.bounds import BoundAtOptimum
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
+from skevgp.rows.source import Moments
 
 from ..oracle import central_differences, collapsed_bound, problem, relative_error, whitened
 
@@ -16,7 +17,6 @@ SHARED = (True, False)
 
 def plain_loss(model, rows, table):
     """The loss per row as plain autograd of the flat vector."""
-    unit = table["inducing_points"].unit
 
     def loss(flat):
         c = table.coordinates(flat)
@@ -24,7 +24,7 @@ def plain_loss(model, rows, table):
             anp.exp(c["hyperparameters"]),
             anp.exp(c["signal"]),
             anp.exp(c["noise"]),
-            c["inducing_points"] * unit,
+            table["inducing_points"].value(c["inducing_points"]),
             rows,
             model.prior,
             model.family,
@@ -61,7 +61,13 @@ def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
     table = starting_table(
-        np.ones(2), table["inducing_points"].start, np.ones(2), Starts(Start(), Start(), Start()), np.ones(2), 0.1, 1
+        Moments.of(rows.inputs),
+        table["inducing_points"].start,
+        np.ones(2),
+        Starts(Start(), Start(), Start()),
+        np.ones(2),
+        0.1,
+        1,
     )
     loss = plain_loss(model, rows, table)
     value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
@@ -93,10 +99,9 @@ def test_residuals_from_statistics_agree_with_those_from_rows():
     model, rows, table = problem()
     values = table.values(table.start())
     blocks = rows.blocks(model.kernel, 17)
-    statistics = model.statistics(values, blocks)[0]
-    bound = BoundAtOptimum(statistics, values["signal"], values["noise"], model.prior)
+    bound = BoundAtOptimum(next(model.groups_on(values, blocks)), "full")
     _, V = whitened(values["hyperparameters"], values["inducing_points"][0], rows.inputs)
-    e = rows.residuals - V.T @ bound.fitted[:6] - rows.features @ bound.fitted[6:]
+    e = rows.residuals - V.T @ bound.weights[:6] - rows.features @ bound.weights[6:]
     np.testing.assert_allclose(bound.residuals().squares, (e**2).sum(axis=0), rtol=1e-8)
     np.testing.assert_allclose(bound.residuals().VE, V @ e, rtol=1e-6, atol=1e-8)
 
@@ -106,4 +111,4 @@ def test_statistics_that_are_not_finite_raise_a_named_error():
     values = table.values(table.start())
     statistics = model.statistics(values, rows.blocks(model.kernel, 17))[0].scaled(np.nan)
     with pytest.raises(NotPositiveDefiniteError, match="not finite"):
-        BoundAtOptimum(statistics, values["signal"], values["noise"], model.prior)
+        model.at_optimum(values, [statistics])

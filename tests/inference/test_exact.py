@@ -7,7 +7,9 @@ import pytest
 
 from skevgp.inference.bounds import CoefficientPrior
 from skevgp.inference.exact import ExactModel
-from skevgp.kernels.covariances import Constant, DotProduct, Sum
+from skevgp.kernels.constant import Constant
+from skevgp.kernels.covariances import Sum
+from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import RawRows
 
@@ -104,7 +106,7 @@ def test_the_reference_of_the_residuals_does_not_matter(vague):
     other = ExactModel(model.kernel, moved, vague, rows)
     assert other.log_likelihood(VALUES)[0] == pytest.approx(model.log_likelihood(VALUES)[0], rel=1e-12)
     new = np.random.RandomState(1).randn(4, D), np.random.RandomState(2).randn(4, P)
-    predictions = (m.posterior(VALUES).predict(*new, True) for m in (other, model))
+    predictions = (m.predictor(VALUES).predict(*new, True) for m in (other, model))
     for actual, expected in zip(*predictions, strict=True):
         np.testing.assert_allclose(actual, expected, rtol=1e-11)
 
@@ -114,7 +116,7 @@ def test_the_posterior_is_that_of_a_dense_gaussian_of_values_and_weights(vague):
     model, Y = problem(vague)
     rng = np.random.RandomState(3)
     X, H, x, h = model.rows.inputs, model.rows.features, rng.randn(6, D), rng.randn(6, P)
-    posterior = model.posterior(VALUES)
+    posterior = model.predictor(VALUES)
     mean, variance = posterior.predict(x, h, return_variance=True)
     _, covariance = posterior.covariance(x, h)
     coef, coef_cov = posterior.coefficients()
@@ -151,7 +153,7 @@ def test_without_features_it_is_a_gaussian_process():
         K += VALUES["noise"][o] * np.eye(N)
         expected -= 0.5 * (Y[:, o] @ np.linalg.solve(K, Y[:, o]) + np.linalg.slogdet(K)[1] + N * LOG_2PI)
     assert model.log_likelihood(VALUES)[0] == pytest.approx(expected, rel=1e-12)
-    coef, covariance = model.posterior(VALUES).coefficients()
+    coef, covariance = model.predictor(VALUES).coefficients()
     assert coef.shape == (O, 0)
     assert covariance.shape == (O, 0, 0)
 
@@ -165,4 +167,4 @@ def test_badly_scaled_vague_features_keep_their_digits():
     prior = CoefficientPrior(np.zeros((1, 2)), np.ones((1, 2)), np.zeros((1, 2)))
     model = ExactModel(SquaredExponential(D), prior, np.ones((1, 2), dtype=bool), RawRows(X, H, H @ beta.T))
     values = VALUES | {"signal": np.array([1e-6]), "noise": np.array([1e-2])}
-    np.testing.assert_allclose(model.posterior(values).coefficients()[0], beta, rtol=1e-4)
+    np.testing.assert_allclose(model.predictor(values).coefficients()[0], beta, rtol=1e-4)

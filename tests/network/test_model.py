@@ -129,7 +129,7 @@ def test_the_expected_log_likelihood_is_the_loss_without_divergence():
     ("sizes", "count"),
     [([3, 15, 15, 2], 634), ([5, 50, 50, 4], 6008), ([5, 60, 60, 4], 8408), ([21, 250, 250, 14], 143028)],
 )
-def test_parameters_are_counted_as_in_the_papers_table_3(sizes, count):
+def test_parameters_are_counted_as_in_the_papers_table_4(sizes, count):
     assert VariationalNetwork(sizes, [1.0] * 3, 0.01).n_parameters == count
 
 
@@ -180,6 +180,6 @@ def test_rows_of_zeros_have_a_finite_gradient():
 
 def test_the_start_is_within_the_bounds():
     for network in NETWORKS:
-        theta, (lower, upper) = network.start(np.random.default_rng(0)), network.bounds()
+        theta, (lower, upper) = network.start(np.random.default_rng(0)), network.limits()
         assert (lower < theta).all()
         assert (theta < upper).all()

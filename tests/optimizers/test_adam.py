@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from skevgp._linalg import NotPositiveDefiniteError
+from skevgp._progress import Monitor
 from skevgp.optimizers.adam import adam
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
@@ -19,7 +20,7 @@ def noisy_bowl(scatter=1.0, seed=0):
 
 def test_the_minimum_of_a_noisy_bowl():
     seen = []
-    minimum = adam(noisy_bowl(), np.zeros(2), FREE, 2000, 0.1, report=lambda i, loss: seen.append((i, loss)))
+    minimum = adam(noisy_bowl(), np.zeros(2), FREE, 2000, 0.1, monitor=Monitor(lambda *told: seen.append(told)))
     np.testing.assert_allclose(minimum.x, 3.0, atol=0.1)
     assert minimum.converged
     assert [i for i, _ in seen] == list(range(1, minimum.n_iter + 1))
@@ -115,8 +116,9 @@ def bowl_with_a_wall(failure, at=300):
 @pytest.mark.parametrize("at", [8, 300])
 def test_what_goes_wrong_keeps_the_best_point(failure, at):
     objective, calls = bowl_with_a_wall(failure, at)
-    minimum = adam(objective, np.zeros(2), FREE, 1000, 0.1)
-    assert minimum.interrupted == (failure is KeyboardInterrupt)
+    monitor = Monitor()
+    minimum = adam(objective, np.zeros(2), FREE, 1000, 0.1, monitor=monitor)
+    assert monitor.stopped == (failure is KeyboardInterrupt)
     assert not minimum.converged
     assert minimum.n_iter == at
     assert any((minimum.x == x).all() for x in calls[:at])

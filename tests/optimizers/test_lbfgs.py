@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from skevgp._linalg import NotPositiveDefiniteError
+from skevgp._progress import Monitor
 from skevgp.optimizers.lbfgs import lbfgs
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
@@ -14,7 +15,7 @@ def rosenbrock(x):
 
 def test_lbfgs_finds_the_minimum_and_reports_each_iteration():
     seen = []
-    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 200, 1e-12, lambda i, loss: seen.append((i, loss)))
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 200, 1e-12, Monitor(lambda *told: seen.append(told)))
     np.testing.assert_allclose(minimum.x, 1.0, atol=1e-5)
     assert minimum.converged
     assert [i for i, _ in seen] == list(range(1, minimum.n_iter + 1))
@@ -76,7 +77,8 @@ def test_ctrl_c_keeps_the_best_point_so_far():
             raise KeyboardInterrupt
         return rosenbrock(x)
 
-    minimum = lbfgs(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1)
-    assert minimum.interrupted
+    monitor = Monitor()
+    minimum = lbfgs(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1, monitor)
+    assert monitor.stopped
     assert not minimum.converged
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]

@@ -22,22 +22,30 @@ def test_values_come_back():
     assert table().size == 8
 
 
-def test_starts_are_put_inside_their_bounds():
+def test_starts_are_put_inside_their_limits():
     np.testing.assert_allclose(table().values(table().start())["length"], [1.0, 1.5])
 
 
-def test_bounds_are_those_of_the_coordinates():
-    lower, upper = table().bounds()
+def test_limits_are_those_of_the_coordinates():
+    lower, upper = table().limits()
     np.testing.assert_allclose(lower[:2], np.log(0.5))
     np.testing.assert_allclose(upper[:2], np.log([3.0, 1.5]))
     assert np.isinf(upper[2:]).all()
-    np.testing.assert_allclose(table()["length"].value_bounds(), [[0.5, 3.0], [0.5, 1.5]])
+    np.testing.assert_allclose(table()["length"].value_limits(), [[0.5, 3.0], [0.5, 1.5]])
 
 
 def test_a_change_of_one_unit_moves_the_coordinate_by_one():
     flat = table().start()
     flat[2:4] += 1.0
     np.testing.assert_allclose(table().values(flat)["points"][0, 0], [2.0, 5.0])
+
+
+def test_coordinates_far_from_zero_are_of_order_one_around_their_origin():
+    first = 1e8 + np.array([0.5, -0.25])
+    far = ParameterTable([Parameter("points", first, unit=2.0, origin=1e8)])
+    np.testing.assert_array_equal(far.start(), [0.25, -0.125])
+    np.testing.assert_array_equal(far.values(far.start())["points"], first)
+    np.testing.assert_array_equal(far.values(far.start() + 1.0)["points"], first + 2.0)
 
 
 def test_warm_starts_take_over_only_what_fits():
@@ -70,7 +78,7 @@ def test_single_entries_can_be_fixed():
     table = partly_fixed()
     assert table.size == 4
     np.testing.assert_allclose(table.values(table.start())["shape"], [1.0, 2.0, 2.5, 4.0])
-    lower, upper = table.bounds()
+    lower, upper = table.limits()
     np.testing.assert_allclose(upper[:2], np.log([5.0, 2.5]))
     np.testing.assert_allclose(lower[:2], np.log(0.5))
     values = table.values(np.array([0.1, 0.2, 7.0, 8.0]))

@@ -13,6 +13,7 @@ from skevgp import EVGPRegressor
 from skevgp.rows.blocks import LocalBlocks, block_rows
 from skevgp.rows.source import LocalSource, Moments, moments_of_rows
 from skevgp.rows.threads import BlockMap, single_threaded_libraries, thread_pool
+from skevgp.solvers import LBFGS
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -195,7 +196,9 @@ def test_fits_have_the_same_bits_in_any_thread():
     target = np.column_stack([np.sin(rows[:, 0]), rows[:, 1] * rows[:, 2]])
 
     def points(n_jobs):
-        fitted = EVGPRegressor(n_inducing=20, sharing="none", n_restarts=1, max_iter=2, n_jobs=n_jobs, random_state=0)
+        fitted = EVGPRegressor(
+            n_inducing=20, sharing="none", solver=LBFGS(n_restarts=1), max_iter=2, n_jobs=n_jobs, random_state=0
+        )
         return fitted.fit(rows, target).inducing_points_
 
     expected = points(1)

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -5,13 +7,15 @@ from numpy.testing import assert_array_equal
 from scipy.sparse import csr_array, issparse
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import FeatureUnion, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 from sklearn.utils.validation import check_is_fitted
 
+from skevgp.kernels import FunctionKernel
 from skevgp.rows import maps as _maps
-from skevgp.rows.maps import apply_map, fit_map
+from skevgp.rows.maps import apply_map, fit_map, take_rows
 
 X = np.random.default_rng(0).normal(size=(10, 3))
 Y = np.zeros(10)
@@ -69,6 +73,13 @@ def test_what_is_no_transformer_is_a_type_error(name, no_map):
         fit_map(no_map, X, Y, name)
 
 
+@pytest.mark.parametrize("name", ["feature_map", "kernel_map"])
+@pytest.mark.parametrize("kernel", [RBF(2.0), ConstantKernel() * RBF(), FunctionKernel(lambda X, Z: X @ Z.T)], ids=str)
+def test_a_kernel_in_place_of_a_map_is_sent_where_it_belongs(name, kernel):
+    with pytest.raises(TypeError, match=f"^{re.escape(f'{name}={kernel!r} is a kernel: give it as kernel=.')}$"):
+        fit_map(kernel, X, Y, name)
+
+
 def test_values_are_what_the_map_makes():
     polynomials = PolynomialFeatures(2).fit(X)
     assert_array_equal(apply_map(polynomials, X, "feature_map"), polynomials.transform(X))
@@ -113,11 +124,32 @@ def test_few_rows_are_one_block_and_not_copied():
 
 
 @pytest.mark.usefixtures("blocks_of_four")
-def test_a_data_frame_stays_one():
-    frame = pd.DataFrame(X, columns=list("abc"), index=range(100, 110))
+def test_a_data_frame_stays_one(frame_of):
+    frame = frame_of(dict(zip("abc", X.T, strict=True)))
     recorder = Recorder().fit(frame)
     assert_array_equal(apply_map(recorder, frame, "feature_map"), X)
+    assert [type(block) for block in recorder.seen_] == [type(frame)] * 3
+
+
+@pytest.mark.usefixtures("blocks_of_four")
+def test_blocks_of_a_data_frame_keep_its_index():
+    frame = pd.DataFrame(X, columns=list("abc"), index=range(100, 110))
+    recorder = Recorder().fit(frame)
+    apply_map(recorder, frame, "feature_map")
     pd.testing.assert_frame_equal(pd.concat(recorder.seen_), frame)
+
+
+@pytest.mark.parametrize("rows", [slice(2, 5), slice(8, 12), np.array([7, 0, 7])], ids=str)
+def test_rows_of_a_frame_are_a_frame(rows, frame_of):
+    frame = frame_of(dict(zip("abc", X.T, strict=True)))
+    taken = take_rows(frame, rows)
+    assert type(taken) is type(frame)
+    assert_array_equal(np.asarray(taken), X[rows])
+
+
+def test_rows_of_an_array_are_of_double_precision():
+    single = X.astype(np.float32)
+    assert_array_equal(take_rows(single, slice(2, 5)), single[2:5].astype(np.float64), strict=True)
 
 
 @pytest.mark.parametrize("function", [lambda X: X[:-1], lambda X: np.vstack([X, X]), lambda X: X[:1]])
@@ -140,7 +172,7 @@ def test_a_result_without_two_dimensions_is_an_error(function):
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_result_that_is_not_finite_is_an_error(value):
-    with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity for finite rows"):
+    with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity"):
         apply_map(returning(lambda X: np.add(X, [0.0, 0.0, value])), X, "kernel_map")
 
 

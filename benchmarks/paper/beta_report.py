@@ -1,0 +1,264 @@
+"""What the rows of beta.py say: heat maps of the weights, and whether positions imitate gravity."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from harness import Row, column, figure_of, provenance_text, pyplot, save_picture, table
+
+SETTINGS = {"paper": "paper's setting", "skevgp": "skevgp's setting"}
+# Blue, white and vermilion of Okabe & Ito's palette; white to black for standard deviations.
+DIVERGING = ("#0072B2", "#8cc1e0", "#ffffff", "#edb48c", "#D55E00")
+# Weights smaller than this are coloured in proportion, larger ones by their logarithm: 1 and Δt are not all one sees.
+LINEAR = 0.02
+# Entries are written into cells up to so many columns.
+WRITTEN = 12
+
+
+def groups(rows: list[Row]) -> Iterator[tuple[str, str, list[Row]]]:
+    """Of one system: setting, model, rows."""
+    for setting, model in sorted({(row["setting"], row["model"]) for row in rows}):
+        yield setting, model, [row for row in rows if (row["setting"], row["model"]) == (setting, model)]
+
+
+def names(rows: list[Row], what: str) -> list[str]:
+    """Outputs or features, in their order."""
+    return list(dict.fromkeys(row[what] for row in rows))
+
+
+def matrix(rows: list[Row], value: str) -> np.ndarray:
+    """Of a column (seeds, o, p)."""
+    seeds = sorted({row["seed"] for row in rows}, key=int)
+    shape = len(names(rows, "output")), len(names(rows, "feature"))
+    return np.array([column((row for row in rows if row["seed"] == seed), value).reshape(shape) for seed in seeds])
+
+
+def positions(rows: list[Row]) -> list[tuple[str, str]]:
+    """(velocity, position) of each joint."""
+    outputs = names(rows, "output")
+    half = len(outputs) // 2
+    return list(zip(outputs[half:], outputs[:half], strict=True))
+
+
+def pretty(name: str) -> str:
+    """As the paper writes it: dq1/dt -> q̇₁, u_q2 -> u₂, sin(q1 + q2) -> sin₁₂."""
+    for pattern, replacement in (
+        (r"sin\(q(\d) \+ q(\d)\)", r"\\sin_{\1\2}"),
+        (r"sin\(q(\d)\)", r"\\sin_\1"),
+        (r"sin\((\w+)\)", r"\\sin \1"),
+        (r"d(q\d*|theta|x)/dt", r"\\dot \1"),
+        (r"^u_[a-z]+$", "u"),
+        (r"^u_q(\d)$", r"u_\1"),
+        (r"q(\d)", r"q_\1"),
+        (r"theta", r"\\theta"),
+        (r"gravity", "g"),
+    ):
+        name = re.sub(pattern, replacement, name)
+    return f"${name}$"
+
+
+def paragraphs(rows: list[Row], output: Path) -> list[str]:
+    """A page: for each system the picture, the weights in question, and what they show.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV, of one size.
+    output : Path
+        The CSV.
+
+    Returns
+    -------
+    parts : list of str
+    """
+    parts = [
+        "# The learned weights of the physics features",
+        "Written by `benchmarks/paper/beta.py`. With inertia and force only (IF) the paper's Figure 7 has negative "
+        "weights of (q̇₁, q₁) and (q̇₂, q₂) of the acrobot, where the prior has 0, to imitate gravity; with features of "
+        f"gravity (IFG) it has not. {provenance_text(rows)}",
+    ]
+    if rows[0]["size"] == "quick":
+        parts.append("**A quick run**: few rows and iterations, not to be compared with the paper.")
+    for system in names(rows, "system"):
+        own = [row for row in rows if row["system"] == system]
+        seeds = sorted({row["seed"] for row in own}, key=int)
+        parts += [
+            f"## {system}",
+            f"![b of the {system}]({picture_of(output, system).name})",
+            f"Shown: seed {seeds[0]}. The weights of positions on the next velocities:",
+            in_question(own),
+            "Mean ± standard error over seeds (of one seed: none); std: the posterior's own. *Least squares* is what "
+            "the features alone would say of the same rows; *GP*: what least squares reads off the mean of the "
+            "Gaussian process. In the picture these entries of b have a frame.",
+            verdict(own) if system == "acrobot" else "",
+            explanation(own),
+            f"Iterations: {iterations(own)}.",
+        ]
+    return [part for part in parts if part]
+
+
+def mean_and_error(values: np.ndarray) -> str:
+    """Over seeds."""
+    error = f" ± {figure_of(values.std(ddof=1) / np.sqrt(len(values)))}" if len(values) > 1 else ""
+    return f"{values.mean():+.3f}{error}"
+
+
+def in_question(rows: list[Row]) -> str:
+    """The table of the weights that would imitate gravity, and of those of gravity itself."""
+    lines = []
+    for setting, model, own in groups(rows):
+        outputs, features = names(own, "output"), names(own, "feature")
+        of_gravity = features[len(names(own, "output")) :]
+        tables = {name: matrix(own, name) for name in ("mean", "std", "least_squares", "least_squares_of_gp")}
+        for velocity, position in positions(own):
+            for feature in (position, *(name for name in of_gravity if name.startswith("sin("))):
+                at = (slice(None), outputs.index(velocity), features.index(feature))
+                mean, std = tables["mean"][at], tables["std"][at]
+                lines.append(
+                    [
+                        *(SETTINGS[setting], model, f"({velocity}, {feature})", mean_and_error(mean)),
+                        *(figure_of(std.mean()), f"{(mean / std).mean():+.1f}"),
+                        *(mean_and_error(tables[name][at]) for name in ("least_squares", "least_squares_of_gp")),
+                    ]
+                )
+    header = ["setting", "model", "entry", "b", "std", "b / std", "least squares", "GP"]
+    return table(header, lines)
+
+
+def verdict(rows: list[Row]) -> str:
+    """Whether the paper's observation holds, for each setting and joint."""
+    sentences = []
+    found = {(setting, model): own for setting, model, own in groups(rows)}
+    for setting in sorted({setting for setting, _ in found}):
+        plain, gravity = (found.get((setting, model)) for model in ("EVGP-IF", "EVGP-IFG"))
+        if plain is None or gravity is None:
+            continue
+        for velocity, position in positions(rows):
+            b, std = ([entry(own, velocity, position, value) for own in (plain, gravity)] for value in ("mean", "std"))
+            gp = [entry(own, velocity, position, "least_squares_of_gp") for own in (plain, gravity)]
+            negative = bool((b[0] < -2.0 * std[0]).all())
+            gone = b[1].mean() > -0.1 * abs(b[0].mean())
+            said = (
+                f"with IF {'significantly negative in every seed' if negative else 'not negative throughout'} "
+                f"({b[0].mean():+.3f}), with IFG {'not' if gone else 'still'} negative beyond a tenth of that "
+                f"({b[1].mean():+.3f})"
+            )
+            shown = "as in the paper" if negative and gone else "**not** as in the paper"
+            if not (negative and gone):
+                said += f"; the Gaussian process takes {gp[0].mean():+.3f} with IF and {gp[1].mean():+.3f} with IFG"
+            sentences.append(f"- {SETTINGS[setting]}, ({velocity}, {position}): {shown}: {said}.")
+    return "\n".join(sentences)
+
+
+def explanation(rows: list[Row]) -> str:
+    """Why b alone does not show where gravity went."""
+    apart = np.concatenate(
+        [
+            matrix(own, "mean").ravel()
+            + matrix(own, "least_squares_of_gp").ravel()
+            - matrix(own, "least_squares").ravel()
+            for _, _, own in groups(rows)
+        ]
+    )
+    said = (
+        "The data determine what b and the Gaussian process say together: in all fits the sum of *b* and *GP* is the "
+        f"least squares weight, to {np.abs(apart).max():.0e}. How it is divided differs between settings and seeds."
+    )
+    stds = {(setting, model): matrix(own, "std").mean(axis=0) for setting, model, own in groups(rows)}
+    models = sorted({model for _, model in stds if {("paper", model), ("skevgp", model)} <= stds.keys()})
+    if models:
+        ratio = np.median(np.concatenate([(stds["skevgp", own] / stds["paper", own]).ravel() for own in models]))
+        said += (
+            " The paper's diagonal posterior has the standard deviation of a weight with all others and the Gaussian "
+            f"process given; the full posterior's, which knows that they can stand in for each other, is {ratio:.0f} "
+            "times as large (median over weights; kernels and noise of the fits differ too)."
+        )
+    return said
+
+
+def entry(rows: list[Row], output: str, feature: str, value: str) -> np.ndarray:
+    """One weight's column, over seeds."""
+    return column((row for row in rows if (row["output"], row["feature"]) == (output, feature)), value)
+
+
+def iterations(rows: list[Row]) -> str:
+    """Of each setting, and the limit if there was one."""
+    said = []
+    for setting in sorted({row["setting"] for row in rows}):
+        own = [row for row in rows if row["setting"] == setting]
+        most = " to ".join(dict.fromkeys(str(f(column(own, "n_iter").astype(int))) for f in (np.min, np.max)))
+        limits = sorted({row["max_iter"] for row in own} - {""}, key=int)
+        said.append(f"{SETTINGS[setting]} {most}" + (f" (limited to {', '.join(limits)})" if limits else ""))
+    return "; ".join(said)
+
+
+def picture_of(output: Path, system: str) -> Path:
+    """Of one system."""
+    return output.with_name(f"{output.stem}_{system}.png")
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """Prior mean, posterior mean and posterior std of the first seed, a row for each setting and model.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV, of one system.
+    path : Path
+        Of the PNG.
+    """
+    from matplotlib.colors import LinearSegmentedColormap, LogNorm, SymLogNorm
+    from matplotlib.patches import Rectangle
+
+    first = min((row["seed"] for row in rows), key=int)
+    shown = list(groups([row for row in rows if row["seed"] == first]))
+    heights = [len(names(own, "output")) for _, _, own in shown]
+    widest = max(len(names(own, "feature")) for _, _, own in shown)
+    figure, grid = pyplot().subplots(
+        *(len(shown), 3),
+        figsize=(8.6, 0.9 + sum(0.5 + min(0.33, 8.0 / widest) * height for height in heights)),
+        squeeze=False,
+        layout="constrained",
+    )
+    stds = np.concatenate([matrix(own, "std").ravel() for _, _, own in shown])
+    stds = stds[stds > 0.0]
+    means = SymLogNorm(LINEAR, vmin=-1.0, vmax=1.0)
+    diverging = LinearSegmentedColormap.from_list("blue to vermilion", DIVERGING)
+    panels: tuple[tuple[str, str, Any, Any], ...] = (
+        ("prior mean", "prior_mean", diverging, means),
+        ("posterior mean b", "mean", diverging, means),
+        ("posterior std", "std", "Greys", LogNorm(stds.min(), 10.0 * stds.max())),
+    )
+    for axes_of_row, (setting, model, own) in zip(grid, shown, strict=True):
+        outputs, features = names(own, "output"), names(own, "feature")
+        wide = widest > WRITTEN
+        for axes, (title, value, colours, norm) in zip(axes_of_row, panels, strict=True):
+            values = matrix(own, value)[0]
+            picture = axes.imshow(values, cmap=colours, norm=norm, aspect="auto")
+            axes.set_xticks(range(len(features)), map(pretty, features), fontsize=5 if wide else 7, rotation=90 * wide)
+            axes.set_yticks(range(len(outputs)), map(pretty, outputs), fontsize=8)
+            axes.tick_params(length=0, top=False)
+            axes.spines[:].set_visible(False)
+            axes.set_title(f"{model}, {SETTINGS[setting]}: {title}" if value == "prior_mean" else title, fontsize=8)
+            for velocity, position in positions(own) if value == "mean" else ():
+                corner = features.index(position) - 0.47, outputs.index(velocity) - 0.47
+                axes.add_patch(Rectangle(corner, 0.94, 0.94, fill=False, edgecolor="k", linewidth=1.2))
+            if wide and value != "prior_mean":
+                figure.colorbar(picture, ax=axes, aspect=30, pad=0.01).ax.tick_params(labelsize=7)
+            for o, j in () if wide else np.ndindex(*values.shape):
+                red, green, blue, _ = picture.cmap(norm(values[o, j]))
+                dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
+                axes.text(j, o, written(values[o, j]), ha="center", va="center", fontsize=6, color="w" if dark else "k")
+    save_picture(figure, path)
+
+
+def written(value: float) -> str:
+    """In few letters."""
+    if value == 0.0:
+        return "0"
+    return f"{value:.0e}".replace("e-0", "e-") if abs(value) < 5e-4 else f"{value:.3f}".replace("0.", ".", 1)

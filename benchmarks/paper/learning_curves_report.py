@@ -1,0 +1,280 @@
+"""What the rows of learning_curves.py say, and whether it is what the paper says: a Markdown page and a picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import reduce
+from pathlib import Path
+
+import numpy as np
+
+from harness import Row, figure_of, logarithmic, provenance_text, pyplot, save_picture, table
+from paper.results_table_report import PAPER
+from skevgp.plotting import LearningCurveDisplay
+
+NOMINAL = "EVGP-IFG, nominal"  # EVGP-IFG in the setting skevgp-nominal
+# Colours of Okabe & Ito's palette, safe for colour-blind readers.
+COLOURS = {
+    "VGP": "#E69F00",
+    "RES-VGP": "#56B4E9",
+    "RES-DBNN": "#009E73",
+    "EVGP-IF": "#D55E00",
+    "EVGP-IFG": "#0072B2",
+    NOMINAL: "#CC79A7",
+}
+CLOSE_UP = ("EVGP-IF", "EVGP-IFG", NOMINAL)
+# An Error that a doubling of the rows leaves above this share of what it was has reached a plateau.
+PLATEAU = 0.9
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Of one model on one system.
+
+    Attributes
+    ----------
+    n_rows : ndarray of shape (n_sizes,)
+    errors : ndarray of shape (n_sizes, n_runs)
+        NaN where a run is missing.
+    """
+
+    n_rows: np.ndarray
+    errors: np.ndarray
+
+    @property
+    def mean(self) -> np.ndarray:
+        return np.nanmean(self.errors, axis=1)
+
+    def rows_to_reach(self, error: float) -> str:
+        """The fewest rows with at most this Error."""
+        return next((str(size) for size, own in zip(self.n_rows, self.mean, strict=True) if own <= error), "—")
+
+    def doubling(self) -> str:
+        """What share of the Error a doubling of the rows leaves, by the last three sizes; in italics if most of it."""
+        if len(self.n_rows) < 2:
+            return ""
+        ratio = 2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(self.mean[-3:]), 1)[0]
+        return f"*{ratio:.2f}*" if ratio > PLATEAU else f"{ratio:.2f}"
+
+
+Curves = dict[str, dict[str, Curve]]  # of a setting: system -> model -> curve
+
+
+def curve_of(rows: list[Row], measure: str) -> Curve:
+    """From the rows of one model on one system."""
+    sizes, seeds = (sorted({int(row[name]) for row in rows}) for name in ("n_rows", "seed"))
+    errors = np.full((len(sizes), len(seeds)), np.nan)
+    for row in rows:
+        errors[sizes.index(int(row["n_rows"])), seeds.index(int(row["seed"]))] = float(row[measure])
+    return Curve(np.array(sizes), errors)
+
+
+def curves_of(rows: list[Row], setting: str, measure: str = "error_mean") -> Curves:
+    """In the order of the paper; skevgp-nominal counts as a model of the setting skevgp."""
+    curves: Curves = {}
+    for system in PAPER:
+        for name in COLOURS:
+            wanted = (system, *(("EVGP-IFG", "skevgp-nominal") if name == NOMINAL else (name, setting)))
+            own = [row for row in rows if (row["system"], row["model"], row["setting"]) == wanted]
+            if own and (name != NOMINAL or setting == "skevgp"):
+                curves.setdefault(system, {})[name] = curve_of(own, measure)
+    return curves
+
+
+def settings_of(rows: list[Row]) -> list[str]:
+    """Of the file, skevgp first; the nominal one is shown with it."""
+    names = {row["setting"].removesuffix("-nominal") for row in rows}
+    return sorted(names, key=lambda name: (name != "skevgp", name))
+
+
+def paragraphs(rows: list[Row]) -> list[str]:
+    """A page: tables of the Error, and the paper's claims checked.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV, of one size.
+
+    Returns
+    -------
+    parts : list of str
+    """
+    parts = [
+        "# Learning curves: Figure 6 of the paper, and ours",
+        "Written by `benchmarks/paper/learning_curves.py`. Error is the mean over test rows of the norm of the error, "
+        "in SI units; the test set is fixed, trajectories are added to the training set. Means over runs; in brackets "
+        f"the lowest and the highest, and how many runs. {provenance_text(rows)}",
+    ]
+    if rows[0]["size"] == "quick":
+        parts.append("**A quick run**: few rows and iterations, not to be compared with the paper.")
+    for setting in settings_of(rows):
+        curves, medians = curves_of(rows, setting), curves_of(rows, setting, "error_median")
+        parts.append(f"## Setting: {setting}")
+        for system, models in curves.items():
+            parts += [
+                f"### {system}",
+                error_table("Error of", models) + f"\nIn the paper, with all rows: {in_the_paper(system)}.",
+                error_table("median row of", medians[system], spread=False),
+            ]
+        parts += ["### What the paper says of it", *claims(curves)]
+    limits = sorted(
+        {(row["system"], int(row["max_iter"])) for row in rows if row["max_iter"]},
+        key=lambda limit: (list(PAPER).index(limit[0]), limit[1]),
+    )
+    if limits:
+        text = ", ".join(f"{system} {limit}" for system, limit in limits)
+        parts.append(f"Iterations of the GPs were limited by `--max-iter`: {text}.")
+    stopped = sum(row["converged"] == "False" for row in rows)
+    parts.append(
+        "The median row is the median of the error over test rows: far below the Error where few rows make the Error, "
+        f"those far from the training data. {stopped} of {len(rows)} fits ended with a ConvergenceWarning."
+    )
+    return parts
+
+
+def error_table(corner: str, models: dict[str, Curve], spread: bool = True) -> str:
+    """A line per model, a column per number of rows: means over runs, and how far these spread."""
+    sizes = sorted({size for curve in models.values() for size in curve.n_rows})
+    lines = []
+    for name, curve in models.items():
+        cells = dict.fromkeys(sizes, "")
+        for size, errors in zip(curve.n_rows, curve.errors, strict=True):
+            own = errors[np.isfinite(errors)]
+            cells[size] = figure_of(own.mean())
+            if spread and len(own) > 1:
+                cells[size] += f" ({figure_of(own.min())} to {figure_of(own.max())}, {len(own)})"
+        lines.append([name, *cells.values()])
+    return table([corner, *(f"{size} rows" for size in sizes)], lines)
+
+
+def in_the_paper(system: str) -> str:
+    return ", ".join(f"{name} {result.error:.3f}" for name, result in PAPER[system].items())
+
+
+def claims(curves: Curves) -> Iterator[str]:
+    """Each of the paper's observations, and what our means over runs say of it."""
+    names = [name for name in COLOURS if any(name in models for models in curves.values())]
+    with_ifg = {system: models for system, models in curves.items() if "EVGP-IFG" in models}
+    if with_ifg:
+        yield (
+            "**EVGP needs fewer samples.** Rows from which each model has at most the Error that EVGP-IFG has with the "
+            "fewest rows (—: not even with the most):"
+        )
+        yield table(
+            ["system", "that Error", *names],
+            [
+                [system, figure_of(target := models["EVGP-IFG"].mean[0])]
+                + [models[name].rows_to_reach(target) if name in models else "" for name in names]
+                for system, models in with_ifg.items()
+            ],
+        )
+    yield "**EVGP is the most accurate.** The model of the lowest Error, with so many rows (without the nominal arm):"
+    yield "\n".join(f"* {system}: {lowest(models)}" for system, models in curves.items() if set(models) != {NOMINAL})
+    yield (
+        "**VGP and RES-VGP plateau.** What a doubling of the rows leaves of the Error, over the last three sizes (a "
+        f"plateau, in italics, is above {PLATEAU}):"
+    )
+    yield table(
+        ["system", *names],
+        [
+            [system, *(models[name].doubling() if name in models else "" for name in names)]
+            for system, models in curves.items()
+        ],
+    )
+    yield (
+        "**The gap from RES-DBNN to EVGP-IFG is reduced with more data, and that from IF to IFG.** Difference of the "
+        "Errors, and their ratio (—: there is no gap to begin with):"
+    )
+    yield table(
+        ["system", "from EVGP-IFG to", "with the fewest rows", "with the most", "difference reduced", "ratio reduced"],
+        [
+            [system, name, *gap(models[name], models["EVGP-IFG"])]
+            for name in ("RES-DBNN", "EVGP-IF")
+            for system, models in with_ifg.items()
+            if name in models
+        ],
+    )
+    above = [
+        f"{system} with {size} rows ({figure_of(ifg)} against {figure_of(other)})"
+        for system, models in with_ifg.items()
+        if "EVGP-IF" in models
+        for size, ifg, other in zip(*common(models["EVGP-IFG"], models["EVGP-IF"]), strict=True)
+        if ifg > other
+    ]
+    yield f"**IFG is below IF.** Not so: {', '.join(above) or 'nowhere'}."
+
+
+def common(*curves: Curve) -> tuple[np.ndarray, ...]:
+    """Numbers of rows that all curves have, and the mean Error of each there."""
+    sizes = reduce(np.intersect1d, [curve.n_rows for curve in curves])
+    return sizes, *(curve.mean[np.isin(curve.n_rows, sizes)] for curve in curves)
+
+
+def gap(other: Curve, ifg: Curve) -> list[str]:
+    """The first and the last, and whether the last is less, as a difference and as a ratio: if there was one."""
+    sizes, other_errors, errors = common(other, ifg)
+    if not len(sizes):
+        return [""] * 4
+    differences, ratios = other_errors - errors, other_errors / errors
+    cells = [f"{figure_of(differences[end])} (× {figure_of(ratios[end])})" for end in (0, -1)]
+    if differences[0] <= 0:
+        return [*cells, "—", "—"]
+    if differences[-1] < 0:
+        return [*cells, "reversed", "reversed"]
+    return cells + ["yes" if values[-1] < values[0] else "no" for values in (differences, ratios)]
+
+
+def lowest(models: dict[str, Curve]) -> str:
+    """Which model is, for each number of rows."""
+    names = [name for name in models if name != NOMINAL]
+    sizes, *errors = common(*(models[name] for name in names))
+    return ", ".join(f"{names[best]} ({size})" for size, best in zip(sizes, np.argmin(errors, axis=0), strict=True))
+
+
+def plot(rows: list[Row], path: Path) -> None:
+    """For the first setting, a column of panels per system: all models above, the EVGP below.
+
+    Parameters
+    ----------
+    rows : list of dict
+        Of the CSV, of one size.
+    path : Path
+        Of the PNG.
+    """
+    setting = settings_of(rows)[0]
+    curves = curves_of(rows, setting)
+    figure, grid = pyplot().subplots(
+        2, len(curves), figsize=(max(2.05 * len(curves), 3.6), 5.0), squeeze=False, layout="constrained"
+    )
+    for column, (system, models) in zip(grid.T, curves.items(), strict=True):
+        for axes, names in zip(column, (set(COLOURS) - {NOMINAL}, CLOSE_UP), strict=True):
+            for name, curve in models.items():
+                if name in names:
+                    LearningCurveDisplay(curve.n_rows, curve.errors).plot(axes, label=name, color=COLOURS[name])
+            axes.set(xlabel="", ylabel="")
+            axes.grid(alpha=0.3)
+            axes.tick_params(which="both", labelsize=7)
+            logarithmic(axes)
+            axes.spines[["top", "right"]].set_visible(False)
+        n_runs = max(curve.errors.shape[1] for curve in models.values())
+        column[0].set_title(f"{system} ({n_runs} run{'s' * (n_runs > 1)})", fontsize=11)
+        column[1].set_xlabel("training rows", fontsize=9)
+    for axes, what in zip(grid[:, 0], ("all models", "EVGP only"), strict=True):
+        axes.set_ylabel(f"test Error, {what}", fontsize=9)
+    notes = ["mean, and band from lowest to highest run"]
+    notes += ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
+    handles = {
+        label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    figure.legend(
+        [handles[name] for name in COLOURS if name in handles],
+        [name for name in COLOURS if name in handles],
+        loc="outside upper center",
+        ncols=6 if len(curves) > 2 else 2,
+        fontsize=9,
+        frameon=False,
+        title="; ".join(notes),
+        title_fontsize=9,
+    )
+    save_picture(figure, path)

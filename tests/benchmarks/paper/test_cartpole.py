@@ -1,0 +1,54 @@
+"""The benchmark of what was tried on the cartpole, in short mode."""
+
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
+from skevgp.features import InertiaForceGravity
+from skevgp.metrics import prediction_error
+
+from ..conftest import read
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
+    output = tmp_path / "cart.csv"
+    options = ("--quick", "--models", "EVGP-IFG", "--jobs", 1, "--output", output, "--variants")
+    assert "[2/2]" in run_script("paper/cartpole.py", *options, "Adam", "L-BFGS, full posterior")
+    assert "1 of 1 cells" in run_script("paper/cartpole.py", *options, "Adam")
+
+    train, test = (make_dynamics("cartpole", 12, random_state=state) for state in (0, 1000))
+    model = EVGPRegressor(InertiaForceGravity("cartpole"), n_inducing=60, sharing="kernel", max_iter=50, random_state=0)
+    with pytest.warns(ConvergenceWarning):
+        model.fit(train.data, train.target)
+    adam, full = read(output)
+    assert (adam["variant"], adam["n_parameters"], adam["n_iter"]) == ("Adam", "1741", "50")
+    assert "setting" not in adam
+    assert adam["max_iter"] == full["max_iter"] == "50"
+    assert (full["variant"], full["n_parameters"]) == ("L-BFGS, full posterior", str(model.n_parameters_))
+    error = prediction_error(test.target, model.predict(test.data))
+    assert float(full["error_mean"]) == pytest.approx(error, rel=1e-6)
+
+    page = output.with_suffix(".md").read_text()
+    assert f"| L-BFGS, full posterior | {error:#.3g} ({error:#.3g}) |" in page
+    assert "In the paper: 0.011." in page
+    assert "EVGP-IF\n" not in page
+    assert output.with_suffix(".png").stat().st_size > 5_000
+
+
+def test_variants_change_parameters_that_exist():
+    from paper.cartpole import VARIANTS
+
+    for changes in VARIANTS.values():
+        EVGPRegressor().set_params(**changes)
+
+
+def test_a_page_has_the_mean_of_data_sets_and_each():
+    from paper.cartpole import paragraphs
+
+    numbers = dict.fromkeys(("error_median", "error_p99", "cr2", "bound_per_row", "fit_seconds"), "1")
+    names = {"variant": "Adam", "model": "EVGP-IF", "size": "full", "date": "today", "versions": "", "machine": ""}
+    rows = [{**names, **numbers, "seed": seed, "error_mean": error} for seed, error in (("1", "0.03"), ("0", "0.01"))]
+    assert "| Adam | 0.0200 (0.0100, 0.0300) | 1.00 |" in "\n".join(paragraphs(rows))

@@ -1,0 +1,145 @@
+"""The benchmark of the paper's Figure 6 in short mode."""
+
+import numpy as np
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
+from skevgp.features import InertiaForceGravity
+from skevgp.metrics import prediction_error, std_norm
+
+from ..conftest import read
+
+
+@pytest.fixture
+def run(run_script, tmp_path):
+    """Tiny fits of the pendulum's EVGP."""
+
+    def run(*arguments):
+        options = ("--quick", "--systems", "pendulum", "--max-iter", 2, "--jobs", 1, "--models", "EVGP-IFG")
+        options += ("--output", tmp_path / "curves.csv")
+        return run_script("paper/learning_curves.py", *options, *arguments)
+
+    return run
+
+
+def made_up(**errors):
+    """Rows of EVGP-IFG, or another model, on the pendulum: for each number of rows the Errors of its runs."""
+    return [
+        {
+            **{"system": "pendulum", "model": model.replace("_", "-"), "setting": "skevgp", "seed": str(seed)},
+            **{"n_rows": str(n_rows), "error_mean": str(error), "error_median": str(error / 10)},
+            **{"size": "full", "max_iter": "", "converged": "True"},
+            **{"date": "2026-01-01", "versions": "skevgp", "machine": "x86_64"},
+        }
+        for model, sizes in errors.items()
+        for n_rows, runs in sizes.items()
+        for seed, error in enumerate(runs)
+    ]
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_it_runs_and_resumes(run, tmp_path):
+    table, page, picture = (tmp_path / f"curves.{suffix}" for suffix in ("csv", "md", "png"))
+    assert "[2/2] pendulum EVGP-IFG skevgp 12 0 quick: Error" in run()
+    before = table.read_text()
+    assert "2 of 4 cells" in run("--seeds", 2)
+    assert table.read_text().startswith(before)
+
+    test = make_dynamics("pendulum", 12, random_state=1000)
+    rows = read(table)
+    assert [(row["seed"], row["n_trajectories"], row["n_rows"]) for row in rows] == [
+        *(("0", "4", "400"), ("0", "12", "1200"), ("1", "4", "400"), ("1", "12", "1200"))
+    ]
+    for row in rows:
+        train = make_dynamics("pendulum", 12, random_state=int(row["seed"]))
+        X, y = train.data[: int(row["n_rows"])], train.target[: int(row["n_rows"])]
+        features = InertiaForceGravity("pendulum")
+        model = EVGPRegressor(features, n_inducing=10, max_iter=2, random_state=int(row["seed"]))
+        with pytest.warns(ConvergenceWarning, match="max_iter"):
+            model.fit(X, y)
+        mean, std = model.predict(test.data, return_std=True)
+        assert float(row["error_mean"]) == pytest.approx(prediction_error(test.target, mean), rel=1e-6)
+        assert float(row["std_norm"]) == pytest.approx(std_norm(std), rel=1e-6)
+        assert (row["max_iter"], row["converged"]) == ("2", "False")
+    assert "limited by `--max-iter`: pendulum 2." in page.read_text()
+    assert picture.stat().st_size > 10_000
+
+
+def test_the_nominal_arm_is_shown_once():
+    from paper.learning_curves import MODELS, SYSTEMS, wanted
+
+    shown = [(system, model) for system in SYSTEMS for model in MODELS if wanted(system, model, "skevgp-nominal")]
+    assert shown == [("iiwa14", "EVGP-IFG")]
+    assert all(wanted(system, model, "skevgp") for system in SYSTEMS for model in MODELS)
+
+
+def test_sizes_end_with_the_papers():
+    from paper.learning_curves import N_TRAJECTORIES
+
+    assert {system: sizes[-1] for system, sizes in N_TRAJECTORIES.items()} == {
+        **{"pendulum": 48, "cartpole": 48, "acrobot": 93, "iiwa14": 465}
+    }
+    assert all(np.all(np.diff(sizes) > 0) for sizes in N_TRAJECTORIES.values())
+
+
+def test_the_page_tells_means_and_ranges_and_checks_the_claims():
+    from paper.learning_curves_report import paragraphs
+
+    rows = made_up(
+        VGP={100: [4.0, 4.0], 400: [1.0, 1.0]},
+        RES_VGP={100: [4.0, 4.0], 400: [3.8, 3.8]},
+        RES_DBNN={100: [9.0, 9.0], 400: [0.5]},
+        EVGP_IF={100: [1.0, 3.0], 400: [0.25, 0.25]},
+        EVGP_IFG={100: [1.0, 1.0], 400: [0.375, 0.125]},
+    )
+    page = "\n".join(paragraphs(rows))
+    assert "| EVGP-IF | 2.00 (1.00 to 3.00, 2) | 0.250 (0.250 to 0.250, 2) |" in page
+    assert "| RES-DBNN | 9.00 (9.00 to 9.00, 2) | 0.500 |" in page
+    assert "| RES-DBNN | 0.900 | 0.0500 |" in page  # medians
+    # Rows to reach 1.0: VGP 400, RES-VGP never, ...
+    assert "| pendulum | 1.00 | 400 | — | 400 | 400 | 100 |" in page
+    assert "EVGP-IFG (100), EVGP-IF (400)" in page  # of equals the first
+    # From 4 to 1 over two doublings: a half each.
+    assert "| pendulum | 0.50 | *0.97* | 0.24 | 0.35 | 0.50 |" in page
+    assert "| pendulum | RES-DBNN | 8.00 (× 9.00) | 0.250 (× 2.00) | yes | yes |" in page
+    assert "| pendulum | EVGP-IF | 1.00 (× 2.00) | 0.00 (× 1.00) | yes | yes |" in page
+    assert "Not so: nowhere." in page
+    assert "0 of 19 fits ended with a ConvergenceWarning" in page
+    worse = "\n".join(paragraphs(made_up(EVGP_IF={100: [1.0], 400: [0.5]}, EVGP_IFG={100: [0.5], 400: [1.5]})))
+    assert "Not so: pendulum with 400 rows (1.50 against 0.500)." in worse
+    assert "| pendulum | EVGP-IF | 0.500 (× 2.00) | -1.00 (× 0.333) | reversed | reversed |" in worse
+    never = "\n".join(paragraphs(made_up(EVGP_IF={100: [0.5], 400: [0.5]}, EVGP_IFG={100: [1.0], 400: [0.25]})))
+    assert "| pendulum | EVGP-IF | -0.500 (× 0.500) | 0.250 (× 2.00) | — | — |" in never
+
+
+def test_a_page_of_few_rows_says_what_it_can(tmp_path):
+    from paper.learning_curves_report import paragraphs, plot
+
+    page = "\n".join(paragraphs(made_up(VGP={100: [4.0]})))
+    assert "| VGP | 4.00 |" in page
+    assert "EVGP needs fewer" not in page
+    assert "| EVGP-IF |  |  |" in "\n".join(paragraphs(made_up(EVGP_IF={100: [1.0]}, EVGP_IFG={400: [2.0]})))
+    nominal = [{**row, "system": "iiwa14", "setting": "skevgp-nominal"} for row in made_up(EVGP_IFG={100: [1.0]})]
+    assert "| EVGP-IFG, nominal | 1.00 |" in "\n".join(paragraphs(nominal))
+    plot(nominal, tmp_path / "nominal.png")
+
+
+def test_each_panel_draws_its_models(tmp_path, monkeypatch):
+    from matplotlib import pyplot
+    from matplotlib.colors import to_rgb
+
+    from paper.learning_curves_report import COLOURS, plot
+
+    drawn = []
+    monkeypatch.setattr(pyplot, "close", drawn.append)
+    plot(made_up(VGP={100: [4.0, 2.0], 400: [1.0]}, EVGP_IFG={100: [1.0], 400: [0.5]}), tmp_path / "curves.png")
+    monkeypatch.undo()
+    (figure,) = drawn
+    above, below = ({line.get_label(): line for line in axes.lines} for axes in figure.axes)
+    assert (set(above), set(below)) == ({"VGP", "EVGP-IFG"}, {"EVGP-IFG"})
+    np.testing.assert_array_equal(above["VGP"].get_xydata(), [[100, 3.0], [400, 1.0]])
+    assert to_rgb(below["EVGP-IFG"].get_color()) == to_rgb(COLOURS["EVGP-IFG"])
+    pyplot.close(figure)

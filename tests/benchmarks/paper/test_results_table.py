@@ -1,0 +1,129 @@
+"""The benchmark of the paper's Table 4 in short mode."""
+
+import csv
+from contextlib import nullcontext
+
+import numpy as np
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
+from skevgp.features import InertiaForceGravity
+from skevgp.metrics import prediction_error, std_norm
+
+from ..conftest import read
+
+COLUMNS = (
+    "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,n_parameters,fit_seconds"
+)
+PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
+
+
+@pytest.fixture
+def run(run_script, tmp_path):
+    """Tiny fits of the pendulum's models."""
+
+    def run(*arguments, max_iter=2):
+        options = ("--quick", "--systems", "pendulum", "--max-iter", max_iter, "--jobs", 1)
+        options += ("--output", tmp_path / "table.csv")
+        return run_script("paper/results_table.py", *options, *arguments)
+
+    return run
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
+    table, page, picture = (tmp_path / f"table.{suffix}" for suffix in ("csv", "md", "png"))
+    both = ("--models", "RES-VGP", "EVGP-IFG", "--settings")
+    said = run(*both, "paper")
+    assert "[2/2] pendulum" in said
+    assert table.read_text().startswith(COLUMNS + ",noise,")
+    before = table.read_text()
+    said = run(*both, "paper", "skevgp")
+    assert "2 of 4 cells" in said
+    assert "[2/2] pendulum" in said
+    assert table.read_text().startswith(before)
+
+    train, test = (make_dynamics("pendulum", 12, random_state=state) for state in (0, 1000))
+    X, y = train.data, train.target
+    models = {
+        ("RES-VGP", "skevgp"): EVGPRegressor(n_inducing=40),
+        ("EVGP-IFG", "skevgp"): EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10),
+        ("EVGP-IFG", "paper"): EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, **PAPER),
+    }
+    rows = {(row["model"], row["setting"]): row for row in read(table)}
+    for key, model in models.items():
+        row, residual = rows[key], float(key[0] == "RES-VGP")
+        with pytest.warns(ConvergenceWarning, match="max_iter") if key[1] == "skevgp" else nullcontext():
+            model.set_params(max_iter=2, random_state=0).fit(X, y - residual * X[:, :2])
+        mean, std = model.predict(test.data, return_std=True)
+        mean += residual * test.data[:, :2]
+        assert float(row["error_mean"]) == pytest.approx(prediction_error(test.target, mean), rel=1e-6)
+        assert float(row["std_norm"]) == pytest.approx(std_norm(std), rel=1e-6)
+        assert row["converged"] == str(key[1] == "paper")
+    assert "| 123 / 123 |" in page.read_text()  # parameters, ours and the paper's
+    assert "/ 0.005 |" in page.read_text()
+    assert picture.stat().st_size > 5_000
+
+    # Of another noise, the file has one row, by hand: nothing is left to do, and the page is of this noise alone.
+    with table.open("a", newline="") as file:
+        csv.DictWriter(file, rows["RES-VGP", "paper"]).writerow({**rows["RES-VGP", "paper"], "noise": "0.5"})
+    assert "1 of 1 cells" in run("--models", "RES-VGP", "--settings", "paper", "--noise", "0.5")
+    assert "Noise: 0.5 " in page.read_text()
+    assert "## CR-2, mean over seeds" in page.read_text()
+    assert "| VGP |" not in page.read_text()
+    assert "RES-VGP | 1 |" in page.read_text()
+    assert "EVGP-IFG | 1 |" not in page.read_text()
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
+    with pytest.raises(SystemExit, match="1 cells failed"):
+        run("--models", "EVGP-IF", "--settings", "skevgp", max_iter=-1)
+    assert not (tmp_path / "table.csv").exists()
+
+
+@pytest.mark.slow
+@pytest.mark.slow
+def test_a_network_has_a_row_like_the_others():
+    from paper import results_table
+
+    row = results_table.run(results_table.Cell("pendulum", "RES-DBNN", "skevgp-angles", 0, 0.0, "quick", 3))
+    assert (row["n_parameters"], row["max_iter"]) == (634 + 2 * 15, "")
+    assert 1 <= row["n_iter"] <= 400
+    assert np.isnan(row["bound_per_row"])
+    assert 0 < row["error_mean"] < 1
+
+
+def test_noise_is_on_the_targets():
+    from paper import results_table
+
+    cell = results_table.Cell("pendulum", "EVGP-IFG", "skevgp", 0, 0.01, "quick", 0)
+    exact, noisy = (results_table.data("pendulum", 0, noise, "quick") for noise in (0.0, 0.01))
+    scale = exact[0].target.std(axis=0)  # of the training set, for both
+    for true, measured in zip(exact, noisy, strict=True):
+        np.testing.assert_allclose((measured.target - true.target).std(axis=0) / scale, 0.01, rtol=0.1)
+        np.testing.assert_array_equal(measured.data, true.data)
+    row = results_table.run(cell)
+    assert (row["noise"], row["seed"], row["size"]) == (0.01, 0, "quick")
+    assert row["error_mean"] >= 0.9 * np.linalg.norm(noisy[1].target - exact[1].target, axis=1).mean()
+
+
+def test_a_page_says_where_it_falls_short():
+    from paper.results_table_report import group, shortfalls
+
+    def rows(model, *errors, cr2=0.95):
+        names = {"system": "pendulum", "model": model, "setting": "skevgp"}
+        return [{**names, "error_mean": str(error), "cr2": str(cr2)} for error in errors]
+
+    good = rows("EVGP-IFG", 0.004, 0.006) + rows("EVGP-IF", 0.01) + rows("VGP", 0.02)
+    assert shortfalls(group(good)).count(": nowhere.") == 3
+    bad = rows("EVGP-IFG", 0.004, 0.02, cr2=0.99) + rows("EVGP-IF", 0.011, cr2=0.92) + rows("RES-VGP", 0.001, cr2=0.5)
+    order, paper, calibration = shortfalls(group(bad)).splitlines()
+    assert shortfalls(group(bad), with_noise=True) == calibration
+    assert "skevgp: EVGP-IFG 0.0120, EVGP-IF 0.0110; pendulum skevgp: EVGP-IF 0.0110, RES-VGP 0.00100." in order
+    assert paper.endswith(": pendulum EVGP-IFG skevgp (0.0120, there 0.005).")
+    assert calibration.endswith(": pendulum EVGP-IF skevgp (0.920); pendulum EVGP-IFG skevgp (0.990).")

@@ -1,0 +1,199 @@
+"""What every covariance must do; a kernel gets here by its line in the registry."""
+
+import pickle
+
+import autograd.numpy as anp
+import numpy as np
+import pytest
+from autograd import grad
+from sklearn.gaussian_process import kernels as sk
+
+from skevgp.kernels import FunctionKernel
+
+from ..oracle import central_differences, relative_error
+from .cases import KERNELS, REGISTERED, ROUGH, SIMPLE, X, Z, parsed, pulled_back, random_bars, scalar
+
+CENTRE = np.array([0.3, -0.2])
+# A covariance of one column, by its distance in any direction.
+OF_ONE_COLUMN = {"ExpSineSquared"}
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_hyperparameters_are_the_kernels_in_its_order(name):
+    covariance, hyperparameters = parsed(REGISTERED[name])
+    assert covariance.n_hyperparameters == len(hyperparameters)
+    np.testing.assert_allclose(hyperparameters, REGISTERED[name].theta)
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_matrices_are_symmetric_and_positive_semi_definite(name):
+    covariance, hyperparameters = parsed(REGISTERED[name])
+    points = X * [1.0, 0.0] if name in OF_ONE_COLUMN else X
+    K = covariance.at(hyperparameters, points).matrix()
+    np.testing.assert_allclose(K, K.T, rtol=1e-14, atol=1e-14)
+    eigenvalues = np.linalg.eigvalsh(K)
+    assert eigenvalues.min() > -1e-12 * eigenvalues.max()
+    assert eigenvalues.max() > 0.0
+
+
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", KERNELS)
+def test_values_are_those_of_the_scikit_learn_kernel(name, centre):
+    kernel = KERNELS[name]
+    covariance, hyperparameters = parsed(kernel, centre)
+    at, prepared = covariance.at(hyperparameters, Z), covariance.prepare(X)
+    close = {"rtol": 1e-12, "atol": 1e-12}
+    np.testing.assert_allclose(at.matrix(), kernel(Z), **close)
+    np.testing.assert_allclose(at.cross(prepared), kernel(Z, X), **close)
+    np.testing.assert_allclose(np.broadcast_to(at.diagonal(prepared), 40), kernel.diag(X), **close)
+    np.testing.assert_allclose(at.linearised(prepared)[0], at.cross(prepared), **close)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_gradients_in_hyperparameters_are_those_of_the_scikit_learn_kernel(name):
+    kernel = KERNELS[name]
+    covariance, hyperparameters = parsed(kernel)
+    _, gradient = kernel(Z, eval_gradient=True)
+    assert gradient.shape[2] == len(hyperparameters)
+    cross_bar, diagonal_bar, K_bar = random_bars(7, 7)
+    expected = np.einsum("ij,ijk->k", cross_bar + K_bar, gradient) + diagonal_bar @ np.einsum("iik->ik", gradient)
+    actual, _ = pulled_back(covariance, hyperparameters, Z, Z, (cross_bar, diagonal_bar, K_bar))
+    # scikit-learn differentiates a general Matérn by forward differences.
+    by_differences = isinstance(kernel, sk.Matern) and kernel.nu not in (0.5, 1.5, 2.5, np.inf)
+    np.testing.assert_allclose(actual, expected, rtol=1e-2 if by_differences else 1e-9)
+
+
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", KERNELS)
+def test_gradients_agree_with_finite_differences(name, centre):
+    covariance, hyperparameters = parsed(KERNELS[name], centre)
+    bars, p = random_bars(7, 40), len(hyperparameters)
+
+    def value(flat):
+        return scalar(covariance, flat[:p], flat[p:].reshape(7, 2), X, bars)
+
+    hyper_bar, Z_bar = pulled_back(covariance, hyperparameters, Z, X, bars)
+    actual = np.concatenate([hyper_bar, Z_bar.ravel()])
+    expected = central_differences(value, np.concatenate([hyperparameters, Z.ravel()]), 1e-5)
+    assert np.abs(actual - expected).max() < 1e-7 * max(np.abs(expected).max(), 1.0)
+
+
+def plain(kernel, A, B, values):
+    """The formulas in plain autograd.numpy; takes the hyperparameters' values off the front of a list."""
+    if isinstance(kernel, sk.KernelOperator):
+        left, right = plain(kernel.k1, A, B, values), plain(kernel.k2, A, B, values)
+        return left + right if isinstance(kernel, sk.Sum) else left * right
+    if isinstance(kernel, FunctionKernel):
+        own = {hyperparameter.name: values.pop(0) for hyperparameter in kernel.hyperparameters}
+        return kernel.function(A, B, **own)
+    if isinstance(kernel, sk.ConstantKernel):
+        return values.pop(0) * np.ones((len(A), len(B)))
+    if isinstance(kernel, sk.DotProduct):
+        return values.pop(0) ** 2 + A @ B.T
+    own = values.pop(0) if isinstance(kernel, sk.RationalQuadratic | sk.ExpSineSquared) else None
+    ard = getattr(kernel, "anisotropic", False)
+    lengths = anp.array([values.pop(0) for _ in range(2 if ard else 1)])
+    squared = anp.sum(((A[:, None, :] - B[None, :, :]) / lengths) ** 2, axis=2)
+    if isinstance(kernel, sk.RationalQuadratic):
+        return (1.0 + squared / (2.0 * own)) ** -own
+    if isinstance(kernel, sk.ExpSineSquared):
+        return anp.exp(-2.0 * (anp.sin(np.pi * anp.sqrt(squared)) / own) ** 2)
+    nu = getattr(kernel, "nu", np.inf)
+    if nu == np.inf:
+        return anp.exp(-0.5 * squared)
+    t = anp.sqrt(2.0 * nu * squared)
+    return {0.5: 1.0, 1.5: 1.0 + t, 2.5: 1.0 + t + t**2 / 3.0}[nu] * anp.exp(-t)
+
+
+def written_out(kernel):
+    """Whether `plain` knows it."""
+    if isinstance(kernel, sk.KernelOperator):
+        return written_out(kernel.k1) and written_out(kernel.k2)
+    known = sk.RBF | sk.Matern | sk.RationalQuadratic | sk.ExpSineSquared | sk.DotProduct | sk.ConstantKernel
+    return isinstance(kernel, known | FunctionKernel) and getattr(kernel, "nu", 0.5) in (0.5, 1.5, 2.5, np.inf)
+
+
+@pytest.mark.parametrize("name", [name for name, kernel in KERNELS.items() if written_out(kernel)])
+def test_gradients_of_the_rows_agree_with_autograd(name):
+    kernel = KERNELS[name]
+    covariance, hyperparameters = parsed(kernel, CENTRE)
+    cross_bar, p = random_bars(7, 40)[0], len(hyperparameters)
+
+    def value(flat):
+        points = flat[p:].reshape(7, 2)
+        return anp.sum(cross_bar * plain(kernel, points, X, [anp.exp(flat[i]) for i in range(p)]))
+
+    flat = np.concatenate([hyperparameters, Z.ravel()])
+    hyper_bar, Z_bar = pulled_back(covariance, hyperparameters, Z, X, (cross_bar, np.zeros(40), np.zeros((7, 7))))
+    assert relative_error(np.concatenate([hyper_bar, Z_bar.ravel()]), grad(value)(flat)) < 1e-9
+
+
+STATIONARY = [name for name, kernel in KERNELS.items() if kernel.is_stationary()]
+
+
+@pytest.mark.parametrize("name", STATIONARY)
+def test_a_covariance_of_differences_keeps_its_digits_far_from_zero(name):
+    """Shifted by 1e8, exactly: told of the centre, values and gradients are those near 0."""
+    near, hyperparameters = parsed(KERNELS[name])
+    shift = np.array([2.0**27, -(2.0**27)])
+    far = near.centred(shift)
+    points, inputs = np.round(Z * 2**20) / 2**20, np.round(X * 2**20) / 2**20
+    bars, close = random_bars(7, 40), {"rtol": 1e-12, "atol": 1e-12}
+    one, other = near.at(hyperparameters, points), far.at(hyperparameters, points + shift)
+    np.testing.assert_allclose(other.matrix(), one.matrix(), **close)
+    np.testing.assert_allclose(other.cross(far.prepare(inputs + shift)), one.cross(near.prepare(inputs)), **close)
+    for actual, expected in zip(
+        pulled_back(far, hyperparameters, points + shift, inputs + shift, bars),
+        pulled_back(near, hyperparameters, points, inputs, bars),
+        strict=True,
+    ):
+        np.testing.assert_allclose(actual, expected, rtol=1e-10, atol=1e-10)
+
+
+def test_there_are_covariances_of_differences_and_others():
+    assert {"RBF", "Matern, ard", "RationalQuadratic", "ExpSineSquared", "sum"} <= set(STATIONARY)
+    assert not {"DotProduct", "FunctionKernel", "nested"} & set(STATIONARY)
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_what_a_worker_receives_can_be_pickled(name):
+    covariance, hyperparameters = parsed(KERNELS[name], CENTRE)
+    again, at = pickle.loads(pickle.dumps((covariance, covariance.at(hyperparameters, Z))))
+    assert again == covariance == parsed(KERNELS[name])[0]
+    prepared = again.prepare(X)
+    total = at.cross_pullback(prepared, at.cross(prepared), np.ones((7, 40)), 1.0)
+    total = pickle.loads(pickle.dumps(total)) + total
+    expected = pulled_back(covariance, hyperparameters, Z, X, (np.ones((7, 40)), np.ones(40), np.zeros((7, 7))), 1)
+    for one, other in zip(at.finish_pullback(total, np.zeros((7, 7))), expected, strict=True):
+        np.testing.assert_allclose(one, 2.0 * other, rtol=1e-10, atol=1e-10)
+
+
+@pytest.mark.parametrize("name", SIMPLE)
+def test_coincident_points(name):
+    """X_m = X with duplicates, far from the origin: k(x, x) keeps its digits and gradients stay finite."""
+    inputs = 1e3 * np.vstack([X, X[:5]])
+    covariance, hyperparameters = parsed(SIMPLE[name])
+    at = covariance.at(hyperparameters, inputs)
+    U = at.cross(covariance.prepare(inputs))
+    exact = name in ROUGH or name == "matern 0.8"
+    np.testing.assert_allclose(U, at.matrix(), rtol=1e-8, atol=1e-12 if exact else 1e-7)
+    for gradient in pulled_back(covariance, hyperparameters, inputs, inputs, random_bars(45, 45)):
+        assert np.isfinite(gradient).all()
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_extreme_hyperparameters_and_distances_are_finite(name):
+    """To the corners of scikit-learn's default bounds and well beyond, on inputs of any size, without warnings."""
+    covariance, hyperparameters = parsed(KERNELS[name])
+    rng = np.random.RandomState(0)
+    for inputs_scale in (1e-12, 1.0, 1e12):
+        points, inputs = inputs_scale * Z, inputs_scale * np.vstack([X, Z])
+        for corner in (-5.0, 5.0, -30.0, 30.0):
+            for which in (np.full(len(hyperparameters), True), rng.rand(len(hyperparameters)) < 0.5):
+                at_corner = np.where(which, corner * np.log(10.0) * np.ones(len(hyperparameters)), hyperparameters)
+                at, prepared = covariance.at(at_corner, points), covariance.prepare(inputs)
+                assert np.isfinite(at.matrix()).all()
+                assert np.isfinite(at.cross(prepared)).all()
+                assert np.isfinite(at.diagonal(prepared)).all()
+                for gradient in pulled_back(covariance, at_corner, points, inputs, random_bars(7, 47)):
+                    assert np.isfinite(gradient).all()

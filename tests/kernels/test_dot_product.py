@@ -1,0 +1,14 @@
+import numpy as np
+
+from skevgp.kernels.dot_product import DotProduct
+
+from .cases import X, Z
+
+
+def test_it_is_of_the_rows_themselves_wherever_they_are():
+    """A centre, which helps covariances of differences, is none of its business."""
+    covariance = DotProduct().centred(np.array([3.0, -2.0]))
+    at, prepared = covariance.at(np.log([0.7]), Z + 1e3), covariance.prepare(X + 1e3)
+    np.testing.assert_allclose(at.cross(prepared), 0.49 + (Z + 1e3) @ (X + 1e3).T, rtol=1e-14)
+    np.testing.assert_allclose(at.diagonal(prepared), 0.49 + np.sum((X + 1e3) ** 2, axis=1), rtol=1e-14)
+    np.testing.assert_allclose(at.matrix(), 0.49 + (Z + 1e3) @ (Z + 1e3).T, rtol=1e-14)
