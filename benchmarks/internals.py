@@ -6,65 +6,46 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from skevgp import EVGPRegressor
 from skevgp.fitting.sparse import SparseTask
-from skevgp.fitting.start import starting_table
-from skevgp.fitting.units import Units
-from skevgp.inference.bounds import PosteriorFamily
-from skevgp.inference.model import SparseModel
-from skevgp.inference.objectives import BoundObjective, ElboObjective
-from skevgp.kernels.parse import Start, Starts
-from skevgp.kernels.stationary import SquaredExponential
+from skevgp.inference.objectives import ElboObjective
 from skevgp.optimizers.adam import adam
 from skevgp.optimizers.minimum import Minimum, Objective
 from skevgp.optimizers.parameters import ParameterTable
-from skevgp.rows.internal import Rows
-from skevgp.rows.source import LocalSource, moments_of_rows
 from skevgp.rows.threads import BlockMap
-from skevgp.solvers import LBFGS, SOLVERS
+from skevgp.solvers import LBFGS, Adam
 
 
-def _problem(
-    n: int,
-    m: int,
-    d: int,
-    n_outputs: int,
-    sharing: Literal["all", "kernel"],
-    posterior: PosteriorFamily,
-    solver: Literal["lbfgs", "adam"],
-) -> tuple[SparseModel, ParameterTable, Rows]:
-    """What a fit minimises over, where it starts.
+def _task(n: int, m: int, d: int, n_outputs: int, solver: type[LBFGS] | type[Adam], **options: Any) -> SparseTask:
+    """What the solver of a fit to random rows is given.
 
     Inducing points are drawn as the rows are, however few these may be: the cost does not depend on where they lie.
     """
-    rng = np.random.RandomState(0)
+    rng, given = np.random.RandomState(0), []
     X = rng.randn(n, d)
     Y = np.sin(X @ rng.randn(d, n_outputs)) + 0.01 * rng.randn(n, n_outputs)
-    source = LocalSource.of(X, np.empty((n, 0)), Y)
-    _, _, targets = source.sum(moments_of_rows)
-    nothing = np.zeros((n_outputs, 0))
-    units = Units.of(source, targets, np.zeros(n_outputs), nothing, nothing)
-    each = tuple(slice(o, o + 1) for o in range(n_outputs))
-    groups = (slice(0, n_outputs),) if sharing == "all" else each
-    model, rows = SparseModel(SquaredExponential(d), units.internal_prior(), posterior, groups), units.rows(source)
-    points = np.repeat(rng.randn(1, m, d), len(groups), axis=0)
-    starts, noise = Starts(Start(), Start(), Start()), SOLVERS[solver].rules.first_noise
-    table = starting_table(rows.inputs, points, units.target_unit, starts, rows.scatter(), noise, d)
-    return model, table, rows
+
+    class Given(solver):  # type: ignore[misc, valid-type]
+        def run(self, task: SparseTask, attempt: Any) -> Any:
+            given.append(task)
+            return super().run(task, attempt)
+
+    EVGPRegressor(inducing_init=rng.randn(m, d), solver=Given(), max_iter=0, **options).fit(X, Y)
+    return given[0]
 
 
 @contextmanager
 def evaluation(
     n: int, m: int, d: int, n_outputs: int, cores: int, sharing: Literal["all", "kernel"] = "all"
 ) -> Iterator[Callable[[], tuple[float, np.ndarray]]]:
-    """Gives () -> the bound and its gradient in all parameters, of all outputs, on random rows."""
-    model, table, rows = _problem(n, m, d, n_outputs, sharing, "full", "lbfgs")
-    threads = BlockMap(cores)
-    rows = replace(rows, threads=threads)
-    objective, start = BoundObjective(model, table, rows.blocks(model.kernel, m)), table.start()
+    """Gives () -> the bound and its gradient in all parameters, of all outputs, on random rows, where a fit starts."""
+    task, threads = _task(n, m, d, n_outputs, LBFGS, sharing=sharing), BlockMap(cores)
+    task = replace(task, rows=replace(task.rows, threads=threads))
+    objective, start = LBFGS().objective(task, task.table), task.table.start()
     try:
         yield lambda: objective(start)
     finally:
@@ -73,9 +54,9 @@ def evaluation(
 
 def adam_step(n: int, m: int, d: int, n_outputs: int, batch_size: int) -> Callable[[], Minimum]:
     """Make () -> one step of Adam in the paper's setting, over all parameters, on random rows."""
-    model, table, rows = _problem(n, m, d, n_outputs, "kernel", "diagonal", "adam")
-    elbo = ElboObjective(model, table, rows.blocks(model.kernel, m))
-    objective = elbo.minibatch(rows.batches(model.kernel, batch_size, np.random.RandomState(0)))
+    task = _task(n, m, d, n_outputs, Adam, sharing="kernel", posterior="diagonal")
+    elbo = ElboObjective(task.model, task.table, task.blocks)
+    objective = elbo.minibatch(task.rows.batches(task.model.kernel, batch_size, np.random.RandomState(0)))
     start, limits = elbo.table.start(), elbo.table.limits()
     return lambda: adam(objective, start, limits, max_iter=1, learning_rate=0.1)
 

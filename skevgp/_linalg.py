@@ -15,7 +15,22 @@ class NotPositiveDefiniteError(ArithmeticError):
     """No jitter up to `MAX_JITTER` makes the matrix positive definite, or it is not finite."""
 
 
-def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
+# Where every pivot is above this share of its diagonal entry, a matrix needs no jitter.
+WELL_CONDITIONED = 1e-6
+
+
+def cholesky_of_covariance(K: np.ndarray, jitter: float) -> np.ndarray:
+    """Lower Cholesky factor of a covariance matrix, with a jitter (`jittered_cholesky`) only where it needs one."""
+    try:
+        L = jittered_cholesky(K, 0.0, 0.0)
+        if (diagonal_of(L) ** 2 >= WELL_CONDITIONED * diagonal_of(K)).all():
+            return L
+    except NotPositiveDefiniteError:
+        pass
+    return jittered_cholesky(K, jitter)
+
+
+def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX_JITTER) -> np.ndarray:
     """Lower Cholesky factor of a symmetric matrix plus the smallest multiple of its diagonal that makes it work.
 
     Parameters
@@ -25,6 +40,9 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
     jitter : float, default=0.0
         Always added, relative to the diagonal; raised by factors of ten, from at least 1e-15, while the
         factorisation fails.
+
+    most : float, default=1e-2
+        The largest jitter that is tried.
 
     Returns
     -------
@@ -50,8 +68,8 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0) -> np.ndarray:
         if not np.isfinite(matrix).all():
             raise NotPositiveDefiniteError("the matrix is not finite")
         jitter = max(10.0 * jitter, 1e-15)
-        if jitter > MAX_JITTER:
-            raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {MAX_JITTER}")
+        if jitter > most:
+            raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {most}")
 
 
 def diagonal_of(matrix: np.ndarray) -> np.ndarray:
@@ -62,12 +80,14 @@ def diagonal_of(matrix: np.ndarray) -> np.ndarray:
 
 
 def triangular_inverse(L: np.ndarray) -> np.ndarray:
-    """Inverse of a lower triangular matrix, lower triangular.
+    """Inverse X of a lower triangular matrix, lower triangular, with a small left residual: X L = I.
 
-    Explicit because it multiplies whole blocks of rows as one matrix product; it is as accurate as a triangular solve
-    with the same factor (Higham 2002, section 14.2).
+    Explicit because it multiplies whole blocks of rows as one matrix product. Rows are whitened by X U, where U = L V:
+    what counts is how far X L is from the identity, and that is what LAPACK's method for a *lower* matrix bounds by
+    |X| |L| (Higham 2002, section 14.2). Its method for an upper one, on the transpose, bounds L X - I instead; X L - I
+    is then larger by the condition of L, 1e6 where there is little noise.
     """
-    return lapack.dtrtri(L.T, lower=0)[0].T
+    return lapack.dtrtri(L, lower=1)[0]
 
 
 def symmetric_inverse(L_inv: np.ndarray) -> np.ndarray:

@@ -96,7 +96,7 @@ class Progress:
 
 
 def monitor_of(verbose: int, callback: Report | None = None) -> Monitor:
-    """The monitor of a fit that prints as ``verbose`` says, and tells the user's callback(iteration, bound, outputs)."""
+    """The monitor of a fit that prints as ``verbose`` says, and calls callback(iteration, bound, outputs)."""
     progress = Progress(verbose) if verbose else None
     if callback is None:
         return Monitor(progress)

@@ -73,7 +73,7 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
 
 def words_of(frame: Any) -> list[Any]:
     """The names of the columns of a data frame that are not numbers."""
-    names = getattr(frame, "column_names", frame.columns)
+    names = frame.column_names if hasattr(type(frame), "column_names") else frame.columns  # the first is pyarrow's
     columns = (safe_indexing(frame, index, axis=1) for index in range(frame.shape[1]))
     return [name for name, column in zip(names, columns, strict=True) if not _are_numbers(column)]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
 
@@ -20,6 +21,9 @@ from .fitting.exact import ExactFit, ExactOptions, fit_exact
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS
+
+# Without inducing points rounding does not matter before the noise is so low: a smooth function is met to 1e-6.
+_RULES = replace(LBFGS.rules, lowest_noise=1e-12)
 
 
 class EGPRegressor(ExplicitGaussianProcess):
@@ -185,7 +189,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y, allow_vague=True)
             rows = problem.units.rows(problem.source)
-            options = ExactOptions(LBFGS.rules, self.max_iter, self.tol, self.n_restarts)
+            options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)
             self._fitted = fit_exact(
                 problem.units,
                 rows,

@@ -277,7 +277,7 @@ class Adam(BaseEstimator):
 
 
 # What the strings of ``solver=`` stand for.
-SOLVERS: dict[str, Any] = {"lbfgs": LBFGS, "adam": Adam}
+SOLVERS: dict[str, type[LBFGS] | type[Adam]] = {"lbfgs": LBFGS, "adam": Adam}
 
 
 def _check_common(solver: LBFGS | Adam) -> None:
@@ -306,7 +306,7 @@ def resolved(solver: Any, posterior: str) -> LBFGS | Adam:
     """
     if isinstance(solver, str) and solver in SOLVERS:
         return SOLVERS[solver]()
-    if not isinstance(solver, tuple(SOLVERS.values())):
+    if not isinstance(solver, LBFGS | Adam):
         names = ", ".join(f'"{name}"' for name in SOLVERS)
         kinds = ", ".join(f"skevgp.solvers.{kind.__name__}(...)" for kind in SOLVERS.values())
         raise ValueError(f"solver must be one of {names}, {kinds}; got {solver!r}.")

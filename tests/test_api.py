@@ -3,15 +3,17 @@
 import numpy as np
 import pandas as pd
 import pytest
+import skops.io
 from sklearn.base import clone
 from sklearn.compose import make_column_transformer
 from sklearn.feature_selection import RFE, SelectFromModel
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, Kernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, Matern, WhiteKernel
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.solvers import Adam
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (40, 2))
@@ -56,6 +58,75 @@ def test_a_y_of_one_column_is_one_output(model):
         actual, expected = getattr(column, name), getattr(plain, name)
         assert actual.shape == expected.shape
         np.testing.assert_allclose(actual, expected, rtol=1e-6, atol=1e-9)
+
+
+# --- values: six points of x sin(x), hardly any noise, as scikit-learn's own tests have them ----------------------
+
+SIX = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
+SIX_Y = SIX[:, 0] * np.sin(SIX[:, 0])
+BETWEEN = np.array([[2.0], [4.0], [5.5], [6.5], [7.5]])
+ALPHA = 1e-10
+WAVE = ConstantKernel(1.0, (1e-2, 1e2)) * RBF(1.0, (1e-3, 1e3))
+# The outermost constant is the signal variance; without a fixed one a free one would be put in front.
+KERNELS = [
+    ConstantKernel(1.0, "fixed") * kernel for kernel in (RBF(1.0), WAVE, WAVE + ConstantKernel(1e-5, (1e-5, 1e2)))
+]
+
+
+def both(kernel, y=SIX_Y, optimise=True):
+    """The exact model, and scikit-learn's, with the same kernel and noise."""
+    ours = EGPRegressor(kernel=kernel + WhiteKernel(ALPHA, "fixed"), max_iter=1000 if optimise else 0)
+    theirs = GaussianProcessRegressor(kernel, alpha=ALPHA, optimizer="fmin_l_bfgs_b" if optimise else None)
+    return ours.fit(SIX, y), theirs.fit(SIX, y)
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+@pytest.mark.parametrize("y", [SIX_Y, np.column_stack([SIX_Y, 2.0 * SIX_Y])], ids=["one output", "two outputs"])
+def test_with_scikit_learns_kernel_and_noise_the_exact_model_is_scikit_learns(kernel, y):
+    ours, theirs = both(kernel, y, optimise=False)
+    for asked in ("return_std", "return_cov"):
+        found = ours.predict(BETWEEN, include_noise=False, **{asked: True})
+        for actual, expected in zip(found, theirs.predict(BETWEEN, **{asked: True}), strict=True):
+            np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-6)
+    assert ours.log_marginal_likelihood_value_ == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-4)
+
+
+@pytest.mark.parametrize("kernel", KERNELS[:2], ids=str)  # the third one ends at a bound
+def test_what_the_exact_model_learns_interpolates_and_is_no_less_likely_than_what_scikit_learns_learns(kernel):
+    ours, theirs = both(kernel)
+    assert ours.log_marginal_likelihood_value_ > theirs.log_marginal_likelihood_value_ - 0.01
+    mean, std = ours.predict(SIX, return_std=True, include_noise=False)
+    np.testing.assert_allclose(mean, SIX_Y, atol=1e-6)
+    np.testing.assert_allclose(std, 0.0, atol=1e-4)
+    assert ((ours.kernel_.bounds[:, 0] <= ours.kernel_.theta) & (ours.kernel_.theta <= ours.kernel_.bounds[:, 1])).all()
+
+
+@pytest.mark.parametrize("kernel", KERNELS, ids=str)
+def test_rows_a_rounding_error_apart_are_duplicates(kernel):
+    fits = [
+        EGPRegressor(kernel=kernel + WhiteKernel(0.01, "fixed"), max_iter=0).fit(np.vstack([SIX, row]), [*SIX_Y, 1.0])
+        for row in (SIX[0], SIX[0] + 1e-15)
+    ]
+    for one, other in zip(*(m.predict(BETWEEN, return_std=True) for m in fits), strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+def test_around_a_constant_target_nothing_is_uncertain(model):
+    y = np.column_stack([SIX_Y, np.full(6, 2.0)])
+    mean, cov = fresh(model, normalize_y=True).fit(SIX, y).predict(SIX, return_cov=True)
+    np.testing.assert_allclose(mean[:, 1], 2.0)
+    np.testing.assert_allclose(np.diagonal(cov[..., 1]), 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("model", MODELS, ids=str)
+def test_rows_are_not_modified(model):
+    rows, new = X.copy(), X_NEW.copy()
+    m = fresh(model, feature_map=TREND, kernel_map=StandardScaler()).fit(rows, Y)
+    m.predict(new, return_std=True)
+    m.sample_y(new)
+    np.testing.assert_array_equal(rows, X)
+    np.testing.assert_array_equal(new, X_NEW)
 
 
 # --- weights ------------------------------------------------------------------------------------------------------
@@ -189,6 +260,49 @@ def test_a_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
     columns.pop("b")
     with pytest.raises(ValueError, match="Feature names seen at fit time, yet now missing"):
         m.predict(frame_of(columns))
+
+
+# --- files --------------------------------------------------------------------------------------------------------
+
+SAVED = [
+    EVGPRegressor(n_inducing=8, max_iter=3, random_state=0),
+    EVGPRegressor(TREND, kernel_map=StandardScaler(), n_inducing=8, max_iter=3, random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver="adam", random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver=Adam(natural_gradient=True), random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, posterior="diagonal", sharing="none", random_state=0),
+    EGPRegressor(
+        TREND, 2.0 * RBF([0.5, 0.7], "fixed") + Matern(nu=1.5) + WhiteKernel(0.1), coef_scale=np.inf, max_iter=3
+    ),
+    BayesianMLPRegressor((5,), max_iter=3, random_state=0),
+    ResidualRegressor(EVGPRegressor(n_inducing=8, max_iter=3, random_state=0)),
+]
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("model", SAVED, ids=str)
+@pytest.mark.parametrize("used", [False, True], ids=["fresh", "used"])
+def test_a_model_from_a_skops_file_is_the_model(model, used):
+    fitted = clone(model).fit(X, Y)
+    if used:
+        fitted.predict(X_NEW, return_std=True)
+    file = skops.io.dumps(fitted)
+    trusted = skops.io.get_untrusted_types(data=file)
+    assert all(name.startswith(("skevgp.", "sklearn.")) or name == "operator.itemgetter" for name in trusted)
+    loaded = skops.io.loads(file, trusted=trusted)
+    for asked in ("return_std", "return_cov"):
+        expected = fitted.predict(X_NEW, **{asked: True})
+        for actual, part in zip(loaded.predict(X_NEW, **{asked: True}), expected, strict=True):
+            np.testing.assert_array_equal(actual, part)
+
+
+@pytest.mark.parametrize("model", SAVED[:2], ids=str)
+def test_a_model_from_a_skops_file_goes_on(model):
+    fitted = fresh(model, max_iter=0).fit(X, Y)
+    loaded = skops.io.loads(file := skops.io.dumps(fitted), trusted=skops.io.get_untrusted_types(data=file))
+    predictions = [m.partial_fit(X_NEW, Y[:15]).predict(X_NEW) for m in (fitted, loaded)]
+    np.testing.assert_array_equal(*predictions)
+    predictions = [m.set_params(warm_start=True).fit(X, Y).predict(X_NEW) for m in (fitted, loaded)]
+    np.testing.assert_array_equal(*predictions)
 
 
 # --- errors -------------------------------------------------------------------------------------------------------

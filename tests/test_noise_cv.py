@@ -165,7 +165,7 @@ def test_it_pickles_and_clones():
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_ctrl_c_leaves_it_out(sharing):
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         if iteration == 3:
             raise KeyboardInterrupt
 

@@ -30,7 +30,6 @@ def test_any_robot_runs():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
     files, chunks = SNIPPETS[3:]

@@ -494,7 +494,7 @@ def test_too_few_iterations_warn_and_say_what_to_change():
 @pytest.mark.parametrize("solver", [LBFGS, Adam])
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_ctrl_c_keeps_the_best_parameters_and_warns(sharing, solver):
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         if iteration == 3:
             raise KeyboardInterrupt
 
@@ -590,7 +590,7 @@ def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver):
     # A run in the background of a shell ignores SIGINT.
     handler = signal.signal(signal.SIGINT, signal.default_int_handler)
 
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         if iteration == 3 and not sent:
             sent.append(os.kill(os.getpid(), signal.SIGINT))
 

@@ -28,11 +28,18 @@ def model(**arguments):
 
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_restarts_keep_the_best_bound(sharing):
+    first_bounds = []
+
+    def look(iteration, bound, outputs):
+        if iteration == 1:
+            first_bounds.append(bound)
+
     once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
-    often = model(sharing=sharing, inducing_init="k-means", solver=LBFGS(n_restarts=3)).fit(X, Y)
+    solver = LBFGS(n_restarts=3, callback=look)
+    often = model(sharing=sharing, inducing_init="k-means", solver=solver).fit(X, Y)
     assert often.lower_bound_ >= once.lower_bound_
-    # Not all from the same place: the eight points leave several optima, of which the first is not the best.
-    assert often.lower_bound_ > once.lower_bound_ + 1e-3
+    # None from where another one started.
+    assert len(set(first_bounds)) == len(first_bounds) >= 4
     assert -often.loss_curve_[-1] == pytest.approx(often.lower_bound_, abs=0.1)
     assert len(often.loss_curve_) == often.n_iter_
 
@@ -69,7 +76,7 @@ def test_without_iterations_there_is_nothing_to_restart():
 def test_ctrl_c_ends_the_restarts_with_the_best_so_far():
     calls = []
 
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         calls.append(iteration)
         # In the second iteration of the second start.
         if calls.count(2) == 2:
@@ -111,7 +118,7 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places():
     """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
     seen = []
 
-    def interrupt(iteration, bound):
+    def interrupt(iteration, bound, outputs):
         seen.append(iteration)
         if iteration == 21:
             raise KeyboardInterrupt

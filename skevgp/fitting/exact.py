@@ -193,6 +193,7 @@ def fit_exact(
         starts,
         rows.scatter(),
         options.rules.first_noise,
+        options.rules.lowest_noise,
         kernel.n_hyperparameters,
         variance,
     )

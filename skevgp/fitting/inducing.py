@@ -20,6 +20,8 @@ MAX_SAMPLE = 10_000
 LARGEST_SEARCH = 10_000_000
 # Below this share of the prior variance, what is left is rounding: it no longer tells which row is the least known.
 _EXHAUSTED = 1e-10
+# After the decimal point, of rows in units of their columns' scatter: those that agree in them are one and the same.
+_DIGITS = 10
 
 
 @dataclass(frozen=True)
@@ -68,17 +70,30 @@ class Placement:
         -------
         inducing_points : ndarray of shape (m, d)
             With m = min(n_inducing, distinct rows): all distinct rows, in the order of their first appearance, if there
-            are no more than ``n_inducing``.
+            are no more than ``n_inducing``. Rows that differ by rounding only are one.
         """
         if isinstance(self.method, np.ndarray):
             return self.method
-        _, first = np.unique(inputs, axis=0, return_index=True)
+        _, first = np.unique(_rounded(inputs, Moments.of(inputs)), axis=0, return_index=True)
         distinct = inputs[np.sort(first)]
         if len(distinct) <= self.n_inducing:
             return distinct
         if self.method == "greedy":
             return _least_known(distinct[rng.permutation(len(distinct))], self.n_inducing, kernel, hyperparameters)
         return _cluster_centres(inputs, self.n_inducing, rng)
+
+
+def are_all_rows(points: np.ndarray, inputs: np.ndarray) -> bool:
+    """Whether each row (n, d) is among the points (m, d), but for rounding."""
+    moments = Moments.of(inputs)
+    known, rows = _rounded(points, moments), _rounded(inputs, moments)
+    n_known = len(np.unique(known, axis=0))
+    return n_known == len(np.unique(np.vstack([known, rows]), axis=0))
+
+
+def _rounded(inputs: np.ndarray, moments: Moments) -> np.ndarray:
+    """Rows in units of their columns' scatter, to the digits that count."""
+    return np.round((inputs - moments.mean) / column_scale(moments), _DIGITS)
 
 
 def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:

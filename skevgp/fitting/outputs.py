@@ -20,7 +20,7 @@ from ..rows.internal import Rows
 from ..rows.source import Source
 from ..rows.threads import BlockMap, thread_pool
 from .advice import interrupted
-from .inducing import Placement
+from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask
 from .start import checked_variance, column_centre, starting_table
 from .strategy import search
@@ -211,15 +211,21 @@ def plan(
     rows = units.rows(request.source, threads)
     kernel = request.spec.covariance.centred(column_centre(rows.inputs))
 
+    stay = False
+
     def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        n_hyper, first_noise = kernel.n_hyperparameters, solver.rules.first_noise
-        return starting_table(rows.inputs, points, unit, starts, scatter, first_noise, n_hyper, variance)
+        noise, n_hyper = (solver.rules.first_noise, solver.rules.lowest_noise), kernel.n_hyperparameters
+        table = starting_table(rows.inputs, points, unit, starts, scatter, *noise, n_hyper, variance)
+        return table.with_fixed("inducing_points") if stay else table
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
     alone = table_of(slice(0, 1), np.empty((1, 0, len(rows.inputs.mean))))
     hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
-    points = placement.points(rows.sample(placement.sample_size, rng).inputs, kernel, hyperparameters, rng)
+    inputs = rows.sample(placement.sample_size, rng).inputs
+    points = placement.points(inputs, kernel, hyperparameters, rng)
+    # Where they are all rows the bound is the likelihood: no other places are better.
+    stay = request.family == "full" and len(inputs) == len(rows) and are_all_rows(points, inputs)
     first = starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.

@@ -21,8 +21,7 @@ _LENGTHSCALE = 0.6
 _LENGTHSCALE_LIMITS = 1e-2, 1e4
 
 # In units of the variance that the features alone leave over.
-# Below 1e-10 of it, rounding in k(x, x) - |v|² (about 1e-16 times the condition of L, 1e6) outweighs the noise.
-_NOISE_LIMITS = 1e-10, 1e2
+_HIGHEST_NOISE = 1e2
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
 _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
@@ -207,6 +206,7 @@ def starting_table(
     starts: Starts,
     scatter: np.ndarray,
     first_noise: float,
+    lowest_noise: float,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
 ) -> ParameterTable:
@@ -226,6 +226,8 @@ def starting_table(
         Variance of the residuals, in squared target units: 1, but for targets far from 0.
     first_noise : float
         Where the noise variance starts, as a share of the scatter, if the user does not say.
+    lowest_noise : float
+        Its lower limit in the same units, if the user does not say.
     n_hyperparameters : int
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
@@ -264,8 +266,8 @@ def starting_table(
                 starts.noise,
                 "noise",
                 first_noise * scatter,
-                np.maximum(_NOISE_LIMITS[0] * scatter, _LOWEST_NOISE),
-                _NOISE_LIMITS[1] * o,
+                np.maximum(lowest_noise * scatter, _LOWEST_NOISE),
+                _HIGHEST_NOISE * o,
                 target_unit**2,
             ),
             Parameter("inducing_points", inducing_points, unit=scale, origin=column_centre(inputs)),

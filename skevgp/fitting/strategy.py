@@ -31,6 +31,9 @@ class Rules:
     first_noise : float
         Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
         keeps L-BFGS out of the optimum where the noise explains everything.
+    lowest_noise : float
+        Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
+        outweighs the noise.
     jitter : float
         Of k(X_m, X_m), relative to the signal variance.
     collapsed : float
@@ -49,6 +52,7 @@ class Rules:
     """
 
     first_noise: float
+    lowest_noise: float = 1e-10
     jitter: float = JITTER
     collapsed: float = 0.9
     other_starts: tuple[tuple[float, float], ...] = ()
@@ -166,7 +170,8 @@ class Strategy:
             best = yield from self._staged(first)
         else:
             # Inducing points that another fit moved have found their places.
-            again = self._staged if np.array_equal(*(v["inducing_points"] for v in (self.warm, first))) else self._once
+            same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
+            again = self._staged if same_points else self._once
             best = yield from again(first | self.warm)
             if self.max_iter > 0 and self.collapsed(best):
                 best = better(best, (yield from self._staged(first)))

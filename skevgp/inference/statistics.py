@@ -14,11 +14,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._linalg import cholesky_pullback, diagonal_of, jittered_cholesky, triangular_inverse
+from .._linalg import cholesky_of_covariance, cholesky_pullback, diagonal_of, triangular_inverse
 from ..rows.blocks import Block, Blocks
 
 # Relative to the signal variance. k(X_m, X_m) from exact differences is accurate to about m times 1e-16.
 JITTER = 1e-12
+_ROUNDING = 4.0 * np.finfo(float).eps
 
 
 class KernelAt(Protocol):
@@ -79,7 +80,7 @@ class Whitening:
     ) -> Whitening:
         """At hyperparameters (n_hyper,) and inducing points (m, d)."""
         covariance = kernel.at(np.log(hyperparameters), inducing_points)
-        L = jittered_cholesky(covariance.matrix(), jitter)
+        L = cholesky_of_covariance(covariance.matrix(), jitter)
         return cls(covariance, L, triangular_inverse(L))
 
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -89,7 +90,11 @@ class Whitening:
 
     def unexplained(self, prepared: Any, V: np.ndarray) -> np.ndarray:
         """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0."""
-        return np.maximum(self.covariance.diagonal(prepared) - np.einsum("mn,mn->n", V, V), 0.0)
+        variance = self.covariance.diagonal(prepared)
+        left = variance - np.einsum("mn,mn->n", V, V)
+        # What is left of a row that is an inducing point is rounding.
+        left -= _ROUNDING * variance
+        return np.maximum(left, 0.0, out=left)
 
     def pull_back(self, rows_bar: Any, L_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in the hyperparameters (their logarithms) and X_m, given those in the rows (`pull_back`) and L."""

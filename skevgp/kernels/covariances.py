@@ -65,7 +65,7 @@ class CentredSquares:
         return np.ascontiguousarray(np.hstack([x, np.ones((len(x), 1)), x**2]).T)
 
     def centred(self, points: np.ndarray) -> np.ndarray:
-        """X - c."""
+        """The same points, seen from c."""
         return points - self._centre
 
     @cached_property
@@ -127,7 +127,7 @@ class Covariance(ABC):
         return tuple(each(inputs) for each in (only, *others)) if others else only(inputs)
 
     def centred(self, centre: np.ndarray) -> Covariance:
-        """The same covariance, exact for inputs near ``centre`` (d,), however far from 0 that is."""
+        """The same covariance, which keeps its digits around ``centre`` (d,), however far from 0 that is."""
         return self
 
     @abstractmethod

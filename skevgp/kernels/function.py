@@ -88,10 +88,12 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         deep : bool, default=True
+            Whether the hyperparameters are among them.
 
         Returns
         -------
         params : dict
+            Each by its name.
         """
         params = super().get_params(deep=False)
         return {**params, **self._values()} if deep else params
@@ -101,11 +103,13 @@ class FunctionKernel(sk.Kernel):
 
         Parameters
         ----------
-        params : dict
+        **params : dict
+            Each by its name.
 
         Returns
         -------
         self : object
+            This kernel.
         """
         names = self._defaults()
         super().set_params(**{name: value for name, value in params.items() if name not in names})
@@ -129,6 +133,7 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         covariance : Function
+            Of the hyperparameters' logarithms.
         """
         return Function(self.function, tuple(self._values()), self.diagonal)
 
@@ -170,10 +175,12 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         X : array-like of shape (n, d)
+            The rows.
 
         Returns
         -------
         diagonal : ndarray of shape (n,)
+            One number of each row.
         """
         return np.asarray(self.covariance().diagonal_values(self._log_values(), np.atleast_2d(X)), dtype=float)
 
@@ -183,6 +190,7 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         stationary : bool
+            False.
         """
         return False
 
@@ -277,7 +285,7 @@ class Function(Covariance):
         """
         # The optimiser looks at what is not finite.
         with np.errstate(all="ignore"):
-            found = self.function(X, Z, **self._arguments(hyperparameters))
+            found = self.function(_own(X), _own(Z), **self._arguments(hyperparameters))
         return self._checked(self.function, found, (len(X), len(Z)))
 
     def diagonal_values(self, hyperparameters: Any, X: Any) -> Any:
@@ -286,7 +294,7 @@ class Function(Covariance):
             chunks: Iterator[Any] = (X[first : first + _CHUNK] for first in range(0, len(X), _CHUNK))
             return anp.concatenate([anp.diag(self.values(hyperparameters, chunk, chunk)) for chunk in chunks])
         with np.errstate(all="ignore"):
-            found = self.diagonal(X, **self._arguments(hyperparameters))
+            found = self.diagonal(_own(X), **self._arguments(hyperparameters))
         return self._checked(self.diagonal, found, (len(X),))
 
     def pulled_back(self, function: Callable[[Any], Any], argument: Any, bar: np.ndarray) -> Any:
@@ -364,6 +372,11 @@ class FunctionAt(CovarianceAt):
     @staticmethod
     def _number(found: Any) -> np.ndarray:
         return np.asarray(found, dtype=float)
+
+
+def _own(rows: Any) -> Any:
+    """A copy of rows, which may be the user's data: a function of his may change what it gets."""
+    return rows.copy() if isinstance(rows, np.ndarray) else rows
 
 
 def name_of(function: Callable[..., Any]) -> str:

@@ -13,6 +13,7 @@ from sklearn.gaussian_process import kernels as sk
 
 from . import stationary
 from .constant import Constant
+from .cosine import Cosine, Wave
 from .covariances import Covariance, Product, Sum
 from .dot_product import DotProduct
 from .function import Function, FunctionKernel
@@ -26,6 +27,7 @@ BUILDERS: dict[type[sk.Kernel], Callable[[Any, int], Covariance]] = {
     sk.RationalQuadratic: stationary.rational_quadratic,
     sk.ExpSineSquared: stationary.exp_sine_squared,
     sk.DotProduct: DotProduct.of,
+    Cosine: Wave.of,
     FunctionKernel: Function.of,
 }
 # The same for people.

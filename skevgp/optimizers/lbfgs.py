@@ -9,6 +9,8 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
+# In units of the best loss's size plus one: what is so far above it is out of the way.
+_FAR = 10.0
 _MAX_RESTARTS = 10
 _PATIENCE = 3
 # Relative size of a step that changes the loss by its rounding error only.
@@ -18,7 +20,11 @@ _WORTH = 100.0
 
 
 class _Guarded:
-    """An objective that never raises and never returns NaN, and remembers the best point it has seen."""
+    """An objective that never raises and never returns NaN, and remembers the best point it has seen.
+
+    A line search that stepped too far interpolates back. It takes forever from a loss of 1e10, or ends within rounding
+    errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
+    """
 
     def __init__(self, objective: Objective, start: np.ndarray):
         self._objective = objective
@@ -29,12 +35,14 @@ class _Guarded:
             loss, gradient = self._objective(x)
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
+        far = _FAR * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-            # A line search that stepped too far: far above the best loss, but finite, so that it interpolates back.
-            worst = self.loss + 10.0 * (1.0 + abs(self.loss)) if np.isfinite(self.loss) else 1e100
-            return worst, np.zeros_like(x)
+            return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
         if loss < self.loss:
             self.x, self.loss = x.copy(), loss
+        ratio = (loss - self.loss) / far
+        if ratio > 1.0:
+            return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
         return loss, gradient
 
 

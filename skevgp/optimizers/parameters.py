@@ -105,6 +105,10 @@ class ParameterTable:
             ]
         )
 
+    def with_fixed(self, name: str) -> ParameterTable:
+        """The same table with a parameter that stays where it starts."""
+        return ParameterTable([replace(own, fixed=True if own.name == name else own.fixed) for own in self.parameters])
+
     def start(self) -> np.ndarray:
         """The flat vector (size,) of the starts, put inside their limits."""
         flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})

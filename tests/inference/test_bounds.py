@@ -67,6 +67,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
         Starts(Start(), Start(), Start()),
         np.ones(2),
         0.1,
+        1e-10,
         1,
     )
     loss = plain_loss(model, rows, table)

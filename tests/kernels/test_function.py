@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import WhiteKernel
 
@@ -91,6 +92,21 @@ def test_a_function_without_hyperparameters():
     model = fitted(lambda X, Z: anp.exp(-anp.sum((X[:, None] - Z[None]) ** 2, axis=2)), tol=1.0)
     assert repr(model.kernel_.k2) == "FunctionKernel(<lambda>)"
     assert model.n_parameters_ == 2 + 8 * 2 + 8 + 8 * 9 // 2
+
+
+def test_a_function_that_changes_its_arguments_leaves_the_data_alone():
+    def rude(X, Z, lengthscale=1.0):
+        X /= 2.0
+        Z /= 2.0
+        return smooth(X, Z, lengthscale)
+
+    inputs = X.copy()
+    model = EVGPRegressor(kernel=rude, n_inducing=8, max_iter=2, random_state=0)
+    with pytest.warns(ConvergenceWarning):
+        model.fit(inputs, Y).predict(inputs, return_std=True)
+    np.testing.assert_array_equal(inputs, X)
+    np.testing.assert_array_equal(model.kernel_(inputs), model.kernel_(X.copy()))
+    np.testing.assert_array_equal(inputs, X)
 
 
 def test_a_function_that_is_0_at_a_row():

@@ -85,7 +85,6 @@ def test_exponents_are_those_of_power_laws(cell):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_what_is_there_is_not_measured_again_and_the_page_is_written(run_script, cell, tmp_path):
     from paper.complexity_report import QUICK
 

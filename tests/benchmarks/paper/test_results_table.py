@@ -33,7 +33,6 @@ def run(run_script, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
     table, page, picture = (tmp_path / f"table.{suffix}" for suffix in ("csv", "md", "png"))
     both = ("--models", "RES-VGP", "EVGP-IFG", "--settings")
@@ -79,14 +78,12 @@ def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
     with pytest.raises(SystemExit, match="1 cells failed"):
         run("--models", "EVGP-IF", "--settings", "skevgp", max_iter=-1)
     assert not (tmp_path / "table.csv").exists()
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_a_network_has_a_row_like_the_others():
     from paper import results_table

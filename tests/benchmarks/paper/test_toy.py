@@ -21,7 +21,6 @@ def run(run_script, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_it_runs_and_resumes(run, tmp_path):
     table, page, picture = (tmp_path / f"toy.{suffix}" for suffix in ("csv", "md", "png"))
     assert "[4/4] toy" in run("--data", "toy")
@@ -61,7 +60,6 @@ def test_it_runs_and_resumes(run, tmp_path):
     assert table.read_text() == before
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_without_snelsons_points_those_of_make_toy_are_taken(run, tmp_path, monkeypatch):
     import harness

@@ -23,7 +23,6 @@ def run(run_script, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_it_runs_and_resumes_and_leaves_out_what_would_take_too_long(run, tmp_path):
     output = tmp_path / "gpr.csv"
     said = run("--sizes", 30, "--models", "GPR", "EVGP")

@@ -1,10 +1,12 @@
 """The comparison with other libraries in short mode, with what is installed for the tests."""
 
 import numpy as np
+import pytest
 
 from ..conftest import read
 
 
+@pytest.mark.slow
 def test_against_peers(run_script, tmp_path):
     output = tmp_path / "peers.csv"
     arguments = ("--quick", "--models", "RES-VGP", "--sharing", "none", "--output", output)

@@ -1,0 +1,182 @@
+"""A wave that never fades: as a scikit-learn kernel, and as the inference sees it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+from sklearn.gaussian_process import kernels as sk
+
+from .covariances import CentredSquares, Covariance, CovarianceAt, PerRow, Pull
+from .stationary import one_lengthscale
+
+
+class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
+    r"""A wave that never fades, periodic in the scaled distance.
+
+    .. math:: k(x, x') = \cos\Bigl(2 \pi \sum_d \frac{x_d - x'_d}{\ell_d}\Bigr)
+
+    Functions drawn from it are sinusoids of one frequency along each column, with a phase and a size of their own. It
+    is a spectral mixture of one component without width (Wilson & Adams 2013): a covariance in any number of columns
+    (Rasmussen & Williams 2006, eq. 4.5), as the cosine of a Euclidean distance is not. Times an `RBF` the wave fades.
+
+    It works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
+    kernels.
+
+    Parameters
+    ----------
+    length_scale : float or array-like of shape (n_features,), default=1.0
+        ℓ, the period along each column, in its units: one for all columns, or one per column.
+    length_scale_bounds : pair of floats, "fixed", or array-like of shape (n_features, 2), default=(1e-5, 1e5)
+        Bounds of the length scale.
+
+    Attributes
+    ----------
+    anisotropic : bool
+        Whether there is one length scale per column.
+    hyperparameter_length_scale : Hyperparameter
+
+    References
+    ----------
+    - A. G. Wilson, R. P. Adams (2013): Gaussian Process Kernels for Pattern Discovery and Extrapolation.
+    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 4.2.1.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.kernels import Cosine
+    >>> X = np.linspace(0, 6, 60).reshape(-1, 1)
+    >>> y = 3 * np.sin(2 * np.pi * X[:, 0] / 1.8 + 0.5) + 0.1 * np.random.RandomState(0).randn(60)
+    >>> model = EVGPRegressor(kernel=Cosine(2.0), n_inducing=5, random_state=0).fit(X, y)
+    >>> model.kernel_.k2
+    Cosine(length_scale=1.8)
+    """
+
+    def __init__(self, length_scale: Any = 1.0, length_scale_bounds: Any = (1e-5, 1e5)):
+        self.length_scale = length_scale
+        self.length_scale_bounds = length_scale_bounds
+
+    @property
+    def anisotropic(self) -> bool:
+        return np.size(self.length_scale) > 1
+
+    @property
+    def hyperparameter_length_scale(self) -> sk.Hyperparameter:
+        return sk.Hyperparameter("length_scale", "numeric", self.length_scale_bounds, np.size(self.length_scale))
+
+    def __call__(self, X: Any, Y: Any = None, eval_gradient: bool = False) -> Any:
+        """The matrix k(X, Y), and its gradient in the logarithms of the length scales.
+
+        Parameters
+        ----------
+        X : array-like of shape (n, d)
+        Y : array-like of shape (m, d), default=None
+            None means X.
+        eval_gradient : bool, default=False
+            Only if Y is None.
+
+        Returns
+        -------
+        K : ndarray of shape (n, m)
+        K_gradient : ndarray of shape (n, n, n_dims)
+            If ``eval_gradient``.
+        """
+        X = np.atleast_2d(X)
+        if Y is not None and eval_gradient:
+            raise ValueError("Gradient can only be evaluated when Y is None.")
+        one_lengthscale(self, X.shape[1])
+        lengths = np.squeeze(self.length_scale)
+        x, z = ((rows - X[0]) / lengths for rows in (X, X if Y is None else np.atleast_2d(Y)))
+        phase = 2.0 * np.pi * np.subtract.outer(x.sum(axis=1), z.sum(axis=1))
+        K = np.cos(phase)
+        if not eval_gradient:
+            return K
+        if self.hyperparameter_length_scale.fixed:
+            return K, np.empty((*K.shape, 0))
+        by_length = 2.0 * np.pi * (x[:, np.newaxis] - z) if self.anisotropic else phase[:, :, np.newaxis]
+        return K, np.sin(phase)[:, :, np.newaxis] * by_length
+
+    def __repr__(self) -> str:
+        lengths = ", ".join(f"{length:.3g}" for length in np.ravel(self.length_scale))
+        return f"Cosine(length_scale={f'[{lengths}]' if self.anisotropic else lengths})"
+
+
+@dataclass(frozen=True)
+class Wave(Covariance):
+    """k̃(x, x') = cos(2π Σ_d (x_d - x'_d) / ℓ_d); hyperparameters log ℓ.
+
+    Parameters
+    ----------
+    n_columns : int
+        d.
+    isotropic : bool, default=False
+        Whether one lengthscale serves all columns.
+    rows : CentredSquares
+        What is computed once of rows; the squares are not used, but may be another part's.
+    """
+
+    n_columns: int
+    isotropic: bool = False
+    rows: CentredSquares = field(default=CentredSquares(), compare=False)
+
+    @classmethod
+    def of(cls, kernel: Cosine, n_columns: int) -> Wave:
+        """The covariance of a Cosine."""
+        return cls(n_columns, one_lengthscale(kernel, n_columns))
+
+    @property
+    def n_hyperparameters(self) -> int:
+        return 1 if self.isotropic else self.n_columns
+
+    @property
+    def preparations(self) -> tuple[CentredSquares]:
+        return (self.rows,)
+
+    def centred(self, centre: np.ndarray) -> Wave:
+        return replace(self, rows=CentredSquares(tuple(centre.tolist())))
+
+    def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> WaveAt:
+        frequencies = np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
+        return WaveAt(frequencies, self.rows.centred(inducing_points), self.isotropic)
+
+
+class WaveAt(CovarianceAt):
+    """A `Wave` with 2π / ℓ (d,) and centred inducing points (m, d) put in.
+
+    With S = Ū sin(phase differences), all gradients follow from S [x, 1].
+    """
+
+    def __init__(self, frequencies: np.ndarray, points: np.ndarray, isotropic: bool):
+        self.frequencies, self.points, self.isotropic = frequencies, points, isotropic
+        self._phases = points @ frequencies
+
+    def matrix(self) -> np.ndarray:
+        return np.cos(np.subtract.outer(self._phases, self._phases))
+
+    def cross(self, prepared: np.ndarray) -> np.ndarray:
+        return np.cos(self._differences(prepared))
+
+    def start_pullback(self) -> np.ndarray:
+        return np.zeros((len(self.points), len(self.frequencies) + 1))
+
+    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
+        differences = self._differences(prepared)
+
+        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
+            U_bar *= np.sin(differences)
+            return U_bar @ prepared[: len(self.frequencies) + 1].T
+
+        return np.cos(differences), pull
+
+    def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
+        within = K_bar * np.sin(np.subtract.outer(self._phases, self._phases))
+        of_phase = total[:, -1] + 2.0 * within.sum(axis=1)
+        length_bar = self.frequencies * (of_phase @ self.points - total[:, :-1].sum(axis=0))
+        return length_bar.sum(keepdims=True) if self.isotropic else length_bar, -np.outer(of_phase, self.frequencies)
+
+    def _differences(self, prepared: np.ndarray) -> np.ndarray:
+        """Of phases, (m, n)."""
+        return np.subtract.outer(self._phases, self.frequencies @ prepared[: len(self.frequencies)])
