@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from skevgp import EVGPRegressor
+from skevgp._linalg import Jitter
 from skevgp.fitting.sparse import SparseTask
 from skevgp.inference.objectives import ElboObjective
 from skevgp.optimizers.adam import adam
@@ -82,5 +83,5 @@ class TimedLBFGS(LBFGS):
 
 def with_jitter(jitter: float) -> LBFGS:
     """L-BFGS on models whose k(X_m, X_m) gets this jitter, relative to the signal variance."""
-    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=jitter)})
+    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=Jitter(jitter))})
     return kind()
