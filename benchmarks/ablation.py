@@ -32,8 +32,8 @@ CLOSE_ERROR = 1.1
 
 
 def everywhere(default: Row) -> bool:
-    """A change that matters to all fits."""
-    return True
+    """A change that matters to all fits; further sets serve only rarer ones."""
+    return not default["case"].startswith("more-")
 
 
 def where_it_collapsed(default: Row) -> bool:
@@ -100,22 +100,22 @@ def changes() -> list[Change]:
         *_of("rules", "much_noise", None, 1e2, concerns=where_points_are_many),
         *_of("rules", "interpolates", 1.0, 3.0, concerns=where_points_are_many),
         *_of("descent", "probes", 0, 1),
-        *_of("descent", "max_restarts", 0, 1, 3),
+        *_of("descent", "max_restarts", 0, 1),
         *_of("descent", "worth", 1.0, 1e4),
         *_of("descent", "patience", 1, 10),
-        *_of("descent", "far", 1.0, 1e100),
+        *_of("descent", "far", 1e100),
         *_of("descent", "memory", 10, 100),
-        *_of("descent", "gradient", 1e-6, 0.0),
-        *_of("rules", "first_noise", 1e-1, 1e-2, 1e-3, 1e-5, 1e-6),
+        *_of("descent", "gradient", 1e-6),
+        *_of("rules", "first_noise", 1e-2, 1e-3, 1e-5, 1e-6),
         *_of("rules", "collapsed", 0.5, 0.99),
-        *_of("rules", "lowest_noise", 1e-6, 1e-8, 1e-12),
-        *_of("rules", "highest_noise", 1.0, 1e4),
+        *_of("rules", "lowest_noise", 1e-8, 1e-12),
+        *_of("rules", "highest_noise", 1.0),
         *_of("rules", "lengthscale", 0.2, 1.5),
         *_of("rules", "lengthscale_limits", (1e-4, 1e6), (1e-1, 1e2)),
         *_of("rules", "signal_limits", (1e-8, 1e8), (1e-3, 1e1)),
         *_of("rules", "jitter.size", 1e-8, 1e-10, 1e-14),
         *_of("rules", "jitter.well_conditioned", 0.0, np.inf),
-        *_of("descent", "hair", 1e-12, 1e-8),
+        *_of("descent", "hair", 1e-8),
     ]
 
 
@@ -154,7 +154,7 @@ def cases(quick: bool) -> dict[tuple[str, int], Callable[[], Data]]:
         found.update({(case, seed): lambda seed=seed: make(seed) for seed in seeds})  # type: ignore[misc]
 
     two = range(1 if quick else 2)
-    for n_waves, n_inducing in [(20, 20)] if quick else [(10, 15), (10, 20), (15, 30), (20, 30), (20, 40), (20, 60)]:
+    for n_waves, n_inducing in [(20, 20)] if quick else [(10, 20), (15, 30), (20, 30), (20, 40)]:
         for noise in (0.01,) if quick else (0.01, 0.3):
             add(
                 f"waves-{n_waves}-points-{n_inducing}-noise-{noise:g}",
@@ -162,15 +162,23 @@ def cases(quick: bool) -> dict[tuple[str, int], Callable[[], Data]]:
                 two,
             )
     for d, noise in [(1, 0.1)] if quick else [(1, 0.0), (1, 0.1), (3, 0.0), (3, 0.1), (6, 0.1)]:
-        for share in (1.0,) if quick else (0.5, 1.0):
-            add(
-                f"few-rows-{d}d-noise-{noise:g}-points-{share:g}",
-                lambda seed, of=(d, noise, share): few_rows(*of, seed),  # type: ignore[misc]
-                two,
-            )
+        share = 0.8 if noise == 0.1 and d != 3 else 1.0
+        add(
+            f"few-rows-{d}d-noise-{noise:g}-points-{share:g}",
+            lambda seed, of=(d, noise, share): few_rows(*of, seed),  # type: ignore[misc]
+            two,
+        )
     add("nasty", robustness.nasty, (s for s in range(2, 20 if quick else 200) if is_smooth(robustness.nasty(s))))
     if quick:
         return found
+    # Where fits collapse.
+    for n_waves, n_inducing in [(10, 15), (10, 20), (15, 30), (20, 30)]:
+        add(
+            f"more-waves-{n_waves}-points-{n_inducing}-noise-0.1",
+            lambda seed, of=(n_waves, n_inducing, 0.1): waves(*of, seed),  # type: ignore[misc]
+            range(2, 10),
+        )
+    add("more-nasty", robustness.nasty, (seed for seed in range(200, 400) if is_smooth(robustness.nasty(seed))))
     for d in (1, 3, 6):
         for noise in robustness.NOISES:
             add(
@@ -181,7 +189,7 @@ def cases(quick: bool) -> dict[tuple[str, int], Callable[[], Data]]:
     for name in ("VGP", "RES-VGP", "IF", "IFG"):
         add(f"pendulum-{name}", lambda seed, name=name: robustness.dynamics("pendulum", name, seed), two)  # type: ignore[misc]
     # The data of seed 0, other random states.
-    add("pendulum-IFG-again", lambda seed: robustness.dynamics("pendulum", "IFG", 0), range(1, 7))
+    add("pendulum-IFG-again", lambda seed: robustness.dynamics("pendulum", "IFG", 0), range(1, 4))
     add("cartpole-IFG", lambda seed: robustness.dynamics("cartpole", "IFG", seed), two)
     return found
 
