@@ -192,8 +192,7 @@ def fit_exact(
         units.target_unit,
         starts,
         rows.scatter(),
-        options.rules.first_noise,
-        options.rules.lowest_noise,
+        options.rules,
         kernel.n_hyperparameters,
         variance,
     )

@@ -215,8 +215,9 @@ def plan(
 
     def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        noise, n_hyper = (solver.rules.first_noise, solver.rules.lowest_noise), kernel.n_hyperparameters
-        table = starting_table(rows.inputs, points, unit, starts, scatter, *noise, n_hyper, variance)
+        table = starting_table(
+            rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
+        )
         return table.with_fixed("inducing_points") if stay else table
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.

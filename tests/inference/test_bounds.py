@@ -55,6 +55,7 @@ def test_gradient_agrees_with_finite_differences(family, shared):
 
 def test_gradient_with_one_lengthscale_for_all_columns():
     from skevgp.fitting.start import starting_table
+    from skevgp.fitting.strategy import Rules
     from skevgp.kernels.parse import Start, Starts
     from skevgp.kernels.stationary import SquaredExponential
 
@@ -66,8 +67,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
         np.ones(2),
         Starts(Start(), Start(), Start()),
         np.ones(2),
-        0.1,
-        1e-10,
+        Rules(0.1),
         1,
     )
     loss = plain_loss(model, rows, table)
