@@ -154,11 +154,11 @@ def test_a_worker_that_dies_does_not_change_the_result(cluster):
 
     def killing(iteration, bound, outputs):
         seen.append(iteration)
-        if len(seen) == 10:
+        if len(seen) == 3:
             os.kill(pids[0], signal.SIGKILL)
 
     survived = model(max_iter=40, solver=LBFGS(callback=killing)).fit(*chunked(X, Y))
-    assert len(seen) > 10
+    assert len(seen) > 4
     np.testing.assert_array_equal(survived.predict(X_NEW), expected.predict(X_NEW))
     assert survived.lower_bound_ == expected.lower_bound_
 
