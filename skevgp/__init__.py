@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import datasets, features, metrics, plotting
+    from . import datasets, features, kernels, metrics, plotting, solvers
     from .bnn import BayesianMLPRegressor
     from .exact import EGPRegressor
     from .regressor import EVGPRegressor
@@ -22,11 +22,13 @@ __all__ = [
     "__version__",
     "datasets",
     "features",
+    "kernels",
     "metrics",
     "plotting",
+    "solvers",
 ]
 
-_SUBMODULES = ("datasets", "features", "metrics", "plotting")
+_SUBMODULES = ("datasets", "features", "kernels", "metrics", "plotting", "solvers")
 _HOME = {
     "BayesianMLPRegressor": "bnn",
     "EGPRegressor": "exact",

@@ -13,7 +13,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 from ._sklearn import safe_indexing
 from ._validation import as_floats, check_magnitude
 
-# Standard deviation of a weight whose map has no opinion: the feature could explain ten times the target's scatter.
+# Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
 _WIDE = 10.0
 
 
@@ -84,24 +84,22 @@ def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.n
     return np.broadcast_to(array, shape)
 
 
-def wide_scale(feature_size: np.ndarray, target_scatter: np.ndarray, target_largest: np.ndarray) -> np.ndarray:
+def wide_scale(feature_size: np.ndarray, target_std: np.ndarray, target_largest: np.ndarray) -> np.ndarray:
     """10 * std(y) / rms(h), the scale of weights of which nothing is known.
 
     Parameters
     ----------
     feature_size : ndarray of shape (p,)
         Root mean square of each feature.
-    target_scatter, target_largest : ndarray of shape (o,)
+    target_std, target_largest : ndarray of shape (o,)
         Standard deviation of each target, and its largest absolute value, which serves where it does not vary.
 
     Returns
     -------
     scale : ndarray of shape (o, p)
     """
-    scatter = np.where(target_scatter > 0.0, target_scatter, target_largest)
-    return (
-        _WIDE * np.where(scatter > 0.0, scatter, 1.0)[:, np.newaxis] / np.where(feature_size > 0.0, feature_size, 1.0)
-    )
+    size = np.where(target_std > 0.0, target_std, target_largest)
+    return _WIDE * np.where(size > 0.0, size, 1.0)[:, np.newaxis] / np.where(feature_size > 0.0, feature_size, 1.0)
 
 
 def _map_prior(feature_map: Any, first: Any, n_outputs: int, width: int) -> tuple[np.ndarray, np.ndarray]:

@@ -92,8 +92,8 @@ class OutputGivenKernel:
         """
         n, s = len(self.L), np.sqrt(self.signal)
         alpha = self.L_inv.T @ self.left_over / s
-        spread = self.L_inv.T @ (self.W @ self.R_inv)
-        P = (symmetric_inverse(self.L_inv) - spread @ spread.T) / self.signal
+        from_weights = self.L_inv.T @ (self.W @ self.R_inv)
+        P = (symmetric_inverse(self.L_inv) - from_weights @ from_weights.T) / self.signal
         trace = float(np.trace(P))
         squares = float(self.left_over @ self.left_over)
         explained = len(self.R) - float(np.sum(self.R_inv[~self.vague] ** 2))

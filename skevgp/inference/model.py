@@ -44,10 +44,10 @@ class SparseModel:
         for points in values["inducing_points"]:
             yield Whitening.of(self.kernel, values["hyperparameters"], points, self.jitter)
 
-    def groups_on(self, values: Values, rows: Blocks) -> Iterator[Group]:
+    def groups_on(self, values: Values, blocks: Blocks) -> Iterator[Group]:
         """Each group with the statistics of some rows: a pass over them for each, when it is asked for."""
         for outputs, whitening in zip(self.groups, self.whitenings(values), strict=True):
-            yield self.group(values, outputs, whitening, collect(rows, whitening, outputs))
+            yield self.group(values, outputs, whitening, collect(blocks, whitening, outputs))
 
     def groups_of(self, values: Values, statistics: Sequence[SufficientStatistics]) -> Iterator[Group]:
         """Each group with its statistics, which were collected for the same hyperparameters and inducing points."""
@@ -59,9 +59,9 @@ class SparseModel:
         signal, noise = values["signal"][outputs], values["noise"][outputs]
         return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs))
 
-    def statistics(self, values: Values, rows: Blocks) -> list[SufficientStatistics]:
+    def statistics(self, values: Values, blocks: Blocks) -> list[SufficientStatistics]:
         """The statistics of each group."""
-        return [group.statistics for group in self.groups_on(values, rows)]
+        return [group.statistics for group in self.groups_on(values, blocks)]
 
     def at_optimum(self, values: Values, statistics: Sequence[SufficientStatistics]) -> tuple[float, Predictor]:
         """The bound and the predictor with q at its optimum.

@@ -33,7 +33,7 @@ class Terms(Protocol):
 
 
 def evaluate(
-    model: SparseModel, values: Values, rows: Blocks, terms_of: Callable[[Group], Terms]
+    model: SparseModel, values: Values, blocks: Blocks, terms_of: Callable[[Group], Terms]
 ) -> tuple[float, Values]:
     """A scalar of the model and some rows, summed over outputs, and its gradient: two passes for each set of points.
 
@@ -41,7 +41,7 @@ def evaluate(
     ----------
     model : SparseModel
     values : dict
-    rows : Blocks
+    blocks : Blocks
     terms_of : callable
         What the scalar is, given a group's statistics.
 
@@ -57,10 +57,10 @@ def evaluate(
         If a matrix is not finite.
     """
     total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
-    for index, group in enumerate(model.groups_on(values, rows)):
+    for index, group in enumerate(model.groups_on(values, blocks)):
         terms = terms_of(group)
         (hyper_bar, Z_bar), residuals = pull_back(
-            rows, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
+            blocks, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
         )
         value, own = terms.finish(residuals)
         total += value
@@ -146,12 +146,12 @@ class ElboObjective:
         if self.natural is not None:
             self.natural.pace(share)
 
-    def evaluate(self, x: np.ndarray, rows: Blocks) -> tuple[float, np.ndarray]:
+    def evaluate(self, x: np.ndarray, blocks: Blocks) -> tuple[float, np.ndarray]:
         """The loss of some rows that stand for all, per row, and its gradient (size,); x is of the same size."""
         values = self.table.values(x)
         # Rows that count N/n times: a noise variance of σ² n/N.
-        counted = values | {"noise": values["noise"] * (rows.linear.n_rows / self.n_rows)}
-        loss, gradient = evaluate(self.model, counted, rows, lambda group: _ElboTerms(self, values, group))
+        counted = values | {"noise": values["noise"] * (blocks.linear.n_rows / self.n_rows)}
+        loss, gradient = evaluate(self.model, counted, blocks, lambda group: _ElboTerms(self, values, group))
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 

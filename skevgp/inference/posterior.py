@@ -9,13 +9,13 @@ import numpy as np
 
 from .statistics import Kernel, Whitening
 
-# Of the spread of all outputs at once.
+# Of the deviations of all outputs at once.
 _PREDICTED_NUMBERS = 2**20
 
 
 @dataclass(frozen=True)
 class PredictorGroup:
-    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has the mean ``mean @ P`` and the spread ``root @ P``.
+    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has mean ``mean @ P`` and deviation ``root @ P``.
 
     Attributes
     ----------
@@ -155,9 +155,9 @@ class Predictor:
             means.append((group.mean @ P).T)
             if return_variance:
                 o, k, size = group.root.shape
-                spread = group.root.reshape(o * k, size) @ P
-                np.multiply(spread, spread, out=spread)
-                squares = spread.reshape(o, k, len(inputs)).sum(axis=1)
+                deviation = group.root.reshape(o * k, size) @ P
+                np.multiply(deviation, deviation, out=deviation)
+                squares = deviation.reshape(o, k, len(inputs)).sum(axis=1)
                 variances.append((np.outer(group.signal, unexplained) + squares).T)
         mean = _side_by_side(means)
         mean += features @ self.offset.T
@@ -173,8 +173,8 @@ class Predictor:
             V = P[: len(group.points)]
             unexplained = self.kernel.at(np.log(group.hyperparameters), inputs).matrix() - V.T @ V
             for signal, root in zip(group.signal, group.root, strict=True):
-                spread = root @ P
-                covariance.append(signal * unexplained + spread.T @ spread)
+                deviation = root @ P
+                covariance.append(signal * unexplained + deviation.T @ deviation)
         return mean, np.stack(covariance, axis=2)
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
@@ -183,8 +183,8 @@ class Predictor:
         for group in self.groups:
             m = len(group.points)
             mean[group.outputs] += group.mean[:, m:]
-            spread = group.root[:, :, m:]
-            covariance.append(spread.transpose(0, 2, 1) @ spread)
+            deviation = group.root[:, :, m:]
+            covariance.append(deviation.transpose(0, 2, 1) @ deviation)
         return mean, np.concatenate(covariance)
 
 

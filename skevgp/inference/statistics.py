@@ -215,22 +215,23 @@ class _SecondPass:
         return rows_bar, np.einsum("no,no->o", e, e), V @ e
 
 
-def collect(rows: Blocks, whitening: Whitening, outputs: slice) -> SufficientStatistics:
+def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientStatistics:
     """First pass over the rows.
 
     Parameters
     ----------
-    rows : Blocks
+    blocks : Blocks
+        Of the rows.
     whitening : Whitening
     outputs : slice
-        Which of the rows' outputs count.
+        Which of their outputs count.
 
     Returns
     -------
     statistics : SufficientStatistics
     """
-    linear = rows.linear
-    VV, VL, unexplained = rows.sum(_FirstPass(whitening, outputs))
+    linear = blocks.linear
+    VV, VL, unexplained = blocks.sum(_FirstPass(whitening, outputs))
     p = len(linear.HH)
     return SufficientStatistics(
         linear.n_rows,
@@ -245,7 +246,7 @@ def collect(rows: Blocks, whitening: Whitening, outputs: slice) -> SufficientSta
 
 
 def pull_back(
-    rows: Blocks,
+    blocks: Blocks,
     whitening: Whitening,
     outputs: slice,
     statistics: SufficientStatistics,
@@ -260,7 +261,7 @@ def pull_back(
 
     Parameters
     ----------
-    rows, whitening, outputs
+    blocks, whitening, outputs
         As in `collect`.
     statistics : SufficientStatistics
         What `collect` returned.
@@ -285,6 +286,6 @@ def pull_back(
         gradient.unexplained,
         weights,
     )
-    rows_bar, squares, VE = rows.sum(second)
+    rows_bar, squares, VE = blocks.sum(second)
     VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
     return whitening.pull_back(rows_bar, gradient.L - np.tril(L_inv.T @ VbarV)), Residuals(squares, VE)

@@ -10,12 +10,12 @@ from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
-from threadpoolctl import ThreadpoolController, threadpool_limits
+from threadpoolctl import OpenBLASController, threadpool_limits
 
 Part = TypeVar("Part")
 Total = TypeVar("Total")
 
-_lock, _users, _originals = Lock(), 0, list[tuple[Any, int]]()
+_lock, _users, _limits = Lock(), 0, list[threadpool_limits]()
 
 
 @contextmanager
@@ -29,9 +29,8 @@ def single_threaded_libraries() -> Iterator[None]:
     with threadpool_limits(1, user_api="openmp"):
         with _lock:
             if _users == 0:
-                for library in ThreadpoolController().select(user_api="blas").lib_controllers:
-                    _originals.append((library, library.num_threads))
-                    _set_threads(library, 1)
+                _take_control()
+                _limits.append(threadpool_limits(1, user_api="blas"))
             _users += 1
         try:
             yield
@@ -39,14 +38,18 @@ def single_threaded_libraries() -> Iterator[None]:
             with _lock:
                 _users -= 1
                 if _users == 0:
-                    while _originals:
-                        _set_threads(*_originals.pop())
+                    _take_control()
+                    _limits.pop().restore_original_limits()
 
 
-def _set_threads(library: Any, number: int) -> None:
-    # From threadpoolctl 3.6 on the first thread that sets a limit is the only one that can, while it lives; a fit may
-    # run in any thread, and the lock above keeps several from fighting.
-    getattr(library, "_real_set_num_threads", library.set_num_threads)(number)
+def _take_control() -> None:
+    """Let this thread limit OpenBLAS, whichever did before it.
+
+    From threadpoolctl 3.6 on the first thread that sets a limit is the only one that can, while it lives; a fit may run
+    in any thread, and the lock above keeps several from fighting.
+    """
+    if hasattr(OpenBLASController, "clear_controlling_thread"):
+        OpenBLASController.clear_controlling_thread(force=True)
 
 
 def thread_pool(n_threads: int) -> ThreadPoolExecutor:

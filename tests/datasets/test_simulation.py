@@ -307,6 +307,7 @@ def test_limits_that_are_all_zero_are_unknown():
     assert_array_equal(simulate("double_pendulum", np.zeros(4), U, dt=0.001, return_inputs=True)[1], U)
 
 
+@pytest.mark.slow
 def test_the_number_of_jobs_does_not_change_a_bit():
     rng = np.random.default_rng(0)
     z0, U = rng.uniform(-1.0, 1.0, (130, 4)), rng.standard_normal((130, 2, 1))

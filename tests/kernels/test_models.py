@@ -160,6 +160,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
     assert model.lower_bound_ == pytest.approx(bound, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", TREES)
 def test_a_fit_gains_and_comes_back_as_the_same_tree(name):
     kernel = TREES[name]
@@ -249,6 +250,7 @@ def test_a_warm_start_takes_over_hyperparameters_of_the_same_kernel_only():
     assert model.kernel_.k2.get_params()["lengthscale"] == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("name", TREES)
 def test_nasty_data_are_fitted(name, scale):
