@@ -55,10 +55,7 @@ def test_the_loss_curve_ends_at_minus_the_likelihood_and_is_what_the_monitor_is_
     done = fitted(max_iter=200, monitor=Monitor(lambda number, loss, outputs: told.append(loss)))
     assert -done.loss_curve.min() == pytest.approx(done.log_marginal_likelihood, abs=0.1)
     assert done.log_marginal_likelihood > fitted().log_marginal_likelihood
-    assert (
-        set(done.loss_curve) <= set(np.round(told, 20))
-        or np.isin(np.round(done.loss_curve, 6), np.round(told, 6)).all()
-    )
+    assert all(np.abs(np.array(told) - loss).min() < 1e-9 for loss in done.loss_curve)
 
 
 @pytest.mark.parametrize(
@@ -125,6 +122,6 @@ def test_ctrl_c_keeps_the_best_so_far():
 
 def test_y_far_from_its_prior_mean_is_told_but_a_vague_weight_has_none():
     """An intercept that explains it, and of which nothing is known, is as near as can be."""
-    far = Y + 1e7
+    far = Y + 1e3
     assert any("prior standard deviations away" in message for message in fitted(Y=far, max_iter=50).messages)
     assert not any("prior" in message for message in fitted(Y=far, max_iter=50, vague=True).messages)
