@@ -65,9 +65,9 @@ class ArrayRows:
     def __len__(self):
         return len(self.inputs)
 
-    def blocks(self, kernel, size):
+    def blocks(self, kernel, size, **options):
         source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock(kernel, lambda raw: raw)
-        return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size)
+        return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size, **options)
 
 
 def identity_rows(inputs, residuals):

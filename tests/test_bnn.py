@@ -98,7 +98,6 @@ def linear():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_without_hidden_layers_means_are_the_exact_posteriors_and_variances_the_mean_field_optimum(linear):
     """Λ = XᵀX / σ² + I / s², of centred inputs; optimal independent variances are 1 / Λ_ii (Bishop 2006, 10.1.2)."""
     x, y, fit = linear

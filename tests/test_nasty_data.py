@@ -47,7 +47,6 @@ def nasty(seed):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(80))
 def test_finite_data_never_fail(seed):
     X, Y, arguments = nasty(seed)

@@ -86,7 +86,6 @@ def test_importing_the_package_loads_no_other():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "code",
     [

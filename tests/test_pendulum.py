@@ -29,7 +29,6 @@ def explained_by_the_gp(model):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_inertia_force_gravity(data):
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
     assert error(model, data) <= 0.002
@@ -44,14 +43,12 @@ def test_inertia_force(data):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_without_physics(data):
     model = EVGPRegressor(n_inducing=40, random_state=0)
     assert error(model, data) <= 0.1
     assert explained_by_the_gp(model)
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_the_papers_setup(data):
     """Adam, diagonal posterior, inducing points per output; a sixteenth of the default steps."""
@@ -61,7 +58,6 @@ def test_the_papers_setup(data):
     assert model.n_parameters_ == 123
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_uncertainty_is_honest_with_noise():
     train = make_dynamics("pendulum", noise=0.01, random_state=0)
@@ -94,7 +90,6 @@ def test_cross_validation_over_trajectories(small):
     assert scores.min() > 0.999
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_grid_search_over_the_number_of_inducing_points(small):
     search = GridSearchCV(

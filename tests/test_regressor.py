@@ -94,12 +94,15 @@ def test_samples_have_the_predicted_moments():
     np.testing.assert_array_equal(samples, m.sample_y(X_NEW[:4], 20_000, random_state=0))
 
 
-def test_prediction_in_blocks_is_prediction_at_once(monkeypatch):
+def test_prediction_in_blocks_is_prediction_at_once():
+    """Of more rows than are predicted at once."""
     m = model(feature_map=PolynomialFeatures(1), tol=1e9).fit(X, Y)
-    whole = m.predict(X_NEW, return_std=True)
-    monkeypatch.setattr("skevgp.inference.posterior.Predictor.rows_at_once", 7)
-    for part, expected in zip(m.predict(X_NEW, return_std=True), whole, strict=True):
-        np.testing.assert_allclose(part, expected, rtol=1e-9)
+    many = np.random.RandomState(2).uniform(-2, 2, (5000, 2))
+    whole = m.predict(many, return_std=True)
+    for first in (0, 4000, 4950):
+        rows = slice(first, first + 50)
+        for part, expected in zip(m.predict(many[rows], return_std=True), whole, strict=True):
+            np.testing.assert_allclose(part, expected[rows], rtol=1e-9)
 
 
 # --- learning ----------------------------------------------------------------------------------------------------
@@ -120,7 +123,6 @@ def test_the_bound_rises_and_ends_at_minus_the_loss():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     """Same kernel: Adam has to find q, whose optimum L-BFGS has in closed form; then all of it."""
@@ -137,7 +139,6 @@ def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_adam_learns_in_mini_batches(sharing, posterior):
@@ -146,7 +147,6 @@ def test_adam_learns_in_mini_batches(sharing, posterior):
     assert m.n_iter_ == len(m.loss_curve_) == 600
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_natural_gradients_learn_in_mini_batches(sharing):
@@ -222,7 +222,6 @@ def test_parameter_counts_are_the_papers(n_columns, n_features, m, outputs, expe
     assert fitted.fit(x, rng.randn(300, outputs)).n_parameters_ == expected
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("features", "m", "expected"),
@@ -348,7 +347,6 @@ def test_scaling_in_kernel_map_leaves_the_features_alone():
 # --- going on ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])

@@ -309,7 +309,6 @@ def test_a_motor_too_weak_to_hold_its_joint_is_no_unstable_controller():
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 def test_the_number_of_jobs_does_not_change_a_bit():
     one, two = (make_dynamics("iiwa14", 65, 2, random_state=0, n_jobs=jobs) for jobs in (1, 2))
     assert_array_equal(one.data, two.data)

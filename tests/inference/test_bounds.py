@@ -4,9 +4,13 @@ import pytest
 from autograd import grad
 
 from skevgp._linalg import NotPositiveDefiniteError
-from skevgp.inference.bounds import BoundAtOptimum
+from skevgp.fitting.start import starting_table
+from skevgp.fitting.strategy import Rules
+from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
+from skevgp.kernels.parse import Start, Starts
+from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import Moments
 
 from ..oracle import central_differences, collapsed_bound, problem, relative_error, whitened
@@ -54,11 +58,6 @@ def test_gradient_agrees_with_finite_differences(family, shared):
 
 
 def test_gradient_with_one_lengthscale_for_all_columns():
-    from skevgp.fitting.start import starting_table
-    from skevgp.fitting.strategy import Rules
-    from skevgp.kernels.parse import Start, Starts
-    from skevgp.kernels.stationary import SquaredExponential
-
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
     table = starting_table(
@@ -77,11 +76,11 @@ def test_gradient_with_one_lengthscale_for_all_columns():
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_recomputed_blocks_give_the_same_as_kept_ones(family, monkeypatch):
+def test_recomputed_blocks_give_the_same_as_kept_ones(family):
     model, rows, table = problem(family)
-    kept = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
-    monkeypatch.setattr("skevgp.rows.blocks.KEEP_BYTES", 0)
-    recomputed = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
+    kept, recomputed = (
+        BoundObjective(model, table, rows.blocks(model.kernel, 17, keep=keep))(table.start()) for keep in (True, False)
+    )
     assert kept[0] == recomputed[0]
     np.testing.assert_array_equal(kept[1], recomputed[1])
 
@@ -113,3 +112,52 @@ def test_statistics_that_are_not_finite_raise_a_named_error():
     statistics = model.statistics(values, rows.blocks(model.kernel, 17))[0].scaled(np.nan)
     with pytest.raises(NotPositiveDefiniteError, match="not finite"):
         model.at_optimum(values, [statistics])
+
+
+def test_a_prior_knows_its_reference_and_its_outputs():
+    prior = CoefficientPrior(
+        np.array([[1.0, 2.0], [3.0, 4.0]]), np.full((2, 2), 10.0), np.array([[0.1, 0.0], [0.0, 0.2]])
+    )
+    np.testing.assert_allclose(prior.offset, [[2.0, 2.0], [3.0, 6.0]])
+    np.testing.assert_allclose(prior.outputs(slice(1, 2)).offset, [[3.0, 6.0]])
+
+
+@pytest.mark.parametrize("p", [0, 3])
+def test_the_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p):
+    """log N(r | -H c w₀, H Σ_β Hᵀ + σ² I), σ² the mean square of r."""
+    model, rows, _ = problem(p=p)
+    prior, r, expected = model.prior, rows.residuals, 0.0
+    for o in range(2):
+        H, noise = rows.features * prior.scale[o], np.mean(r[:, o] ** 2)
+        e, covariance = r[:, o] + H @ prior.reference[o], H @ H.T + noise * np.eye(len(rows))
+        quadratic = e @ np.linalg.solve(covariance, e)
+        expected -= 0.5 * (len(rows) * np.log(2 * np.pi) + np.linalg.slogdet(covariance)[1] + quadratic)
+    assert features_alone_bound(rows.blocks(model.kernel, 17).linear, prior) == pytest.approx(expected, rel=1e-10)
+
+
+@pytest.mark.parametrize("p", [0, 3])
+def test_features_that_explain_everything_have_a_finite_bound(p):
+    model, rows, _ = problem(p=p)
+    rows.residuals[:] = 0.0
+    assert np.isfinite(features_alone_bound(rows.blocks(model.kernel, 17).linear, model.prior))
+
+
+@pytest.mark.parametrize("shared", SHARED)
+def test_the_papers_family_has_the_lower_bound(shared):
+    bounds = {}
+    for family in FAMILIES:
+        model, rows, table = problem(family, shared)
+        bounds[family] = -BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())[0]
+    assert bounds["diagonal"] < bounds["full"]
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_a_noise_far_below_the_signal_costs_no_digits(family):
+    """1e8 in variance: e is summed row by row."""
+    model, rows, table = problem(family)
+    values = table.values_at_start() | {"noise": np.full(2, 1e-8)}
+    small = table.started_at(values)
+    value, gradient = BoundObjective(model, small, rows.blocks(model.kernel, 17))(small.start())
+    loss = plain_loss(model, rows, small)
+    np.testing.assert_allclose(value, loss(small.start()), rtol=1e-6)
+    assert relative_error(gradient, grad(loss)(small.start())) < 1e-5

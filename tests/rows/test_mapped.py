@@ -1,19 +1,15 @@
-"""Rows in files and in memory: the same model, without a copy of the data."""
+"""Rows through the user's maps: kept or made anew, from memory or from files, without a copy of the data."""
 
+import pickle
 import tracemalloc
-from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pandas as pd
 import pytest
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
-from threadpoolctl import threadpool_info
 
 from skevgp import EVGPRegressor
-from skevgp.rows.blocks import LocalBlocks, block_rows
-from skevgp.rows.source import LocalSource, Moments, moments_of_rows
-from skevgp.rows.threads import BlockMap, single_threaded_libraries, thread_pool
-from skevgp.solvers import LBFGS
+from skevgp.rows.mapped import MappedRows, map_rows
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -26,6 +22,67 @@ pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceW
 def model(**parameters):
     maps = {"feature_map": PolynomialFeatures(1), "kernel_map": StandardScaler()}
     return EVGPRegressor(**{"n_inducing": 12, "max_iter": 4, "random_state": 0, **maps, **parameters})
+
+
+class Counting(FunctionTransformer):
+    """The sine of each column, which counts the rows that it is given."""
+
+    def transform(self, X):
+        self.n_rows_ = getattr(self, "n_rows_", 0) + len(X)
+        return np.sin(X)
+
+
+def mapped(feature_map=None, kernel_map=None, X=X, y=Y):
+    return MappedRows(X, X, y, feature_map, kernel_map)
+
+
+def test_without_maps_the_kernel_sees_X_and_there_are_no_features():
+    raw = mapped()(slice(3, 7))
+    np.testing.assert_array_equal(raw.inputs, X[3:7])
+    assert raw.features.shape == (4, 0)
+    np.testing.assert_array_equal(raw.targets, Y[3:7])
+
+
+@pytest.mark.parametrize("rows", [slice(3, 7), np.array([9, 0, 9])], ids=str)
+@pytest.mark.parametrize("kept", [True, False])
+def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
+    if not kept:
+        monkeypatch.setattr("skevgp.rows.mapped.MAPPED_BYTES", 0)
+    scaler, trend = StandardScaler().fit(X), PolynomialFeatures(1).fit(X)
+    raw = mapped(trend, scaler)(rows)
+    np.testing.assert_allclose(raw.inputs, scaler.transform(X)[rows], rtol=1e-15)
+    np.testing.assert_array_equal(raw.features, trend.transform(X)[rows])
+    np.testing.assert_array_equal(raw.targets, Y[rows])
+
+
+def test_what_fits_is_mapped_once_and_what_does_not_at_each_pass(monkeypatch):
+    own = mapped(kept := Counting())
+    for _ in range(3):
+        own(slice(0, 400))
+    assert kept.n_rows_ == 400
+    # Two features of 400 rows: a byte less, and they are not kept.
+    monkeypatch.setattr("skevgp.rows.mapped.MAPPED_BYTES", 8 * 2 * 400 - 1)
+    own = mapped(again := Counting())
+    for _ in range(3):
+        own(slice(0, 400))
+    assert again.n_rows_ == 4 * 400
+
+
+def test_rows_and_targets_of_single_precision_become_double():
+    raw = mapped(X=X.astype(np.float32), y=Y.astype(np.float32))(slice(0, 5))
+    assert raw.inputs.dtype == raw.targets.dtype == np.float64
+
+
+def test_mapped_rows_can_be_sent_to_workers():
+    own = mapped(PolynomialFeatures(1).fit(X))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(own))(slice(2, 4)).features, own(slice(2, 4)).features)
+
+
+def test_a_frame_is_for_the_maps():
+    frame = pd.DataFrame(X, columns=["a", "b"])
+    inputs, features = map_rows(frame, X, FunctionTransformer(lambda given: given[["b"]]), None)
+    assert inputs is X
+    np.testing.assert_array_equal(features, X[:, 1:])
 
 
 @pytest.fixture
@@ -71,7 +128,6 @@ def little_memory(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.slow
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     n, d = 500_000, 8
@@ -86,7 +142,6 @@ def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     assert peak < 0.9 * mapped[0].nbytes
 
 
-@pytest.mark.slow
 @pytest.mark.slow
 def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
     """Beyond what may be kept, four times the rows need no more memory."""
@@ -118,107 +173,3 @@ def test_single_precision_is_computed_in_double():
     single, double = model().fit(X32, Y32), model().fit(X32.astype(float), Y32.astype(float))
     np.testing.assert_array_equal(single.predict(X_NEW), double.predict(X_NEW))
     assert single.predict(X_NEW.astype(np.float32)).dtype == np.float64
-
-
-def test_moments_of_pieces_are_those_of_the_whole():
-    values = RNG.randn(100, 3) * [1.0, 1e-3, 0.0] + [1e6, 0.0, 7.0]
-    whole = Moments.of(values)
-    pieces = Moments.of(values[:1]) + Moments.of(values[1:40]) + Moments.of(values[40:])
-    np.testing.assert_allclose(pieces.mean, values.mean(axis=0), rtol=1e-15)
-    np.testing.assert_allclose(pieces.variance, values.var(axis=0), rtol=1e-9)
-    np.testing.assert_allclose(pieces.rms, np.sqrt(np.mean(values**2, axis=0)), rtol=1e-14)
-    for name in ("n", "lowest", "highest"):
-        np.testing.assert_array_equal(getattr(pieces, name), getattr(whole, name))
-    assert pieces.variance[2] == 0.0
-    assert pieces.mean[2] == 7.0
-
-
-def test_a_source_hands_out_rows_by_index(monkeypatch):
-    monkeypatch.setattr("skevgp.rows.source.PASS_ROWS", 7)
-    source = LocalSource.of(X, Y, Y[:, :1])
-    raw = source.take(np.array([5, 2]))
-    np.testing.assert_array_equal(raw.inputs, X[[5, 2]])
-    np.testing.assert_allclose(source.sum(moments_of_rows)[1].mean, Y.mean(axis=0), rtol=1e-12)
-
-
-def test_an_error_in_a_thread_reaches_the_caller_and_ends_the_rest():
-    seen = []
-
-    def fails(part):
-        seen.append(part)
-        if part == 3:
-            raise ValueError("part 3")
-        return part
-
-    threads = BlockMap(2)
-    with pytest.raises(ValueError, match="part 3"):
-        list(threads(fails, range(1000)))
-    threads.close()
-    assert len(seen) < 20
-
-
-@pytest.mark.parametrize("n_inducing", [1, 10, 100, 1000])
-def test_blocks_cover_all_rows_once(n_inducing):
-    from skevgp.rows.blocks import Block
-
-    n = 10_001
-    blocks = LocalBlocks(lambda rows: Block(None, np.ones((rows.stop - rows.start, 1)), 0), n, n_inducing)
-    sizes = [len(blocks[index].linear) for index in range(len(blocks))]
-    assert sum(sizes) == n
-    assert set(sizes[:-1]) == {block_rows(n_inducing)}
-    assert blocks.linear.n_rows == n
-
-
-def test_every_row_gets_into_mini_batches_however_many_there_are(monkeypatch):
-    from skevgp.rows.internal import Rows
-
-    monkeypatch.setattr("skevgp.rows.internal._SHUFFLED_ROWS", 40)
-    n = 150
-    rows = Rows(
-        LocalSource.of(np.arange(n, dtype=float)[:, np.newaxis], np.empty((n, 0)), np.zeros((n, 1))), lambda r: r
-    )
-
-    class Identity:
-        def prepare(self, inputs):
-            return inputs
-
-    batches = rows.batches(Identity(), 32, np.random.RandomState(0))
-    seen = [next(batches).block.prepared[:, 0] for _ in range(60)]
-    assert {len(batch) for batch in seen} == {32}
-    assert all(len(set(batch)) == 32 for batch in seen)
-    assert set(np.concatenate(seen)) == set(range(n))
-
-
-def test_fits_have_the_same_bits_in_any_thread():
-    """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
-    rng = np.random.RandomState(0)
-    rows = rng.randn(12_000, 4)
-    target = np.column_stack([np.sin(rows[:, 0]), rows[:, 1] * rows[:, 2]])
-
-    def points(n_jobs):
-        fitted = EVGPRegressor(
-            n_inducing=20, sharing="none", solver=LBFGS(n_restarts=1), max_iter=2, n_jobs=n_jobs, random_state=0
-        )
-        return fitted.fit(rows, target).inducing_points_
-
-    expected = points(1)
-    np.testing.assert_array_equal(points(2), expected)
-    with ThreadPoolExecutor(1) as other:
-        np.testing.assert_array_equal(other.submit(points, 1).result(), expected)
-
-
-def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
-    def threads():
-        return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
-
-    def limited():
-        with single_threaded_libraries():
-            return threads()
-
-    before = threads()
-    assert set(limited().values()) == {1}
-    with ThreadPoolExecutor(1) as other:
-        assert set(other.submit(limited).result().values()) == {1}
-    with single_threaded_libraries(), single_threaded_libraries(), thread_pool(1) as pool:
-        assert set(pool.submit(threads).result().values()) == {1}
-    assert threads() == before

@@ -1,0 +1,48 @@
+"""A small problem as an estimator hands it over: rows in the user's units, units, and a request."""
+
+import numpy as np
+
+from skevgp.fitting.inducing import Placement
+from skevgp.fitting.outputs import Request
+from skevgp.fitting.units import Units
+from skevgp.kernels.parse import parse_kernel
+from skevgp.rows.source import LocalSource, Moments
+from skevgp.solvers import LBFGS
+
+_rng = np.random.RandomState(0)
+N, O = 60, 2  # noqa: E741
+X = _rng.uniform(-2.0, 2.0, (N, 2))
+H = np.column_stack([np.ones(N), X[:, 0]])
+Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], 50.0 * np.cos(X[:, 1]) * X[:, 0]])
+Y += [1.0, 50.0] * (0.05 * _rng.randn(N, O)) + [3.0, 0.0]
+NO_FEATURES = H[:, :0]
+COEF_MEAN, COEF_SCALE = np.array([[0.5, 0.0], [0.0, 10.0]]), np.array([[2.0, 1.0], [50.0, 100.0]])
+
+
+def source_of(X=X, H=H, Y=Y):
+    return LocalSource.of(X, H, Y)
+
+
+def units_of(X=X, H=H, Y=Y, target_mean=(0.0, 0.0)):
+    """With both features, or with none if H has no columns."""
+    o, p = Y.shape[1], H.shape[1]
+    prior = COEF_MEAN[:o, :p], COEF_SCALE[:o, :p]
+    return Units.of(source_of(X, H, Y), Moments.of(Y), np.array(target_mean)[:o], *prior)
+
+
+def request(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
+    """What an estimator asks for."""
+    options = {
+        "source": source_of(X, H, Y),
+        "units": units_of(X, H, Y),
+        "spec": parse_kernel(kernel, X.shape[1]),
+        "sharing": "all",
+        "family": "full",
+        "placement": Placement("k-means", n_inducing),
+        "solver": LBFGS(),
+        "max_iter": 20,
+        "tol": 1.0,
+        "noise_cv": None,
+        "n_threads": 1,
+    }
+    return Request(**options | changes)

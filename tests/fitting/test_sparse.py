@@ -1,0 +1,238 @@
+"""A sparse model to be fitted, and what is kept of it."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from skevgp._progress import Monitor
+from skevgp.fitting.inducing import Placement
+from skevgp.fitting.outputs import plan
+from skevgp.fitting.sparse import Learned
+from skevgp.fitting.strategy import Attempt, Fit
+from skevgp.inference.bounds import features_alone_bound
+from skevgp.rows.threads import BlockMap
+from skevgp.solvers import LBFGS
+
+from .cases import NO_FEATURES, H, N, O, X, Y, request, source_of, units_of
+
+
+def task_of(monitor=None, seed=0, **changes):
+    """The one task of a request whose outputs share everything."""
+    monitor = Monitor() if monitor is None else monitor
+    (task,) = plan(request(**changes), np.random.RandomState(seed), monitor, BlockMap())
+    return task
+
+
+def started(task, **options):
+    """A fit that ended where it started."""
+    values = task.table.values_at_start()
+    bound, _ = task.model.at_optimum(values, task.model.statistics(values, task.blocks))
+    return Fit(values, **{"bound": bound, **options})
+
+
+# --- a task --------------------------------------------------------------------------------------------------------
+
+
+def test_a_task_knows_its_points_and_blocks():
+    task = task_of(n_inducing=7)
+    assert task.n_inducing == 7
+    assert task.blocks is task.blocks
+    assert task.blocks.linear.n_rows == len(X)
+
+
+def test_chance_is_the_seeds():
+    task = task_of()
+    first, again = (replace(task).rng.rand() for _ in range(2))
+    assert first == again != replace(task, seed=task.seed + 1).rng.rand()
+    assert task.rng is task.rng
+
+
+def test_the_strategy_is_the_solvers_and_the_estimators():
+    solver = LBFGS(n_restarts=3)
+    own = task_of(solver=solver, max_iter=77).strategy
+    assert own.rules is LBFGS.rules
+    assert (own.max_iter, own.n_restarts) == (77, 3)
+    assert own.warm is None
+    np.testing.assert_allclose(own.scatter, units_of().rows(source_of()).scatter())
+
+
+def test_the_strategy_knows_what_the_features_alone_explain():
+    """And a fit that ended below that is tried from elsewhere."""
+    task = task_of()
+    own = task.strategy
+    assert own.alone == features_alone_bound(task.blocks.linear, task.model.prior)
+    values = task.table.values_at_start()
+    assert own.collapsed(Fit(values, own.alone - 1.0))
+    assert not own.collapsed(Fit(values, own.alone + 1.0))
+
+
+def test_the_kernel_may_interpolate_where_points_are_nearly_as_many_as_rows():
+    enough = int(np.ceil(N / LBFGS.rules.interpolates))
+    assert enough > 10
+    assert task_of(n_inducing=enough).strategy.interpolates
+    assert not task_of(n_inducing=enough - 1).strategy.interpolates
+
+
+@pytest.mark.parametrize(
+    ("placement", "moves"),
+    [("auto", True), ("k-means", False), ("greedy", False), (X[:5], False)],
+    ids=["auto", "k-means", "greedy", "the user's"],
+)
+def test_points_are_placed_anew_only_if_nobody_said_where(placement, moves):
+    own = task_of(placement=Placement(placement, 5)).strategy
+    assert (own.place is not None) == moves
+
+
+def test_places_follow_the_kernel_that_was_learned():
+    """Where one column does not matter, the greedy search spreads points over the other."""
+    task = task_of(placement=Placement("auto", 8))
+    values = task.table.values_at_start()
+    placed = task.strategy.place(values | {"hyperparameters": np.array([0.5, 1e3])})
+    assert placed["inducing_points"].shape == values["inducing_points"].shape
+    assert {tuple(point) for point in placed["inducing_points"][0]} <= {tuple(row) for row in X}
+    assert np.abs(np.diff(np.sort(placed["inducing_points"][0, :, 0]))).min() > 0.1
+    assert placed["noise"] is values["noise"]
+
+
+def test_each_group_has_the_placed_points():
+    task = task_of(placement=Placement("auto", 8), sharing="kernel")
+    placed = task.strategy.place(task.table.values_at_start())["inducing_points"]
+    assert placed.shape == (2, 8, 2)
+    np.testing.assert_array_equal(placed[0], placed[1])
+
+
+def test_restarts_start_elsewhere_in_all():
+    task = task_of()
+    first, drawn = task.table.values_at_start(), task.strategy.restart()
+    for name in ("hyperparameters", "noise", "inducing_points"):
+        assert (drawn[name] != first[name]).any(), name
+    lower, upper = task.table.limits()
+    flat = task.table.started_at(drawn).start()
+    assert ((lower <= flat) & (flat <= upper)).all()
+
+
+def test_an_attempt_is_the_solvers():
+    seen = []
+
+    class Told(LBFGS):
+        def run(self, task, attempt):
+            seen.append((task, attempt))
+            return started(task)
+
+    task = task_of(solver=Told())
+    attempt = Attempt(task.table.values_at_start(), 5)
+    assert task.minimise(attempt).bound == started(task).bound
+    assert seen == [(task, attempt)]
+
+
+# --- what is kept --------------------------------------------------------------------------------------------------
+
+
+def test_what_is_kept_is_where_the_fit_ended():
+    task = task_of()
+    fit = started(task, loss_curve=[3.0, 2.0])
+    learned = Learned.of(task, fit)
+    assert learned.model is task.model
+    assert learned.values is fit.values
+    assert learned.loss_curve == [3.0, 2.0]
+    assert learned.bound == fit.bound
+    assert learned.message == ""
+    expected = task.model.at_optimum(fit.values, learned.statistics)[1]
+    for found, value in zip(learned.predictor.predict(X, H, True), expected.predict(X, H, True), strict=True):
+        np.testing.assert_array_equal(found, value)
+
+
+def test_the_bound_is_that_of_the_fit_unless_it_has_none():
+    """That was summed row by row, and has more digits."""
+    task = task_of()
+    fit = started(task)
+    assert Learned.of(task, replace(fit, bound=fit.bound + 1e-3)).bound == fit.bound + 1e-3
+    assert Learned.of(task, replace(fit, bound=-np.inf)).bound == pytest.approx(fit.bound)
+
+
+def test_a_solver_that_has_moved_q_says_where_it_is():
+    task = task_of()
+    fit = started(task)
+    size = 8 + 2
+    own = task.model.predictor(fit.values, [np.zeros(size)] * O, [np.eye(size)] * O)
+    learned = Learned.of(task, replace(fit, predictor=own))
+    assert learned.predictor is own
+    # Rows that come later put it at its optimum.
+    moved = learned.updated(task.rows).predictor
+    assert np.abs(moved.groups[0].mean).max() > 0.0 == np.abs(own.groups[0].mean).max()
+
+
+def test_sentences_for_the_user_are_joined():
+    task = task_of(H=NO_FEATURES, Y=Y + [0.0, 1e9])
+    message = Learned.of(task, replace(started(task), message="It ended.")).message
+    assert message.startswith("It ended. y is more than")
+
+
+@pytest.mark.parametrize("stopped", [True, False])
+def test_noise_that_explains_everything_is_told_unless_ctrl_c_did_it(stopped):
+    monitor = Monitor()
+    task = task_of(monitor)
+    fit = started(task)
+    fit = replace(fit, values=fit.values | {"noise": task.rows.scatter()})
+    if stopped:
+        monitor.stop()
+    assert Learned.of(task, fit).message.startswith("The noise explains everything") != stopped
+
+
+# --- rows that come later ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("family", ["full", "diagonal"])
+@pytest.mark.parametrize("sharing", ["all", "kernel"])
+def test_new_rows_are_added_exactly(sharing, family):
+    """The sums of all rows, and q at its optimum for them."""
+    task = task_of(sharing=sharing, family=family)
+    values, units = task.table.values_at_start(), units_of()
+    parts = [units.rows(source_of(X[part], H[part], Y[part])) for part in (slice(0, 25), slice(25, None))]
+    first = replace(task, rows=parts[0])
+    both = Learned.of(first, started(first)).updated(parts[1])
+    whole = Learned.of(task, started(task))
+    assert both.bound == pytest.approx(whole.bound, rel=1e-8)
+    for own, expected in zip(both.predictor.groups, whole.predictor.groups, strict=True):
+        np.testing.assert_allclose(own.mean, expected.mean, rtol=1e-6, atol=1e-8)
+    assert both.values.keys() == values.keys()
+
+
+def test_earlier_rows_may_count_less():
+    task = task_of()
+    learned = Learned.of(task, started(task))
+    faded = learned.updated(task.rows, 0.5)
+    assert faded.statistics[0].n_rows == 1.5 * len(X)
+    np.testing.assert_allclose(faded.statistics[0].VV, 1.5 * learned.statistics[0].VV, rtol=1e-12)
+
+
+# --- calibration ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("why", ["nobody asked", "Ctrl-C", "the noise is fixed"])
+def test_the_noise_is_calibrated_only_if_it_may(why):
+    monitor, kernel = Monitor(), ConstantKernel() * RBF([1.0, 1.0])
+    if why == "the noise is fixed":
+        kernel += WhiteKernel(0.3, "fixed")
+    task = task_of(monitor, kernel=kernel, noise_cv=None if why == "nobody asked" else 5)
+    fit = started(task)
+    if why == "Ctrl-C":
+        monitor.stop()
+    np.testing.assert_array_equal(Learned.of(task, fit).values["noise"], fit.values["noise"])
+
+
+def test_a_calibrated_noise_is_that_of_the_folds_and_q_is_at_its_optimum_for_it():
+    task = task_of(noise_cv=5)
+    fit = started(task)
+    learned = Learned.of(task, fit)
+    plain = Learned.of(replace(task, noise_cv=None), fit)
+    assert (learned.values["noise"] != fit.values["noise"]).all()
+    for name in ("hyperparameters", "signal", "inducing_points"):
+        np.testing.assert_array_equal(learned.values[name], fit.values[name])
+    np.testing.assert_array_equal(plain.calibrated(task.table, task.rows, 5).values["noise"], learned.values["noise"])
+    bound, predictor = task.model.at_optimum(learned.values, learned.statistics)
+    assert learned.bound == bound
+    np.testing.assert_array_equal(learned.predictor.groups[0].mean, predictor.groups[0].mean)
+    assert learned.loss_curve == plain.loss_curve

@@ -1,0 +1,256 @@
+"""Whitening and the two passes over the rows, against dense formulas and finite differences."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skevgp.inference.statistics import (
+    JITTER,
+    StatisticsGradient,
+    SufficientStatistics,
+    Whitening,
+    collect,
+    pull_back,
+)
+from skevgp.kernels.stationary import SquaredExponential
+
+from ..oracle import ArrayRows, central_differences, problem, relative_error, squared_exponential
+
+RNG = np.random.RandomState(0)
+N, M, D, P, O = 60, 6, 2, 3, 2  # noqa: E741
+LENGTHSCALES = np.array([0.9, 1.4])
+Z = RNG.randn(M, D)
+X, H, R = RNG.randn(N, D), RNG.randn(N, P), RNG.randn(N, O)
+KERNEL = SquaredExponential(D)
+THETA = np.concatenate([np.log(LENGTHSCALES), Z.ravel()])
+ROWS = ArrayRows(X, H, R)
+STATISTICS = ("n_rows", "VV", "VH", "VR", "HH", "HR", "RR", "unexplained")
+
+
+def whitening(theta=THETA, points=None):
+    points = theta[D:].reshape(M, D) if points is None else points
+    return Whitening.of(KERNEL, np.exp(theta[:D]), points)
+
+
+def blocks(size=17, rows=ROWS):
+    return rows.blocks(KERNEL, size)
+
+
+def dense(theta=THETA):
+    """L, and U of all rows, written down."""
+    lengthscales, points = np.exp(theta[:D]), theta[D:].reshape(M, D)
+    L = np.linalg.cholesky(squared_exponential(points, points, lengthscales))
+    return L, squared_exponential(points, X, lengthscales)
+
+
+# --- one set of inducing points ------------------------------------------------------------------------------------
+
+
+def test_whitened_rows_agree_with_a_solve():
+    L, U = dense()
+    own = whitening()
+    np.testing.assert_allclose(own.L, L, rtol=1e-10, atol=1e-12)
+    np.testing.assert_allclose(own.L_inv @ own.L, np.eye(M), atol=1e-10)
+    found_U, V = own.project(KERNEL.prepare(X))
+    np.testing.assert_allclose(found_U, U, rtol=1e-10)
+    np.testing.assert_allclose(V, np.linalg.solve(L, U), rtol=1e-8, atol=1e-10)
+
+
+def test_whitened_rows_go_where_one_says():
+    out = np.empty((M, N))
+    _, V = whitening().project(KERNEL.prepare(X), out=out)
+    assert V is out
+    np.testing.assert_array_equal(V, whitening().project(KERNEL.prepare(X))[1])
+
+
+def test_what_the_points_leave_of_a_row_agrees_with_a_solve():
+    L, U = dense()
+    expected = 1.0 - np.einsum("mn,mn->n", U, np.linalg.solve(L @ L.T, U))
+    own, prepared = whitening(), KERNEL.prepare(X)
+    left = own.unexplained(prepared, own.project(prepared)[1])
+    np.testing.assert_allclose(left, expected, rtol=1e-8, atol=1e-12)
+    assert (left > 0.0).any()
+
+
+def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
+    """Nor of any row within a long lengthscale, whatever rounding says."""
+    prepared = KERNEL.prepare(Z)
+    own = whitening()
+    np.testing.assert_allclose(own.unexplained(prepared, own.project(prepared)[1]), 0.0, atol=1e-12)
+    for factor in (1e2, 1e4):
+        own = Whitening.of(KERNEL, factor * LENGTHSCALES, Z)
+        left = own.unexplained(KERNEL.prepare(X), own.project(KERNEL.prepare(X))[1])
+        assert (left >= 0.0).all()
+
+
+def test_there_is_a_jitter_only_where_the_points_need_one():
+    K = squared_exponential(Z, Z, LENGTHSCALES)
+    np.testing.assert_array_equal(whitening().L, Whitening.of(KERNEL, LENGTHSCALES, Z, 0.1).L)
+    np.testing.assert_allclose(whitening().L @ whitening().L.T, K, atol=1e-15)
+    twice = np.vstack([Z, Z])
+    own = whitening(points=twice)
+    assert np.isfinite(own.L_inv).all()
+    K = squared_exponential(twice, twice, LENGTHSCALES)
+    np.testing.assert_allclose(own.L @ own.L.T, K + JITTER * np.eye(2 * M), atol=1e-14)
+
+
+def test_gradients_in_the_factor_are_pulled_back():
+    weights = np.tril(RNG.randn(M, M))
+    own = whitening()
+    found = own.pull_back(own.covariance.start_pullback(), weights)
+    expected = central_differences(lambda theta: np.vdot(weights, whitening(theta).L), THETA)
+    assert relative_error(np.concatenate([part.ravel() for part in found]), expected) < 1e-7
+
+
+def test_gradients_in_whitened_rows_are_pulled_back():
+    """Of <W, V>: Ū = L⁻ᵀ W, and L̄ = -tril(Ū Vᵀ)."""
+    weights, prepared = RNG.randn(M, N), KERNEL.prepare(X)
+    own = whitening()
+    U, V = own.project(prepared)
+    U_bar = own.L_inv.T @ weights
+    L_bar = -np.tril(U_bar @ V.T)
+    found = own.pull_back(own.covariance.cross_pullback(prepared, U, U_bar, 0.0), L_bar)
+    expected = central_differences(lambda theta: np.vdot(weights, whitening(theta).project(prepared)[1]), THETA)
+    assert relative_error(np.concatenate([part.ravel() for part in found]), expected) < 1e-7
+
+
+# --- the first pass ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("size", [1, 17, 60])
+def test_the_first_pass_collects_the_sums(size):
+    L, U = dense()
+    V = np.linalg.solve(L, U)
+    found = collect(blocks(size), whitening(), slice(0, O))
+    assert found.n_rows == N
+    expected = {"VV": V @ V.T, "VH": V @ H, "VR": V @ R, "HH": H.T @ H, "HR": H.T @ R, "RR": np.sum(R**2, axis=0)}
+    expected["unexplained"] = N - np.sum(V**2)
+    for name, value in expected.items():
+        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)
+
+
+@pytest.mark.parametrize("output", range(O))
+def test_sums_of_some_outputs_are_among_those_of_all(output):
+    every, own = (collect(blocks(), whitening(), outputs) for outputs in (slice(0, O), slice(output, output + 1)))
+    for name in STATISTICS:
+        expected = getattr(every, name)
+        if name in ("VR", "HR", "RR"):
+            expected = expected[..., [output]]
+        np.testing.assert_allclose(getattr(own, name), expected, rtol=1e-12, atol=1e-12, err_msg=name)
+
+
+def test_sums_add_and_fade():
+    whole = collect(blocks(), whitening(), slice(0, O))
+    halves = [
+        collect(blocks(rows=ArrayRows(X[part], H[part], R[part])), whitening(), slice(0, O))
+        for part in (slice(0, 25), slice(25, N))
+    ]
+    added, faded = halves[0] + halves[1], whole.scaled(0.25)
+    for name in STATISTICS:
+        np.testing.assert_allclose(getattr(added, name), getattr(whole, name), rtol=1e-10, atol=1e-11, err_msg=name)
+        np.testing.assert_array_equal(getattr(faded, name), 0.25 * getattr(whole, name))
+
+
+def test_summing_whitened_rows_keeps_digits_that_whitening_the_sums_would_lose():
+    """Points so near to each other that K has a condition of 1e10; the oracle is a QR factorisation of L."""
+    points = np.linspace(-1.0, 1.0, M)[:, np.newaxis] * [0.35, 0.0]
+    own = Whitening.of(KERNEL, np.ones(D), points)
+    assert np.linalg.cond(own.L) > 1e4
+    prepared = KERNEL.prepare(X)
+    U, _ = own.project(prepared)
+    V = np.linalg.solve(own.L, U)
+    error = relative_error(collect(blocks(), own, slice(0, O)).VV, V @ V.T)
+    late = np.linalg.solve(own.L, np.linalg.solve(own.L, U @ U.T).T)
+    assert error < 1e-9
+    assert error < 1e-2 * relative_error(late, V @ V.T)
+
+
+# --- the second pass -----------------------------------------------------------------------------------------------
+
+
+def some_gradient(outputs=O, seed=1):
+    rng = np.random.RandomState(seed)
+    VV = rng.randn(M, M)
+    return StatisticsGradient(VV, rng.randn(M, P), rng.randn(M, outputs), float(rng.randn()), np.tril(rng.randn(M, M)))
+
+
+def scalar(statistics, own, gradient):
+    """What has these gradients where the mean of q is 0, so that e = r."""
+    parts = [(getattr(gradient, name), getattr(statistics, name)) for name in ("VV", "VH")]
+    parts += [(gradient.VE, statistics.VR), (gradient.L, own.L)]
+    return sum(np.vdot(*part) for part in parts) + gradient.unexplained * statistics.unexplained
+
+
+def flat(gradients):
+    return np.concatenate([part.ravel() for part in gradients])
+
+
+@pytest.mark.parametrize("size", [1, 17, 60])
+def test_the_second_pass_is_the_gradient_of_the_first(size):
+    gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
+    statistics = collect(blocks(size), own, outputs)
+    found, _ = pull_back(blocks(size), own, outputs, statistics, gradient, np.zeros((M + P, O)))
+
+    def value(theta):
+        at = whitening(theta)
+        return scalar(collect(blocks(), at, outputs), at, gradient)
+
+    assert relative_error(flat(found), central_differences(value, THETA)) < 1e-7
+
+
+def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
+    gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
+    weights = RNG.randn(M + P, O)
+    V = own.project(KERNEL.prepare(X))[1]
+    e = R - V.T @ weights[:M] - H @ weights[M:]
+    found, residuals = pull_back(blocks(), own, outputs, collect(blocks(), own, outputs), gradient, weights)
+    np.testing.assert_allclose(residuals.squares, np.sum(e**2, axis=0), rtol=1e-10)
+    np.testing.assert_allclose(residuals.VE, V @ e, rtol=1e-8, atol=1e-10)
+    left = blocks(rows=ArrayRows(X, H, e))
+    expected, _ = pull_back(left, own, outputs, collect(left, own, outputs), gradient, np.zeros((M + P, O)))
+    np.testing.assert_allclose(flat(found), flat(expected), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.parametrize("output", range(O))
+def test_the_second_pass_of_one_output_sees_no_other(output):
+    outputs, weights, gradient = slice(output, output + 1), RNG.randn(M + P, O), some_gradient()
+    own = whitening()
+    alone = replace(gradient, VE=gradient.VE[:, outputs])
+    found, residuals = pull_back(blocks(), own, outputs, collect(blocks(), own, outputs), alone, weights[:, outputs])
+    silent = replace(gradient, VE=gradient.VE * (np.arange(O) == output))
+    both = slice(0, O)
+    expected, all_residuals = pull_back(blocks(), own, both, collect(blocks(), own, both), silent, weights)
+    np.testing.assert_allclose(flat(found), flat(expected), rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(residuals.squares, all_residuals.squares[outputs], rtol=1e-12)
+    np.testing.assert_allclose(residuals.VE, all_residuals.VE[:, outputs], rtol=1e-9, atol=1e-11)
+
+
+def test_what_the_first_pass_left_serves_the_second_and_no_other_whitening():
+    """Kept blocks give the bits of those made again; those of other points are not mistaken for one's own."""
+    gradient, outputs, weights = some_gradient(), slice(0, O), np.zeros((M + P, O))
+    kept, made = blocks(), blocks()
+    own, other = whitening(), whitening(THETA + 0.1)
+    assert kept[0].may_keep
+    statistics = collect(kept, own, outputs)
+    assert kept[0].kept[0] is own
+    first = pull_back(kept, own, outputs, statistics, gradient, weights)
+    collect(kept, other, outputs)
+    for part, expected in zip(pull_back(kept, own, outputs, statistics, gradient, weights)[0], first[0], strict=True):
+        np.testing.assert_array_equal(part, expected)
+    for index in range(len(made)):
+        made[index].may_keep = False
+    statistics = collect(made, own, outputs)
+    assert made[0].kept is None
+    for part, expected in zip(pull_back(made, own, outputs, statistics, gradient, weights)[0], first[0], strict=True):
+        np.testing.assert_array_equal(part, expected)
+
+
+def test_statistics_of_a_model_are_those_of_its_points():
+    model, rows, table = problem(shared=False)
+    values = table.values_at_start()
+    found = model.statistics(values, rows.blocks(model.kernel, 17))
+    assert [type(own) for own in found] == [SufficientStatistics] * 2
+    for own, outputs, points in zip(found, model.groups, values["inducing_points"], strict=True):
+        at = Whitening.of(model.kernel, values["hyperparameters"], points)
+        np.testing.assert_array_equal(own.VR, collect(rows.blocks(model.kernel, 17), at, outputs).VR)
