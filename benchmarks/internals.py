@@ -11,7 +11,9 @@ from typing import Any, Literal
 import numpy as np
 
 from skevgp import EVGPRegressor
+from skevgp._linalg import Jitter
 from skevgp.fitting.sparse import SparseTask
+from skevgp.fitting.strategy import Attempt, Fit
 from skevgp.inference.objectives import ElboObjective
 from skevgp.optimizers.adam import adam
 from skevgp.optimizers.minimum import Minimum, Objective
@@ -82,5 +84,39 @@ class TimedLBFGS(LBFGS):
 
 def with_jitter(jitter: float) -> LBFGS:
     """L-BFGS on models whose k(X_m, X_m) gets this jitter, relative to the signal variance."""
-    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=jitter)})
+    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=Jitter(jitter))})
     return kind()
+
+
+class ObservedLBFGS(TimedLBFGS):
+    """L-BFGS that writes down how the fits from its starts ended, too."""
+
+    def __init__(self, n_restarts: int = 0, callback: object = None):
+        super().__init__(n_restarts, callback)
+        self.n_starts_ = self.n_collapsed_ = 0
+        self.placed_anew_, self.points_per_row_ = False, 0.0
+
+    def run(self, task: SparseTask, attempt: Attempt) -> Fit:
+        fit, strategy = super().run(task, attempt), task.strategy
+        self.n_starts_ += 1
+        self.n_collapsed_ += strategy.collapsed(fit)
+        self.placed_anew_ |= strategy.place is not None
+        self.points_per_row_ = task.n_inducing / len(task.rows)
+        return fit
+
+
+def ablated_default(record: str, name: str) -> Any:
+    """A number of the default solver: ``name`` of its ``record``, "rules" or "descent"."""
+    return getattr(getattr(LBFGS, record), name)
+
+
+def ablated_field(record: str, name: str, value: Any) -> dict[str, Any]:
+    """What replaces a field, or by "field.name" one of a record in it, of the default solver's ``record``."""
+    outer, _, inner = name.partition(".")
+    return {outer: replace(ablated_default(record, outer), **{inner: value}) if inner else value}
+
+
+def ablated(rules: dict[str, Any], descent: dict[str, Any]) -> ObservedLBFGS:
+    """The default solver with some of its rules and numbers replaced."""
+    own = {"rules": replace(LBFGS.rules, **rules), "descent": replace(LBFGS.descent, **descent)}
+    return type("LBFGS", (ObservedLBFGS,), own)()

@@ -19,6 +19,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ._coef_prior import resolve_coef_prior, wide_scale
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
+from ._theta import OfKernel, value_at
 from ._validation import (
     FLOATS,
     check_integer,
@@ -47,6 +48,8 @@ class Problem:
 
     Attributes
     ----------
+    data : tuple
+        What `ExplicitGaussianProcess._source` makes the source from.
     source : Source
         The rows through the maps.
     units : Units
@@ -58,6 +61,7 @@ class Problem:
         Width of the kernel's inputs.
     """
 
+    data: tuple[Any, Any, np.ndarray]
     source: Source
     units: Units
     spec: KernelSpec
@@ -237,6 +241,15 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         )
         return samples[:, 0] if single else samples
 
+    def _check_gradient_of(self, theta: ArrayLike | None, eval_gradient: bool) -> None:
+        check_is_fitted(self)
+        if theta is None and eval_gradient:
+            raise ValueError("Gradient can only be evaluated for theta!=None: give theta=kernel_.theta.")
+
+    def _value_at(self, theta: ArrayLike, eval_gradient: bool, of_kernel: OfKernel) -> Any:
+        """What is the sum of ``of_kernel`` over outputs, and its gradient; see `value_at`."""
+        return value_at(theta, eval_gradient, self._spec.order, self._predictor, of_kernel)
+
     def _problem(self, X: Any, y: Any, allow_vague: bool = False) -> Problem:
         """Look at X and y for a new fit: maps, kernel, prior and units."""
         given, X, y = self._validated(X, y, reset=True)
@@ -264,7 +277,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         units = Units.of(source, targets, target_mean, mean, np.where(vague, unit, scale))
         self._spec = spec
-        return Problem(source, units, spec, vague, len(inputs.mean))
+        return Problem((given, X, y), source, units, spec, vague, len(inputs.mean))
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
@@ -15,19 +16,34 @@ class NotPositiveDefiniteError(ArithmeticError):
     """No jitter up to `MAX_JITTER` makes the matrix positive definite, or it is not finite."""
 
 
-# Where every pivot is above this share of its diagonal entry, a matrix needs no jitter.
-WELL_CONDITIONED = 1e-6
+@dataclass(frozen=True)
+class Jitter:
+    """What is added to the diagonal of a covariance matrix that needs it.
+
+    Attributes
+    ----------
+    size : float
+        Relative to the diagonal. k(X_m, X_m) from exact differences is accurate to about m times 1e-16.
+    well_conditioned : float
+        Where every pivot is above this share of its diagonal entry, a matrix needs no jitter.
+    """
+
+    size: float = 1e-12
+    well_conditioned: float = 1e-6
 
 
-def cholesky_of_covariance(K: np.ndarray, jitter: float) -> np.ndarray:
+JITTER = Jitter()
+
+
+def cholesky_of_covariance(K: np.ndarray, jitter: Jitter) -> np.ndarray:
     """Lower Cholesky factor of a covariance matrix, with a jitter (`jittered_cholesky`) only where it needs one."""
     try:
         L = jittered_cholesky(K, 0.0, 0.0)
-        if (diagonal_of(L) ** 2 >= WELL_CONDITIONED * diagonal_of(K)).all():
+        if (diagonal_of(L) ** 2 >= jitter.well_conditioned * diagonal_of(K)).all():
             return L
     except NotPositiveDefiniteError:
         pass
-    return jittered_cholesky(K, jitter)
+    return jittered_cholesky(K, jitter.size)
 
 
 def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX_JITTER) -> np.ndarray:

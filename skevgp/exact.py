@@ -170,7 +170,8 @@ class EGPRegressor(ExplicitGaussianProcess):
 
         Returns
         -------
-        self : object
+        self : EGPRegressor
+            The estimator itself, fitted.
 
         Raises
         ------
@@ -207,3 +208,43 @@ class EGPRegressor(ExplicitGaussianProcess):
             self.n_iter_ = len(self.loss_curve_)
         self._warn_of(self._fitted.messages)
         return self
+
+    def log_marginal_likelihood(
+        self, theta: ArrayLike | None = None, eval_gradient: bool = False, clone_kernel: bool = True
+    ) -> Any:
+        """Log marginal likelihood of the training data under another kernel, with the fitted noise.
+
+        As of `GaussianProcessRegressor`, but always in the units of y, and with ``normalize_y`` too.
+
+        Parameters
+        ----------
+        theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
+            Logarithms of the free hyperparameters, in the order of ``kernel_.theta``; for several outputs those of each
+            one's kernel, which need not agree in what the fitted ones share. None means the fitted ones.
+        eval_gradient : bool, default=False
+            Whether to return the gradient too; only with a ``theta``.
+        clone_kernel : bool, default=True
+            Whether ``kernel_`` is left as it is; if not, ``theta`` stays in it, and predictions do not change.
+
+        Returns
+        -------
+        log_likelihood : float
+            In nats, summed over outputs; with vague weights, of contrasts, as ``log_marginal_likelihood_value_``.
+        gradient : ndarray of the shape of ``theta``
+            If ``eval_gradient``. For what outputs share add up its rows.
+
+        Raises
+        ------
+        ValueError
+            If ``theta`` has another shape or is out of range, or a gradient is asked for without it.
+        """
+        self._check_gradient_of(theta, eval_gradient)
+        if theta is None:
+            return self.log_marginal_likelihood_value_
+        with single_threaded_libraries():
+            found = self._value_at(theta, eval_gradient, self._fitted.log_likelihood_at)
+        if not clone_kernel:
+            kernels, thetas = np.atleast_1d(self.kernel_), np.atleast_2d(np.asarray(theta, dtype=np.float64))
+            for kernel, own in zip(kernels, thetas, strict=True):
+                kernel.theta = own
+        return found

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import closing
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self, cast
 
@@ -19,7 +21,7 @@ from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
 from .fitting.inducing import Placement
 from .fitting.outputs import FittedOutputs, Request, fit_outputs
-from .rows.threads import single_threaded_libraries
+from .rows.threads import BlockMap, single_threaded_libraries
 from .solvers import LBFGS, Adam, resolved
 
 
@@ -180,6 +182,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
     }
 
     _fitted: FittedOutputs
+    # What `_source` makes the rows of the last fit from.
+    _training_data: tuple[Any, Any, np.ndarray] | None = None
 
     def __init__(
         self,
@@ -236,14 +240,15 @@ class EVGPRegressor(ExplicitGaussianProcess):
             Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
             with a ``kernel_map`` it may hold what is no number, such as words that the maps encode. Memory-mapped
             arrays of float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see
-            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X. (Without a
-            ``dask.distributed.Client`` chunks are read anew at each pass.)
+            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X.
+            Without a ``dask.distributed.Client`` chunks are read anew at each pass.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
 
         Returns
         -------
-        self : object
+        self : EVGPRegressor
+            The estimator itself, fitted.
 
         Raises
         ------
@@ -260,6 +265,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         solver = resolved(self.solver, self.posterior)
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y)
+            self._training_data = problem.data
             n_rows = problem.source.n_rows
             if self.noise_cv is not None and self.noise_cv > n_rows:
                 raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
@@ -297,10 +303,12 @@ class EVGPRegressor(ExplicitGaussianProcess):
             The first rows should be like all: they place the inducing points (no more than there are rows), kernel and
             noise.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
+            With as many outputs as in the first call.
 
         Returns
         -------
-        self : object
+        self : EVGPRegressor
+            The estimator itself, with the new rows in its posterior.
 
         Raises
         ------
@@ -319,8 +327,52 @@ class EVGPRegressor(ExplicitGaussianProcess):
             residuals = self._fitted.units.rows(source).residuals
             check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
             self._fitted = self._fitted.updated(source, self.forgetting_factor)
+            self._training_data = None
             self._set_attributes()
         return self
+
+    def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
+        """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
+
+        With q at its optimum. The rows are those of the last `fit`: the model refers to X and y, and has copied only
+        what were no arrays of floats.
+
+        Parameters
+        ----------
+        theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
+            Logarithms of the free hyperparameters, as ``kernel_.theta``; for several outputs those of each one's
+            kernel, which need not agree in what the fitted ones share. None means the fitted ones.
+        eval_gradient : bool, default=False
+            Whether to return the gradient too; only with a ``theta``.
+
+        Returns
+        -------
+        bound : float
+            In nats, summed over outputs.
+        gradient : ndarray of the shape of ``theta``
+            If ``eval_gradient``. For what outputs share add up its rows.
+
+        Raises
+        ------
+        ValueError
+            If ``theta`` has another shape or is out of range, a gradient is asked for without it, or the rows are gone:
+            after `partial_fit`, and in copies and pickles, which leave them out.
+        """
+        self._check_gradient_of(theta, eval_gradient)
+        if theta is None:
+            return self.lower_bound_
+        if self._training_data is None:
+            raise ValueError(
+                "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
+                "and pickles of a model leave them out. Call fit, or lower_bound() for the fitted kernel."
+            )
+        with closing(BlockMap(effective_n_jobs(self.n_jobs))) as threads, single_threaded_libraries():
+            rows = self._fitted.units.rows(self._source(*self._training_data), threads)
+            return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Models are small, however many rows they have seen.
+        return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
 
     def _placement(self, n_columns: int) -> Placement:
         """How inducing points start, in the space of ``kernel_map``."""

@@ -15,7 +15,7 @@ from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
 from .optimizers.adam import adam
-from .optimizers.lbfgs import lbfgs
+from .optimizers.lbfgs import DESCENT, Descent, lbfgs
 from .optimizers.minimum import Minimum, Objective
 from .optimizers.parameters import ParameterTable
 
@@ -47,6 +47,8 @@ class LBFGS(BaseEstimator):
     ----------
     rules : Rules
         From where fits start; a subclass may have others.
+    descent : Descent
+        The numbers of the optimiser; likewise.
     default_max_iter : int
         What ``max_iter=None`` means.
 
@@ -71,6 +73,7 @@ class LBFGS(BaseEstimator):
         # With 50 or 300 the bounds are about as good.
         stage=100,
     )
+    descent: ClassVar[Descent] = DESCENT
 
     def __init__(self, n_restarts: int = 0, callback: Callback | None = None):
         self.n_restarts = n_restarts
@@ -127,6 +130,7 @@ class LBFGS(BaseEstimator):
             attempt.until - spent,
             task.tol / n_rows,
             task.monitor.seen_as(spent, n_rows),
+            self.descent,
         )
         return Fit(
             table.values(minimum.x),

@@ -4,6 +4,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from skevgp.fitting.start import starting_table
+from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import LOG_2PI, CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.kernels.parse import Start, Starts
@@ -85,7 +86,7 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     model = SparseModel(SquaredExponential(d), prior, family, groups)
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
-    table = starting_table(Moments.of(X), Z, np.ones(o), Starts(*starts), np.ones(o), 1e-2, 1e-10, d)
+    table = starting_table(Moments.of(X), Z, np.ones(o), Starts(*starts), np.ones(o), Rules(1e-2), d)
     return model, rows, table
 
 

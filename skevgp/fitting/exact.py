@@ -128,6 +128,36 @@ class ExactFit:
         """In nats, summed over outputs."""
         return self.model.log_likelihood(self.fit.values)[0] - self._shift
 
+    def log_likelihood_at(self, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
+        """Of an output under another kernel, with the fitted noise, and its gradient in the kernel's logarithms.
+
+        Parameters
+        ----------
+        output : int
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        signal : float
+            s², in the user's units.
+
+        Returns
+        -------
+        value : float
+            In nats, in the user's units.
+        gradient : ndarray of shape (n_hyper + 1,)
+            That in log s² last.
+        """
+        own, model = slice(output, output + 1), self.model
+        rows = replace(model.rows, targets=model.rows.targets[:, own])
+        model = replace(model, prior=model.prior.outputs(own), vague=model.vague[own], rows=rows)
+        values = {
+            "hyperparameters": hyperparameters,
+            "signal": signal / self.units.target_unit[own] ** 2,
+            "noise": self.fit.values["noise"][own],
+        }
+        value, gradient = model.log_likelihood(values)
+        shift = log_units_of_contrasts(self.units, self.model)[output]
+        return value - float(shift), np.append(gradient["hyperparameters"], gradient["signal"])
+
     @property
     def loss_curve(self) -> np.ndarray:
         """Minus the log marginal likelihood per iteration."""
@@ -140,7 +170,7 @@ class ExactFit:
 
     @property
     def _shift(self) -> float:
-        return log_unit_of_contrasts(self.units, self.model)
+        return float(log_units_of_contrasts(self.units, self.model).sum())
 
 
 def fit_exact(
@@ -192,13 +222,12 @@ def fit_exact(
         units.target_unit,
         starts,
         rows.scatter(),
-        options.rules.first_noise,
-        options.rules.lowest_noise,
+        options.rules,
         kernel.n_hyperparameters,
         variance,
     )
     model = ExactModel(kernel, units.internal_prior(), vague, everything)
-    monitor = monitor.seen_as(shift=log_unit_of_contrasts(units, model))
+    monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     advice = [best.message, far_from_prior(proper, rows)]
@@ -208,10 +237,9 @@ def fit_exact(
     return ExactFit(units, model, table, best, (message,) if message else ())
 
 
-def log_unit_of_contrasts(units: Units, model: ExactModel) -> float:
-    """From internal units to the user's, for a loss of all rows: each contrast has a unit."""
-    n_rows = len(model.rows.inputs)
-    return float(((n_rows - model.vague.sum(axis=1)) * np.log(units.target_unit)).sum())
+def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
+    """From internal units to the user's, for each output's loss (o,) of all rows: each contrast has a unit."""
+    return (len(model.rows.inputs) - model.vague.sum(axis=1)) * np.log(units.target_unit)
 
 
 def _check_independent(features: np.ndarray, vague: np.ndarray) -> None:

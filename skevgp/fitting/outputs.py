@@ -135,11 +135,39 @@ class FittedOutputs:
 
     def limits(self, name: str, output: int) -> np.ndarray:
         """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
-        index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
+        index, within = self._place_of(output)
         limits = self.tables[index][name].value_limits()
-        if name == "signal":
-            return limits[[output - self.outputs[index].start]] * self.units.target_unit[output] ** 2
-        return limits
+        return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
+
+    def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
+        """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
+
+        Parameters
+        ----------
+        rows : Rows
+            Those of the fit.
+        output : int
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        signal : float
+            s², in the user's units.
+
+        Returns
+        -------
+        bound : float
+            In nats, in the user's units.
+        gradient : ndarray of shape (n_hyper + 1,)
+            That in log s² last.
+        """
+        (index, within), own = self._place_of(output), slice(output, output + 1)
+        internal = signal / self.units.target_unit[own] ** 2
+        bound, gradient = self.learned[index].bound_at(rows.outputs(own), within, hyperparameters, internal)
+        return bound - len(rows) * self.units.log_unit(own), gradient
+
+    def _place_of(self, output: int) -> tuple[int, int]:
+        """Which model an output belongs to, and which of the model's it is."""
+        index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
+        return index, output - self.outputs[index].start
 
     def values_in(self, units: Units, rows: Rows, kernel: Kernel, index: int) -> Values:
         """A model's values in other internal units, as far as they can serve another fit."""
@@ -215,8 +243,9 @@ def plan(
 
     def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        noise, n_hyper = (solver.rules.first_noise, solver.rules.lowest_noise), kernel.n_hyperparameters
-        table = starting_table(rows.inputs, points, unit, starts, scatter, *noise, n_hyper, variance)
+        table = starting_table(
+            rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
+        )
         return table.with_fixed("inducing_points") if stay else table
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.

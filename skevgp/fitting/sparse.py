@@ -10,8 +10,9 @@ from typing import Protocol
 import numpy as np
 
 from .._progress import Monitor
-from ..inference.bounds import features_alone_bound
+from ..inference.bounds import BoundAtOptimum, features_alone_bound
 from ..inference.model import SparseModel, Values
+from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
 from ..inference.statistics import SufficientStatistics
 from ..optimizers.parameters import ParameterTable
@@ -175,6 +176,44 @@ class Learned:
         if task.noise_cv is None or task.monitor.stopped or not free_noise:
             return learned
         return learned.calibrated(task.table, task.rows, task.noise_cv)
+
+    def bound_at(
+        self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: np.ndarray
+    ) -> tuple[float, np.ndarray]:
+        """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
+
+        Noise and inducing points are the fitted ones, and q is at its optimum.
+
+        Parameters
+        ----------
+        rows : Rows
+            Those of the fit, of this output.
+        output : int
+            Of the model's outputs.
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        signal : ndarray of shape (1,)
+            s².
+
+        Returns
+        -------
+        bound : float
+        gradient : ndarray of shape (n_hyper + 1,)
+            That in log s² last.
+        """
+        own = slice(output, output + 1)
+        index = next(i for i, group in enumerate(self.model.groups) if group.start <= output < group.stop)
+        points = self.values["inducing_points"][[index]]
+        values = {
+            "hyperparameters": hyperparameters,
+            "signal": signal,
+            "noise": self.values["noise"][own],
+            "inducing_points": points,
+        }
+        model = replace(self.model, prior=self.model.prior.outputs(own), groups=(slice(0, 1),))
+        blocks = rows.blocks(model.kernel, points.shape[1])
+        bound, gradient = evaluate(model, values, blocks, partial(BoundAtOptimum, family=model.family))
+        return bound, np.append(gradient["hyperparameters"], gradient["signal"])
 
     def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
         """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far.

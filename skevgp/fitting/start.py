@@ -14,22 +14,13 @@ from ..kernels.parse import Start, Starts
 from ..optimizers.parameters import Parameter, ParameterTable
 from ..rows.internal import Rows
 from ..rows.source import Moments, RawRows, Source
+from .strategy import Rules
 
-# Lengthscales start at this many standard deviations of their column, times √d: rows are then neither all alike nor
-# all strangers, whatever the number of columns.
-_LENGTHSCALE = 0.6
-_LENGTHSCALE_LIMITS = 1e-2, 1e4
-
-# In units of the variance that the features alone leave over.
-_HIGHEST_NOISE = 1e2
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
 _LOWEST_NOISE = 1e-20
 # So that the lowest noise variance in the user's units is not rounded to 0.
 _SMALLEST_UNIT = 1e-140
 _NEIGHBOUR_SAMPLE = 2000
-# A function that varies by more than ten times the data's scatter would do so outside of them only: without an upper
-# bound L-BFGS makes long waves of huge height from small ones (on the cartpole, Errors outside the data of 50).
-_SIGNAL_LIMITS = 1e-8, 1e2
 
 
 @dataclass(frozen=True)
@@ -205,8 +196,7 @@ def starting_table(
     target_unit: np.ndarray,
     starts: Starts,
     scatter: np.ndarray,
-    first_noise: float,
-    lowest_noise: float,
+    rules: Rules,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
 ) -> ParameterTable:
@@ -224,10 +214,8 @@ def starting_table(
         What the user says of them.
     scatter : ndarray of shape (o,)
         Variance of the residuals, in squared target units: 1, but for targets far from 0.
-    first_noise : float
-        Where the noise variance starts, as a share of the scatter, if the user does not say.
-    lowest_noise : float
-        Its lower limit in the same units, if the user does not say.
+    rules : Rules
+        Starts and limits where the user does not say.
     n_hyperparameters : int
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
@@ -241,7 +229,7 @@ def starting_table(
     o, scale = np.ones(len(target_unit)), column_scale(inputs)
     typical = scale if n_hyperparameters > 1 else np.sqrt(np.mean(scale**2, keepdims=True))
     root_d = np.sqrt(len(scale))
-    lower, upper = _LENGTHSCALE_LIMITS
+    lower, upper = rules.lengthscale_limits
     first = starts.hyperparameters.value
     signal = o / mean_variance
     return ParameterTable(
@@ -249,7 +237,7 @@ def starting_table(
             parameter_of(
                 starts.hyperparameters,
                 "hyperparameters",
-                _LENGTHSCALE * root_d * typical if first is None else first,
+                rules.lengthscale * root_d * typical if first is None else first,
                 lower * typical,
                 upper * root_d * typical,
                 1.0,
@@ -258,16 +246,16 @@ def starting_table(
                 starts.signal,
                 "signal",
                 signal,
-                _SIGNAL_LIMITS[0] * signal,
-                _SIGNAL_LIMITS[1] * signal,
+                rules.signal_limits[0] * signal,
+                rules.signal_limits[1] * signal,
                 target_unit**2,
             ),
             parameter_of(
                 starts.noise,
                 "noise",
-                first_noise * scatter,
-                np.maximum(lowest_noise * scatter, _LOWEST_NOISE),
-                _HIGHEST_NOISE * o,
+                rules.first_noise * scatter,
+                np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
+                rules.highest_noise * o,
                 target_unit**2,
             ),
             Parameter("inducing_points", inducing_points, unit=scale, origin=column_centre(inputs)),

@@ -15,10 +15,10 @@ from typing import Protocol
 
 import numpy as np
 
+from .._linalg import JITTER, Jitter
 from .._progress import Monitor
 from ..inference.model import Values
 from ..inference.posterior import Predictor
-from ..inference.statistics import JITTER
 from ..optimizers.parameters import ParameterTable
 
 
@@ -34,8 +34,19 @@ class Rules:
     lowest_noise : float
         Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
         outweighs the noise.
-    jitter : float
-        Of k(X_m, X_m), relative to the signal variance.
+    highest_noise : float
+        Its upper limit, in units of the variance that the features leave over.
+    lengthscale : float
+        Where lengthscales start, in standard deviations of their column, times √d: rows are then neither all alike nor
+        all strangers, whatever the number of columns.
+    lengthscale_limits : (float, float)
+        In the same units, the lower one without √d.
+    signal_limits : (float, float)
+        Of the signal variance, in units of the variance that the features leave over. A function that varies by more
+        than ten times the data's scatter would do so outside of them only: without an upper limit L-BFGS makes long
+        waves of huge height from small ones.
+    jitter : Jitter
+        Of k(X_m, X_m).
     collapsed : float
         An output counts as not learned when noise comes to explain this share of what the features leave over.
     other_starts : tuple of (float, float)
@@ -53,7 +64,11 @@ class Rules:
 
     first_noise: float
     lowest_noise: float = 1e-10
-    jitter: float = JITTER
+    highest_noise: float = 1e2
+    lengthscale: float = 0.6
+    lengthscale_limits: tuple[float, float] = (1e-2, 1e4)
+    signal_limits: tuple[float, float] = (1e-8, 1e2)
+    jitter: Jitter = JITTER
     collapsed: float = 0.9
     other_starts: tuple[tuple[float, float], ...] = ()
     interpolates: float = 1.5

@@ -7,10 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from .._linalg import JITTER, Jitter
 from ..rows.blocks import Blocks
 from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances
 from .posterior import Predictor, PredictorGroup
-from .statistics import JITTER, Kernel, SufficientStatistics, Whitening, collect
+from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
 # Of ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``, the values of the model's parameters.
 Values = dict[str, np.ndarray]
@@ -29,15 +30,15 @@ class SparseModel:
     family : {"full", "diagonal"}
     groups : tuple of slice
         The outputs that each set of inducing points serves.
-    jitter : float, default=1e-12
-        Of k(X_m, X_m), relative to its diagonal.
+    jitter : Jitter, default=Jitter()
+        Of k(X_m, X_m).
     """
 
     kernel: Kernel
     prior: CoefficientPrior
     family: PosteriorFamily
     groups: tuple[slice, ...]
-    jitter: float = JITTER
+    jitter: Jitter = JITTER
 
     def whitenings(self, values: Values) -> Iterator[Whitening]:
         """Of each set of inducing points."""

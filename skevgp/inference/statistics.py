@@ -14,11 +14,9 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._linalg import cholesky_of_covariance, cholesky_pullback, diagonal_of, triangular_inverse
+from .._linalg import JITTER, Jitter, cholesky_of_covariance, cholesky_pullback, diagonal_of, triangular_inverse
 from ..rows.blocks import Block, Blocks
 
-# Relative to the signal variance. k(X_m, X_m) from exact differences is accurate to about m times 1e-16.
-JITTER = 1e-12
 _ROUNDING = 4.0 * np.finfo(float).eps
 
 
@@ -76,7 +74,7 @@ class Whitening:
 
     @classmethod
     def of(
-        cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray, jitter: float = JITTER
+        cls, kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray, jitter: Jitter = JITTER
     ) -> Whitening:
         """At hyperparameters (n_hyper,) and inducing points (m, d)."""
         covariance = kernel.at(np.log(hyperparameters), inducing_points)

@@ -128,6 +128,29 @@ class KernelSpec:
 
         return fitted(self.tree)
 
+    @property
+    def order(self) -> np.ndarray:
+        """Where in (k̃'s hyperparameters, s²) each entry of theta is: theta is ``np.log(numbers[order])``.
+
+        Gradients in the logarithms go the same way.
+        """
+        n_hyper = self.covariance.n_hyperparameters
+        following, found = iter(range(n_hyper)), list[int]()
+        for kernel in _simple_kernels(self.tree):
+            for hyperparameter in kernel.hyperparameters:
+                own = [n_hyper] if kernel is self.signal else list(islice(following, hyperparameter.n_elements))
+                found += [] if hyperparameter.fixed else own
+        return np.array(found, dtype=int)
+
+
+def _simple_kernels(tree: Any) -> Iterator[Any]:
+    """The leaves of a tree, from left to right as theta has them."""
+    if isinstance(tree, sk.KernelOperator):
+        yield from _simple_kernels(tree.k1)
+        yield from _simple_kernels(tree.k2)
+    else:
+        yield tree
+
 
 def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kernel:
     """A copy of a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""

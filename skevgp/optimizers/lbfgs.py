@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 
@@ -9,14 +11,42 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
-# In units of the best loss's size plus one: what is so far above it is out of the way.
-_FAR = 10.0
-_MAX_RESTARTS = 10
-_PATIENCE = 3
-# Relative size of a step that changes the loss by its rounding error only.
-_HAIR = 1e-10
-# A fresh start is worth another when it lowers the loss by this many times the tolerance.
-_WORTH = 100.0
+
+@dataclass(frozen=True)
+class Descent:
+    """The numbers of L-BFGS.
+
+    Attributes
+    ----------
+    memory : int
+        Pairs of steps and gradients from which the curvature is known.
+    gradient : float
+        Where no gradient is larger, a line search has nowhere to go.
+    patience : int
+        So many iterations in a row that gain less than the tolerance are a stall.
+    max_restarts : int
+        Fresh starts from the best point.
+    worth : float
+        A fresh start is worth another when it lowers the loss by this many times the tolerance.
+    hair : float
+        Relative size of a step that changes the loss by its rounding error only.
+    probes : int
+        A fresh start begins a hair away from the best point, at that of so many points which has the median loss.
+    far : float
+        In units of the best loss's size plus one: what is so far above it is out of the way.
+    """
+
+    memory: int = 30
+    gradient: float = 1e-9
+    patience: int = 3
+    max_restarts: int = 10
+    worth: float = 100.0
+    hair: float = 1e-10
+    probes: int = 5
+    far: float = 10.0
+
+
+DESCENT = Descent()
 
 
 class _Guarded:
@@ -26,8 +56,8 @@ class _Guarded:
     errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
     """
 
-    def __init__(self, objective: Objective, start: np.ndarray):
-        self._objective = objective
+    def __init__(self, objective: Objective, start: np.ndarray, far: float):
+        self._objective, self._far = objective, far
         self.x, self.loss = start.copy(), np.inf
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -35,7 +65,7 @@ class _Guarded:
             loss, gradient = self._objective(x)
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
-        far = _FAR * (1.0 + abs(self.loss))
+        far = self._far * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
             return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
         if loss < self.loss:
@@ -46,12 +76,15 @@ class _Guarded:
         return loss, gradient
 
 
-def _nudged(guarded: _Guarded, limits: Limits) -> tuple[np.ndarray, float]:
+def _nudged(guarded: _Guarded, limits: Limits, descent: Descent) -> tuple[np.ndarray, float]:
     """A point next to the best with a middling loss, and how much the loss scatters there: its rounding error."""
+    if descent.probes == 0:
+        return guarded.x, 0.0
     rng, best = np.random.RandomState(0), guarded.x
-    points = [np.clip(best + _HAIR * np.maximum(np.abs(best), 1.0) * rng.randn(len(best)), *limits) for _ in range(5)]
+    reach = descent.hair * np.maximum(np.abs(best), 1.0)
+    points = [np.clip(best + reach * rng.randn(len(best)), *limits) for _ in range(descent.probes)]
     losses = np.array([guarded(point)[0] for point in points])
-    return points[int(np.argsort(losses)[2])], float(losses.std())
+    return points[int(np.argsort(losses)[descent.probes // 2])], float(losses.std())
 
 
 def lbfgs(
@@ -61,6 +94,7 @@ def lbfgs(
     max_iter: int,
     tol: float,
     monitor: Monitor | None = None,
+    descent: Descent = DESCENT,
 ) -> Minimum:
     """L-BFGS-B (SciPy), started anew from the best point when it stalls or a line search fails.
 
@@ -76,13 +110,14 @@ def lbfgs(
         Start anew when each of three iterations in a row lowers the loss by less than this; stop when that no longer
         lowers it by a hundred times as much.
     monitor : Monitor, default=None
+    descent : Descent, default=Descent()
 
     Returns
     -------
     minimum : Minimum
     """
     monitor = Monitor() if monitor is None else monitor
-    guarded = _Guarded(objective, start)
+    guarded = _Guarded(objective, start, descent.far)
     minimum = Minimum(start, np.inf)
     stalled = 0
 
@@ -94,7 +129,7 @@ def lbfgs(
         minimum.loss_curve.append(loss)
         monitor.iteration(minimum.n_iter, loss)
         stalled = stalled + 1 if before - loss < tol else 0
-        if stalled >= _PATIENCE:
+        if stalled >= descent.patience:
             raise StopIteration
 
     with monitor.keeping_the_best():
@@ -102,7 +137,7 @@ def lbfgs(
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
         x, enough = start, -np.inf
-        for _ in range(1 + _MAX_RESTARTS):
+        for _ in range(1 + descent.max_restarts):
             remaining = max_iter - minimum.n_iter
             if minimum.converged or remaining <= 0:
                 break
@@ -114,14 +149,20 @@ def lbfgs(
                 method="L-BFGS-B",
                 bounds=np.column_stack(limits),
                 callback=callback,
-                options={"maxiter": remaining, "maxfun": 20 * remaining + 100, "maxcor": 30, "ftol": 0.0, "gtol": 1e-9},
+                options={
+                    "maxiter": remaining,
+                    "maxfun": 20 * remaining + 100,
+                    "maxcor": descent.memory,
+                    "ftol": 0.0,
+                    "gtol": descent.gradient,
+                },
             )
             if result.status == 1:
                 break
             # It stalled, or a line search failed: either it is done, or memory and rounding errors led it astray.
             # Start anew a hair away, where the loss is not what rounding made of it here, until that gains no more.
             minimum.converged = before - guarded.loss <= enough
-            x, rounding = _nudged(guarded, limits)
-            enough = max(_WORTH * tol, 2.0 * rounding)
+            x, rounding = _nudged(guarded, limits, descent)
+            enough = max(descent.worth * tol, 2.0 * rounding)
     minimum.x, minimum.loss = guarded.x, guarded.loss
     return minimum

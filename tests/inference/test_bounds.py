@@ -5,6 +5,7 @@ from autograd import grad
 
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp.fitting.start import starting_table
+from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
@@ -65,8 +66,7 @@ def test_gradient_with_one_lengthscale_for_all_columns():
         np.ones(2),
         Starts(Start(), Start(), Start()),
         np.ones(2),
-        0.1,
-        1e-10,
+        Rules(0.1),
         1,
     )
     loss = plain_loss(model, rows, table)

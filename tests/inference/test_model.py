@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from skevgp._linalg import Jitter
 from skevgp.inference.bounds import BoundAtOptimum
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.statistics import Whitening
@@ -134,7 +135,7 @@ def test_the_jitter_is_the_models():
     values = values | {"inducing_points": np.repeat(values["inducing_points"][:, :3], 2, axis=1)}
     factors = [
         next(type(model)(model.kernel, model.prior, "full", model.groups, jitter).whitenings(values)).L
-        for jitter in (1e-12, 1e-6)
+        for jitter in (Jitter(1e-12), Jitter(1e-6))
     ]
     np.testing.assert_allclose(np.diag(factors[1])[1::2] ** 2, 2e-6, rtol=1e-3)
     assert (np.diag(factors[0])[1::2] ** 2 < 1e-10).all()

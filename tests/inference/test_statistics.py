@@ -5,8 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from skevgp._linalg import JITTER, Jitter
 from skevgp.inference.statistics import (
-    JITTER,
     StatisticsGradient,
     SufficientStatistics,
     Whitening,
@@ -86,13 +86,13 @@ def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
 
 def test_there_is_a_jitter_only_where_the_points_need_one():
     K = squared_exponential(Z, Z, LENGTHSCALES)
-    np.testing.assert_array_equal(whitening().L, Whitening.of(KERNEL, LENGTHSCALES, Z, 0.1).L)
+    np.testing.assert_array_equal(whitening().L, Whitening.of(KERNEL, LENGTHSCALES, Z, Jitter(0.1)).L)
     np.testing.assert_allclose(whitening().L @ whitening().L.T, K, atol=1e-15)
     twice = np.vstack([Z, Z])
     own = whitening(points=twice)
     assert np.isfinite(own.L_inv).all()
     K = squared_exponential(twice, twice, LENGTHSCALES)
-    np.testing.assert_allclose(own.L @ own.L.T, K + JITTER * np.eye(2 * M), atol=1e-14)
+    np.testing.assert_allclose(own.L @ own.L.T, K + JITTER.size * np.eye(2 * M), atol=1e-14)
 
 
 def test_gradients_in_the_factor_are_pulled_back():

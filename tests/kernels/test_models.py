@@ -19,6 +19,7 @@ from sklearn.gaussian_process.kernels import (
 
 from skevgp import EVGPRegressor
 from skevgp.fitting.start import checked_variance, starting_table
+from skevgp.fitting.strategy import Rules
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective, ElboObjective
 from skevgp.kernels import FunctionKernel
@@ -40,7 +41,7 @@ def model_with(kernel, shared=True, **sizes):
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
     variance = checked_variance(covariance, spec.starts.hyperparameters.value, points[0])
     inputs, ones, size = Moments.of(rows.inputs), np.ones(2), covariance.n_hyperparameters
-    table = starting_table(inputs, points, ones, starts, ones, 1e-2, 1e-10, size, variance)
+    table = starting_table(inputs, points, ones, starts, ones, Rules(1e-2), size, variance)
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
 
 
