@@ -4,7 +4,7 @@ import pytest
 from autograd import grad
 
 from skevgp._linalg import (
-    WELL_CONDITIONED,
+    Jitter,
     NotPositiveDefiniteError,
     cholesky_of_covariance,
     cholesky_pullback,
@@ -65,6 +65,9 @@ def test_an_empty_matrix_has_an_empty_factor():
 # --- a jitter only where it is needed -----------------------------------------------------------------------------
 
 
+LARGE = Jitter(1e-3, well_conditioned=1e-6)
+
+
 def with_last_pivot(pivot):
     """A covariance whose last row is known from the first but for this share of its variance."""
     L = np.array([[1.0, 0.0], [np.sqrt(1.0 - pivot), np.sqrt(pivot)]])
@@ -72,20 +75,20 @@ def with_last_pivot(pivot):
 
 
 def test_a_well_conditioned_covariance_gets_none():
-    for A in (positive_definite(7), with_last_pivot(2.0 * WELL_CONDITIONED)):
-        np.testing.assert_array_equal(cholesky_of_covariance(A, 1e-3), jittered_cholesky(A))
+    for A in (positive_definite(7), with_last_pivot(2e-6)):
+        np.testing.assert_array_equal(cholesky_of_covariance(A, LARGE), jittered_cholesky(A))
 
 
-@pytest.mark.parametrize("pivot", [0.5 * WELL_CONDITIONED, 1e-12, 0.0])
+@pytest.mark.parametrize("pivot", [5e-7, 1e-12, 0.0])
 def test_one_whose_rows_nearly_follow_from_each_other_gets_it(pivot):
     A = with_last_pivot(pivot)
-    L = cholesky_of_covariance(A, 1e-3)
+    L = cholesky_of_covariance(A, LARGE)
     np.testing.assert_allclose(L @ L.T, A + 1e-3 * np.diag(np.diag(A)), rtol=1e-14)
 
 
 def test_a_covariance_that_is_none_raises_a_named_error():
     with pytest.raises(NotPositiveDefiniteError, match="not positive definite"):
-        cholesky_of_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]), 1e-12)
+        cholesky_of_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]), Jitter())
 
 
 # --- errors -------------------------------------------------------------------------------------------------------

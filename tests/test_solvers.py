@@ -1,5 +1,6 @@
 """The solvers as records of options: what they take, what they refuse, what their callbacks are told."""
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -78,9 +79,7 @@ def test_a_name_is_the_solver_with_its_defaults(name, kind):
 
 @pytest.mark.parametrize("solver", ["sgd", "LBFGS", None, 3, LBFGS, object()], ids=str)
 def test_what_is_no_solver_is_named_with_what_is(solver):
-    expected = (
-        r'solver must be one of "lbfgs", "adam", skevgp\.solvers\.LBFGS\(\.\.\.\), skevgp\.solvers\.Adam\(\.\.\.\)'
-    )
+    names = re.escape('"lbfgs", "adam", skevgp.solvers.LBFGS(...), skevgp.solvers.Adam(...)')
     with pytest.raises(ValueError, match=f"solver must be one of {names}; got "):
         resolved(solver, "full")
     with pytest.raises((ValueError, TypeError), match="solver"):
