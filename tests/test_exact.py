@@ -245,6 +245,13 @@ def test_a_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
         assert (std < 1e-3).all()
 
 
+def test_a_line_search_that_steps_far_off_comes_back():
+    """A little noise makes the loss 1e10 there; told as it is, the fit ended after two iterations, at 56.7 nats."""
+    x = np.linspace(0, 10, 30)[:, np.newaxis]
+    m = EGPRegressor(kernel=RBF(1.0) + WhiteKernel(1e-10, "fixed")).fit(x, x[:, 0] * np.sin(x[:, 0]))
+    assert m.log_marginal_likelihood_value_ > 160.0
+
+
 @pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize(

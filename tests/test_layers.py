@@ -2,15 +2,19 @@
 
 import ast
 import sys
+import threading
 from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import grimp
+import numpy as np
 import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
 import skevgp
+from skevgp.inference.objectives import BoundObjective
+from skevgp.solvers import LBFGS
 
 PACKAGE = Path(skevgp.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -161,6 +165,81 @@ def test_no_modules_import_each_other():
     assert arrows["skevgp.regressor"]
     with pytest.raises(CycleError):
         TopologicalSorter({**arrows, "skevgp._linalg": {"skevgp.regressor"}}).prepare()
+
+
+# --- the walk of a fit -------------------------------------------------------------------------------------------
+
+
+def own_frames(frame):
+    """The package's functions on the way to here, the first one first."""
+    found = []
+    while frame is not None:
+        if Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
+            found.append(frame.f_code.co_qualname)
+        frame = frame.f_back
+    return found[::-1]
+
+
+class Walked(LBFGS):
+    """Writes down the way to each evaluation of the bound: in its own thread, and in the one that waits for it."""
+
+    def objective(self, task, table):
+        objective, main = super().objective(task, table), threading.main_thread().ident
+        assert isinstance(objective, BoundObjective)
+
+        def walked(x):
+            here = own_frames(sys._getframe(1))
+            waiting = [] if threading.get_ident() == main else own_frames(sys._current_frames()[main])
+            # But for the few probes of rounding errors before a fresh start.
+            if "_nudged" not in here:
+                self.ways.append((waiting, here))
+            return objective(x)
+
+        return walked
+
+
+def ways(**arguments):
+    rng = np.random.RandomState(0)
+    solver, X = Walked(), rng.randn(60, 2)
+    solver.ways = []
+    model = skevgp.EVGPRegressor(n_inducing=5, solver=solver, tol=10.0, random_state=0, **arguments)
+    model.fit(X, np.column_stack([np.sin(X[:, 0]), X[:, 1] ** 2]))
+    assert len(solver.ways) > model.n_iter_
+    return solver.ways
+
+
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_the_walk_of_a_fit_to_the_bound_is_short(sharing):
+    for waiting, way in ways(sharing=sharing):
+        assert waiting == []
+        assert way[0] == "EVGPRegressor.fit"
+        assert len(way) <= 8, way
+
+
+def test_the_walk_of_fits_in_threads_is_no_longer():
+    """The worker's functions, and those that wait for it in the main thread."""
+    found = ways(sharing="none", n_jobs=2)
+    assert any(waiting for waiting, _ in found)
+    for waiting, way in found:
+        assert waiting[0] == "EVGPRegressor.fit"
+        assert len(waiting) + len(way) <= 8, (waiting, way)
+
+
+# --- tests mirror the house --------------------------------------------------------------------------------------
+
+# What has tests of its own elsewhere, or nothing to test.
+TESTED_WITH = {"optimizers/minimum.py": "optimizers/test_lbfgs.py"}
+FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "rows")
+
+
+@pytest.mark.parametrize(
+    "module",
+    [path.relative_to(PACKAGE) for path in MODULES if path.parent.name in FLOORS and path.stem != "__init__"],
+    ids=Path.as_posix,
+)
+def test_each_module_has_its_file_of_tests(module):
+    own = TESTED_WITH.get(module.as_posix(), module.with_name(f"test_{module.name}"))
+    assert (Path(__file__).parent / own).is_file()
 
 
 @pytest.mark.parametrize(

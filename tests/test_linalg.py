@@ -4,9 +4,13 @@ import pytest
 from autograd import grad
 
 from skevgp._linalg import (
+    Jitter,
     NotPositiveDefiniteError,
+    cholesky_of_covariance,
     cholesky_pullback,
+    diagonal_of,
     jittered_cholesky,
+    symmetric_inverse,
     triangular_inverse,
 )
 
@@ -47,6 +51,49 @@ def test_a_singular_matrix_gets_just_enough_jitter():
     np.testing.assert_allclose(L @ L.T, A, atol=1e-12)
 
 
+def test_a_jitter_above_the_most_is_not_tried():
+    indefinite = np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])
+    assert np.isfinite(jittered_cholesky(indefinite)).all()
+    with pytest.raises(NotPositiveDefiniteError, match="with a relative jitter of 1e-08"):
+        jittered_cholesky(indefinite, most=1e-8)
+
+
+def test_an_empty_matrix_has_an_empty_factor():
+    assert jittered_cholesky(np.empty((0, 0))).shape == (0, 0)
+
+
+# --- a jitter only where it is needed -----------------------------------------------------------------------------
+
+
+LARGE = Jitter(1e-3, well_conditioned=1e-6)
+
+
+def with_last_pivot(pivot):
+    """A covariance whose last row is known from the first but for this share of its variance."""
+    L = np.array([[1.0, 0.0], [np.sqrt(1.0 - pivot), np.sqrt(pivot)]])
+    return 4.0 * L @ L.T
+
+
+def test_a_well_conditioned_covariance_gets_none():
+    for A in (positive_definite(7), with_last_pivot(2e-6)):
+        np.testing.assert_array_equal(cholesky_of_covariance(A, LARGE), jittered_cholesky(A))
+
+
+@pytest.mark.parametrize("pivot", [5e-7, 1e-12, 0.0])
+def test_one_whose_rows_nearly_follow_from_each_other_gets_it(pivot):
+    A = with_last_pivot(pivot)
+    L = cholesky_of_covariance(A, LARGE)
+    np.testing.assert_allclose(L @ L.T, A + 1e-3 * np.diag(np.diag(A)), rtol=1e-14)
+
+
+def test_a_covariance_that_is_none_raises_a_named_error():
+    with pytest.raises(NotPositiveDefiniteError, match="not positive definite"):
+        cholesky_of_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]), Jitter())
+
+
+# --- errors -------------------------------------------------------------------------------------------------------
+
+
 @pytest.mark.parametrize("bad", [np.array([[1.0, 2.0], [2.0, 1.0]]), np.full((2, 2), np.nan), np.array([[np.inf]])])
 def test_hopeless_matrices_raise_a_named_error(bad):
     with pytest.raises(NotPositiveDefiniteError, match="not positive definite|not finite"):
@@ -58,6 +105,37 @@ def test_triangular_inverse():
     inverse = triangular_inverse(L)
     np.testing.assert_allclose(inverse @ L, np.eye(6), atol=1e-13)
     np.testing.assert_array_equal(inverse, np.tril(inverse))
+
+
+@pytest.mark.parametrize("lengthscale", [0.05, 0.3, 1.0])
+def test_the_inverse_has_a_small_left_residual_however_ill_conditioned_the_factor(lengthscale):
+    """Higham 2002, section 14.2: |X L - I| <= c n u |X| |L|, entry by entry; here with the product's own rounding."""
+    x = np.linspace(0.0, 1.0, 60)
+    L = jittered_cholesky(np.exp(-0.5 * ((x[:, np.newaxis] - x) / lengthscale) ** 2), 1e-12)
+    assert np.linalg.cond(L) > 1e5
+    inverse = triangular_inverse(L)
+    bound = 4 * len(x) * np.finfo(float).eps * (np.abs(inverse) @ np.abs(L))
+    assert (np.abs(inverse @ L - np.eye(60)) <= bound).all()
+    # A whitened row comes back: V = L⁻¹ (L V).
+    V = np.random.RandomState(0).randn(60, 5)
+    assert (
+        np.abs(inverse @ (L @ V) - V) <= 4 * len(x) * np.finfo(float).eps * (np.abs(inverse) @ np.abs(L) @ np.abs(V))
+    ).all()
+
+
+def test_the_inverse_of_a_product_with_itself():
+    A = positive_definite(6)
+    inverse = symmetric_inverse(triangular_inverse(np.linalg.cholesky(A)))
+    np.testing.assert_allclose(inverse @ A, np.eye(6), atol=1e-12)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_the_diagonal_can_be_written(order):
+    A = np.array(positive_definite(3), order=order)
+    expected = A + np.diag([1.0, 2.0, 3.0])
+    np.testing.assert_array_equal(diagonal_of(A), np.diag(A))
+    diagonal_of(A)[...] += [1.0, 2.0, 3.0]
+    np.testing.assert_array_equal(A, expected)
 
 
 def test_the_factors_pull_back_agrees_with_autograd():

@@ -4,7 +4,7 @@ import warnings
 
 import numpy as np
 import pytest
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
@@ -220,3 +220,18 @@ def test_a_failed_fit_leaves_the_data_alone():
         EVGPRegressor(PolynomialFeatures(1), coef_scale=-1.0).fit(X, y)
     np.testing.assert_array_equal(X, GOOD)
     np.testing.assert_array_equal(y, GOOD[:, 0])
+
+
+@pytest.mark.parametrize("n_inducing", [10, 40, 80])
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+def test_rows_that_are_equal_but_for_rounding_are_duplicates(posterior, n_inducing):
+    rng = np.random.RandomState(0)
+    rows, new = rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, 2, (30, 2))
+    y = np.tile(np.sin(2 * rows[:, 0]) + rows[:, 1], 2) + 0.05 * rng.randn(80)
+    nearly = rows * (1.0 + 4e-16 * rng.choice([-1, 1], rows.shape))
+    model = EVGPRegressor(n_inducing=n_inducing, posterior=posterior, noise_variance=0.01, max_iter=0, random_state=0)
+    same, near = (clone(model).fit(np.vstack([rows, others]), y) for others in (rows, nearly))
+    assert (np.vstack([rows, nearly]) != np.vstack([rows, rows])).any()
+    for found, expected in zip(near.predict(new, return_std=True), same.predict(new, return_std=True), strict=True):
+        np.testing.assert_allclose(found, expected, atol=1e-8)
+    assert near.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-6)

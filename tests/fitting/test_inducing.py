@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from skevgp.fitting.inducing import Placement
+from skevgp.fitting.inducing import LARGEST_SEARCH, MAX_SAMPLE, Placement, are_all_rows
 from skevgp.kernels.stationary import SquaredExponential
 
 
@@ -28,10 +28,38 @@ def test_points_spread_over_the_data_whatever_the_scales(method):
 
 
 @pytest.mark.parametrize("method", ["k-means", "greedy"])
-def test_a_sample_serves_for_many_rows(method, monkeypatch):
-    monkeypatch.setattr("skevgp.fitting.inducing.MAX_SAMPLE", 100)
-    X = np.random.RandomState(0).rand(5000, 1)
-    assert points(X, 100, method).shape == (100, 1)
+def test_rows_that_differ_by_rounding_only_are_one(method):
+    """In units of their column's scatter, however far from 0 that is."""
+    rng = np.random.RandomState(0)
+    for X in (rng.randn(20, 2), 1e6 * rng.randn(20, 2), 1e-6 * rng.randn(20, 2)):
+        twice = np.vstack([X, X * (1.0 + 4e-16 * rng.choice([-1, 1], X.shape))])
+        np.testing.assert_array_equal(points(twice, 30, method), X)
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_whether_points_are_all_rows_but_for_rounding(scale):
+    X = scale * np.random.RandomState(0).randn(20, 2)
+    assert are_all_rows(X, X)
+    assert are_all_rows(X[::-1] * (1.0 + 1e-15), np.vstack([X, X]))
+    assert are_all_rows(np.vstack([X, X[:1] + scale]), X)
+    assert not are_all_rows(X[1:], X)
+    assert not are_all_rows(X + 1e-6 * scale, X)
+
+
+def test_points_are_placed_anew_only_if_nobody_said_how():
+    assert Placement("auto", 7).anew == Placement("greedy", 7)
+    for method in ("k-means", "greedy", np.zeros((3, 1))):
+        assert Placement(method, 7).anew is None
+
+
+@pytest.mark.parametrize("method", ["auto", "k-means", "greedy"])
+@pytest.mark.parametrize("n_inducing", [1, 100, 1000, 5000])
+def test_a_sample_has_rows_enough_to_choose_from_and_no_more(method, n_inducing):
+    size = Placement(method, n_inducing).sample_size
+    assert size >= 2 * n_inducing
+    assert size <= max(MAX_SAMPLE, 10 * n_inducing)
+    if method == "greedy" and size > 2 * n_inducing:
+        assert size * n_inducing <= LARGEST_SEARCH
 
 
 @pytest.mark.parametrize("method", ["k-means", "greedy"])

@@ -3,7 +3,7 @@ import pytest
 
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
-from skevgp.optimizers.lbfgs import lbfgs
+from skevgp.optimizers.lbfgs import Descent, lbfgs
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
@@ -82,3 +82,48 @@ def test_ctrl_c_keeps_the_best_point_so_far():
     assert monitor.stopped
     assert not minimum.converged
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
+
+
+def test_a_wall_at_the_very_start_is_told():
+    """Nothing is known of the loss then: there is no point to come back to."""
+
+    def nowhere(x):
+        raise NotPositiveDefiniteError
+
+    minimum = lbfgs(nowhere, np.ones(2), FREE, 50, 1e-9)
+    np.testing.assert_array_equal(minimum.x, 1.0)
+    assert minimum.loss == np.inf
+
+
+def cliff(height):
+    """A gentle slope down to 1, and beyond that a loss which rises at once to any height."""
+
+    def loss(x):
+        beyond = np.maximum(x - 1.0, 0.0)
+        return float((-x + height * beyond**2).sum()), -1.0 + 2.0 * height * beyond
+
+    return loss
+
+
+@pytest.mark.parametrize("height", [1e3, 1e6, 1e9, 1e12])
+def test_a_loss_far_off_does_not_end_the_way(height):
+    minimum = lbfgs(cliff(height), np.zeros(2), FREE, 300, 1e-9)
+    np.testing.assert_allclose(minimum.x, 1.0, atol=1e-3)
+    assert minimum.converged
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rounding_errors_do_not_end_the_way(seed):
+    """A loss with errors far above the tolerance, as near a singular matrix: the best is as good as they allow."""
+    directions = np.random.RandomState(seed).randn(2)
+
+    def rough(x):
+        value, gradient = rosenbrock(x)
+        return value + 1e-9 * np.sin(1e13 * (x @ directions)), gradient
+
+    assert lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
+
+
+def test_no_probes_start_at_the_best_point_itself():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 200, 1e-12, descent=Descent(probes=0))
+    np.testing.assert_allclose(minimum.x, 1.0, atol=1e-5)
