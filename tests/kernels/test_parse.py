@@ -1,3 +1,4 @@
+import inspect
 import warnings
 
 import numpy as np
@@ -105,7 +106,7 @@ def test_people_are_told_what_works_from_the_registry():
     listed = ", ".join(kind.__name__ for kind in BUILDERS)
     assert f"takes {listed}, sums and products of these, and a WhiteKernel" in kernels.__doc__
     for regressor in (skevgp.EVGPRegressor, skevgp.EGPRegressor):
-        parameter = regressor.__doc__.partition("    kernel : ")[2].partition("    kernel_map : ")[0]
+        parameter = inspect.getdoc(regressor).partition("\nkernel : ")[2].partition("\nkernel_map : ")[0]
         assert "`skevgp.kernels`" in parameter or "`EVGPRegressor`" in parameter
         assert not any(kind.__name__ in parameter for kind in (DotProduct, RationalQuadratic))
     with pytest.raises(ValueError, match=f"These work: {listed}, sums"):
