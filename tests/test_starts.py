@@ -141,7 +141,7 @@ def test_points_stay_where_they_have_a_reason_to(why):
     """The same fit as from clusters, or from the user's points, which are not placed anew."""
     arguments = {
         "warm start": {"n_inducing": 20, "warm_start": True},
-        "as many points as rows": {"n_inducing": 80, "tol": 1.0},
+        "as many points as rows": {"n_inducing": 120, "tol": 1.0},
         "few iterations": {"max_iter": 100, "tol": 1.0},
         "Adam": {"solver": "adam", "max_iter": 150},
         "own points": {"inducing_init": Z},

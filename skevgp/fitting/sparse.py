@@ -104,7 +104,7 @@ class SparseTask:
             self.solver.n_restarts,
             self.rows.scatter(),
             features_alone_bound(self.blocks.linear, self.model.prior),
-            rules.interpolates * self.n_inducing >= len(self.rows),
+            self.n_inducing >= len(self.rows),
             None if anew is None else partial(self._placed, placement=anew),
             lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
             self.warm,

@@ -51,10 +51,9 @@ class Rules:
         An output counts as not learned when noise comes to explain this share of what the features leave over.
     other_starts : tuple of (float, float)
         Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
-    interpolates : float
-        With so many times as many inducing points as rows, or more, the kernel may explain every row by itself.
     much_noise : float, optional
-        Such fits, which cost little, start from a noise so many times higher too: a low one may lead to that plateau.
+        With as many inducing points as rows, the kernel may explain every row by itself. Such fits, which cost little,
+        start from a noise so many times higher too: a low one may lead to that plateau.
     stage : int, optional
         Iterations after which inducing points are placed anew, and so many again until it shows whether that was
         better. None leaves them.
@@ -71,7 +70,6 @@ class Rules:
     jitter: Jitter = JITTER
     collapsed: float = 0.9
     other_starts: tuple[tuple[float, float], ...] = ()
-    interpolates: float = 1.5
     much_noise: float | None = None
     stage: int | None = None
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
@@ -158,7 +156,7 @@ class Strategy:
     alone : float
         The bound of the features without a Gaussian process.
     interpolates : bool
-        Whether there are about as many inducing points as rows.
+        Whether there are as many inducing points as rows.
     place : callable, optional
         Values -> the same values with inducing points placed anew under their kernel; None leaves them.
     restart : callable, optional

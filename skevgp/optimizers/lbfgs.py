@@ -24,14 +24,6 @@ class Descent:
         Where no gradient is larger, a line search has nowhere to go.
     patience : int
         So many iterations in a row that gain less than the tolerance are a stall.
-    max_restarts : int
-        Fresh starts from the best point.
-    worth : float
-        A fresh start is worth another when it lowers the loss by this many times the tolerance.
-    hair : float
-        Relative size of a step that changes the loss by its rounding error only.
-    probes : int
-        A fresh start begins a hair away from the best point, at that of so many points which has the median loss.
     far : float
         In units of the best loss's size plus one: what is so far above it is out of the way.
     """
@@ -39,10 +31,6 @@ class Descent:
     memory: int = 30
     gradient: float = 1e-9
     patience: int = 3
-    max_restarts: int = 10
-    worth: float = 100.0
-    hair: float = 1e-10
-    probes: int = 5
     far: float = 10.0
 
 
@@ -76,17 +64,6 @@ class _Guarded:
         return loss, gradient
 
 
-def _nudged(guarded: _Guarded, limits: Limits, descent: Descent) -> tuple[np.ndarray, float]:
-    """A point next to the best with a middling loss, and how much the loss scatters there: its rounding error."""
-    if descent.probes == 0:
-        return guarded.x, 0.0
-    rng, best = np.random.RandomState(0), guarded.x
-    reach = descent.hair * np.maximum(np.abs(best), 1.0)
-    points = [np.clip(best + reach * rng.randn(len(best)), *limits) for _ in range(descent.probes)]
-    losses = np.array([guarded(point)[0] for point in points])
-    return points[int(np.argsort(losses)[descent.probes // 2])], float(losses.std())
-
-
 def lbfgs(
     objective: Objective,
     start: np.ndarray,
@@ -107,8 +84,8 @@ def lbfgs(
     max_iter : int
         Iterations in all.
     tol : float
-        Start anew when each of three iterations in a row lowers the loss by less than this; stop when that no longer
-        lowers it by a hundred times as much.
+        Start anew when each of three iterations in a row lowers the loss by less than this, or a line search fails;
+        stop when a start lowers it by no more.
     monitor : Monitor, default=None
     descent : Descent, default=Descent()
 
@@ -136,15 +113,11 @@ def lbfgs(
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
-        x, enough = start, -np.inf
-        for _ in range(1 + descent.max_restarts):
-            remaining = max_iter - minimum.n_iter
-            if minimum.converged or remaining <= 0:
-                break
-            before, stalled = guarded.loss, 0
+        while not minimum.converged and minimum.n_iter < max_iter:
+            remaining, before, stalled = max_iter - minimum.n_iter, guarded.loss, 0
             result = minimize(
                 guarded,
-                x,
+                guarded.x,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=np.column_stack(limits),
@@ -159,10 +132,9 @@ def lbfgs(
             )
             if result.status == 1:
                 break
-            # It stalled, or a line search failed: either it is done, or memory and rounding errors led it astray.
-            # Start anew a hair away, where the loss is not what rounding made of it here, until that gains no more.
-            minimum.converged = before - guarded.loss <= enough
-            x, rounding = _nudged(guarded, limits, descent)
-            enough = max(descent.worth * tol, 2.0 * rounding)
+            # It stalled, or a line search failed: either it is done, or its memory led it astray.
+            if not before - guarded.loss > tol:
+                minimum.converged = bool(np.isfinite(guarded.loss))
+                break
     minimum.x, minimum.loss = guarded.x, guarded.loss
     return minimum

@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from scipy.optimize import rosen, rosen_der
 
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
@@ -56,6 +57,22 @@ def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
     minimum = lbfgs(barrier, np.zeros(2), FREE, 300, 1e-12)
     np.testing.assert_allclose(minimum.x, (-1.0 + np.sqrt(1.0 + pull**2)) / pull, atol=1e-6)
     assert outside
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_stall_is_not_the_end(seed):
+    """In a bent valley of twenty columns three small steps in a row may lie far from the minimum at 0."""
+    free = (np.full(20, -np.inf), np.full(20, np.inf))
+    start = np.random.RandomState(seed).uniform(-2.0, 2.0, 20)
+    minimum = lbfgs(lambda x: (rosen(x), rosen_der(x)), start, free, 1000, 0.03)
+    assert minimum.converged
+    assert minimum.loss < 1.0
+
+
+def test_a_start_that_cannot_be_evaluated_has_not_converged():
+    minimum = lbfgs(lambda x: (np.nan, np.zeros(2)), np.zeros(2), FREE, 50, 1e-6)
+    assert not minimum.converged
+    assert minimum.loss == np.inf
 
 
 def test_lbfgs_ends_when_rounding_has_the_last_word():
