@@ -356,8 +356,20 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     def _warn_of(self, messages: tuple[str, ...]) -> None:
         """Tell the user of ``fit`` how it ended."""
-        for message in messages:
+        for message in (*messages, *(self._at_bounds() if self.max_iter != 0 else ())):
             warnings.warn(message, ConvergenceWarning, stacklevel=4)
+
+    def _at_bounds(self) -> list[str]:
+        """Which parameters of the user's kernel ended at its bounds; what outputs share, once."""
+        signal, noise = self._predictor.signal, self._predictor.noise
+        return list(
+            dict.fromkeys(
+                message
+                for group in self._predictor.groups
+                for o in range(len(noise))[group.outputs]
+                for message in self._spec.at_bounds(group.hyperparameters, float(signal[o]), float(noise[o]))
+            )
+        )
 
     @property
     def _n_outputs(self) -> int:

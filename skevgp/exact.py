@@ -183,7 +183,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         -----
         ConvergenceWarning
             If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
-            kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
+            kept); if the Gaussian process learned nothing; if y is far from its prior mean; if a parameter of the given
+            kernel ended at one of its bounds. It says what to change.
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")

@@ -259,8 +259,9 @@ class EVGPRegressor(ExplicitGaussianProcess):
         Warns
         -----
         ConvergenceWarning
-            If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
-            kept); if the Gaussian process learned nothing; if y is far from its prior mean. It says what to change.
+            If the iterations were used up, rounding errors or Ctrl-C ended them (the best parameters so far are kept);
+            if the Gaussian process learned nothing, y is far from its prior mean, or a parameter of the given kernel
+            ended at a bound of it. It says what to change.
         """
         solver = resolved(self.solver, self.posterior)
         with unchanged_if_it_fails(self), single_threaded_libraries():
@@ -334,8 +335,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
         """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
 
-        With q at its optimum. The rows are those of the last `fit`: the model refers to X and y, and has copied only
-        what were no arrays of floats.
+        With q at its optimum, for the rows of the last `fit`: the model refers to X and y, and copies no floats.
 
         Parameters
         ----------

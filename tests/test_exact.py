@@ -349,7 +349,8 @@ def test_the_noise_starts_in_one_place():
 
 def test_bounds_and_fixed_values_are_respected():
     kernel = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], (0.5, 0.7)) + WhiteKernel(0.03, "fixed")
-    m = EGPRegressor(kernel=kernel).fit(X, Y[:, 0])
+    with pytest.warns(ConvergenceWarning, match="parameter k1__k2__length_scale is close to the specified"):
+        m = EGPRegressor(kernel=kernel).fit(X, Y[:, 0])
     assert m.kernel_.k1.constant_value == 2.0
     assert ((m.kernel_.k2.length_scale >= 0.5) & (m.kernel_.k2.length_scale <= 0.7)).all()
     assert m.noise_variance_ == pytest.approx(0.03)

@@ -62,7 +62,8 @@ def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
 @pytest.mark.slow
 def test_restarts_stay_inside_the_users_bounds():
     kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
-    m = model(kernel=kernel, solver=LBFGS(n_restarts=3)).fit(X, Y[:, 0])
+    with pytest.warns(ConvergenceWarning, match="close to the specified"):
+        m = model(kernel=kernel, solver=LBFGS(n_restarts=3)).fit(X, Y[:, 0])
     lengthscales = m.kernel_.k2.length_scale
     assert 0.9 - 1e-9 <= lengthscales[0] <= 1.1 + 1e-9
     assert 0.2 - 1e-9 <= lengthscales[1] <= 5.0 + 1e-9

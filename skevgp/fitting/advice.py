@@ -5,12 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from ..inference.bounds import CoefficientPrior
+from ..inference.model import Values
+from ..inference.statistics import Kernel
 from ..optimizers.minimum import Minimum
+from ..optimizers.parameters import ParameterTable
 from ..rows.internal import Rows
-from .start import alike_neighbours
+from .start import alike_neighbours, neighbours
 
 # When no start got below this share, the user should know.
 _NOTHING_LEARNED = 0.99
+# A kernel is white noise if of so many pairs of neighbours hardly any, this share, have this correlation. (The likeness
+# that counts in `alike_neighbours` is more than that of such a share.)
+_PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 # y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
@@ -63,6 +69,16 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     return ""
 
 
+def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, rows: Rows, sparse: bool = True) -> str:
+    """Whether noise explains what the Gaussian process could have learned: the model's, or the kernel as noise."""
+    told = ""
+    if table["noise"].free.any():
+        told = nothing_learned(values["noise"], rows, sparse)
+    if not told and table["hyperparameters"].free.any():
+        told = white_kernel(kernel, values["hyperparameters"], rows)
+    return told
+
+
 def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
     """Whether noise variances (o,) explain everything of targets whose neighbouring rows are alike."""
     nothing = noise > _NOTHING_LEARNED * rows.scatter()
@@ -76,4 +92,22 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
         "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
         f"Raise {'n_inducing or ' if sparse else ''}n_restarts, let kernel or noise_variance start elsewhere, or look "
         "at the scales of the kernel's columns."
+    )
+
+
+def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str:
+    """Whether the kernel itself, k̃, is white noise though neighbouring rows are alike."""
+    if len(rows) < 2:
+        return ""
+    each, other = neighbours(rows, _PAIRS)
+    n = len(each.inputs)
+    K = np.abs(kernel.at(np.log(hyperparameters), np.vstack([each.inputs, other.inputs])).matrix())
+    variance = np.diagonal(K)
+    correlated = np.diagonal(K[:n, n:]) >= _WHITE * np.sqrt(variance[:n] * variance[n:])
+    if correlated.mean() > _WHITE_SHARE or not alike_neighbours(rows).any():
+        return ""
+    return (
+        "The kernel became white noise: to it neighbouring rows are strangers, though they are alike, and elsewhere it "
+        "predicts nothing beyond the features and the prior mean. Let its length scales start higher, raise their "
+        "lower bounds, or raise n_restarts."
     )

@@ -14,7 +14,7 @@ from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs
 from ..optimizers.parameters import ParameterTable
 from ..rows.internal import Rows
-from .advice import far_from_prior, how_it_ended, interrupted, nothing_learned
+from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
 from .start import checked_variance, column_centre, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
 from .units import Units
@@ -231,8 +231,8 @@ def fit_exact(
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     advice = [best.message, far_from_prior(proper, rows)]
-    if options.max_iter > 0 and table["noise"].free.any():
-        advice.append(nothing_learned(best.values["noise"], rows, sparse=False))
+    if options.max_iter > 0:
+        advice.append(learned_too_little(kernel, best.values, table, rows, sparse=False))
     message = interrupted(best.n_iter) if monitor.stopped else " ".join(part for part in advice if part)
     return ExactFit(units, model, table, best, (message,) if message else ())
 

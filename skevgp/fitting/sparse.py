@@ -18,7 +18,7 @@ from ..inference.statistics import SufficientStatistics
 from ..optimizers.parameters import ParameterTable
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
-from .advice import far_from_prior, nothing_learned
+from .advice import far_from_prior, learned_too_little
 from .calibration import calibrated_noise
 from .inducing import Placement
 from .strategy import Attempt, Fit, Rules, Strategy, drawn
@@ -161,8 +161,8 @@ class Learned:
         bound, predictor = task.model.at_optimum(fit.values, statistics)
         advice = [fit.message, far_from_prior(task.model.prior, task.rows)]
         free_noise = task.table["noise"].free.any()
-        if not task.monitor.stopped and task.max_iter > 0 and free_noise:
-            advice.append(nothing_learned(fit.values["noise"], task.rows))
+        if not task.monitor.stopped and task.max_iter > 0:
+            advice.append(learned_too_little(task.model.kernel, fit.values, task.table, task.rows))
         learned = cls(
             task.model,
             fit.values,

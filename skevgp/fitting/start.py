@@ -179,15 +179,21 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
     -------
     alike : ndarray of shape (o,)
     """
-    if _constant(rows.inputs).all():
+    if _constant(rows.inputs).all() or len(rows) < 2:
         return np.zeros(len(rows.scatter()), dtype=bool)
+    each, other = neighbours(rows)
+    difference = np.mean((each.targets - other.targets) ** 2, axis=0)
+    return difference < 2.0 * each.targets.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(each.inputs)))
+
+
+def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawRows]:
+    """Up to ``size`` of a sample of the rows, and the nearest of its others to each, in standard deviations."""
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
-    inputs, residuals = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs), some.targets
-    if len(inputs) < 2:
-        return np.zeros(residuals.shape[1], dtype=bool)
-    _, nearest = cKDTree(inputs).query(inputs, 2)
-    difference = np.mean((residuals[nearest[:, 0]] - residuals[nearest[:, 1]]) ** 2, axis=0)
-    return difference < 2.0 * residuals.var(axis=0) * (1.0 - 6.4 / np.sqrt(len(inputs)))
+    inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
+    queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
+    _, nearest = cKDTree(inputs).query(inputs[queried], 2)
+    each, other = (RawRows(some.inputs[own], some.features[own], some.targets[own]) for own in nearest.T)
+    return each, other
 
 
 def starting_table(

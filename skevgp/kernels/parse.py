@@ -88,12 +88,15 @@ class KernelSpec:
         s² k̃ as a scikit-learn kernel.
     signal : Kernel
         The ConstantKernel in it that is s².
+    given : Kernel, optional
+        What the user gave, of which ``tree`` is made; None if that was no kernel.
     """
 
     covariance: Covariance
     starts: Starts
     tree: sk.Kernel
     signal: sk.Kernel
+    given: sk.Kernel | None = None
 
     def with_noise(self, noise_variance: float) -> KernelSpec:
         """The same kernel with a start of the noise."""
@@ -134,11 +137,48 @@ class KernelSpec:
 
         Gradients in the logarithms go the same way.
         """
+        return self._order_in(self.tree)
+
+    def at_bounds(self, hyperparameters: np.ndarray, signal: float, noise: float) -> list[str]:
+        """Which parameters of the user's kernel are at its bounds, in scikit-learn's words.
+
+        Parameters
+        ----------
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        signal, noise : float
+            s² and σ².
+
+        Returns
+        -------
+        found : list of str
+            What `GaussianProcessRegressor` warns of; a sentence for each.
+        """
+        if self.given is None:
+            return []
+        theta = np.log(np.append(hyperparameters, [signal, noise]))[self._order_in(self.given)]
+        at_bound = iter(np.isclose(self.given.bounds, theta[:, np.newaxis]))
+        return [
+            f"The optimal value found for dimension {dimension} of parameter {parameter.name} is close to the "
+            f"specified {side} bound {parameter.bounds[dimension, column]}. {change} the bound and calling fit again "
+            "may find a better value."
+            for parameter in self.given.hyperparameters
+            if not parameter.fixed
+            for dimension, at in zip(range(parameter.n_elements), at_bound, strict=False)
+            for column, (side, change) in enumerate((("lower", "Decreasing"), ("upper", "Increasing")))
+            if at[column]
+        ]
+
+    def _order_in(self, tree: sk.Kernel) -> np.ndarray:
+        """Where in (k̃'s hyperparameters, s², σ²) each entry of a tree's theta is."""
         n_hyper = self.covariance.n_hyperparameters
         following, found = iter(range(n_hyper)), list[int]()
-        for kernel in _simple_kernels(self.tree):
+        for kernel in _simple_kernels(tree):
             for hyperparameter in kernel.hyperparameters:
-                own = [n_hyper] if kernel is self.signal else list(islice(following, hyperparameter.n_elements))
+                if kernel is self.signal or type(kernel) is sk.WhiteKernel:
+                    own = [n_hyper if kernel is self.signal else n_hyper + 1]
+                else:
+                    own = list(islice(following, hyperparameter.n_elements))
                 found += [] if hyperparameter.fixed else own
         return np.array(found, dtype=int)
 
@@ -201,7 +241,8 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
             f"None; got {kernel!r}. These work: {WORKING}."
         )
     # A copy: the same kernel may be in a tree twice.
-    tree, noise = _without_noise(clone(kernel))
+    given = clone(kernel)
+    tree, noise = _without_noise(given)
     if tree is None or len(noise) > 1:
         said = "it has no other term" if tree is None else f"there are {len(noise)}"
         raise ValueError(f"kernel={kernel!r}: of WhiteKernel there can be one, plus what it is the noise of; {said}.")
@@ -219,6 +260,7 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
         Starts(_joined(starts), signal_start, _starts(noise[0]) if noise else Start()),
         tree,
         signal,
+        given,
     )
 
 

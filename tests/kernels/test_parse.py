@@ -1,5 +1,10 @@
+import inspect
+import warnings
+
 import numpy as np
 import pytest
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import (
     RBF,
     CompoundKernel,
@@ -101,7 +106,7 @@ def test_people_are_told_what_works_from_the_registry():
     listed = ", ".join(kind.__name__ for kind in BUILDERS)
     assert f"takes {listed}, sums and products of these, and a WhiteKernel" in kernels.__doc__
     for regressor in (skevgp.EVGPRegressor, skevgp.EGPRegressor):
-        parameter = regressor.__doc__.partition("    kernel : ")[2].partition("    kernel_map : ")[0]
+        parameter = inspect.getdoc(regressor).partition("\nkernel : ")[2].partition("\nkernel_map : ")[0]
         assert "`skevgp.kernels`" in parameter or "`EVGPRegressor`" in parameter
         assert not any(kind.__name__ in parameter for kind in (DotProduct, RationalQuadratic))
     with pytest.raises(ValueError, match=f"These work: {listed}, sums"):
@@ -164,7 +169,8 @@ def test_bounds_are_respected_and_come_back():
     kernel = ConstantKernel(2.0, (1.9, 2.1)) * RBF([0.5, 0.5], [(0.4, 0.6), (0.45, 0.55)]) + WhiteKernel(
         0.5, (0.4, 0.6)
     )
-    model = fitted(kernel)
+    with pytest.warns(ConvergenceWarning, match="close to the specified"):
+        model = fitted(kernel)
     assert 1.9 <= model.kernel_.k1.constant_value <= 2.1
     assert (model.kernel_.k2.length_scale >= [0.4, 0.45]).all()
     assert (model.kernel_.k2.length_scale <= [0.6, 0.55]).all()
@@ -204,3 +210,81 @@ def test_outputs_have_their_own_signal_variance_and_share_the_shape():
 def test_noise_from_two_sides_is_an_error():
     with pytest.raises(ValueError, match="noise_variance=0.1 or from the WhiteKernel"):
         fitted(RBF(1.0) + WhiteKernel(0.1), noise_variance=0.1)
+
+
+# --- bounds ------------------------------------------------------------------------------------------------------
+
+BOUNDS = (0.5, 8.0)
+
+
+@pytest.mark.parametrize(
+    ("kernel", "at_bounds"),
+    [
+        (RBF(2.0, BOUNDS), []),
+        (RBF(8.0, BOUNDS), ["length_scale 0 upper 8.0"]),
+        (RBF(8.0, "fixed"), []),
+        (RBF([2.0, 0.5], [(0.1, 3.0), BOUNDS]), ["length_scale 1 lower 0.5"]),
+        (ConstantKernel(0.5, BOUNDS) * RBF(2.0, BOUNDS), ["k1__constant_value 0 lower 0.5"]),
+        (RBF(2.0, BOUNDS) * ConstantKernel(8.0, BOUNDS), ["k2__constant_value 0 upper 8.0"]),
+        (ConstantKernel(8.0, "fixed") * RBF(0.5, BOUNDS), ["k2__length_scale 0 lower 0.5"]),
+        (
+            WhiteKernel(8.0, BOUNDS) + 2.0 * RBF([2.0, 8.0], BOUNDS),
+            ["k1__noise_level 0 upper 8.0", "k2__k2__length_scale 1 upper 8.0"],
+        ),
+        (RBF(2.0, BOUNDS) + DotProduct(0.5, BOUNDS) + WhiteKernel(0.5, "fixed"), ["k1__k2__sigma_0 0 lower 0.5"]),
+        (
+            ConstantKernel(2.0) * (DotProduct(8.0, "fixed") + RationalQuadratic(8.0, 0.5, BOUNDS, BOUNDS))
+            + WhiteKernel(0.5, BOUNDS),
+            ["k1__k2__k2__alpha 0 lower 0.5", "k1__k2__k2__length_scale 0 upper 8.0", "k2__noise_level 0 lower 0.5"],
+        ),
+    ],
+    ids=str,
+)
+def test_what_is_at_a_users_bound_is_named_as_in_the_users_kernel(kernel, at_bounds):
+    spec = parse_kernel(kernel, 2)
+    # Where the user lets them start.
+    signal, noise = (
+        1.0 if start.value is None else float(start.value[0]) for start in (spec.starts.signal, spec.starts.noise)
+    )
+    found = spec.at_bounds(spec.starts.hyperparameters.value, signal, noise)
+    assert len(found) == len(at_bounds)
+    for sentence, expected in zip(found, at_bounds, strict=True):
+        name, dimension, side, bound = expected.split()
+        assert f"dimension {dimension} of parameter {name} is close to the specified {side} bound {bound}." in sentence
+
+
+def warnings_of(model, X, y):
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        model.fit(X, y)
+    return [str(one.message) for one in told if issubclass(one.category, ConvergenceWarning)]
+
+
+@pytest.mark.parametrize("regressor", [skevgp.EGPRegressor, EVGPRegressor])
+@pytest.mark.parametrize("kernel", [RBF(1.0, (1e-5, 1e-3)), WhiteKernel(1.0, (1e-5, 1e-3)) + RBF(1.0, (1e3, 1e5))])
+def test_who_ends_at_a_bound_is_warned_in_scikit_learns_words(regressor, kernel):
+    rows = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
+    y = (rows * np.sin(rows))[:, 0]
+    expected = warnings_of(GaussianProcessRegressor(kernel), rows, y)
+    assert expected
+    actual = warnings_of(regressor(kernel=kernel), rows, y)
+    assert [message for message in actual if "specified" in message] == expected
+
+
+def test_our_own_bounds_are_not_warned_of():
+    """The second column says nothing of y, and there is no noise: both end at limits, which are ours."""
+    y = np.sin(2 * X[:, 0])
+    free = ConstantKernel(1.0, (1e-5, 1e7)) * RBF([1.0, 1.0], (1e-3, 1e3)) + WhiteKernel(1e-3, (1e-9, 1.0))
+    told = warnings_of(skevgp.EGPRegressor(kernel=free), X, y)
+    assert any("length_scale" in message for message in told)
+    for kernel in (None, RBF([1.0, 1.0], "fixed")):
+        assert warnings_of(skevgp.EGPRegressor(kernel=kernel), X, y) == []
+    assert warnings_of(skevgp.EGPRegressor(kernel=free, max_iter=0), X, y) == []
+
+
+def test_outputs_that_share_a_kernel_are_warned_of_its_bound_once():
+    Y = np.sin(np.column_stack([X[:, 0], X[:, 1]]))
+    kernel = RBF(0.1, (0.05, 0.1))
+    for sharing in ("all", "none"):
+        model = EVGPRegressor(kernel=kernel, sharing=sharing, noise_variance=0.1, inducing_init=X, random_state=0)
+        assert sum("length_scale" in message for message in warnings_of(model, X, Y)) == 1
