@@ -77,7 +77,7 @@ def test_a_name_is_the_solver_with_its_defaults(name, kind):
     np.testing.assert_array_equal(by_name, by_hand)
 
 
-@pytest.mark.parametrize("solver", ["sgd", "LBFGS", None, 3, LBFGS, object()], ids=str)
+@pytest.mark.parametrize("solver", ["sgd", "LBFGS", None, 3, LBFGS, {"n_restarts": 2}], ids=str)
 def test_what_is_no_solver_is_named_with_what_is(solver):
     names = re.escape('"lbfgs", "adam", skevgp.solvers.LBFGS(...), skevgp.solvers.Adam(...)')
     with pytest.raises(ValueError, match=f"solver must be one of {names}; got "):
