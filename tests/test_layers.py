@@ -4,6 +4,7 @@ import ast
 import sys
 import threading
 from collections import Counter
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -24,6 +25,7 @@ HERE = PACKAGE / "rows" / "blocks.py"
 each_module = pytest.mark.parametrize("module", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
 
 
+@cache
 def parsed(module):
     return ast.parse(module.read_text(encoding="utf-8"))
 

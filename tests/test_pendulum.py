@@ -70,6 +70,7 @@ def test_uncertainty_is_honest_with_noise():
     np.testing.assert_allclose(np.sqrt(model.noise_variance_), noise, rtol=0.1)
 
 
+@pytest.mark.slow
 def test_the_weights_are_physics():
     train = make_dynamics("pendulum", random_state=0)
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0).fit(train.data, train.target)

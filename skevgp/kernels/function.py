@@ -56,14 +56,14 @@ class FunctionKernel(sk.Kernel):
     A wave whose size grows with x:
 
     >>> import autograd.numpy as np
-    >>> from sklearn.gaussian_process.kernels import ConstantKernel, WhiteKernel
+    >>> from sklearn.gaussian_process.kernels import ConstantKernel
     >>> from skevgp import EVGPRegressor
     >>> from skevgp.kernels import FunctionKernel
     >>> def growing(X, Z, period=2.0):
     ...     return X @ Z.T * np.cos(2 * np.pi * (X - Z.T) / period)
-    >>> kernel = ConstantKernel() * FunctionKernel(growing) + WhiteKernel(0.1)
+    >>> kernel = ConstantKernel() * FunctionKernel(growing)
     >>> kernel
-    1**2 * FunctionKernel(growing, period=2) + WhiteKernel(noise_level=0.1)
+    1**2 * FunctionKernel(growing, period=2)
     >>> X = np.linspace(0, 6, 60).reshape(-1, 1)
     >>> model = EVGPRegressor(kernel=kernel, n_inducing=10, random_state=0)
     >>> model.fit(X, X[:, 0] * np.sin(2 * np.pi * X[:, 0] / 1.8)).kernel_.k2

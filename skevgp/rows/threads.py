@@ -10,12 +10,12 @@ from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
-from threadpoolctl import OpenBLASController, threadpool_limits
+from threadpoolctl import OpenBLASController, ThreadpoolController, threadpool_limits
 
 Part = TypeVar("Part")
 Total = TypeVar("Total")
 
-_lock, _users, _limits = Lock(), 0, list[threadpool_limits]()
+_lock, _users, _limits = Lock(), 0, list[Any]()
 
 
 @contextmanager
@@ -26,11 +26,12 @@ def single_threaded_libraries() -> Iterator[None]:
     is each thread's own.
     """
     global _users
-    with threadpool_limits(1, user_api="openmp"):
+    # Each of its own libraries only: a limit gives all that it knows the number back that it found.
+    with ThreadpoolController().select(user_api="openmp").limit(limits=1):
         with _lock:
             if _users == 0:
                 _take_control()
-                _limits.append(threadpool_limits(1, user_api="blas"))
+                _limits.append(ThreadpoolController().select(user_api="blas").limit(limits=1))
             _users += 1
         try:
             yield

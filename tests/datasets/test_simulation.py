@@ -360,6 +360,7 @@ def test_a_step_that_differs_by_rounding_is_the_controllers():
     assert simulate("ur5", np.zeros(12), controller, 0.3, n_steps=1).shape == (2, 12)
 
 
+@pytest.mark.slow
 def test_stiffness_is_decided_per_group_whatever_the_jobs():
     model = load_robot("acrobot")
     model.damping = np.full(2, 1e5)

@@ -5,7 +5,7 @@ from threading import Event, get_ident
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
 from skevgp.rows.threads import BlockMap, add, ordered_sum, single_threaded_libraries, thread_pool
@@ -96,6 +96,31 @@ def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     assert numbers_of_threads() == before
 
 
+@pytest.mark.parametrize("first_out", [0, 1], ids=["the first", "the second"])
+def test_of_fits_at_once_the_last_sets_libraries_free_whichever_it_is(first_out):
+    """The second finds them limited, and that is not how it leaves them."""
+    entered, leave = [Event(), Event()], [Event(), Event()]
+
+    def hold(index):
+        with single_threaded_libraries():
+            entered[index].set()
+            assert leave[index].wait(60.0)
+
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
+        before = numbers_of_threads()
+        assert set(before.values()) == {2}
+        fits = []
+        for index in (0, 1):
+            fits.append(pool.submit(hold, index))
+            assert entered[index].wait(60.0)
+        assert numbers_of_threads()["blas"] == 1
+        for index in (first_out, 1 - first_out):
+            assert numbers_of_threads()["blas"] == 1
+            leave[index].set()
+            fits[index].result(60.0)
+        assert numbers_of_threads() == before
+
+
 def test_libraries_are_set_free_after_an_error():
     before = numbers_of_threads()
     with pytest.raises(ZeroDivisionError), single_threaded_libraries():
@@ -103,6 +128,7 @@ def test_libraries_are_set_free_after_an_error():
     assert numbers_of_threads() == before
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_fits_have_the_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
