@@ -61,8 +61,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         Further fits with kernel and noise drawn log-uniformly around the first start, within their bounds; the
         likeliest is kept.
     tol : float, default=0.01
-        In nats. L-BFGS starts anew when each of three iterations in a row raises the log marginal likelihood by less
-        than this, and stops when that no longer gains a hundred times as much.
+        In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the log marginal
+        likelihood by less than this, and stops when a fresh start gains no more.
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0

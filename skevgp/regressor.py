@@ -90,8 +90,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
         The most iterations of L-BFGS or steps of Adam; None means 1000 or 16000. With 0 nothing is optimised: kernel
         and inducing points stay where they start, and q is at its optimum.
     tol : float, default=0.01
-        In nats. L-BFGS starts anew when each of three iterations in a row raises the bound by less than this, and stops
-        when that no longer gains a hundred times as much. Adam goes over to its last steps, as many as before, when the
+        In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
+        than this, and stops when a fresh start gains no more. Adam goes over to its last steps, as many as before, when the
         loss stays flat: when its median over the last third of the steps differs from that over the third before by
         less than this, or by no more than chance (mini-batches are noisy, so chance mostly decides).
     forgetting_factor : float, default=1.0
