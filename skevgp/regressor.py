@@ -57,9 +57,9 @@ class EVGPRegressor(ExplicitGaussianProcess):
         the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
         ``"auto"``: at cluster centres, and with L-BFGS after 100 iterations once more, greedily under the kernel
         learned so far; 100 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
-        placed). They are not placed anew with ``max_iter`` up to 100, a kernel that is fixed, a warm start, or as many
-        points as two thirds of the rows. Or at given points in the space of ``kernel_map``, whose number then replaces
-        ``n_inducing``. With ``max_iter=0`` they stay there.
+        placed). They are not placed anew with ``max_iter`` up to 100, a kernel that is fixed, or a warm start. Or at
+        given points in the space of ``kernel_map``, whose number then replaces ``n_inducing``. With ``max_iter=0``, or
+        where they are all rows (and ``posterior="full"``), they stay where they start.
     sharing : {"all", "kernel", "none"}, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Signal variance, noise and weights are always per output.
@@ -91,8 +91,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
         and inducing points stay where they start, and q is at its optimum.
     tol : float, default=0.01
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
-        than this, and stops when a fresh start gains no more. Adam goes over to its last steps, as many as before, when the
-        loss stays flat: when its median over the last third of the steps differs from that over the third before by
+        than this, and stops when a fresh start gains no more. Adam goes over to its last steps, as many as before, when
+        the loss stays flat: when its median over the last third of the steps differs from that over the third before by
         less than this, or by no more than chance (mini-batches are noisy, so chance mostly decides).
     forgetting_factor : float, default=1.0
         What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers

@@ -104,7 +104,8 @@ class SparseTask:
             self.solver.n_restarts,
             self.rows.scatter(),
             features_alone_bound(self.blocks.linear, self.model.prior),
-            self.n_inducing >= len(self.rows),
+            # Points that stay are all rows, some of them perhaps the same.
+            self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any(),
             None if anew is None else partial(self._placed, placement=anew),
             lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
             self.warm,
