@@ -192,9 +192,7 @@ class Walked(LBFGS):
         def walked(x):
             here = own_frames(sys._getframe(1))
             waiting = [] if threading.get_ident() == main else own_frames(sys._current_frames()[main])
-            # But for the few probes of rounding errors before a fresh start.
-            if "_nudged" not in here:
-                self.ways.append((waiting, here))
+            self.ways.append((waiting, here))
             return objective(x)
 
         return walked

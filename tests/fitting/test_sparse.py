@@ -68,11 +68,9 @@ def test_the_strategy_knows_what_the_features_alone_explain():
     assert not own.collapsed(Fit(values, own.alone + 1.0))
 
 
-def test_the_kernel_may_interpolate_where_there_is_a_point_for_each_row():
-    assert task_of(n_inducing=N).strategy.interpolates
-    assert not task_of(n_inducing=N - 1).strategy.interpolates
-    own = task_of(n_inducing=5)
-    assert replace(own, table=own.table.with_fixed("inducing_points")).strategy.interpolates
+@pytest.mark.parametrize(("n_inducing", "interpolates"), [(N - 1, False), (N, True), (2 * N, True)])
+def test_the_kernel_may_interpolate_where_points_are_as_many_as_rows(n_inducing, interpolates):
+    assert task_of(n_inducing=n_inducing).strategy.interpolates == interpolates
 
 
 @pytest.mark.parametrize(

@@ -101,17 +101,6 @@ def test_ctrl_c_keeps_the_best_point_so_far():
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
 
 
-def test_a_wall_at_the_very_start_is_told():
-    """Nothing is known of the loss then: there is no point to come back to."""
-
-    def nowhere(x):
-        raise NotPositiveDefiniteError
-
-    minimum = lbfgs(nowhere, np.ones(2), FREE, 50, 1e-9)
-    np.testing.assert_array_equal(minimum.x, 1.0)
-    assert minimum.loss == np.inf
-
-
 def cliff(height):
     """A gentle slope down to 1, and beyond that a loss which rises at once to any height."""
 
