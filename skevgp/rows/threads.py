@@ -10,12 +10,12 @@ from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
-from threadpoolctl import OpenBLASController, threadpool_limits
+from threadpoolctl import OpenBLASController, ThreadpoolController, threadpool_limits
 
 Part = TypeVar("Part")
 Total = TypeVar("Total")
 
-_lock, _users, _limits = Lock(), 0, list[threadpool_limits]()
+_lock, _users, _limits = Lock(), 0, list[Any]()
 
 
 @contextmanager
@@ -26,11 +26,11 @@ def single_threaded_libraries() -> Iterator[None]:
     is each thread's own.
     """
     global _users
-    with threadpool_limits(1, user_api="openmp"):
+    with _one_thread("openmp"):
         with _lock:
             if _users == 0:
                 _take_control()
-                _limits.append(threadpool_limits(1, user_api="blas"))
+                _limits.append(_one_thread("blas"))
             _users += 1
         try:
             yield
@@ -40,6 +40,11 @@ def single_threaded_libraries() -> Iterator[None]:
                 if _users == 0:
                     _take_control()
                     _limits.pop().restore_original_limits()
+
+
+def _one_thread(user_api: str) -> Any:
+    """A limit on these libraries only: one of `threadpool_limits`, when lifted, also sets the others back."""
+    return ThreadpoolController().select(user_api=user_api).limit(limits=1)
 
 
 def _take_control() -> None:

@@ -5,7 +5,7 @@ from threading import Event, get_ident
 
 import numpy as np
 import pytest
-from threadpoolctl import threadpool_info
+from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
 from skevgp.rows.threads import BlockMap, add, ordered_sum, single_threaded_libraries, thread_pool
@@ -94,6 +94,31 @@ def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     with single_threaded_libraries(), single_threaded_libraries(), thread_pool(1) as pool:
         assert set(pool.submit(numbers_of_threads).result().values()) == {1}
     assert numbers_of_threads() == before
+
+
+def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
+    """Whichever came first."""
+    second_is_in, first_is_out = Event(), Event()
+
+    def second():
+        with single_threaded_libraries():
+            second_is_in.set()
+            assert first_is_out.wait(60.0)
+
+    def first(pool):
+        with single_threaded_libraries():
+            late = pool.submit(second)
+            assert second_is_in.wait(60.0)
+        return late
+
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
+        before = numbers_of_threads()
+        assert set(before.values()) == {2}
+        late = pool.submit(first, pool).result()
+        assert numbers_of_threads()["blas"] == 1
+        first_is_out.set()
+        late.result()
+        assert numbers_of_threads() == before
 
 
 def test_libraries_are_set_free_after_an_error():
