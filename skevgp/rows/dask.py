@@ -165,7 +165,8 @@ def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:
     while len(sums) > 1:
         groups = (sums[first : first + _SUMMED_AT_ONCE] for first in range(0, len(sums), _SUMMED_AT_ONCE))
         sums = [delayed(ordered_sum)(group) for group in groups]
-    return sums[0].compute()
+    # Numbers from a worker may lie at odd addresses, where np.vdot crashes with the BLAS of some processors.
+    return deepcopy(sums[0].compute())
 
 
 def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, shape: tuple[int, ...]) -> Any:

@@ -26,12 +26,11 @@ def single_threaded_libraries() -> Iterator[None]:
     is each thread's own.
     """
     global _users
-    # Each of its own libraries only: a limit gives all that it knows the number back that it found.
-    with ThreadpoolController().select(user_api="openmp").limit(limits=1):
+    with _one_thread("openmp"):
         with _lock:
             if _users == 0:
                 _take_control()
-                _limits.append(ThreadpoolController().select(user_api="blas").limit(limits=1))
+                _limits.append(_one_thread("blas"))
             _users += 1
         try:
             yield
@@ -41,6 +40,11 @@ def single_threaded_libraries() -> Iterator[None]:
                 if _users == 0:
                     _take_control()
                     _limits.pop().restore_original_limits()
+
+
+def _one_thread(user_api: str) -> Any:
+    """A limit on these libraries only: one of `threadpool_limits`, when lifted, also sets the others back."""
+    return ThreadpoolController().select(user_api=user_api).limit(limits=1)
 
 
 def _take_control() -> None:

@@ -96,28 +96,28 @@ def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     assert numbers_of_threads() == before
 
 
-@pytest.mark.parametrize("first_out", [0, 1], ids=["the first", "the second"])
-def test_of_fits_at_once_the_last_sets_libraries_free_whichever_it_is(first_out):
-    """The second finds them limited, and that is not how it leaves them."""
-    entered, leave = [Event(), Event()], [Event(), Event()]
+def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
+    """Whichever came first."""
+    second_is_in, first_is_out = Event(), Event()
 
-    def hold(index):
+    def second():
         with single_threaded_libraries():
-            entered[index].set()
-            assert leave[index].wait(60.0)
+            second_is_in.set()
+            assert first_is_out.wait(60.0)
+
+    def first(pool):
+        with single_threaded_libraries():
+            late = pool.submit(second)
+            assert second_is_in.wait(60.0)
+        return late
 
     with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
         before = numbers_of_threads()
         assert set(before.values()) == {2}
-        fits = []
-        for index in (0, 1):
-            fits.append(pool.submit(hold, index))
-            assert entered[index].wait(60.0)
+        late = pool.submit(first, pool).result()
         assert numbers_of_threads()["blas"] == 1
-        for index in (first_out, 1 - first_out):
-            assert numbers_of_threads()["blas"] == 1
-            leave[index].set()
-            fits[index].result(60.0)
+        first_is_out.set()
+        late.result()
         assert numbers_of_threads() == before
 
 
