@@ -104,7 +104,6 @@ def changes() -> list[Change]:
         *_of("rules", "stage", None, 50, 200, concerns=where_points_move),
         *_of("rules", "much_noise", None, 1e2, concerns=where_points_are_many),
         *_of("descent", "patience", 1, 10),
-        *_of("descent", "far", 1e100),
         *_of("rules", "first_noise", 1e-2, 1e-3, 1e-5, 1e-6),
         *_of("rules", "signal_limits", (1e-8, 1e8), (1e-3, 1e1)),
         *_of("rules", "lowest_noise", 1e-8, 1e-12),
@@ -293,7 +292,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = harness.argument_parser(__doc__, quick="a few small sets, a few rules")
     parser.add_argument("--rules", nargs="+", choices=rules, help="default: all")
     options = parser.parse_args(arguments)
-    asked = options.rules or (["luck", "probes"] if options.quick else rules)
+    asked = options.rules or (["luck", "patience"] if options.quick else rules)
     output, sets = harness.output_path(options, "ablation"), list(cases(options.quick))
 
     def missing(cells: list[Cell]) -> int:

@@ -11,6 +11,9 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
+# Above the best loss by so many times its size plus one is what could not be evaluated.
+_FAR = 10.0
+
 
 @dataclass(frozen=True)
 class Descent:
@@ -24,28 +27,21 @@ class Descent:
         Where no gradient is larger, a line search has nowhere to go.
     patience : int
         So many iterations in a row that gain less than the tolerance are a stall.
-    far : float
-        In units of the best loss's size plus one: what is so far above it is out of the way.
     """
 
     memory: int = 30
     gradient: float = 1e-9
     patience: int = 3
-    far: float = 10.0
 
 
 DESCENT = Descent()
 
 
 class _Guarded:
-    """An objective that never raises and never returns NaN, and remembers the best point it has seen.
+    """An objective that never raises and never returns NaN, and remembers the best point it has seen."""
 
-    A line search that stepped too far interpolates back. It takes forever from a loss of 1e10, or ends within rounding
-    errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
-    """
-
-    def __init__(self, objective: Objective, start: np.ndarray, far: float):
-        self._objective, self._far = objective, far
+    def __init__(self, objective: Objective, start: np.ndarray):
+        self._objective = objective
         self.x, self.loss = start.copy(), np.inf
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -53,14 +49,11 @@ class _Guarded:
             loss, gradient = self._objective(x)
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
-        far = self._far * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-            return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
+            # A line search that stepped too far interpolates back; from a loss of 1e100 it would take forever.
+            return (self.loss + _FAR * (1.0 + abs(self.loss)) if np.isfinite(self.loss) else 1e100), np.zeros_like(x)
         if loss < self.loss:
             self.x, self.loss = x.copy(), loss
-        ratio = (loss - self.loss) / far
-        if ratio > 1.0:
-            return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
         return loss, gradient
 
 
@@ -94,7 +87,7 @@ def lbfgs(
     minimum : Minimum
     """
     monitor = Monitor() if monitor is None else monitor
-    guarded = _Guarded(objective, start, descent.far)
+    guarded = _Guarded(objective, start)
     minimum = Minimum(start, np.inf)
     stalled = 0
 
