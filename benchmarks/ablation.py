@@ -271,7 +271,11 @@ def line_of(change: Change, rows: Sequence[Row], default: dict[tuple[str, str], 
 def report(rows: Sequence[Row]) -> list[str]:
     """The page."""
     default = {(row["case"], row["seed"]): row for row in rows if row["rule"] == DEFAULT.rule}
-    lines = [line for change in changes() if (line := line_of(change, rows, default))]
+    known = {(change.rule, change.variant): change for change in changes()}
+    done = dict.fromkeys((row["rule"], row["variant"]) for row in rows if row["rule"] != DEFAULT.rule)
+    lines = [line for own in done if (line := line_of(known.get(own, Change(*own)), rows, default))]
+    for line in lines:
+        line[0] += "" if (line[0], line[1]) in known else " (deleted since)"
     header = ["rule", "variant", "bound better / equal / worse", "median difference", "worst difference"]
     header += ["error better / worse", "error, ratio", "evaluations, ratio"]
     return [

@@ -11,8 +11,10 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
-# Above the best loss by so many times its size plus one is what could not be evaluated.
+# In units of the best loss's size plus one: what is so far above it is out of the way.
 _FAR = 10.0
+# Relative size of a step that changes the loss by its rounding error only.
+_HAIR = 1e-10
 
 
 @dataclass(frozen=True)
@@ -38,7 +40,11 @@ DESCENT = Descent()
 
 
 class _Guarded:
-    """An objective that never raises and never returns NaN, and remembers the best point it has seen."""
+    """An objective that never raises and never returns NaN, and remembers the best point it has seen.
+
+    A line search that stepped too far interpolates back. It takes forever from a loss of 1e10, or ends within rounding
+    errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
+    """
 
     def __init__(self, objective: Objective, start: np.ndarray):
         self._objective = objective
@@ -49,11 +55,14 @@ class _Guarded:
             loss, gradient = self._objective(x)
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
+        far = _FAR * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-            # A line search that stepped too far interpolates back; from a loss of 1e100 it would take forever.
-            return (self.loss + _FAR * (1.0 + abs(self.loss)) if np.isfinite(self.loss) else 1e100), np.zeros_like(x)
+            return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
         if loss < self.loss:
             self.x, self.loss = x.copy(), loss
+        ratio = (loss - self.loss) / far
+        if ratio > 1.0:
+            return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
         return loss, gradient
 
 
@@ -106,11 +115,12 @@ def lbfgs(
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
+        x, rng = start, np.random.RandomState(0)
         while not minimum.converged and minimum.n_iter < max_iter:
             remaining, before, stalled = max_iter - minimum.n_iter, guarded.loss, 0
             result = minimize(
                 guarded,
-                guarded.x,
+                x,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=np.column_stack(limits),
@@ -129,5 +139,8 @@ def lbfgs(
             if not before - guarded.loss > tol:
                 minimum.converged = bool(np.isfinite(guarded.loss))
                 break
+            # A hair away, where the loss is not what rounding made of it at the best of all points.
+            reach = _HAIR * np.maximum(np.abs(guarded.x), 1.0)
+            x = np.clip(guarded.x + reach * rng.randn(len(x)), *limits)
     minimum.x, minimum.loss = guarded.x, guarded.loss
     return minimum
