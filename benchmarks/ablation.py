@@ -104,7 +104,6 @@ def changes() -> list[Change]:
         *_of("rules", "stage", None, 50, 200, concerns=where_points_move),
         *_of("rules", "much_noise", None, 1e2, concerns=where_points_are_many),
         *_of("descent", "patience", 1, 10),
-        *_of("descent", "far", 1e100),
         *_of("rules", "first_noise", 1e-2, 1e-3, 1e-5, 1e-6),
         *_of("rules", "signal_limits", (1e-8, 1e8), (1e-3, 1e1)),
         *_of("rules", "lowest_noise", 1e-8, 1e-12),
@@ -272,7 +271,11 @@ def line_of(change: Change, rows: Sequence[Row], default: dict[tuple[str, str], 
 def report(rows: Sequence[Row]) -> list[str]:
     """The page."""
     default = {(row["case"], row["seed"]): row for row in rows if row["rule"] == DEFAULT.rule}
-    lines = [line for change in changes() if (line := line_of(change, rows, default))]
+    known = {(change.rule, change.variant): change for change in changes()}
+    done = dict.fromkeys((row["rule"], row["variant"]) for row in rows if row["rule"] != DEFAULT.rule)
+    lines = [line for own in done if (line := line_of(known.get(own, Change(*own)), rows, default))]
+    for line in lines:
+        line[0] += "" if (line[0], line[1]) in known else " (deleted since)"
     header = ["rule", "variant", "bound better / equal / worse", "median difference", "worst difference"]
     header += ["error better / worse", "error, ratio", "evaluations, ratio"]
     return [
@@ -293,7 +296,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = harness.argument_parser(__doc__, quick="a few small sets, a few rules")
     parser.add_argument("--rules", nargs="+", choices=rules, help="default: all")
     options = parser.parse_args(arguments)
-    asked = options.rules or (["luck", "probes"] if options.quick else rules)
+    asked = options.rules or (["luck", "patience"] if options.quick else rules)
     output, sets = harness.output_path(options, "ablation"), list(cases(options.quick))
 
     def missing(cells: list[Cell]) -> int:

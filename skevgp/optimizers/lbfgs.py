@@ -11,6 +11,11 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
+# In units of the best loss's size plus one: what is so far above it is out of the way.
+_FAR = 10.0
+# Relative size of a step that changes the loss by its rounding error only.
+_HAIR = 1e-10
+
 
 @dataclass(frozen=True)
 class Descent:
@@ -24,14 +29,11 @@ class Descent:
         Where no gradient is larger, a line search has nowhere to go.
     patience : int
         So many iterations in a row that gain less than the tolerance are a stall.
-    far : float
-        In units of the best loss's size plus one: what is so far above it is out of the way.
     """
 
     memory: int = 30
     gradient: float = 1e-9
     patience: int = 3
-    far: float = 10.0
 
 
 DESCENT = Descent()
@@ -44,8 +46,8 @@ class _Guarded:
     errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
     """
 
-    def __init__(self, objective: Objective, start: np.ndarray, far: float):
-        self._objective, self._far = objective, far
+    def __init__(self, objective: Objective, start: np.ndarray):
+        self._objective = objective
         self.x, self.loss = start.copy(), np.inf
 
     def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
@@ -53,7 +55,7 @@ class _Guarded:
             loss, gradient = self._objective(x)
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
-        far = self._far * (1.0 + abs(self.loss))
+        far = _FAR * (1.0 + abs(self.loss))
         if not (np.isfinite(loss) and np.isfinite(gradient).all()):
             return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
         if loss < self.loss:
@@ -94,7 +96,7 @@ def lbfgs(
     minimum : Minimum
     """
     monitor = Monitor() if monitor is None else monitor
-    guarded = _Guarded(objective, start, descent.far)
+    guarded = _Guarded(objective, start)
     minimum = Minimum(start, np.inf)
     stalled = 0
 
@@ -113,11 +115,12 @@ def lbfgs(
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
+        x, rng = start, np.random.RandomState(0)
         while not minimum.converged and minimum.n_iter < max_iter:
             remaining, before, stalled = max_iter - minimum.n_iter, guarded.loss, 0
             result = minimize(
                 guarded,
-                guarded.x,
+                x,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=np.column_stack(limits),
@@ -136,5 +139,8 @@ def lbfgs(
             if not before - guarded.loss > tol:
                 minimum.converged = bool(np.isfinite(guarded.loss))
                 break
+            # A hair away, where the loss is not what rounding made of it at the best of all points.
+            reach = _HAIR * np.maximum(np.abs(guarded.x), 1.0)
+            x = np.clip(guarded.x + reach * rng.randn(len(x)), *limits)
     minimum.x, minimum.loss = guarded.x, guarded.loss
     return minimum

@@ -14,14 +14,14 @@ def ablation(benchmarks):
 
 def test_it_runs_resumes_and_writes_its_page(ablation, tmp_path):
     output = tmp_path / "ablation.csv"
-    arguments = ["--quick", "--rules", "probes", "stage", "--jobs", "1", "--output", str(output)]
+    arguments = ["--quick", "--rules", "patience", "stage", "--jobs", "1", "--output", str(output)]
     ablation.main(arguments)
     rows = read(output)
     # Of these sets, stages concern only those whose inducing points may be placed anew.
     rules = {case: {row["rule"] for row in rows if row["case"].startswith(case)} for case in ("nasty", "waves")}
-    assert rules == {"nasty": {"default", "probes"}, "waves": {"default", "probes", "stage"}}
+    assert rules == {"nasty": {"default", "patience"}, "waves": {"default", "patience", "stage"}}
     assert all(row["outcome"] == "ok" and int(row["n_evaluations"]) >= int(row["n_iter"]) for row in rows)
-    assert "| probes | 0 |" in output.with_suffix(".md").read_text()
+    assert "| patience | 1 |" in output.with_suffix(".md").read_text()
     ablation.main(arguments)
     assert read(output) == rows
 
@@ -43,12 +43,12 @@ def test_the_page_counts_what_is_better_and_what_is_worse(ablation):
 
     default = {("a", seed): row("default", "", seed, "1.0", "0.1", "100") for seed in "0123"}
     rows = [
-        row("probes", "0", "0", "1.5", "0.05", "50"),
-        row("probes", "0", "1", "1.001", "0.1", "50"),
-        row("probes", "0", "2", "0.8", "0.2", "100"),
-        row("probes", "0", "3", "", "", "1", "ValueError"),
+        row("patience", "1", "0", "1.5", "0.05", "50"),
+        row("patience", "1", "1", "1.001", "0.1", "50"),
+        row("patience", "1", "2", "0.8", "0.2", "100"),
+        row("patience", "1", "3", "", "", "1", "ValueError"),
     ]
-    change = next(change for change in ablation.changes() if (change.rule, change.variant) == ("probes", "0"))
+    change = next(change for change in ablation.changes() if (change.rule, change.variant) == ("patience", "1"))
     line = ablation.line_of(change, rows, default)
     assert line[2:] == ["1 / 1 / 1, 1 failed", "+0.150", "-0.200, a (2)", "1 / 1", "1.00", "0.67"]
     assert ablation.line_of(change, [], default) == []
