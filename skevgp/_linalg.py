@@ -56,7 +56,6 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX
     jitter : float, default=0.0
         Always added, relative to the diagonal; raised by factors of ten, from at least 1e-15, while the
         factorisation fails.
-
     most : float, default=1e-2
         The largest jitter that is tried.
 
@@ -68,7 +67,7 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX
     Raises
     ------
     NotPositiveDefiniteError
-        If even `MAX_JITTER` does not help, or the matrix is not finite.
+        If even ``most`` does not help, or the matrix is not finite.
     """
     diagonal = diagonal_of(matrix)
     while True:

@@ -51,11 +51,17 @@ class Monitor:
         return part
 
     def iteration(self, number: int, loss: float) -> None:
-        """Tell of an iteration; raises KeyboardInterrupt once the fit has been told to stop."""
+        """Tell of an iteration; raises KeyboardInterrupt once the fit has been told to stop.
+
+        A StopIteration, by which callbacks of SciPy's optimisers end them, tells it to.
+        """
         if self.stopped:
             raise KeyboardInterrupt
         if self._report is not None:
-            self._report(self._n_before + number, self._factor * loss + self._shift, self._outputs)
+            try:
+                self._report(self._n_before + number, self._factor * loss + self._shift, self._outputs)
+            except StopIteration:
+                raise KeyboardInterrupt from None
 
     @property
     def stopped(self) -> bool:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from contextlib import closing
 from functools import partial
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from joblib import effective_n_jobs
@@ -18,7 +18,7 @@ from sklearn.utils import check_random_state
 from ._base import ExplicitGaussianProcess
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
-from ._validation import as_floats, check_magnitude, unchanged_if_it_fails
+from ._validation import check_magnitude, unchanged_if_it_fails
 from .fitting.inducing import Placement
 from .fitting.outputs import FittedOutputs, Request, fit_outputs
 from .rows.threads import BlockMap, single_threaded_libraries
@@ -182,7 +182,6 @@ class EVGPRegressor(ExplicitGaussianProcess):
     }
 
     _fitted: FittedOutputs
-    # What `_source` makes the rows of the last fit from.
     _training_data: tuple[Any, Any, np.ndarray] | None = None
 
     def __init__(
@@ -267,8 +266,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y)
             self._training_data = problem.data
-            n_rows = problem.source.n_rows
-            if self.noise_cv is not None and self.noise_cv > n_rows:
+            if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
                 raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
             request = Request(
                 problem.source,
@@ -276,7 +274,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
                 problem.spec,
                 self.sharing,
                 self.posterior,
-                self._placement(problem.n_columns),
+                Placement.of(self.inducing_init, self.n_inducing, problem.n_columns),
                 solver,
                 solver.default_max_iter if self.max_iter is None else self.max_iter,
                 self.tol,
@@ -335,13 +333,14 @@ class EVGPRegressor(ExplicitGaussianProcess):
     def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
         """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
 
-        With q at its optimum, for the rows of the last `fit`: the model refers to X and y, and copies no floats.
+        With q at its optimum, for the rows of the last `fit`, as they now are. The model refers to them, which keeps
+        them in memory (not in pickles and copies).
 
         Parameters
         ----------
         theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
-            Logarithms of the free hyperparameters, as ``kernel_.theta``; for several outputs those of each one's
-            kernel, which need not agree in what the fitted ones share. None means the fitted ones.
+            Logarithms of the free hyperparameters, as ``kernel_.theta``; of several outputs one row each, which need
+            not agree in what the fitted kernels share. None means the fitted ones.
         eval_gradient : bool, default=False
             Whether to return the gradient too; only with a ``theta``.
 
@@ -370,24 +369,25 @@ class EVGPRegressor(ExplicitGaussianProcess):
             rows = self._fitted.units.rows(self._source(*self._training_data), threads)
             return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
 
-    def __getstate__(self) -> dict[str, Any]:
-        # Models are small, however many rows they have seen.
-        return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
+    def set_params(self, **params: Any) -> Self:
+        """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.
 
-    def _placement(self, n_columns: int) -> Placement:
-        """How inducing points start, in the space of ``kernel_map``."""
-        if isinstance(self.inducing_init, str):
-            return Placement(cast(Literal["auto", "k-means", "greedy"], self.inducing_init), self.n_inducing)
-        points = as_floats(self.inducing_init, "inducing_init")
-        if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
-            raise ValueError(
-                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {n_columns}): points in "
-                f"the space of kernel_map; got the shape {points.shape}."
-            )
-        if not np.isfinite(points).all():
-            raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
-        check_magnitude(points, "inducing_init")
-        return Placement(points, len(points))
+        Parameters
+        ----------
+        **params : dict
+            Parameters of the estimator, and of what it is made of.
+
+        Returns
+        -------
+        self : object
+            The estimator itself.
+        """
+        if isinstance(self.solver, str) and any(name.startswith("solver__") for name in params):
+            self.solver = resolved(self.solver, self.posterior)
+        return super().set_params(**params)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
 
     def _set_attributes(self) -> None:
         self._set_common_attributes()

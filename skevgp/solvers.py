@@ -40,8 +40,9 @@ class LBFGS(BaseEstimator):
         start. Each takes the time of a fit.
     callback : callable, default=None
         callback(iteration, lower_bound, outputs), once per iteration; ``outputs`` is the range of y's columns that the
-        bound is of: where outputs share nothing, each has fits of its own. A KeyboardInterrupt that it raises ends the
-        fit with the best parameters so far.
+        bound is of: where outputs share nothing, each has fits of its own. A StopIteration or KeyboardInterrupt that
+        it raises ends the fit with the best parameters so far, as Ctrl-C does. ``clone`` copies a callable object, and
+        leaves a function what it is.
 
     Attributes
     ----------
@@ -310,9 +311,10 @@ def resolved(solver: Any, posterior: str) -> LBFGS | Adam:
     """
     if isinstance(solver, str) and solver in SOLVERS:
         return SOLVERS[solver]()
-    if not isinstance(solver, LBFGS | Adam):
+    kinds = tuple(SOLVERS.values())
+    if not isinstance(solver, kinds):
         names = ", ".join(f'"{name}"' for name in SOLVERS)
-        kinds = ", ".join(f"skevgp.solvers.{kind.__name__}(...)" for kind in SOLVERS.values())
-        raise ValueError(f"solver must be one of {names}, {kinds}; got {solver!r}.")
+        objects = ", ".join(f"skevgp.solvers.{kind.__name__}(...)" for kind in kinds)
+        raise ValueError(f"solver must be one of {names}, {objects}; got {solver!r}.")
     solver.check(posterior)
     return solver

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GridSearchCV
 
 from skevgp import EVGPRegressor
@@ -236,3 +237,37 @@ def test_no_iterations_are_the_start(solver):
     assert m.n_iter_ == 0
     assert m.loss_curve_.shape == (0,)
     assert np.isfinite(m.predict(X, return_std=True)).all()
+
+
+@pytest.mark.parametrize("solver", [LBFGS, Adam])
+def test_a_stop_iteration_of_the_callback_ends_the_fit_with_the_best_so_far(solver):
+    seen = []
+
+    def stop(iteration, bound, outputs):
+        seen.append(iteration)
+        if iteration == 4:
+            raise StopIteration
+
+    with pytest.warns(ConvergenceWarning, match="interrupted after 4 iterations"):
+        model = EVGPRegressor(n_inducing=5, solver=solver(callback=stop), random_state=0).fit(X, Y)
+    assert seen == [1, 2, 3, 4]
+    assert np.isfinite(model.predict(X)).all()
+
+
+def test_parameters_of_a_solver_that_is_a_string_are_reached():
+    model = EVGPRegressor(solver="adam").set_params(solver__batch_size=7)
+    assert (type(model.solver), model.solver.batch_size) == (Adam, 7)
+    assert EVGPRegressor(solver="adam").set_params(n_inducing=3).solver == "adam"
+    with pytest.raises(ValueError, match="Invalid parameter 'batch_size' for estimator LBFGS"):
+        EVGPRegressor().set_params(solver__batch_size=7)
+
+
+def test_a_solver_of_the_registry_may_be_given_as_an_object(monkeypatch):
+    class Mine:
+        def check(self, posterior):
+            self.asked = posterior
+
+    monkeypatch.setitem(SOLVERS, "mine", Mine)
+    mine = Mine()
+    assert resolved(mine, "full") is mine
+    assert mine.asked == "full"

@@ -90,8 +90,8 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
     return (
         f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
         "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
-        f"Raise {'n_inducing or ' if sparse else ''}n_restarts, let kernel or noise_variance start elsewhere, or look "
-        "at the scales of the kernel's columns."
+        f"Raise {'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, let kernel or noise_variance "
+        "start elsewhere, or look at the scales of the kernel's columns."
     )
 
 
@@ -109,5 +109,5 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
     return (
         "The kernel became white noise: to it neighbouring rows are strangers, though they are alike, and elsewhere it "
         "predicts nothing beyond the features and the prior mean. Let its length scales start higher, raise their "
-        "lower bounds, or raise n_restarts."
+        "lower bounds, or raise n_restarts (of the solver, if there is one)."
     )

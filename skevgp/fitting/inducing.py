@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal, cast
 
 import numpy as np
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
+from .._validation import as_floats, check_magnitude
 from ..inference.statistics import Kernel
 from ..rows.source import Moments
 from .start import column_scale
@@ -38,6 +39,22 @@ class Placement:
 
     method: Literal["auto", "k-means", "greedy"] | np.ndarray
     n_inducing: int
+
+    @classmethod
+    def of(cls, inducing_init: Any, n_inducing: int, n_columns: int) -> Placement:
+        """What ``inducing_init`` says, for inputs of so many columns; points are checked."""
+        if isinstance(inducing_init, str):
+            return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), n_inducing)
+        points = as_floats(inducing_init, "inducing_init")
+        if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
+            raise ValueError(
+                f"inducing_init must be 'auto', 'k-means', 'greedy' or an array of shape (m, {n_columns}): points in "
+                f"the space of kernel_map; got the shape {points.shape}."
+            )
+        if not np.isfinite(points).all():
+            raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
+        check_magnitude(points, "inducing_init")
+        return cls(points, len(points))
 
     @property
     def anew(self) -> Placement | None:

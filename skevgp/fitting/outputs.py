@@ -272,7 +272,7 @@ def plan(
         tasks.append(
             SparseTask(
                 SparseModel(
-                    kernel, units.internal_prior().outputs(outputs), request.family, groups, solver.rules.jitter
+                    kernel, units.internal_prior().outputs(outputs), request.family, groups, solver.rules.jitter, stay
                 ),
                 rows.outputs(outputs, share),
                 table,

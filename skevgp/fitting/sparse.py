@@ -174,9 +174,10 @@ class Learned:
             fit.loss_curve,
             " ".join(part for part in advice if part),
         )
-        if task.noise_cv is None or task.monitor.stopped or not free_noise:
-            return learned
-        return learned.calibrated(task.table, task.rows, task.noise_cv)
+        if task.noise_cv is not None and free_noise and not task.monitor.stopped:
+            with task.monitor.keeping_the_best():
+                learned = learned.calibrated(task.table, task.rows, task.noise_cv)
+        return learned
 
     def bound_at(
         self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: np.ndarray
@@ -222,9 +223,11 @@ class Learned:
         ``weight`` multiplies the log likelihood of the earlier rows.
         """
         n_inducing = self.values["inducing_points"].shape[1]
-        new = self.model.statistics(self.values, rows.blocks(self.model.kernel, n_inducing))
+        # Whatever its points were of the rows before.
+        model = replace(self.model, complete=False)
+        new = model.statistics(self.values, rows.blocks(model.kernel, n_inducing))
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        return replace(self, statistics=statistics)._at_optimum()
+        return replace(self, model=model, statistics=statistics)._at_optimum()
 
     def calibrated(self, table: ParameterTable, rows: Rows, n_folds: int) -> Learned:
         """The noise that is free from cross-validation, and q at its optimum for it."""

@@ -9,7 +9,6 @@ prevents, and the test that fails without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -258,6 +257,14 @@ def drawn(table: ParameterTable, rules: Rules, rng: np.random.RandomState) -> Va
     return table.values(np.clip(table.flat(coordinates), *table.limits()))
 
 
+def _after(attempts: Attempts, fit: Fit) -> Attempt | None:
+    """The next attempt after a fit, if there is one."""
+    try:
+        return attempts.send(fit)
+    except StopIteration:
+        return None
+
+
 class Task(Protocol):
     """A model to be fitted."""
 
@@ -283,14 +290,12 @@ def search(task: Task) -> Fit:
     """
     best: Fit | None = None
     attempts = task.strategy.attempts()
-    with task.monitor.keeping_the_best(), suppress(StopIteration):
-        attempt = next(attempts)
-        while True:
+    with task.monitor.keeping_the_best():
+        attempt: Attempt | None = next(attempts)
+        while attempt is not None:
             fit = task.minimise(attempt)
             best = better(best, fit)
-            if task.monitor.stopped:
-                break
-            attempt = attempts.send(fit)
+            attempt = None if task.monitor.stopped else _after(attempts, fit)
     if best is None:
         raise KeyboardInterrupt
     return best

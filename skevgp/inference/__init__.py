@@ -1,1 +1,1 @@
-"""The mathematics: statistics, bounds, posterior and optimisers. Knows no estimator and no robot."""
+"""The mathematics: statistics, bounds, objectives, posterior. Knows no estimator and no robot."""

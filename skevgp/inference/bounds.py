@@ -83,6 +83,8 @@ class Group:
         s² and σ².
     prior : CoefficientPrior
         Of these outputs, with p features.
+    complete : bool, default=False
+        Whether the inducing points are all rows, so that they leave nothing unexplained.
     """
 
     outputs: slice
@@ -91,6 +93,7 @@ class Group:
     signal: np.ndarray
     noise: np.ndarray
     prior: CoefficientPrior
+    complete: bool = False
 
 
 def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
@@ -174,7 +177,7 @@ class BoundAtOptimum:
             np.zeros((m, m)),
             np.zeros((m, p)),
             np.empty((m, len(signal))),
-            -0.5 * (signal / noise).sum(),
+            0.0 if group.complete else -0.5 * (signal / noise).sum(),
             np.zeros((m, m)),
         )
         # Terms of each output that do not depend on e, and their derivatives in log s² and log σ².

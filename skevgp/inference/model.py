@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -32,6 +32,9 @@ class SparseModel:
         The outputs that each set of inducing points serves.
     jitter : Jitter, default=Jitter()
         Of k(X_m, X_m).
+    complete : bool, default=False
+        Whether the inducing points are all rows: the bound is then the likelihood, and what is left of k(x, x) - |v|²
+        is rounding.
     """
 
     kernel: Kernel
@@ -39,6 +42,7 @@ class SparseModel:
     family: PosteriorFamily
     groups: tuple[slice, ...]
     jitter: Jitter = JITTER
+    complete: bool = False
 
     def whitenings(self, values: Values) -> Iterator[Whitening]:
         """Of each set of inducing points."""
@@ -58,7 +62,9 @@ class SparseModel:
     def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
         """What belongs to one set of inducing points."""
         signal, noise = values["signal"][outputs], values["noise"][outputs]
-        return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs))
+        if self.complete:
+            statistics = replace(statistics, unexplained=0.0)
+        return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs), self.complete)
 
     def statistics(self, values: Values, blocks: Blocks) -> list[SufficientStatistics]:
         """The statistics of each group."""

@@ -192,7 +192,11 @@ class _ElboTerms:
         self.weights = np.vstack([f, b])
         self._ratio = group.signal / group.noise
         self.gradient = StatisticsGradient(
-            self._spread.VV, self._spread.VH, -f / group.noise, 0.5 * self._ratio.sum(), self._spread.L
+            self._spread.VV,
+            self._spread.VH,
+            -f / group.noise,
+            0.0 if group.complete else 0.5 * self._ratio.sum(),
+            self._spread.L,
         )
 
     def finish(self, residuals: Residuals) -> tuple[float, Values]:

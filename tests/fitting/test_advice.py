@@ -60,7 +60,7 @@ def test_what_noise_explains_is_told_where_neighbours_are_alike():
     scatter = rows.scatter()
     assert "of 1 of 2 outputs" in nothing_learned(scatter, rows)
     assert nothing_learned(0.9 * scatter, rows) == ""
-    assert "n_inducing or n_restarts" in nothing_learned(scatter, rows)
+    assert "n_inducing, or n_restarts of the solver" in nothing_learned(scatter, rows)
     assert "Raise n_restarts" in nothing_learned(scatter, rows, sparse=False)
 
 
