@@ -116,7 +116,9 @@ def lbfgs(
         # Nothing to move, or asked not to: the start is the answer.
         minimum.converged = len(start) == 0 or max_iter == 0
         x, rng = start, np.random.RandomState(0)
-        while not minimum.converged and minimum.n_iter < max_iter:
+        for _ in range(max_iter):  # a start whose first line search fails has no iteration
+            if minimum.converged or minimum.n_iter >= max_iter:
+                break
             remaining, before, stalled = max_iter - minimum.n_iter, guarded.loss, 0
             result = minimize(
                 guarded,
