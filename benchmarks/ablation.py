@@ -2,7 +2,8 @@
 
 Fits many data sets with the default solver, and again with one rule or number changed at a time; writes one row per fit
 to a CSV (fits that are there already are not repeated), and a page with one line per change beside it. The lines of
-"luck" change nothing that matters: what they gain and lose is the noise by which the others are to be judged.
+"luck" change nothing that matters: what they gain and lose is the noise by which the others are to be judged. (The rows
+are kept as results/ablation.csv.gz; unpack them to add to them.)
 
     python benchmarks/ablation.py                   # everything: about an hour on one core
     python benchmarks/ablation.py --rules stage     # only some rules
@@ -275,7 +276,7 @@ def report(rows: Sequence[Row]) -> list[str]:
     done = dict.fromkeys((row["rule"], row["variant"]) for row in rows if row["rule"] != DEFAULT.rule)
     lines = [line for own in done if (line := line_of(known.get(own, Change(*own)), rows, default))]
     for line in lines:
-        line[0] += "" if (line[0], line[1]) in known else " (deleted since)"
+        line[0] += "" if (line[0], line[1]) in known else " (no field any more)"
     header = ["rule", "variant", "bound better / equal / worse", "median difference", "worst difference"]
     header += ["error better / worse", "error, ratio", "evaluations, ratio"]
     return [

@@ -84,7 +84,7 @@ class TimedLBFGS(LBFGS):
 
 def with_jitter(jitter: float) -> LBFGS:
     """L-BFGS on models whose k(X_m, X_m) gets this jitter, relative to the signal variance."""
-    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=Jitter(jitter))})
+    kind = type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, jitter=Jitter(jitter, well_conditioned=np.inf))})
     return kind()
 
 

@@ -434,3 +434,18 @@ def test_the_readme_toy():
     h = np.array([1.0, 50.0])
     variance = h @ m.coef_cov_ @ h + m.kernel_.k1.constant_value + m.noise_variance_
     assert std[0] == pytest.approx(np.sqrt(variance), rel=1e-6)
+
+
+@pytest.mark.parametrize("noise", [1e-10, 1e-6])
+def test_points_at_all_rows_give_the_exact_likelihood(noise):
+    """The sparse bound at X_m = X, where rounding in k(x, x) - |v|² is far above so low a noise."""
+    x = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
+    y, kernel = x[:, 0] * np.sin(x[:, 0]), RBF(1.0) + WhiteKernel(noise, "fixed")
+    sparse, exact = EVGPRegressor(kernel=kernel).fit(x, y), EGPRegressor(kernel=kernel).fit(x, y)
+    assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=1e-6)
+    # Rows beyond the points are something else again.
+    x_new = np.array([[2.0], [4.0]])
+    bound = sparse.partial_fit(x_new, x_new[:, 0] * np.sin(x_new[:, 0])).lower_bound_
+    both = EGPRegressor(kernel=exact.kernel_ + WhiteKernel(noise, "fixed"), max_iter=0)
+    all_rows = np.vstack([x, x_new])
+    assert bound < both.fit(all_rows, all_rows[:, 0] * np.sin(all_rows[:, 0])).log_marginal_likelihood_value_

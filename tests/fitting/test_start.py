@@ -1,10 +1,11 @@
 import numpy as np
 import pytest
 
-from skevgp.fitting.start import alike_neighbours, features_alone, parameter_of, unit_of
-from skevgp.kernels.parse import Start
+from skevgp.fitting.start import alike_neighbours, features_alone, parameter_of, starting_table, unit_of
+from skevgp.fitting.strategy import Rules
+from skevgp.kernels.parse import Start, Starts
 from skevgp.optimizers.parameters import ParameterTable
-from skevgp.rows.source import LocalSource
+from skevgp.rows.source import LocalSource, Moments
 
 from ..oracle import identity_rows
 
@@ -87,3 +88,21 @@ def test_a_start_outside_the_default_bounds_is_put_inside():
     parameter = parameter_of(Start(np.array([100.0])), "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
     table = ParameterTable([parameter])
     np.testing.assert_allclose(table.values(table.start())["x"], [3.0])
+
+
+def test_starts_and_limits_follow_the_data_and_the_rules():
+    """Twice as far, or ten times as high, is twice or ten times as much for the parameters too."""
+    X = np.random.RandomState(0).randn(50, 2) * [1.0, 2.0]
+    limits = {"highest_noise": 50.0, "lengthscale_limits": (0.1, 10.0), "signal_limits": (1e-3, 1e3)}
+    rules = Rules(1e-4, 1e-10, lengthscale=0.5, **limits)
+    scatter, points = np.array([1.0, 0.01]), np.zeros((1, 3, 2))
+    starts = Starts(Start(), Start(), Start())
+    table = starting_table(Moments.of(X), points, np.ones(2), starts, scatter, rules, 2)
+    first, (sigma, root) = table.values(table.start()), (X.std(axis=0), np.sqrt(2.0))
+    np.testing.assert_allclose(first["hyperparameters"], 0.5 * root * sigma)
+    np.testing.assert_allclose(first["signal"], 1.0)
+    np.testing.assert_allclose(first["noise"], 1e-4 * scatter)
+    lower, upper = (table.values(limit) for limit in table.limits())
+    np.testing.assert_allclose([lower["hyperparameters"], upper["hyperparameters"]], [0.1 * sigma, 10.0 * root * sigma])
+    np.testing.assert_allclose([lower["signal"], upper["signal"]], [[1e-3] * 2, [1e3] * 2])
+    np.testing.assert_allclose([lower["noise"], upper["noise"]], [1e-10 * scatter, [50.0] * 2])
