@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from ..inference.bounds import CoefficientPrior
-from ..inference.model import Values
 from ..inference.statistics import Kernel
 from ..optimizers.minimum import Minimum
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from .start import alike_neighbours, neighbours
 

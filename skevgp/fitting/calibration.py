@@ -39,8 +39,9 @@ from ..inference.bounds import (
     optimal_posterior,
     projected,
 )
-from ..inference.model import SparseModel, Values
+from ..inference.model import SparseModel
 from ..inference.statistics import SufficientStatistics, collect
+from ..optimizers.parameters import Values
 from ..rows.blocks import Block, Blocks
 from ..rows.internal import Rows
 from ..rows.threads import BlockMap

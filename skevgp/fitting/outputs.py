@@ -11,11 +11,11 @@ import numpy as np
 
 from .._progress import Monitor
 from ..inference.bounds import PosteriorFamily
-from ..inference.model import SparseModel, Values
+from ..inference.model import SparseModel
 from ..inference.posterior import Predictor
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import Source
 from ..rows.threads import BlockMap, thread_pool
@@ -239,14 +239,11 @@ def plan(
     rows = units.rows(request.source, threads)
     kernel = request.spec.covariance.centred(column_centre(rows.inputs))
 
-    stay = False
-
     def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        table = starting_table(
+        return starting_table(
             rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
         )
-        return table.with_fixed("inducing_points") if stay else table
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
     alone = table_of(slice(0, 1), np.empty((1, 0, len(rows.inputs.mean))))
@@ -268,6 +265,8 @@ def plan(
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
         table = table_of(outputs, np.repeat(points[np.newaxis], len(groups), axis=0), variance)
+        if stay:
+            table = table.with_fixed("inducing_points")
         shift = len(rows) * units.log_unit(outputs)
         tasks.append(
             SparseTask(

@@ -11,11 +11,11 @@ import numpy as np
 
 from .._progress import Monitor
 from ..inference.bounds import BoundAtOptimum, features_alone_bound
-from ..inference.model import SparseModel, Values
+from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
 from ..inference.statistics import SufficientStatistics
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from .advice import far_from_prior, learned_too_little
@@ -103,12 +103,12 @@ class SparseTask:
             self.max_iter,
             self.solver.n_restarts,
             self.rows.scatter(),
-            features_alone_bound(self.blocks.linear, self.model.prior),
+            alone=features_alone_bound(self.blocks.linear, self.model.prior),
             # Points that stay are all rows, some of them perhaps the same.
-            self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any(),
-            None if anew is None else partial(self._placed, placement=anew),
-            lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
-            self.warm,
+            interpolates=self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any(),
+            place=None if anew is None else partial(self._placed, placement=anew),
+            restart=lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
+            warm=self.warm,
         )
 
     @property

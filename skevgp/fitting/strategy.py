@@ -16,9 +16,8 @@ import numpy as np
 
 from .._linalg import JITTER, Jitter
 from .._progress import Monitor
-from ..inference.model import Values
 from ..inference.posterior import Predictor
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 
 
 @dataclass(frozen=True)
@@ -129,7 +128,7 @@ class Attempt:
         return [] if self.after is None else self.after.loss_curve
 
 
-# Yields a start, is sent how the fit from there ended, and returns the best.
+# Yields starts, is sent how the fit from each ended, and returns the best of these.
 Attempts = Generator[Attempt, Fit, Fit]
 
 
@@ -175,22 +174,21 @@ class Strategy:
     restart: Callable[[], Values] | None = None
     warm: Values | None = None
 
-    def attempts(self) -> Attempts:
+    def attempts(self) -> Generator[Attempt, Fit, None]:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
         first = self.table.values_at_start()
         if self.warm is None:
-            best = yield from self._staged(first)
+            yield from self._staged(first)
         else:
             # Inducing points that another fit moved have found their places.
             same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
             again = self._staged if same_points else self._once
-            best = yield from again(first | self.warm)
-            if self.max_iter > 0 and self.collapsed(best):
-                best = better(best, (yield from self._staged(first)))
+            fit = yield from again(first | self.warm)
+            if self.max_iter > 0 and self.collapsed(fit):
+                yield from self._staged(first)
         if self.restart is not None and self.max_iter > 0 and self.table.size > 0:
             for _ in range(self.n_restarts):
-                best = better(best, (yield from self._staged(self.restart())))
-        return best
+                yield from self._staged(self.restart())
 
     def collapsed(self, fit: Fit) -> bool:
         """Whether noise came to explain everything, or the kernel explains less than nothing would."""
@@ -257,7 +255,7 @@ def drawn(table: ParameterTable, rules: Rules, rng: np.random.RandomState) -> Va
     return table.values(np.clip(table.flat(coordinates), *table.limits()))
 
 
-def _after(attempts: Attempts, fit: Fit) -> Attempt | None:
+def _after(attempts: Generator[Attempt, Fit, None], fit: Fit) -> Attempt | None:
     """The next attempt after a fit, if there is one."""
     try:
         return attempts.send(fit)

@@ -24,9 +24,9 @@ import numpy as np
 from scipy.linalg import lapack
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from ..optimizers.parameters import Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI, CoefficientPrior
-from .model import Values
 from .posterior import Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
 

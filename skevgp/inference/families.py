@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
-from ..optimizers.parameters import Parameter
+from ..optimizers.parameters import Parameter, Values
 from .bounds import Group, WhitenedPosterior, diagonal_root, log_variances, projected
 
 
@@ -46,9 +46,6 @@ class SpreadTerms:
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
         VV, VH, L = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
         return cls(0.0, VV, VH, L, np.zeros(o), np.zeros(o), np.zeros((o, k)))
-
-
-Values = dict[str, np.ndarray]
 
 
 class Family(Protocol):

@@ -8,18 +8,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._linalg import JITTER, Jitter
+from ..optimizers.parameters import Values
 from ..rows.blocks import Blocks
 from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances
 from .posterior import Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
-# Of ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``, the values of the model's parameters.
-Values = dict[str, np.ndarray]
-
 
 @dataclass(frozen=True)
 class SparseModel:
     """Covariance, prior and family of q: all that a bound needs but the rows and the parameters.
+
+    Its parameters are ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``.
 
     Attributes
     ----------
@@ -79,18 +79,34 @@ class SparseModel:
         statistics : sequence of SufficientStatistics
             What `statistics` returns for these values.
         """
-        total, mean, root = 0.0, [], []
+        total, whitenings, mean, root = 0.0, [], [], []
         for group in self.groups_of(values, statistics):
             bound = BoundAtOptimum(group, self.family)
             total += bound.value(bound.residuals())
+            whitenings.append(group.whitening)
             L_inv = group.whitening.L_inv
             for q in bound.posteriors:
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
-        return total, self.predictor(values, mean, root)
+        return total, self.predictor(values, whitenings, mean, root)
 
-    def predictor(self, values: Values, mean: Sequence[np.ndarray], root: Sequence[np.ndarray]) -> Predictor:
-        """Put q(ω) of each output, with its mean (m + p,) and covariance rootᵀ root, together with the parameters."""
+    def predictor(
+        self,
+        values: Values,
+        whitenings: Sequence[Whitening],
+        mean: Sequence[np.ndarray],
+        root: Sequence[np.ndarray],
+    ) -> Predictor:
+        """Put q(ω) of each output, with its mean (m + p,) and covariance rootᵀ root, together with the parameters.
+
+        Parameters
+        ----------
+        values : dict
+        whitenings : sequence of Whitening
+            What `whitenings` yields for these values.
+        mean, root : sequence of ndarray
+            One per output.
+        """
         return Predictor(
             self.kernel,
             tuple(
@@ -104,9 +120,7 @@ class SparseModel:
                     mean[outputs],
                     root[outputs],
                 )
-                for outputs, points, whitening in zip(
-                    self.groups, values["inducing_points"], self.whitenings(values), strict=True
-                )
+                for outputs, points, whitening in zip(self.groups, values["inducing_points"], whitenings, strict=True)
             ),
             values["noise"],
             self.prior.offset,

@@ -8,11 +8,11 @@ from typing import Protocol
 
 import numpy as np
 
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from .bounds import LOG_2PI, BoundAtOptimum, Group
 from .families import DiagonalFamily, Family, FullFamily, NaturalFamily
-from .model import SparseModel, Values
+from .model import SparseModel
 from .posterior import Predictor
 from .statistics import Residuals, StatisticsGradient, pull_back
 
@@ -164,12 +164,14 @@ class ElboObjective:
         if self.natural is not None:
             self.natural.forget()
         bound = -self.evaluate(x, self.blocks)[0] * self.n_rows
+        whitenings = list(self.model.whitenings(values))
         L_inv = [
             whitening.L_inv
-            for outputs, whitening in zip(self.model.groups, self.model.whitenings(values), strict=True)
+            for outputs, whitening in zip(self.model.groups, whitenings, strict=True)
             for _ in range(outputs.start, outputs.stop)
         ]
-        return bound, self.model.predictor(values, self.family.means(values), self.family.roots(values, L_inv))
+        roots = self.family.roots(values, L_inv)
+        return bound, self.model.predictor(values, whitenings, self.family.means(values), roots)
 
 
 class _ElboTerms:

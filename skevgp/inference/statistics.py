@@ -8,8 +8,7 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, Protocol
 
 import numpy as np
@@ -133,15 +132,11 @@ class SufficientStatistics:
     unexplained: Any
 
     def __add__(self, other: SufficientStatistics) -> SufficientStatistics:
-        return SufficientStatistics(*(getattr(self, name) + getattr(other, name) for name in self._fields()))
+        return SufficientStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
     def scaled(self, factor: float) -> SufficientStatistics:
         """Each sum times ``factor``: a past that fades."""
-        return SufficientStatistics(*(factor * getattr(self, name) for name in self._fields()))
-
-    @classmethod
-    def _fields(cls) -> Iterable[str]:
-        return cls.__dataclass_fields__
+        return SufficientStatistics(*(factor * getattr(self, field.name) for field in fields(self)))
 
 
 @dataclass(frozen=True)

@@ -86,8 +86,8 @@ def lbfgs(
     max_iter : int
         Iterations in all.
     tol : float
-        Start anew when each of three iterations in a row lowers the loss by less than this, or a line search fails;
-        stop when a start lowers it by no more.
+        Start anew when each of ``descent.patience`` iterations in a row lowers the loss by less than this, or a line
+        search fails; stop when a start lowers it by no more.
     monitor : Monitor, default=None
     descent : Descent, default=Descent()
 

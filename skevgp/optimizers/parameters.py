@@ -9,6 +9,9 @@ from typing import Any, Literal
 import autograd.numpy as anp
 import numpy as np
 
+# Of parameters, by name.
+Values = dict[str, np.ndarray]
+
 
 @dataclass(frozen=True)
 class Parameter:
@@ -63,7 +66,7 @@ class Parameter:
         return np.exp(coordinate) if self.transform == "log" else self.origin + coordinate * self.unit
 
 
-def _shape(values: dict[str, np.ndarray], name: str) -> tuple[int, ...] | None:
+def _shape(values: Values, name: str) -> tuple[int, ...] | None:
     return values[name].shape if name in values else None
 
 
@@ -94,7 +97,7 @@ class ParameterTable:
     def __getitem__(self, name: str) -> Parameter:
         return next(parameter for parameter in self.parameters if parameter.name == name)
 
-    def started_at(self, values: dict[str, np.ndarray]) -> ParameterTable:
+    def started_at(self, values: Values) -> ParameterTable:
         """The same table with other starts, for what is free of the parameters whose shapes agree."""
         return ParameterTable(
             [
@@ -114,7 +117,7 @@ class ParameterTable:
         flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})
         return np.clip(flat, *self.limits())
 
-    def values_at_start(self) -> dict[str, np.ndarray]:
+    def values_at_start(self) -> Values:
         """The values by name where the optimiser starts."""
         return self.values(self.start())
 
@@ -141,7 +144,7 @@ class ParameterTable:
             found[name] = part.reshape(parameter.start.shape)
         return found
 
-    def values(self, flat: np.ndarray) -> dict[str, np.ndarray]:
+    def values(self, flat: np.ndarray) -> Values:
         """The values by name, in the parameters' own units."""
         coordinates = self.coordinates(flat)
         return {parameter.name: parameter.value(coordinates[parameter.name]) for parameter in self.parameters}

@@ -98,7 +98,7 @@ class Rows:
 
     def scatter(self) -> np.ndarray:
         """Variance (o,) of the residuals; 1 where they do not vary."""
-        scatter = self._moments[1].variance[self.columns]
+        scatter = self.residuals.variance[self.columns]
         return np.where(scatter > 0.0, scatter, 1.0)
 
     def some(self, chosen: np.ndarray) -> RawRows:

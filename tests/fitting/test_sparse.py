@@ -154,7 +154,9 @@ def test_a_solver_that_has_moved_q_says_where_it_is():
     task = task_of()
     fit = started(task)
     size = 8 + 2
-    own = task.model.predictor(fit.values, [np.zeros(size)] * O, [np.eye(size)] * O)
+    own = task.model.predictor(
+        fit.values, list(task.model.whitenings(fit.values)), [np.zeros(size)] * O, [np.eye(size)] * O
+    )
     learned = Learned.of(task, replace(fit, predictor=own))
     assert learned.predictor is own
     # Rows that come later put it at its optimum.

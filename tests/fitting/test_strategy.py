@@ -1,6 +1,7 @@
 """The decisions of a fit, one by one: which start comes next, given how the fits before it ended."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -40,17 +41,17 @@ def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True):
 
 
 def drive(strategy, *results):
-    """The attempts that a strategy makes when fits end with these (bound, options); the fit that it returns."""
-    attempts, made, results = strategy.attempts(), [], list(results)
-    attempt = next(attempts)
-    while True:
+    """The attempts that a strategy makes when fits end with these (bound, options); the best of these fits."""
+    made, results = [], list(results)
+
+    def minimise(attempt):
         made.append(attempt)
         bound, options = results.pop(0)
-        try:
-            attempt = attempts.send(ended(attempt, bound, **options))
-        except StopIteration as done:
-            assert not results
-            return made, done.value
+        return ended(attempt, bound, **options)
+
+    best = search(SimpleNamespace(strategy=strategy, monitor=Monitor(), minimise=minimise))
+    assert not results
+    return made, best
 
 
 GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}

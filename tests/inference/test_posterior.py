@@ -22,7 +22,7 @@ def some_posterior(shared=True, p=P, seed=3):
     model, _, table = problem(shared=shared, p=p)
     values, rng = table.values_at_start(), np.random.RandomState(seed)
     mean, root = rng.randn(O, M + p), 0.5 * rng.randn(O, M + p, M + p)
-    predictor = model.predictor(values, list(mean), list(root))
+    predictor = model.predictor(values, list(model.whitenings(values)), list(mean), list(root))
     return predictor, mean, np.einsum("oki,okj->oij", root, root), values, model
 
 
@@ -127,7 +127,7 @@ def test_predictors_of_single_outputs_are_joined_side_by_side():
         alone = SparseModel(model.kernel, model.prior.outputs(own), "full", (slice(0, 1),))
         of_output = {name: value[own] for name, value in values.items() if name != "hyperparameters"}
         of_output["hyperparameters"] = values["hyperparameters"]
-        parts.append(alone.predictor(of_output, mean[own], root[own]))
+        parts.append(alone.predictor(of_output, list(alone.whitenings(of_output)), mean[own], root[own]))
     unit, offset, intercept = np.array([2.0, 30.0]), RNG.randn(O, P), np.array([1.0, -4.0])
     joined, expected = (Predictor.joined(own, unit, offset, intercept) for own in (parts, [whole]))
     assert [group.outputs for group in joined.groups] == [slice(0, 1), slice(1, 2)]
@@ -185,7 +185,7 @@ def test_q_at_the_prior_predicts_the_prior():
     prior = CoefficientPrior(model.prior.mean, model.prior.scale, np.zeros((O, P)))
     values = table.values_at_start()
     own = SparseModel(model.kernel, prior, "full", model.groups)
-    predictor = own.predictor(values, [np.zeros(M + P)] * O, [np.eye(M + P)] * O)
+    predictor = own.predictor(values, list(own.whitenings(values)), [np.zeros(M + P)] * O, [np.eye(M + P)] * O)
     mean, covariance = predictor.covariance(X_NEW, H_NEW)
     np.testing.assert_allclose(mean, H_NEW @ prior.mean.T, atol=1e-14)
     for o in range(O):
