@@ -108,7 +108,6 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes[2].margins(x=0.15)
     axes[0].set_yscale("log")
-    axes[0].set_ylim(0.9, None)
     axes[0].yaxis.set_major_locator(FixedLocator([1, 2, 5, 10, 20, 50, 100]))
     axes[0].yaxis.set_minor_locator(NullLocator())
     axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
