@@ -102,7 +102,8 @@ def changes() -> list[Change]:
         Change("luck", "first_noise=1.1e-4", {"first_noise": 1.1e-4}),
         Change("luck", "lengthscale=0.61", {"lengthscale": 0.61}),
         *_of("rules", "other_starts", *fewer, concerns=where_it_collapsed),
-        *_of("rules", "stage", None, 50, 200, concerns=where_points_move),
+        *_of("rules", "stage", None, 50, 100, concerns=where_points_move),
+        *_of("rules", "sample", None, (1000, 10)),
         *_of("rules", "much_noise", None, 1e2, concerns=where_points_are_many),
         *_of("descent", "patience", 1, 10),
         *_of("rules", "first_noise", 1e-2, 1e-3, 1e-5, 1e-6),
@@ -114,7 +115,9 @@ def changes() -> list[Change]:
         *_of("rules", "lengthscale", 0.2, 1.5),
         *_of("rules", "lengthscale_limits", (1e-4, 1e6), (1e-1, 1e2)),
         *_of("rules", "highest_noise", 1.0),
-        *_of("descent", "memory", 10, 100),
+        *_of("descent", "memory", 30, 300),
+        *_of("descent", "enough", 1e-5, 1e-4),
+        *_of("descent", "probes", 2),
         *_of("descent", "gradient", 1e-6),
     ]
 

@@ -70,8 +70,8 @@ class TimedLBFGS(LBFGS):
         super().__init__(n_restarts, callback)
         self.seconds_: list[float] = []
 
-    def objective(self, task: SparseTask, table: ParameterTable) -> Objective:
-        evaluate = super().objective(task, table)
+    def objective(self, task: SparseTask, table: ParameterTable, n_rows: int | None = None) -> Objective:
+        evaluate = super().objective(task, table, n_rows)
 
         def timed(flat: np.ndarray) -> tuple[float, np.ndarray]:
             start = time.perf_counter()

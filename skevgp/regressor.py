@@ -87,13 +87,14 @@ class EVGPRegressor(ExplicitGaussianProcess):
         among them. The strings are the solvers with their defaults; what only one of them understands is said there:
         ``Adam(batch_size=1000)``, ``LBFGS(n_restarts=2)``, and ``solver__batch_size`` in a grid search.
     max_iter : int, default=None
-        The most iterations of L-BFGS or steps of Adam; None means 1000 or 16000. With 0 nothing is optimised: kernel
-        and inducing points stay where they start, and q is at its optimum.
-    tol : float, default=0.01
+        The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
+        16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
+    tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
-        than this, and stops when a fresh start gains no more. Adam goes over to its last steps, as many as before, when
-        the loss stays flat: when its median over the last third of the steps differs from that over the third before by
-        less than this, or by no more than chance (mini-batches are noisy, so chance mostly decides).
+        than this, and stops when a fresh start gains no more. ``"auto"`` is 0.003 % of what the fit has gained over
+        features and noise alone, and at least 0.01. Adam goes over to its last steps, as many as before, when the loss
+        stays flat: when its median over the last third of the steps differs from that over the third before by less
+        than this (``"auto"``: 0.01), or by no more than chance, which mostly decides.
     forgetting_factor : float, default=1.0
         What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers
         all of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
@@ -176,6 +177,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
+        "tol": [StrOptions({"auto"}), Interval(Real, 0, None, closed="left")],
         "forgetting_factor": [Interval(Real, 0, 1, closed="right")],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
@@ -201,7 +203,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
-        tol: float = 0.01,
+        tol: float | Literal["auto"] = "auto",
         forgetting_factor: float = 1.0,
         warm_start: bool = False,
         n_jobs: int | None = None,
@@ -277,7 +279,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
                 Placement.of(self.inducing_init, self.n_inducing, problem.n_columns),
                 solver,
                 solver.default_max_iter if self.max_iter is None else self.max_iter,
-                self.tol,
+                None if isinstance(self.tol, str) else self.tol,
                 self.noise_cv,
                 effective_n_jobs(self.n_jobs),
             )

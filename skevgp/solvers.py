@@ -15,7 +15,8 @@ from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
 from .optimizers.adam import adam
-from .optimizers.lbfgs import DESCENT, Descent, lbfgs
+from .optimizers.curvature import curvature_units
+from .optimizers.lbfgs import DESCENT, Descent, Tolerance, lbfgs
 from .optimizers.minimum import Minimum, Objective
 from .optimizers.parameters import ParameterTable
 
@@ -23,6 +24,8 @@ __all__ = ["LBFGS", "Adam"]
 
 # Relative size of the rounding errors in a bound on all rows.
 _ROUNDING = 1e-8
+# An iteration that gains less, in nats in all, does not matter.
+_LEAST_TOL = 0.01
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
 
@@ -71,8 +74,8 @@ class LBFGS(BaseEstimator):
         first_noise=1e-4,
         other_starts=((0.5, 1.0), (2.0, 100.0), (1.0, 1e3)),
         much_noise=1e3,
-        # With 50 or 300 the bounds are about as good.
-        stage=100,
+        stage=25,
+        sample=(1000, 20),
     )
     descent: ClassVar[Descent] = DESCENT
 
@@ -90,7 +93,7 @@ class LBFGS(BaseEstimator):
         """
         _check_common(self)
 
-    def objective(self, task: SparseTask, table: ParameterTable) -> Objective:
+    def objective(self, task: SparseTask, table: ParameterTable, n_rows: int | None = None) -> Objective:
         """Make what is minimised; a subclass may look at each evaluation.
 
         Parameters
@@ -99,13 +102,15 @@ class LBFGS(BaseEstimator):
             The model and its rows.
         table : ParameterTable
             Its parameters.
+        n_rows : int, default=None
+            Of the sample that is fitted; None means all rows.
 
         Returns
         -------
         objective : callable
             x -> (minus the bound per row, its gradient).
         """
-        return BoundObjective(task.model, table, task.blocks)
+        return BoundObjective(task.model, table, task.blocks_of(n_rows))
 
     def run(self, task: SparseTask, attempt: Attempt) -> Fit:
         """Go from one start; called by the fit.
@@ -125,13 +130,14 @@ class LBFGS(BaseEstimator):
         table = task.table.started_at(attempt.values)
         spent, n_rows = len(attempt.loss_curve), len(task.rows)
         minimum = lbfgs(
-            self.objective(task, table),
+            self.objective(task, table, attempt.n_rows),
             table.start(),
             table.limits(),
             attempt.until - spent,
-            task.tol / n_rows,
+            self._tolerance(task),
             task.monitor.seen_as(spent, n_rows),
             self.descent,
+            None if attempt.cold else self._units(task, table, attempt),
         )
         return Fit(
             table.values(minimum.x),
@@ -139,7 +145,19 @@ class LBFGS(BaseEstimator):
             attempt.loss_curve + [n_rows * loss for loss in minimum.loss_curve],
             minimum.converged,
             how_it_ended(minimum, spent + minimum.n_iter, task.max_iter, task.tol),
+            n_rows=attempt.n_rows,
         )
+
+    def _tolerance(self, task: SparseTask) -> Tolerance:
+        n_rows = len(task.rows)
+        if task.tol is not None:
+            return Tolerance(task.tol / n_rows)
+        return Tolerance(_LEAST_TOL / n_rows, self.descent.enough, -task.alone / n_rows)
+
+    def _units(self, task: SparseTask, table: ParameterTable, attempt: Attempt) -> Callable[[np.ndarray], np.ndarray]:
+        """From the curvature on the smallest sample, or on the rows that are fitted."""
+        objective = BoundObjective(task.model, table, task.blocks_of(task.samples[0] if task.samples else None))
+        return lambda x: curvature_units(objective, x, table.alike(), self.descent.probes)
 
 
 class Adam(BaseEstimator):
@@ -232,6 +250,7 @@ class Adam(BaseEstimator):
             Where it ended.
         """
         n_rows, table = len(task.rows), task.table.started_at(attempt.values)
+        tol = _LEAST_TOL if task.tol is None else task.tol
         elbo = ElboObjective(task.model, table, task.blocks, _NATURAL_RATES if self.natural_gradient else None)
         start = elbo.table.start()
         minimum = adam(
@@ -240,7 +259,7 @@ class Adam(BaseEstimator):
             elbo.table.limits(),
             attempt.until,
             self.learning_rate,
-            task.tol / n_rows,
+            tol / n_rows,
             task.monitor.seen_as(factor=n_rows),
             elbo.pace,
         )
@@ -256,7 +275,7 @@ class Adam(BaseEstimator):
             if solution[0] >= bound:
                 x, (bound, predictor) = other, solution
         values = elbo.table.values(x)
-        fell = not reached >= first - max(task.tol, _ROUNDING * abs(first))
+        fell = not reached >= first - max(tol, _ROUNDING * abs(first))
         return Fit(
             {name: values[name] for name in attempt.values},
             bound,

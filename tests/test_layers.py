@@ -185,8 +185,8 @@ def own_frames(frame):
 class Walked(LBFGS):
     """Writes down the way to each evaluation of the bound: in its own thread, and in the one that waits for it."""
 
-    def objective(self, task, table):
-        objective, main = super().objective(task, table), threading.main_thread().ident
+    def objective(self, task, table, n_rows=None):
+        objective, main = super().objective(task, table, n_rows), threading.main_thread().ident
         assert isinstance(objective, BoundObjective)
 
         def walked(x):

@@ -68,12 +68,14 @@ def test_independent_rows_keep_their_noise():
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["no features", "features"])
 def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
     settings = {"feature_map": feature_map, "sharing": sharing, "solver": solver, "posterior": posterior}
-    plain, calibrated = (model(**settings, max_iter=10, noise_cv=noise_cv).fit(X, Y) for noise_cv in (None, 5))
+    # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
+    settings |= {"max_iter": 10}
+    plain, calibrated = (model(**settings, noise_cv=noise_cv).fit(X[:1900], Y[:1900]) for noise_cv in (None, 5))
     np.testing.assert_array_equal(calibrated.inducing_points_, plain.inducing_points_)
     np.testing.assert_array_equal([k.theta for k in calibrated.kernel_], [k.theta for k in plain.kernel_])
     np.testing.assert_array_equal(calibrated.loss_curve_, plain.loss_curve_)
-    assert (mean_square_z(plain) > 3.0).all()
-    z = mean_square_z(calibrated)
+    before, z = mean_square_z(plain), mean_square_z(calibrated)
+    assert (before > 2.0).all()
     assert (z > 0.3).all()
     assert (z < 2.0).all()
 

@@ -477,7 +477,8 @@ def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch
 def test_verbose_prints_iteration_bound_and_time(capsys):
     m = model(verbose=2).fit(X, Y)
     lines = capsys.readouterr().out.splitlines()
-    assert len(lines) == m.n_iter_
+    # Those of starts that were not kept too.
+    assert len(lines) >= m.n_iter_
     assert lines[-1].startswith(f"iteration {m.n_iter_:6d}   bound")
     assert float(lines[-1].split()[3]) == pytest.approx(m.lower_bound_, abs=1e-2)
     model(verbose=1, tol=1e9).fit(X, Y)

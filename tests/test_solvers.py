@@ -155,8 +155,8 @@ def test_a_subclass_may_look_at_each_evaluation():
     seen = []
 
     class Watched(LBFGS):
-        def objective(self, task, table):
-            objective = super().objective(task, table)
+        def objective(self, task, table, n_rows=None):
+            objective = super().objective(task, table, n_rows)
             assert isinstance(objective, BoundObjective)
 
             def watched(x):

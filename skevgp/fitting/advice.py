@@ -20,7 +20,7 @@ _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 
-def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float, sparse: bool = True) -> str:
+def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
     """Why L-BFGS ended before it converged; nothing if it did.
 
     Parameters
@@ -29,8 +29,8 @@ def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float, spars
     n_iter : int
         Its iterations and those before.
     max_iter : int
-    tol : float
-        In nats.
+    tol : float or None
+        In nats; None if the solver chose it.
     sparse : bool, default=True
         Whether there are inducing points.
     """
@@ -44,7 +44,7 @@ def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float, spars
         )
     return (
         f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
-        f"max_iter, or stop earlier on purpose with a larger tol (now {tol})."
+        f"max_iter, or stop earlier on purpose with a {'larger tol (now ' + str(tol) + ')' if tol is not None else 'tol'}."
     )
 
 

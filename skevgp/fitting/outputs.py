@@ -48,8 +48,8 @@ class Request:
         Of the inducing points.
     solver : Solver
     max_iter : int
-    tol : float
-        In nats.
+    tol : float or None
+        In nats; None leaves it to the solver.
     noise_cv : int or None
         Folds of consecutive rows by which the noise is calibrated.
     n_threads : int
@@ -64,7 +64,7 @@ class Request:
     placement: Placement
     solver: Solver
     max_iter: int
-    tol: float
+    tol: float | None
     noise_cv: int | None
     n_threads: int
 

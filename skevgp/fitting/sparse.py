@@ -54,8 +54,8 @@ class SparseTask:
         Of inducing points.
     solver : Solver
     max_iter : int
-    tol : float
-        In nats.
+    tol : float or None
+        In nats; None leaves it to the solver.
     noise_cv : int, optional
         Folds of consecutive rows by which the noise is calibrated.
     seed : int
@@ -72,7 +72,7 @@ class SparseTask:
     placement: Placement
     solver: Solver
     max_iter: int
-    tol: float
+    tol: float | None
     noise_cv: int | None
     seed: int
     monitor: Monitor
@@ -87,6 +87,34 @@ class SparseTask:
     def blocks(self) -> Blocks:
         """All rows."""
         return self.rows.blocks(self.model.kernel, self.n_inducing)
+
+    @cached_property
+    def samples(self) -> tuple[int, ...]:
+        """The sizes of the samples that the fit begins with."""
+        interpolates = self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
+        return () if interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing)
+
+    @cached_property
+    def _largest_sample(self) -> Rows:
+        return self.rows.sampled(self.samples[-1], self.rng)
+
+    def blocks_of(self, n_rows: int | None) -> Blocks:
+        """A sample of so many rows, of which the smaller ones are parts; None means all."""
+        if n_rows is None:
+            return self.blocks
+        if n_rows not in self._sampled:
+            part = self._largest_sample.part(0, n_rows, 1.0)
+            self._sampled[n_rows] = part.blocks(self.model.kernel, self.n_inducing)
+        return self._sampled[n_rows]
+
+    @cached_property
+    def _sampled(self) -> dict[int, Blocks]:
+        return {}
+
+    @cached_property
+    def alone(self) -> float:
+        """The bound of the features without a Gaussian process."""
+        return features_alone_bound(self.blocks.linear, self.model.prior)
 
     @property
     def n_inducing(self) -> int:
@@ -103,9 +131,10 @@ class SparseTask:
             self.max_iter,
             self.solver.n_restarts,
             self.rows.scatter(),
-            alone=features_alone_bound(self.blocks.linear, self.model.prior),
+            alone=self.alone,
             # Points that stay are all rows, some of them perhaps the same.
             interpolates=self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any(),
+            samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),
             restart=lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
             warm=self.warm,
@@ -169,7 +198,7 @@ class Learned:
             fit.values,
             statistics,
             # Summed row by row, which keeps its digits where the noise is low.
-            fit.bound if np.isfinite(fit.bound) else bound,
+            fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound,
             predictor if fit.predictor is None else fit.predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),

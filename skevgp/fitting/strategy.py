@@ -9,7 +9,7 @@ prevents, and the test that fails without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -18,6 +18,10 @@ from .._linalg import JITTER, Jitter
 from .._progress import Monitor
 from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
+
+
+# Rows: samples are held in memory.
+LARGEST_SAMPLE = 100_000
 
 
 @dataclass(frozen=True)
@@ -50,11 +54,17 @@ class Rules:
     other_starts : tuple of (float, float)
         Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
     much_noise : float, optional
-        With as many inducing points as rows, the kernel may explain every row by itself. Such fits, which cost little,
-        start from a noise so many times higher too: a low one may lead to that plateau.
+        A start from a noise so many times higher comes after the first, where it costs little: on a sample of the rows,
+        or with as many inducing points as rows. The kernel may then explain every row by itself, and a low noise lead
+        to that plateau; a high one finds much noise sooner.
     stage : int, optional
         Iterations after which inducing points are placed anew, and so many again until it shows whether that was
-        better. None leaves them.
+        better; also those on each larger sample. None leaves the points.
+    sample : (int, int), optional
+        Rows, and rows per inducing point: so many are enough to begin with, the larger number counts. None takes all.
+    growth : int
+        A sample is followed by one so many times larger, and those of more than half or `LARGEST_SAMPLE` of the rows by
+        all.
     restart_factors : dict
         A restart multiplies the first values by numbers between 1 / factor and the factor, drawn log-uniformly.
     """
@@ -70,7 +80,19 @@ class Rules:
     other_starts: tuple[tuple[float, float], ...] = ()
     much_noise: float | None = None
     stage: int | None = None
+    sample: tuple[int, int] | None = None
+    growth: int = 4
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
+
+    def samples(self, n_rows: int, n_inducing: int) -> tuple[int, ...]:
+        """The sizes of the samples that a fit begins with, of ``n_rows`` rows; none if there are too few."""
+        if self.sample is None:
+            return ()
+        sizes, size = [], max(self.sample[0], self.sample[1] * n_inducing)
+        while size <= min(n_rows // 2, LARGEST_SAMPLE):
+            sizes.append(size)
+            size *= self.growth
+        return tuple(sizes)
 
 
 @dataclass(frozen=True)
@@ -90,6 +112,8 @@ class Fit:
         What the user should know of how it ended; empty if it converged.
     predictor : Predictor, optional
         If q is not at its optimum for the values.
+    n_rows : int, optional
+        Of the sample that it is a fit to; None means all rows.
     """
 
     values: Values
@@ -98,10 +122,16 @@ class Fit:
     converged: bool = True
     message: str = ""
     predictor: Predictor | None = None
+    n_rows: int | None = None
 
     @property
     def n_iter(self) -> int:
         return len(self.loss_curve)
+
+    @property
+    def rank(self) -> tuple[float, float]:
+        """By which the better of two fits is known: one to more rows is."""
+        return np.inf if self.n_rows is None else self.n_rows, self.bound
 
 
 @dataclass(frozen=True)
@@ -115,12 +145,18 @@ class Attempt:
     until : int
         The most iterations, those of ``after`` among them.
     after : Fit, optional
-        The fit that it goes on from.
+        The fit to the same rows that it goes on from.
+    n_rows : int, optional
+        Of the sample that is fitted; None means all rows.
+    cold : bool, default=False
+        Whether the values are a first guess, where the curvature of the bound says little of that at the end.
     """
 
     values: Values
     until: int
     after: Fit | None = None
+    n_rows: int | None = None
+    cold: bool = False
 
     @property
     def loss_curve(self) -> list[float]:
@@ -134,7 +170,7 @@ Attempts = Generator[Attempt, Fit, Fit]
 
 def better(best: Fit | None, fit: Fit) -> Fit:
     """The fit with the higher bound; of equals the later, which may have gone on from the other."""
-    return fit if best is None or fit.bound >= best.bound else best
+    return fit if best is None or fit.rank >= best.rank else best
 
 
 @dataclass(frozen=True)
@@ -155,6 +191,8 @@ class Strategy:
         The bound of the features without a Gaussian process.
     interpolates : bool
         Whether there are as many inducing points as rows.
+    samples : tuple of int
+        Sizes of the samples that a fit begins with.
     place : callable, optional
         Values -> the same values with inducing points placed anew under their kernel; None leaves them.
     restart : callable, optional
@@ -170,6 +208,7 @@ class Strategy:
     scatter: np.ndarray
     alone: float = -np.inf
     interpolates: bool = False
+    samples: tuple[int, ...] = ()
     place: Callable[[Values], Values] | None = None
     restart: Callable[[], Values] | None = None
     warm: Values | None = None
@@ -178,26 +217,45 @@ class Strategy:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
         first = self.table.values_at_start()
         if self.warm is None:
-            yield from self._staged(first)
+            yield from self._climbing(first)
         else:
             # Inducing points that another fit moved have found their places.
             same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
-            again = self._staged if same_points else self._once
+            again = self._climbing if same_points else self._once
             fit = yield from again(first | self.warm)
             if self.max_iter > 0 and self.collapsed(fit):
-                yield from self._staged(first)
+                yield from self._climbing(first)
         if self.restart is not None and self.max_iter > 0 and self.table.size > 0:
             for _ in range(self.n_restarts):
-                yield from self._staged(self.restart())
+                yield from self._climbing(self.restart())
 
     def collapsed(self, fit: Fit) -> bool:
         """Whether noise came to explain everything, or the kernel explains less than nothing would."""
         if (fit.values["noise"] > self.rules.collapsed * self.scatter).any():
             return True
         # What has not ended yet may still be below.
-        return fit.converged and fit.bound < self.alone
+        return fit.n_rows is None and fit.converged and fit.bound < self.alone
 
-    def _staged(self, values: Values) -> Attempts:
+    def _climbing(self, values: Values) -> Attempts:
+        """A fit to a sample of the rows, then on from there to larger ones, and at last to all.
+
+        Most of what kernel and noise have to learn is learned from a few rows, where an iteration costs little.
+        """
+        stage = self.rules.stage
+        if stage is None or not self.samples or self.max_iter == 0:
+            return (yield from self._staged(values, self.max_iter))
+        best: Fit | None = None
+        for n_rows in self.samples:
+            if best is None or self.collapsed(best):
+                best = yield from self._staged(values, min(2 * stage, self.max_iter), n_rows)
+            else:
+                best = yield Attempt(best.values, min(stage, self.max_iter), n_rows=n_rows)
+        assert best is not None
+        if self.collapsed(best):
+            return (yield from self._staged(values, self.max_iter))
+        return (yield Attempt(best.values, self.max_iter))
+
+    def _staged(self, values: Values, max_iter: int, n_rows: int | None = None) -> Attempts:
         """A fit whose inducing points are placed anew under the kernel that the first iterations learned.
 
         (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
@@ -208,33 +266,38 @@ class Strategy:
         if (
             self.place is None
             or stage is None
-            or self.max_iter <= stage
+            or max_iter <= stage
             or self.interpolates
             or not self.table["hyperparameters"].free.any()
         ):
-            return (yield from self._once(values))
-        first, until = (yield from self._unless_collapsed(values, stage)), min(2 * stage, self.max_iter)
-        best = better(first, (yield Attempt(self.place(first.values), until, first)))
+            return (yield from self._unless_collapsed(values, max_iter, n_rows))
+        first, until = (yield from self._unless_collapsed(values, stage, n_rows)), min(2 * stage, max_iter)
+        best = better(first, (yield Attempt(self.place(first.values), until, first, n_rows)))
         if not first.converged:
-            best = better(best, (yield Attempt(first.values, until, first)))
-        if not best.converged and best.n_iter < self.max_iter:
-            best = better(best, (yield Attempt(best.values, self.max_iter, best)))
+            best = better(best, (yield Attempt(first.values, until, first, n_rows)))
+        if not best.converged and best.n_iter < max_iter:
+            best = better(best, (yield Attempt(best.values, max_iter, best, n_rows)))
         return best
 
     def _once(self, values: Values) -> Attempts:
         return (yield from self._unless_collapsed(values, self.max_iter))
 
-    def _unless_collapsed(self, values: Values, until: int) -> Attempts:
+    def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Attempts:
         """A fit from these values; from other starts too where it may have ended in a bad optimum."""
-        best = yield Attempt(values, until)
+
+        def cold(values: Values) -> Attempt:
+            return Attempt(values, until, n_rows=n_rows, cold=True)
+
+        best = yield cold(values)
         if until == 0 or not self.table["noise"].free.any():
             return best
-        if self.interpolates and self.rules.much_noise is not None:
-            best = better(best, (yield Attempt(moved(values, 1.0, self.rules.much_noise), until)))
+        if (self.interpolates or n_rows is not None) and self.rules.much_noise is not None:
+            high = cold(moved(values, 1.0, self.rules.much_noise))
+            best = better(best, (yield replace(high, cold=n_rows is None)))
         for factors in self.rules.other_starts:
             if not self.collapsed(best):
                 break
-            best = better(best, (yield Attempt(moved(values, *factors), until)))
+            best = better(best, (yield cold(moved(values, *factors))))
         return best
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,14 +30,43 @@ class Descent:
         Where no gradient is larger, a line search has nowhere to go.
     patience : int
         So many iterations in a row that gain less than the tolerance are a stall.
+    enough : float
+        The tolerance where the user gives none, as a share of what the fit has gained over features and noise alone.
+    probes : int
+        Pairs of gradients from which the curvature is estimated.
     """
 
-    memory: int = 30
+    memory: int = 100
     gradient: float = 1e-9
     patience: int = 3
+    enough: float = 3e-5
+    probes: int = 8
 
 
 DESCENT = Descent()
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """What an iteration has to gain: so much, or that share of what is gained already.
+
+    Attributes
+    ----------
+    least : float
+        In units of the loss.
+    share : float
+        Of the difference to ``origin``.
+    origin : float
+        The loss of doing nothing.
+    """
+
+    least: float
+    share: float = 0.0
+    origin: float = 0.0
+
+    def at(self, loss: float) -> float:
+        """In units of the loss, where that is so much."""
+        return max(self.least, self.share * (self.origin - loss)) if np.isfinite(loss) else self.least
 
 
 class _Guarded:
@@ -44,15 +74,19 @@ class _Guarded:
 
     A line search that stepped too far interpolates back. It takes forever from a loss of 1e10, or ends within rounding
     errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
+
+    It is asked in coordinates x / ``unit``, and has the objective's x itself.
     """
 
     def __init__(self, objective: Objective, start: np.ndarray):
         self._objective = objective
-        self.x, self.loss = start.copy(), np.inf
+        self.x, self.loss, self.unit = start.copy(), np.inf, np.ones(len(start))
 
-    def __call__(self, x: np.ndarray) -> tuple[float, np.ndarray]:
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        x = z * self.unit
         try:
             loss, gradient = self._objective(x)
+            gradient = gradient * self.unit
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
         far = _FAR * (1.0 + abs(self.loss))
@@ -66,14 +100,33 @@ class _Guarded:
         return loss, gradient
 
 
+class _Watch:
+    """Writes down the losses of iterations, tells the monitor, and ends what stalls."""
+
+    def __init__(self, minimum: Minimum, tolerance: Tolerance, patience: int, monitor: Monitor):
+        self._minimum, self._tolerance, self._patience, self._monitor = minimum, tolerance, patience, monitor
+        self._stalled = 0
+
+    def iteration(self, intermediate_result: OptimizeResult) -> None:
+        # The iterate's own loss: a probe of a line search may have seen a better one by chance.
+        loss, curve = float(intermediate_result.fun), self._minimum.loss_curve
+        before = curve[-1] if curve else np.inf
+        curve.append(loss)
+        self._monitor.iteration(len(curve), loss)
+        self._stalled = self._stalled + 1 if before - loss < self._tolerance.at(loss) else 0
+        if self._stalled >= self._patience:
+            raise StopIteration
+
+
 def lbfgs(
     objective: Objective,
     start: np.ndarray,
     limits: Limits,
     max_iter: int,
-    tol: float,
+    tol: float | Tolerance,
     monitor: Monitor | None = None,
     descent: Descent = DESCENT,
+    units: Callable[[np.ndarray], np.ndarray] | None = None,
 ) -> Minimum:
     """L-BFGS-B (SciPy), started anew from the best point when it stalls or a line search fails.
 
@@ -85,32 +138,21 @@ def lbfgs(
     limits : (lower, upper), each of shape (size,)
     max_iter : int
         Iterations in all.
-    tol : float
+    tol : float or Tolerance
         Start anew when each of ``descent.patience`` iterations in a row lowers the loss by less than this, or a line
         search fails; stop when a start lowers it by no more.
     monitor : Monitor, default=None
     descent : Descent, default=Descent()
+    units : callable, optional
+        x -> the size (size,) of a step along each coordinate; asked at each start.
 
     Returns
     -------
     minimum : Minimum
     """
+    guarded, minimum = _Guarded(objective, start), Minimum(start, np.inf)
     monitor = Monitor() if monitor is None else monitor
-    guarded = _Guarded(objective, start)
-    minimum = Minimum(start, np.inf)
-    stalled = 0
-
-    def callback(intermediate_result: OptimizeResult) -> None:
-        # The iterate's own loss: a probe of a line search may have seen a better one by chance.
-        nonlocal stalled
-        loss = float(intermediate_result.fun)
-        before = minimum.loss_curve[-1] if minimum.loss_curve else np.inf
-        minimum.loss_curve.append(loss)
-        monitor.iteration(minimum.n_iter, loss)
-        stalled = stalled + 1 if before - loss < tol else 0
-        if stalled >= descent.patience:
-            raise StopIteration
-
+    tolerance = tol if isinstance(tol, Tolerance) else Tolerance(tol)
     with monitor.keeping_the_best():
         guarded(start)
         # Nothing to move, or asked not to: the start is the answer.
@@ -119,26 +161,21 @@ def lbfgs(
         for _ in range(max_iter):  # a start whose first line search fails has no iteration
             if minimum.converged or minimum.n_iter >= max_iter:
                 break
-            remaining, before, stalled = max_iter - minimum.n_iter, guarded.loss, 0
+            before = guarded.loss
+            if units is not None:
+                guarded.unit = units(x)
+            watch = _Watch(minimum, tolerance, descent.patience, monitor)
+            options = {"maxiter": max_iter - minimum.n_iter, "maxfun": 20 * (max_iter - minimum.n_iter) + 100}
+            options |= {"maxcor": descent.memory, "ftol": 0.0, "gtol": descent.gradient}
+            box = np.column_stack([limit / guarded.unit for limit in limits])
+            start = x / guarded.unit
             result = minimize(
-                guarded,
-                x,
-                jac=True,
-                method="L-BFGS-B",
-                bounds=np.column_stack(limits),
-                callback=callback,
-                options={
-                    "maxiter": remaining,
-                    "maxfun": 20 * remaining + 100,
-                    "maxcor": descent.memory,
-                    "ftol": 0.0,
-                    "gtol": descent.gradient,
-                },
+                guarded, start, jac=True, method="L-BFGS-B", bounds=box, callback=watch.iteration, options=options
             )
             if result.status == 1:
                 break
             # It stalled, or a line search failed: either it is done, or its memory led it astray.
-            if not before - guarded.loss > tol:
+            if not before - guarded.loss > tolerance.at(guarded.loss):
                 minimum.converged = bool(np.isfinite(guarded.loss))
                 break
             # A hair away, where the loss is not what rounding made of it at the best of all points.

@@ -127,6 +127,16 @@ class ParameterTable:
         upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
         return lower, upper
 
+    def alike(self) -> np.ndarray:
+        """An integer (size,) for each coordinate, the same for those of one column of a parameter of three axes."""
+        kinds, n_kinds = {}, 0
+        for parameter in self.parameters:
+            shape = parameter.start.shape
+            n_own = shape[2] if len(shape) == 3 else parameter.start.size
+            kinds[parameter.name] = n_kinds + np.arange(parameter.start.size) % max(n_own, 1)
+            n_kinds += n_own
+        return self.flat(kinds).astype(int)
+
     def coordinates(self, flat: Any) -> dict[str, Any]:
         """The coordinates by name, each in its parameter's shape; can be traced by autograd."""
         found = {}

@@ -12,7 +12,7 @@ import numpy as np
 from sklearn.utils.random import sample_without_replacement
 
 from .blocks import Batch, Block, Blocks
-from .source import Moments, RawRows, Source
+from .source import LocalSource, Moments, RawRows, Source
 from .threads import BlockMap
 
 # Mini-batches are drawn from so many rows at a time: shuffling needs memory.
@@ -131,6 +131,13 @@ class Rows:
                 order = first + rng.permutation(last - first)
                 for begin in range(0, len(order) - size + 1, size):
                     yield Batch(make(self.source.take(order[begin : begin + size])))
+
+    def sampled(self, size: int, rng: np.random.RandomState) -> Rows:
+        """``size`` of the rows, drawn at random and held in memory, in random order."""
+        chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
+        raw, order = self.source.take(chosen), rng.permutation(size)
+        source = LocalSource.of(raw.inputs[order], raw.features[order], raw.targets[order])
+        return replace(self, source=source)
 
     def part(self, first: int, end: int, share: float) -> Rows:
         """Consecutive rows, with a share of the memory."""

@@ -37,7 +37,8 @@ def place(values):
 def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True):
     """How a fit from a start may have ended: the hyperparameters say after how many iterations."""
     n_iter = attempt.until if n_iter is None else n_iter
-    return Fit(attempt.values | {"noise": np.full(2, noise)}, bound, [0.0] * n_iter, converged)
+    values = attempt.values | {"noise": np.full(2, noise)}
+    return Fit(values, bound, [0.0] * n_iter, converged, n_rows=attempt.n_rows)
 
 
 def drive(strategy, *results):
@@ -239,3 +240,85 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
 
     with pytest.raises(KeyboardInterrupt):
         search(Interrupted(strategy(), []))
+
+
+# --- samples of the rows ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("n_rows", "n_inducing", "sizes"),
+    [
+        (1999, 10, ()),
+        (2000, 10, (1000,)),
+        (36_000, 256, (5120,)),
+        (36_000, 100, (2000, 8000)),
+        (10**7, 10, (1000, 4000, 16_000, 64_000)),
+    ],
+)
+def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, sizes):
+    assert replace(RULES, sample=(1000, 20)).samples(n_rows, n_inducing) == sizes
+
+
+def test_without_a_rule_there_are_no_samples():
+    assert RULES.samples(10**6, 10) == ()
+
+
+def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
+    own = strategy(samples=(1000, 4000), place=place)
+    made, best = drive(
+        own, (5.0, UNFINISHED), (4.0, UNFINISHED), (6.0, GOOD), (4.5, GOOD), (3.0, UNFINISHED), (2.0, GOOD)
+    )
+    # Two noises, points placed anew and the old ones; then the better on more rows, and on all.
+    assert [attempt.n_rows for attempt in made] == [1000, 1000, 1000, 1000, 4000, None]
+    assert [attempt.until for attempt in made] == [100, 100, 200, 200, 100, 1000]
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    assert made[0].cold
+    assert not any(attempt.cold for attempt in made[1:])
+    for later in made[4:]:
+        np.testing.assert_allclose(later.values["inducing_points"], PLACES + 10.0)
+        assert later.after is None
+    # A fit to more rows is the better one, whatever the bounds of samples.
+    assert best.bound == 2.0
+    assert best.n_rows is None
+
+
+def test_what_collapsed_on_a_sample_starts_anew_on_more_rows():
+    rules = replace(RULES, other_starts=())
+    made, best = drive(
+        strategy(rules=rules, samples=(1000, 4000)),
+        *((5.0, COLLAPSED), (5.0, COLLAPSED)),
+        *((5.0, COLLAPSED), (5.0, COLLAPSED)),
+        (2.0, GOOD),
+    )
+    assert [attempt.n_rows for attempt in made] == [1000, 1000, 4000, 4000, None]
+    for cold in made[::2]:
+        np.testing.assert_allclose(cold.values["hyperparameters"], [2.0, 3.0])
+        np.testing.assert_allclose(cold.values["noise"], 1e-4)
+        assert cold.cold
+    assert best.bound == 2.0
+
+
+def test_no_iterations_need_no_sample():
+    made, _ = drive(strategy(samples=(1000,), max_iter=0), (5.0, GOOD))
+    assert [attempt.n_rows for attempt in made] == [None]
+
+
+def test_few_iterations_are_the_most_on_a_sample_too():
+    made, _ = drive(strategy(samples=(1000,), max_iter=7), (5.0, UNFINISHED), (4.0, UNFINISHED), (2.0, UNFINISHED))
+    assert [attempt.until for attempt in made] == [7, 7, 7]
+
+
+def test_after_ctrl_c_on_a_sample_its_best_fit_counts():
+    own, made = strategy(samples=(1000,)), []
+
+    def minimise(attempt):
+        made.append(attempt)
+        if len(made) == 2:
+            monitor.stop()
+        return ended(attempt, float(len(made)))
+
+    monitor = Monitor()
+    best = search(SimpleNamespace(strategy=own, monitor=monitor, minimise=minimise))
+    assert len(made) == 2
+    assert best.n_rows == 1000
+    assert best.bound == 2.0

@@ -222,6 +222,8 @@ def test_a_signal_variance_that_is_not_given_matches_the_scatter():
         assert high == pytest.approx(1e2 * model.kernel_.k1.constant_value)
 
 
+# One of them ends at its limit, and the user is told.
+@pytest.mark.filterwarnings("ignore:The optimal value found")
 def test_single_hyperparameters_can_be_fixed():
     kernel = 2.0 * (
         RBF([0.5, 1.0], "fixed") + ConstantKernel(0.5) * RationalQuadratic(1.5, 0.7, "fixed", (0.1, 5.0))

@@ -4,7 +4,7 @@ from scipy.optimize import rosen, rosen_der
 
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
-from skevgp.optimizers.lbfgs import lbfgs
+from skevgp.optimizers.lbfgs import Tolerance, lbfgs
 
 FREE = (np.full(2, -np.inf), np.full(2, np.inf))
 
@@ -142,3 +142,30 @@ def test_starts_that_gain_without_an_iteration_come_to_an_end():
     minimum = lbfgs(sinking, np.zeros(2), FREE, 20, 1e-9)
     assert not minimum.converged
     assert minimum.loss == -len(looks)
+
+
+def test_limits_hold_in_whatever_units():
+    limits = np.full(2, -2.0), np.full(2, 0.5)
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), limits, 200, 1e-12, units=lambda x: np.array([0.1, 7.0]))
+    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-5)
+
+
+def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
+    def valley(x):
+        return rosen(x), rosen_der(x)
+
+    start, free = np.full(20, -1.0), (np.full(20, -np.inf), np.full(20, np.inf))
+    origin = rosen(start)
+    full = lbfgs(valley, start, free, 1000, 1e-9)
+    near = lbfgs(valley, start, free, 1000, Tolerance(1e-9, 1e-4, origin))
+    assert near.converged
+    assert near.n_iter < full.n_iter
+    assert origin - near.loss > 0.97 * (origin - full.loss)
+
+
+def test_a_tolerance_has_a_least_value():
+    assert Tolerance(0.1).at(-5.0) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(1.0) == 1.0
+    assert Tolerance(0.1, 0.5, 3.0).at(4.0) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(np.nan) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(-np.inf) == 0.1
