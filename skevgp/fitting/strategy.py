@@ -19,9 +19,8 @@ from .._progress import Monitor
 from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
 
-
 # Rows: samples are held in memory.
-LARGEST_SAMPLE = 100_000
+LARGEST_SAMPLE = 40_000
 
 
 @dataclass(frozen=True)

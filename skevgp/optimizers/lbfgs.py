@@ -165,12 +165,18 @@ def lbfgs(
             if units is not None:
                 guarded.unit = units(x)
             watch = _Watch(minimum, tolerance, descent.patience, monitor)
-            options = {"maxiter": max_iter - minimum.n_iter, "maxfun": 20 * (max_iter - minimum.n_iter) + 100}
-            options |= {"maxcor": descent.memory, "ftol": 0.0, "gtol": descent.gradient}
+            left = max_iter - minimum.n_iter
+            ends = {"maxiter": left, "maxfun": 20 * left + 100, "ftol": 0.0, "gtol": descent.gradient}
             box = np.column_stack([limit / guarded.unit for limit in limits])
             start = x / guarded.unit
             result = minimize(
-                guarded, start, jac=True, method="L-BFGS-B", bounds=box, callback=watch.iteration, options=options
+                guarded,
+                start,
+                jac=True,
+                method="L-BFGS-B",
+                bounds=box,
+                callback=watch.iteration,
+                options=ends | {"maxcor": descent.memory},
             )
             if result.status == 1:
                 break

@@ -146,7 +146,7 @@ def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
 def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
     """Beyond what may be kept, four times the rows need no more memory."""
     peaks = []
-    for n in (50_000, 200_000):
+    for n in (100_000, 400_000):
         np.save(tmp_path / "X.npy", RNG.uniform(-2.0, 2.0, (n, 8)))
         np.save(tmp_path / "y.npy", RNG.randn(n))
         mapped = [np.load(tmp_path / name, mmap_mode="r") for name in ("X.npy", "y.npy")]
