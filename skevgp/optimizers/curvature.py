@@ -17,8 +17,8 @@ def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_pr
     """1 / √|∂²loss/∂x²|, of which coordinates that are alike have one: the root of what they are in the mean.
 
     The diagonal of the Hessian from differences of gradients in random directions v of signs: the mean of
-    v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). What the other
-    entries add to it by chance makes units smaller, not larger.
+    v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). What the
+    other entries add to it by chance makes units smaller, not larger.
 
     Parameters
     ----------
