@@ -23,8 +23,9 @@ The kernel is a squared exponential with a lengthscale per column, the prior mea
 each output, or shared as the peer does it: skevgp keeps them per output, the others share them too. skevgp has its
 defaults; the others 120 iterations of L-BFGS (GPflow), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its tutorial's 0.01
 gets nowhere in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from 5-fold
-cross-validation outside the clock. Each fit has a process of its own on two cores; the clock does not run while a fit
-is looked at. Of skevgp, what there was at an earlier time is what a fit returns that is ended then, with its time.
+cross-validation outside the clock. Each fit has a process of its own on two cores. The clock starts with the arrays in
+memory and the libraries imported, so that TensorFlow's tracing is part of a fit; it does not run while a fit is looked
+at. Of skevgp, what there was at an earlier time is what a fit returns that is ended then, with its time.
 """
 
 from __future__ import annotations
@@ -36,7 +37,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
@@ -51,19 +54,36 @@ from peers.jobs import Job, Result
 from peers.models import PEERS
 from skevgp.metrics import negative_log_predictive_density, std_norm
 
-DEFAULT_PEERS = (
-    *("skevgp", "GPflow SGPR", "GPyTorch SGPR", "scikit-learn GPR"),
-    *("scikit-learn HistGradientBoosting", "scikit-learn BayesianRidge"),
-)
-QUICK_PEERS = ("skevgp", "scikit-learn GPR", "scikit-learn HistGradientBoosting", "scikit-learn BayesianRidge")
-SPLITS_PEERS = ("skevgp", "GPflow SGPR", "scikit-learn HistGradientBoosting", "scikit-learn BayesianRidge")
-KEY = ("peer", "dataset", "sharing", "m", "n_train", "seed")
+_LINE, _TREES = "scikit-learn BayesianRidge", "scikit-learn HistGradientBoosting"
+_TABLES = [name for name, one in DATASETS.items() if one.from_folder]
+# What options mean that are not given: usually, for all splits of the tables, and in short mode.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "against_peers": {
+        "datasets": list(DATASETS),
+        "seeds": 1,
+        "checkpoints": 12,
+        "peers": ["skevgp", "GPflow SGPR", "GPyTorch SGPR", "scikit-learn GPR", _TREES, _LINE],
+    },
+    "splits": {
+        "datasets": _TABLES,
+        "seeds": 10,
+        "checkpoints": 0,
+        "peers": ["skevgp", "GPflow SGPR", _TREES, _LINE],
+    },
+    "against_peers_quick": {
+        "datasets": list(QUICK),
+        "seeds": 1,
+        "checkpoints": 3,
+        "peers": ["skevgp", "scikit-learn GPR", _TREES, _LINE],
+    },
+}
+KEY = ("peer", "dataset", "sharing", "seed")
 COLUMNS = (
-    *KEY,
+    *(*KEY, "m", "n_train"),
     *("seconds", "cpu_seconds", "predict_seconds", "iterations", "evaluations", "stop", "bound", "output_bounds"),
     *("rmse", "nlpd", "error_mean", "error_median", "error_p99", "std_norm", "load", "date", "versions", "machine"),
 )
-CURVE_COLUMNS = (*KEY, "seconds_so_far", "cpu_seconds_so_far", "bound_so_far", "rmse_so_far", "nlpd_so_far")
+CURVE_COLUMNS = (*KEY, "n_train", "seconds_so_far", "cpu_seconds_so_far", "bound_so_far", "rmse_so_far", "nlpd_so_far")
 _CURVE_POINTS = 150
 
 
@@ -129,6 +149,8 @@ def run(python: str, peer: str, data: Data, job: Job, key: Row) -> tuple[Row, li
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     provenance = harness.provenance()
     values: dict[str, object] = {
+        "m": {"inducing": len(job.inducing_points), "rows": len(job.X), "none": ""}[PEERS[peer].points],
+        "n_train": len(job.X),
         "load": round(load, 1),
         "date": provenance["date"],
         "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
@@ -157,7 +179,9 @@ def run(python: str, peer: str, data: Data, job: Job, key: Row) -> tuple[Row, li
         "std_norm": std_norm(result.std[0]),
         "versions": result.versions,
     }
-    return {name: str({**key, **values}[name]) for name in COLUMNS}, curve_of(result, Y, key)
+    return {name: str({**key, **values}[name]) for name in COLUMNS}, curve_of(
+        result, Y, key | {"n_train": str(len(job.X))}
+    )
 
 
 def curve_of(result: Result, Y: np.ndarray, key: Row) -> list[Row]:
@@ -210,62 +234,66 @@ def arguments() -> argparse.Namespace:
     parser.add_argument("--peers", nargs="+", choices=PEERS, metavar="PEER", help=f"of {', '.join(PEERS)}")
     parser.add_argument("--sharing", nargs="+", choices=("none", "all", "default"), help="default: all")
     parser.add_argument("--all-splits", action="store_true", help="other defaults: the tables, 10 splits, no curves")
-    said = "times before the end at which a fit of the first seed is looked at; default: 12"
+    said = "times before the end at which a fit of the first seed is looked at, 0 and more; default: 12"
     parser.add_argument("--checkpoints", type=int, help=said)
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch")
     parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
     options = parser.parse_args()
-    known = {
-        name: one
-        for name, one in (QUICK if options.quick else DATASETS).items()
-        if options.datasets is None or name in options.datasets
-    }
-    if options.all_splits:
-        name, peers, defaults = "splits", SPLITS_PEERS, {"seeds": 10, "checkpoints": 0}
-        known = {name: one for name, one in known.items() if one.from_folder}
-    else:
-        name, peers, defaults = "against_peers", DEFAULT_PEERS, {"seeds": 1, "checkpoints": 12}
-    if options.datasets is None and not options.all_splits and options.data_folder is None:
-        known = {name: one for name, one in known.items() if not one.from_folder}
-    for option, value in (defaults | {"peers": list(QUICK_PEERS if options.quick else peers)}).items():
+    name = "splits" if options.all_splits else "against_peers"
+    for option, value in DEFAULTS["against_peers_quick" if options.quick else name].items():
         if getattr(options, option) is None:
             setattr(options, option, value)
-    options.datasets = known
+            if option == "datasets" and options.data_folder is None:
+                options.datasets = [name for name in value if name not in _TABLES]
+    known = QUICK if options.quick else DATASETS
+    options.datasets = {name: known[name] for name in options.datasets if name in known}
     options.output = harness.output_path(options, name)
     return options
 
 
-def sharings(peer: str, n_outputs: int, chosen: list[str] | None) -> list[str]:
+def sharings(peer: str, dataset: DataSet, chosen: list[str] | None) -> list[str]:
     """With one output there is nothing to share."""
-    if n_outputs == 1:
+    if not dataset.several:
         return ["none"]
     return [sharing for sharing in PEERS[peer].sharing if chosen is None or sharing in chosen]
 
 
-def run_all(name: str, dataset: DataSet, seed: int, pythons: dict[str, str], options: argparse.Namespace) -> None:
+def run_missing(
+    name: str, seed: int, pythons: dict[str, str], options: argparse.Namespace, table: Table, curves: Table
+) -> None:
     """All fits of a data set that the tables do not have."""
-    table, curves = options.tables
-    data = Data.of(dataset, seed, options.data_folder)
-    for peer, python in pythons.items():
+    dataset: DataSet = options.datasets[name]
+    keys = [
+        dict(zip(KEY, (peer, name, sharing, str(seed)), strict=True))
+        for peer in pythons
+        for sharing in sharings(peer, dataset, options.sharing)
+    ]
+    keys = [key for key in keys if options.redo or not table.of(key)]
+    data = Data.of(dataset, seed, options.data_folder) if keys else None
+    for key in keys:
+        peer = key["peer"]
+        options.agree()
         rows = data.rows(PEERS[peer].points == "rows", seed)
-        X, Y = data.sets.X[rows], data.sets.Y[rows]
-        m = {"inducing": len(data.inducing_points), "rows": len(X), "none": 0}[PEERS[peer].points]
-        for sharing in sharings(peer, Y.shape[1], options.sharing):
-            key = dict(zip(KEY, map(str, (peer, name, sharing, m, len(X), seed)), strict=True))
-            if table.of(key) and not options.redo:
-                continue
-            own_rule = PEERS[peer].own_rule and not options.quick
-            limits = 0 if own_rule else dataset.max_iter, options.time_limit, seed
-            checkpoints = options.checkpoints if seed == 0 else 0
-            job = Job(X, Y, data.sets.X_test, data.inducing_points, data.lengthscales, sharing, *limits, checkpoints)
-            print(f"{name}, seed {seed}: {peer}, sharing {sharing} ...", end=" ", flush=True)
-            row, curve = run(python, peer, data, job, key)
-            table.replace(key, [row])
-            curves.replace(key, curve)
-            said = "RMSE {:.4f}, NLPD {:.4f} in {:.2f} s,"
-            numbers = [float(row[name]) for name in ("rmse", "nlpd", "seconds") if row["seconds"]]
-            print(said.format(*numbers) if numbers else "", row["stop"], flush=True)
+        job = Job(
+            data.sets.X[rows],
+            data.sets.Y[rows],
+            data.sets.X_test,
+            data.inducing_points,
+            data.lengthscales,
+            key["sharing"],
+            0 if PEERS[peer].own_rule and not options.quick else dataset.max_iter,
+            options.time_limit,
+            seed,
+            options.checkpoints if seed == 0 else 0,
+        )
+        print(f"{name}, seed {seed}: {peer}, sharing {key['sharing']} ...", end=" ", flush=True)
+        row, curve = run(pythons[peer], peer, data, job, key)
+        table.replace(key, [row])
+        curves.replace(key, curve)
+        said = "RMSE {:.4f}, NLPD {:.4f} in {:.2f} s,"
+        numbers = [float(row[name]) for name in ("rmse", "nlpd", "seconds") if row["seconds"]]
+        print(said.format(*numbers) if numbers else "", row["stop"], flush=True)
 
 
 def main() -> None:
@@ -276,12 +304,11 @@ def main() -> None:
         raise SystemExit(f"No picture could be drawn ({problem}): pip install matplotlib") from problem
     table = Table(options.output, COLUMNS)
     curves = Table(options.output.with_name(f"{options.output.stem}_curves.csv"), CURVE_COLUMNS)
-    options.tables = table, curves
     pythons = interpreters(options.peers, options.peer_python)
-    agreement.check(pythons, work)
-    for name, dataset in options.datasets.items():
+    options.agree = cache(partial(agreement.check, pythons, work))  # once, before the first fit
+    for name in options.datasets:
         for seed in range(options.seeds):
-            run_all(name, dataset, seed, pythons, options)
+            run_missing(name, seed, pythons, options, table, curves)
     against_peers_report.draw(table.rows, curves.rows, options.output.with_suffix(".png"))
     harness.write_report(against_peers_report.paragraphs(table.rows, curves.rows), options.output)
 

@@ -92,7 +92,7 @@ def against_reference(row: Row, rows: list[Row], curves: Curve) -> dict[str, flo
     if not references:
         return dict.fromkeys(("to_bound", "faster", "faster_cpu", "to_nlpd"), np.nan)
     reference = references[0]
-    own = _own(curves, peer=row["peer"], sharing=row["sharing"], m=row["m"], **same)
+    own = _own(curves, peer=row["peer"], sharing=row["sharing"], **same)
     bound = float(reference["bound"]) - _ROUNDING
     to_bound, cpu = (time_to_reach(own, "bound", bound, clock) for clock in ("seconds", "cpu_seconds"))
     return {
@@ -146,7 +146,7 @@ def _first_seed(rows: list[Row], all_rows: list[Row], curves: Curve) -> str:
     )
     lines = []
     for row in rows:
-        said = [row["peer"], row["sharing"], row["n_train"], row["m"] if row["m"] != "0" else ""]
+        said = [row["peer"], row["sharing"], row["n_train"], row["m"]]
         if not row["seconds"]:
             lines.append([*said, *[""] * 10, row["load"], row["stop"]])
             continue

@@ -16,8 +16,8 @@ from scipy.linalg import cho_factor, cho_solve
 from scipy.spatial.distance import cdist
 from scipy.stats import multivariate_normal
 
+from peers import models
 from peers.jobs import Fixed, Said
-from peers.models import PEERS
 
 # Relative.
 TOLERANCE = 1e-6
@@ -86,15 +86,21 @@ def check(peers: Mapping[str, str], work: Callable[[str, str, Path, Path], None]
     SystemExit
         If a library disagrees, by name.
     """
-    asked = {PEERS[peer].package: peer for peer in reversed(peers) if PEERS[peer].at_fixed}
+    asked: dict[str, str] = {}
+    for peer in peers:
+        if models.PEERS[peer].at_fixed:
+            asked.setdefault(models.PEERS[peer].package, peer)
     fixed = cases()
-    for package, peer in reversed(asked.items()):
+    for package, peer in asked.items():
         with tempfile.TemporaryDirectory() as folder:
             given, said = Path(folder, "given"), Path(folder, "said")
             given.mkdir(), said.mkdir()
             for index, case in enumerate(fixed):
                 case.save(given / f"{index}.npz")
-            work(peers[peer], peer, given, said)
+            try:
+                work(peers[peer], peer, given, said)
+            except RuntimeError as problem:
+                raise SystemExit(f"{package} failed at fixed hyperparameters: {problem}") from problem
             apart = {
                 int(path.stem): difference(Said.load(path), expected(fixed[int(path.stem)])) for path in said.iterdir()
             }
@@ -103,6 +109,9 @@ def check(peers: Mapping[str, str], work: Callable[[str, str, Path, Path], None]
             raise SystemExit(
                 f"{package} disagrees: {apart[worst]:.1e} from the dense matrices (kernel {fixed[worst].kernel}, "
                 f"{len(fixed[worst].X)} rows, {len(fixed[worst].inducing_points)} inducing points, jitter "
-                f"{PEERS[peer].jitter}); at most {TOLERANCE:g} is allowed. Nothing was timed."
+                f"{models.PEERS[peer].jitter}); at most {TOLERANCE:g} is allowed. Nothing was timed."
             )
-        print(f"{package} agrees with dense matrices to {apart[worst]:.0e} (jitter: {PEERS[peer].jitter})", flush=True)
+        print(
+            f"{package} agrees with dense matrices to {apart[worst]:.0e} (jitter: {models.PEERS[peer].jitter})",
+            flush=True,
+        )

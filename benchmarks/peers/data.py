@@ -82,25 +82,28 @@ class DataSet:
         The common limit of L-BFGS, per model.
     from_folder : bool
         Whether it is read from the folder that the user gives.
+    several : bool
+        Whether it has several outputs, which may share.
     """
 
     load: Callable[[int, Path | None], Sets]
     n_inducing: int
     max_iter: int = 120
     from_folder: bool = False
+    several: bool = False
 
 
 DATASETS = {
     **{name: DataSet(partial(tabular, name), 256, from_folder=True) for name in ("airfoil", "elevators", "kin40k")},
     "smooth": DataSet(partial(smooth, 10_000), 256),
-    "pendulum": DataSet(partial(dynamics, "pendulum"), 40),
-    "cartpole": DataSet(partial(dynamics, "cartpole"), 100),
-    "acrobot": DataSet(partial(dynamics, "acrobot"), 250),
-    "iiwa14": DataSet(partial(dynamics, "iiwa14"), 500),
+    **{
+        name: DataSet(partial(dynamics, name), n_inducing, several=True)
+        for name, n_inducing in (("pendulum", 40), ("cartpole", 100), ("acrobot", 250), ("iiwa14", 500))
+    },
 }
 QUICK = {
     "smooth": DataSet(partial(smooth, 200), 8, 20),
-    "pendulum": DataSet(partial(dynamics, "pendulum", n_trajectories=5, n_steps=12), 8, 20),
+    "pendulum": DataSet(partial(dynamics, "pendulum", n_trajectories=5, n_steps=12), 8, 20, several=True),
 }
 
 

@@ -27,8 +27,8 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
 
-from peers import with_gpflow, with_gpytorch, with_skevgp, with_sklearn
 from peers.jobs import Checkpoint, Fitted, Fixed, Job, Result, Said, Watch
+from peers.libraries import with_gpflow, with_gpytorch, with_skevgp, with_sklearn
 
 # Of the times of two checkpoints.
 STEP = 1.4

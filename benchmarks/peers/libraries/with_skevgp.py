@@ -73,5 +73,5 @@ def _fit_until(job: Job, watch: Watch, seconds: float) -> tuple[Any, str, int]:
         model.fit(job.X, job.Y if job.Y.shape[1] > 1 else np.ravel(job.Y))
     messages = " ".join(str(warning.message) for warning in caught)
     reasons = {"interrupted": "time", "max_iter=": "iterations", "rounding": "rounding"}
-    stop = [reason for sign, reason in reasons.items() if sign in messages] or ["converged"]
+    stop = [reason for sign, reason in reasons.items() if sign in messages] or ["warned" if messages else "converged"]
     return model, " ".join(stop), iterations
