@@ -65,9 +65,9 @@ class Result(Archive):
 
     Attributes
     ----------
-    mean, std : ndarray of shape (1 + n_checkpoints, n_test, o)
-        With noise: at the end, and at the checkpoints.
-    seconds, cpu_seconds, bound : ndarray of shape (1 + n_checkpoints,)
+    mean, std : ndarray of shape (1 + k, n_test, o)
+        With noise: at the end, and at up to ``n_checkpoints`` times before.
+    seconds, cpu_seconds, bound : ndarray of shape (1 + k,)
         Wall-clock; of the processor, over all threads; the sum of the models' bounds, NaN if there is none.
     predict_seconds : float
     iterations, evaluations : float

@@ -102,8 +102,11 @@ def run(peer: str, job: Job) -> Result:
         predict_seconds = time.perf_counter() - begin
         points = [end]
         for k in range(job.n_checkpoints if fitted.at else 0):
-            points.append(fitted.at(end.seconds / STEP ** (k + 1)))
-            predictions.append(points[-1].predict(job.X_test))
+            point = fitted.at(end.seconds / STEP ** (k + 1))
+            if point.seconds == points[-1].seconds:  # there was nothing before
+                break
+            points.append(point)
+            predictions.append(point.predict(job.X_test))
     packages = [import_module(name.partition(".")[0]) for name in (*PEERS[peer].modules, "numpy")]
     mean, std = (np.array(part) for part in zip(*predictions, strict=True))
     return Result(

@@ -148,6 +148,7 @@ def test_a_fit_is_timed_against_the_last_bound_and_nlpd_of_the_reference():
     # A hundredth of a nat is rounding.
     assert to["to_bound"] == pytest.approx(np.exp(np.interp(8.99 / 10.0, [0.0, 1.0], [0.0, np.log(4.0)])))
     assert to["faster"] == pytest.approx(40.0 / to["to_bound"])
+    assert to["net"] == pytest.approx(39.9 / to["to_bound"])
     assert to["faster_cpu"] == pytest.approx(to["faster"])
     assert to["to_nlpd"] == pytest.approx(2.0, rel=1e-4)
     assert np.isnan(list(against_reference(own, [own], curves).values())).all()
