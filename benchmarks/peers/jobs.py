@@ -36,6 +36,8 @@ class Job(Archive):
     X, Y, X_test : ndarray of shape (n, d), (n, o), (n_test, d)
     inducing_points : ndarray of shape (m, d)
     lengthscales : ndarray of shape (d,)
+    noise : float
+        Where the noise variance of other peers than skevgp starts, a share of the mean square of the targets.
     sharing : {"none", "all", "default"}
         Independent models per output, one for all of them, or what the peer does by itself.
     max_iter : int
@@ -52,6 +54,7 @@ class Job(Archive):
     X_test: np.ndarray
     inducing_points: np.ndarray
     lengthscales: np.ndarray
+    noise: float
     sharing: str
     max_iter: int
     time_limit: float

@@ -78,7 +78,6 @@ PEERS = {
     "skevgp": Peer(*_SKEVGP, ("default", "none"), own_rule=True),
     "skevgp, same limit": Peer(*_SKEVGP, ("default", "none")),
     "GPflow SGPR": Peer(with_gpflow.MODULES, with_gpflow.fit, *_GPFLOW, ("none", "all")),
-    "GPflow SGPR, noise 1": Peer(with_gpflow.MODULES, lambda job, watch: with_gpflow.fit(job, watch, 1.0), *_GPFLOW),
     "GPyTorch SGPR": Peer(with_gpytorch.MODULES, lambda job, watch: with_gpytorch.fit(job, watch, False), *_GPYTORCH),
     "GPyTorch SVGP": Peer(with_gpytorch.MODULES, lambda job, watch: with_gpytorch.fit(job, watch, True)),
     "scikit-learn GPR": Peer(*_GPR, ("none", "all"), points="rows"),

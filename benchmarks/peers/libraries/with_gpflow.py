@@ -11,8 +11,6 @@ from peers.jobs import Fitted, Fixed, Job, Predict, Said, Scaled, TimeUpError, W
 
 MODULES = ("gpflow", "tensorflow", "scipy")
 JITTER = "absolute 1e-12 where libraries are compared, 1e-6, its own, where it is timed"
-# Of the mean square of the targets. GPflow's own is all of it.
-NOISE_START = 0.01
 
 
 def sgpr(
@@ -74,14 +72,14 @@ def _recorded_optimizer(watch: Watch, scaled: Scaled, index: int) -> Any:
     return Recorded()
 
 
-def fit(job: Job, watch: Watch, noise_start: float = NOISE_START) -> Fitted:
+def fit(job: Job, watch: Watch) -> Fitted:
     """GPflow's own noise floor and jitter (both 1e-6)."""
     import tensorflow as tf
 
     scaled = Scaled(job)
     ways, bounds, stops, iterations = [], [], [], 0
     for index, columns in enumerate(scaled.models):
-        model = sgpr(scaled.X, scaled.Y[:, columns], scaled.Z, scaled.lengthscales, 1.0, noise_start, "rbf")
+        model = sgpr(scaled.X, scaled.Y[:, columns], scaled.Z, scaled.lengthscales, 1.0, job.noise, "rbf")
         optimizer, variables = _recorded_optimizer(watch, scaled, index), model.trainable_variables
         try:
             minimum = optimizer.minimize(

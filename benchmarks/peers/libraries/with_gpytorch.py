@@ -112,7 +112,7 @@ def fit(job: Job, watch: Watch, variational: bool) -> Fitted:
     ways, bounds, stops, n_done = [], [], [], 0
     for index, columns in enumerate(scaled.models):
         deadline, y, stop = watch.deadline(index), torch.tensor(scaled.Y[:, columns[0]]), "steps"
-        kernel, likelihood = covariance("rbf", scaled.lengthscales, 1.0), gaussian(0.01)
+        kernel, likelihood = covariance("rbf", scaled.lengthscales, 1.0), gaussian(job.noise)
         if variational:
             model = svgp(Z, kernel)
             objective = gpytorch.mlls.VariationalELBO(likelihood, model, num_data=len(X))

@@ -31,7 +31,7 @@ def fit_gpr(job: Job, watch: Watch) -> Fitted:
 
     scaled = Scaled(job)
     # The default floor of the noise, 1e-5, is above the noise of dynamics.
-    kernel = ConstantKernel() * RBF(scaled.lengthscales) + WhiteKernel(0.01, (1e-10, 10.0))
+    kernel = ConstantKernel() * RBF(scaled.lengthscales) + WhiteKernel(job.noise, (1e-10, 10.0))
     models = []
     for columns in scaled.models:
         gp = GaussianProcessRegressor(kernel, random_state=job.seed).fit(scaled.X, scaled.Y[:, columns])

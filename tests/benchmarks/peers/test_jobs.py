@@ -10,14 +10,14 @@ def test_bounds_of_scaled_targets_are_in_the_users_units():
 
     rng = np.random.RandomState(0)
     X, Y = rng.randn(20, 2), rng.randn(20, 3) * [1e-3, 1.0, 50.0]
-    job = Job(X, Y, X, X[:4], np.ones(2), "none", 10, 1.0, 0)
+    job = Job(X, Y, X, X[:4], np.ones(2), 0.1, "none", 10, 1.0, 0)
     scaled = Scaled(job)
     K = np.exp(-0.5 * ((X[:, np.newaxis] - X) ** 2).sum(axis=2)) + 0.1 * np.eye(20)
     for o, columns in enumerate(scaled.models):
         inside = multivariate_normal(np.zeros(20), K).logpdf(scaled.Y[:, o])
         outside = multivariate_normal(np.zeros(20), K * scaled.unit[o] ** 2).logpdf(Y[:, o])
         assert scaled.bound(inside, columns) == pytest.approx(outside, abs=1e-9)
-    assert Scaled(Job(X, Y, X, X[:4], np.ones(2), "all", 10, 1.0, 0)).models == [[0, 1, 2]]
+    assert Scaled(Job(X, Y, X, X[:4], np.ones(2), 0.1, "all", 10, 1.0, 0)).models == [[0, 1, 2]]
 
 
 def test_the_curve_is_the_sum_of_the_best_bounds_so_far():
@@ -39,7 +39,7 @@ def test_a_fit_is_looked_at_as_it_was_at_a_time():
     from peers.jobs import Job, Scaled, Watch
 
     X, Y = np.array([[-1.0], [1.0]]), np.array([[2.0, 3.0], [-2.0, 3.0]])
-    scaled, watch = Scaled(Job(X, Y, X, X, np.ones(1), "none", 10, 1.0, 0)), Watch(100.0, 2)
+    scaled, watch = Scaled(Job(X, Y, X, X, np.ones(1), 0.1, "none", 10, 1.0, 0)), Watch(100.0, 2)
     watch.records = [(1.0, 1.5, 0, -5.0), (2.0, 2.5, 0, -4.0), (4.0, 4.5, 1, -9.0), (5.0, 5.5, 1, -1.0)]
 
     def predicts(value):
