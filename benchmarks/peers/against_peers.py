@@ -1,15 +1,32 @@
 """skevgp against other libraries: same data, same number of inducing points, same kernel, same start.
 
-Writes one row per fit to a CSV (fits that are there already are not repeated), the way of the bound over time to a
-second one, draws a picture from both, and prints a table. Peers that are not installed are left out. GPflow needs
-another NumPy than skevgp: give the interpreter that has the peers (see requirements.txt).
+First every library has to agree with the others at fixed hyperparameters (`agreement.py`). Then it writes one row per
+fit to a CSV (fits that are there already are not repeated), bound, RMSE and NLPD over time to a second one, draws a
+picture from both, and writes and prints a Markdown page: how long each took to reach the bound and the NLPD of GPflow's
+SGPR after its iterations, and means over seeds. Peers that are not installed are left out. GPflow needs another NumPy
+than skevgp: give the interpreter that has the peers (see requirements.txt).
 
-    python benchmarks/peers/against_peers.py --peer-python .peers/bin/python
-    python benchmarks/peers/against_peers.py --systems cartpole --peers skevgp "GPflow SGPR" --redo
-    python benchmarks/peers/against_peers.py --quick  # a few seconds: a small pendulum, skevgp and scikit-learn
+    python benchmarks/peers/against_peers.py --peer-python .peers/bin/python --data-folder ../uci
+    python benchmarks/peers/against_peers.py --datasets cartpole --peers skevgp "GPflow SGPR" --redo
+    python benchmarks/peers/against_peers.py --quick  # half a minute: small data, skevgp and scikit-learn
+
+All ten splits of the tables, GPflow's SGPR, gradient boosting and a straight line beside skevgp, without curves:
+
+    python benchmarks/peers/against_peers.py --all-splits --peer-python .peers/bin/python --data-folder ../uci
+
+The tables airfoil, elevators and kin40k are read from --data-folder (NAME/data.csv.gz, the target last, and
+NAME/test_mask.csv.gz, a column per split); a seed is a split. Their inputs and targets are standardised with the
+training rows; so are those of "smooth", 10,000 rows of waves of 8 columns with noise. Of systems the change of the
+state is learned.
 
 The kernel is a squared exponential with a lengthscale per column, the prior mean 0; signal variance and noise are of
-each output, or with sharing="all" what the peer makes of it: skevgp keeps them per output, the others share them too.
+each output, or shared as the peer does it: skevgp keeps them per output, the others share them too. skevgp has its
+defaults; the noise of the others starts at all of the variance (GPflow's own start), of systems at a hundredth, and
+they have 120 iterations of L-BFGS (GPflow), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its tutorial's 0.01 gets nowhere
+in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from 5-fold cross-validation
+outside the clock. Each fit has a process of its own on two cores. The clock starts with the arrays in memory and the
+libraries imported, so that TensorFlow's tracing is part of a fit; it does not run while a fit is looked at. Of skevgp,
+what there was at an earlier time is what a fit returns that is ended then, with its time.
 """
 
 from __future__ import annotations
@@ -21,9 +38,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Iterable
-from dataclasses import dataclass
-from importlib.util import find_spec
+from functools import cache, partial
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
@@ -32,86 +49,52 @@ import numpy as np
 import harness
 import skevgp
 from harness import Row
+from peers import against_peers_report, agreement
+from peers.data import DATASETS, QUICK, Data, DataSet
 from peers.jobs import Job, Result
 from peers.models import PEERS
-from skevgp import EVGPRegressor
-from skevgp.datasets import make_dynamics
 from skevgp.metrics import negative_log_predictive_density, std_norm
 
-# Where the peer ends whose last bound the others are timed against.
-REFERENCE = ("GPflow SGPR", "none")
-QUICK_PEERS = ("skevgp", "scikit-learn GPR", "scikit-learn BayesianRidge")
-# Rows of an exact GP.
-SUBSET = 600
-KEY = ("peer", "dataset", "model", "sharing", "m", "n_train", "seed")
+_LINE, _TREES = "scikit-learn BayesianRidge", "scikit-learn HistGradientBoosting"
+_TABLES = [name for name, one in DATASETS.items() if one.from_folder]
+# What options mean that are not given: usually, for all splits of the tables, and in short mode.
+DEFAULTS: dict[str, dict[str, Any]] = {
+    "against_peers": {
+        "datasets": list(DATASETS),
+        "seeds": 1,
+        "checkpoints": 12,
+        "peers": ["skevgp", "GPflow SGPR", "GPyTorch SGPR", "scikit-learn GPR", _TREES, _LINE],
+    },
+    "splits": {
+        "datasets": _TABLES,
+        "seeds": 10,
+        "checkpoints": 0,
+        "peers": ["skevgp", "GPflow SGPR", _TREES, _LINE],
+    },
+    "against_peers_quick": {
+        "datasets": list(QUICK),
+        "seeds": 1,
+        "checkpoints": 3,
+        "peers": ["skevgp", "scikit-learn GPR", _TREES, _LINE],
+    },
+}
+KEY = ("peer", "dataset", "sharing", "seed")
 COLUMNS = (
-    *KEY,
-    *("target", "seconds", "cpu_seconds", "predict_seconds", "iterations", "evaluations", "stop", "bound"),
-    *("output_bounds", "error_mean", "error_median", "error_p99", "nlpd", "std_norm", "load", "versions", "machine"),
+    *(*KEY, "m", "n_train"),
+    *("seconds", "cpu_seconds", "predict_seconds", "iterations", "evaluations", "stop", "bound", "output_bounds"),
+    *("rmse", "nlpd", "error_mean", "error_median", "error_p99", "std_norm", "load", "date", "versions", "machine"),
 )
-CURVE_COLUMNS = (*KEY, "seconds_so_far", "cpu_seconds_so_far", "bound_so_far")
+CURVE_COLUMNS = (*KEY, "n_train", "seconds_so_far", "cpu_seconds_so_far", "bound_so_far", "rmse_so_far", "nlpd_so_far")
 _CURVE_POINTS = 150
 
 
-@dataclass(frozen=True)
-class System:
-    """A data set, and the size of the model that learns it.
-
-    Attributes
-    ----------
-    name : str
-    n_inducing : int
-        Of the paper's VGP (its Table 2).
-    max_iter : int
-        The common limit of L-BFGS, per output.
-    sizes : dict
-        For `make_dynamics`; empty for the paper's.
-    """
-
-    name: str
-    n_inducing: int
-    max_iter: int
-    sizes: dict[str, int]
-
-
-SYSTEMS = {
-    "pendulum": System("pendulum", 40, 300, {}),
-    "cartpole": System("cartpole", 100, 200, {}),
-    "acrobot": System("acrobot", 250, 100, {}),
-}
-QUICK = System("pendulum", 8, 20, {"n_trajectories": 5, "n_steps": 12})
-# What is learned: the next state as it is, or the change of the state.
-MODELS = {"VGP": "state", "RES-VGP": "change"}
-
-
-@dataclass(frozen=True)
-class Data:
-    """Training and test rows, and where all fits of a seed start."""
-
-    X: np.ndarray
-    Y: np.ndarray
-    X_test: np.ndarray
-    Y_test: np.ndarray
-    inducing_points: np.ndarray
-    lengthscales: np.ndarray
-
-    @classmethod
-    def of(cls, system: System, model: str, seed: int) -> Data:
-        train = make_dynamics(system.name, random_state=seed, **system.sizes)
-        test = make_dynamics(system.name, random_state=1000 + seed, **system.sizes)
-        before, before_test = (
-            (data.data[:, : data.target.shape[1]] if MODELS[model] == "change" else 0.0) for data in (train, test)
-        )
-        Y = train.target - before
-        start = EVGPRegressor(n_inducing=system.n_inducing, max_iter=0, random_state=seed).fit(train.data, Y)
-        lengthscales = np.broadcast_to(start.kernel_[0].k2.length_scale, train.data.shape[1])
-        return cls(train.data, Y, test.data, test.target - before_test, start.inducing_points_, lengthscales)
-
-    def rows(self, peer: str, seed: int) -> np.ndarray | slice:
-        """The training rows that a peer gets."""
-        if not PEERS[peer].subset or len(self.X) <= SUBSET:
-            return slice(None)
-        return np.random.RandomState(seed).choice(len(self.X), SUBSET, replace=False)
+def environment(peer: str) -> dict[str, str]:
+    """Of a peer's process: the same skevgp as here, installed or not."""
+    own = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
+    if PEERS[peer].package == "skevgp":
+        here = str(Path(skevgp.__file__).parents[1])
+        own["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    return own
 
 
 def interpreters(peers: Iterable[str], peer_python: str) -> dict[str, str]:
@@ -128,96 +111,102 @@ def interpreters(peers: Iterable[str], peer_python: str) -> dict[str, str]:
     return found
 
 
-def fit(python: str, peer: str, job: Job) -> Result:
-    """Run a job in a process of its own.
+def work(python: str, peer: str, given: Path, result: Path, time_limit: float = 300.0) -> None:
+    """Run a peer in a process of its own.
 
     Raises
     ------
     RuntimeError
-        If the peer failed, with the last line of what it said; or ran over twice its time.
+        If the peer failed, with the last line of what it said; or ran over its time.
     """
-    environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
-    if PEERS[peer].package == "skevgp":
-        # The same skevgp as here, installed or not.
-        here = str(Path(skevgp.__file__).parents[1])
-        environment["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
+    command = [python, str(Path(__file__).parent / "models.py"), peer, str(given), str(result)]
+    try:
+        done = subprocess.run(
+            command, env=environment(peer), capture_output=True, text=True, timeout=time_limit, check=False
+        )
+    except subprocess.TimeoutExpired as error:
+        raise RuntimeError("time") from error
+    if done.returncode:
+        raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+
+
+def fit(python: str, peer: str, job: Job) -> Result:
+    """Run a job in a process of its own, which may take its time for all checkpoints."""
     with tempfile.TemporaryDirectory() as folder:
         given, result = Path(folder, "job.npz"), Path(folder, "result.npz")
         job.save(given)
-        command = [python, str(Path(__file__).parent / "models.py"), peer, str(given), str(result)]
-        try:
-            done = subprocess.run(
-                command, env=environment, capture_output=True, text=True, timeout=2 * job.time_limit + 60, check=False
-            )
-        except subprocess.TimeoutExpired as error:
-            raise RuntimeError("time") from error
-        if done.returncode:
-            raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+        work(python, peer, given, result, (2 + 4 * (job.n_checkpoints > 0)) * job.time_limit + 60)
         return Result.load(result)
 
 
-def run(python: str, peer: str, system: System, data: Data, key: Row, time_limit: float) -> tuple[Row, list[Row]]:
+def scores(Y: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
+    """RMSE and NLPD, over rows; not a number where scikit-learn's GPR has rounded a negative variance up to 0."""
+    nlpd = negative_log_predictive_density(Y, mean, std) if (std > 0.0).all() else np.nan
+    return {"rmse": float(np.sqrt(np.mean(np.sum((Y - mean) ** 2, axis=1)))), "nlpd": nlpd}
+
+
+def run(python: str, peer: str, data: Data, job: Job, key: Row) -> tuple[Row, list[Row]]:
     """Fit one peer: its row of the table, and its curve."""
-    seed = int(key["seed"])
-    rows = data.rows(peer, seed)
-    job = Job(
-        data.X[rows],
-        data.Y[rows],
-        data.X_test,
-        data.inducing_points,
-        data.lengthscales,
-        key["sharing"],
-        0 if PEERS[peer].own_rule and system is not QUICK else system.max_iter,
-        time_limit,
-        seed,
-    )
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    provenance = harness.provenance()
     values: dict[str, object] = {
-        "target": MODELS[key["model"]],
+        "m": {"inducing": len(job.inducing_points), "rows": len(job.X), "none": ""}[PEERS[peer].points],
+        "n_train": len(job.X),
         "load": round(load, 1),
+        "date": provenance["date"],
         "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
     }
+    Y = data.sets.Y_test
     try:
         result = fit(python, peer, job)
         if not (np.isfinite(result.mean).all() and np.isfinite(result.std).all()):
             raise RuntimeError("predictions that are not finite")
     except RuntimeError as error:
         return {name: str({**key, **values, "stop": f"failed: {error}"}.get(name, "")) for name in COLUMNS}, []
-    errors = np.linalg.norm(data.Y_test - result.mean, axis=1)
-    # scikit-learn's GPR rounds negative variances up to 0.
-    proper = (result.std > 0.0).all()
+    errors = np.linalg.norm(Y - result.mean[0], axis=1)
     values |= {
-        "seconds": result.seconds,
-        "cpu_seconds": result.cpu_seconds,
+        "seconds": result.seconds[0],
+        "cpu_seconds": result.cpu_seconds[0],
         "predict_seconds": result.predict_seconds,
         "iterations": result.iterations,
         "evaluations": result.evaluations,
         "stop": result.stop,
-        "bound": result.bounds.sum() if len(result.bounds) else np.nan,
+        "bound": result.bound[0],
         "output_bounds": " ".join(f"{bound:.2f}" for bound in result.bounds),
+        **scores(Y, result.mean[0], result.std[0]),
         "error_mean": errors.mean(),
         "error_median": np.median(errors),
         "error_p99": np.quantile(errors, 0.99),
-        "nlpd": negative_log_predictive_density(data.Y_test, result.mean, result.std) if proper else np.nan,
-        "std_norm": std_norm(result.std),
+        "std_norm": std_norm(result.std[0]),
         "versions": result.versions,
     }
-    clock, bound = np.column_stack([result.curve_seconds, result.curve_cpu_seconds]), result.curve_bound
-    if len(bound):
-        # The first gains are large, the many later ones small; the last point is kept.
-        some = np.linspace(0, len(bound) - 1, _CURVE_POINTS).round().astype(int)
-        some = np.union1d(some, np.arange(min(_CURVE_POINTS, len(bound))))
-        clock, bound = clock[some], bound[some]
-    curve = [
+    return {name: str({**key, **values}[name]) for name in COLUMNS}, curve_of(
+        result, Y, key | {"n_train": str(len(job.X))}
+    )
+
+
+def curve_of(result: Result, Y: np.ndarray, key: Row) -> list[Row]:
+    """Its bounds on the way, with RMSE and NLPD where it was looked at, and the end."""
+    _, n_bounds = result.curve.shape
+    # The first gains are large, the many later ones small; the last point is kept.
+    some = np.linspace(0, n_bounds - 1, min(n_bounds, _CURVE_POINTS)).round().astype(int)
+    some = np.union1d(some, np.arange(min(_CURVE_POINTS, n_bounds)))
+    points = [(*result.curve[:, i], {"rmse": "", "nlpd": ""}) for i in some]
+    for i in range(len(result.seconds)):
+        looked_at = scores(Y, result.mean[i], result.std[i])
+        points.append(
+            (result.seconds[i], result.cpu_seconds[i], result.bound[i], {n: f"{v:.6f}" for n, v in looked_at.items()})
+        )
+    return [
         {
             **key,
             "seconds_so_far": f"{seconds:.4f}",
             "cpu_seconds_so_far": f"{cpu_seconds:.4f}",
-            "bound_so_far": f"{value:.3f}",
+            "bound_so_far": f"{bound:.3f}",
+            **{f"{name}_so_far": value for name, value in looked_at.items()},
         }
-        for (seconds, cpu_seconds), value in zip(clock, bound, strict=True)
+        for seconds, cpu_seconds, bound, looked_at in sorted(points, key=lambda point: point[:2])
     ]
-    return {name: str({**key, **values}[name]) for name in COLUMNS}, curve
 
 
 class Table:
@@ -225,6 +214,8 @@ class Table:
 
     def __init__(self, path: Path, columns: tuple[str, ...]):
         self.path, self.columns, self.rows = path, columns, harness.read(path)
+        if self.rows and set(self.rows[0]) != set(columns):
+            raise SystemExit(f"{path} has other columns, of another version: give another --output, or move it away.")
 
     def of(self, key: Row) -> list[Row]:
         return [row for row in self.rows if all(row[name] == value for name, value in key.items())]
@@ -235,109 +226,93 @@ class Table:
         harness.write(self.rows, self.columns, self.path)
 
 
-def time_to_reach(curve: list[Row], bound: float, clock: str) -> float:
-    """Seconds until a bound was reached; NaN if it never was."""
-    for row in curve:
-        if float(row["bound_so_far"]) >= bound:
-            return float(row[f"{clock}_so_far"])
-    return float("nan")
-
-
-def comparison(row: Row, table: Table, curves: Table) -> tuple[float, float, float]:
-    """Seconds of a fit to the reference's last bound, and how many times faster than the reference that is.
-
-    Returns
-    -------
-    seconds, faster, faster_cpu : float
-        The last one by the processor's seconds, which other work on the machine disturbs less.
-    """
-    name, sharing = REFERENCE
-    key = {column: row[column] for column in KEY}
-    reference = [one for one in table.of(key | {"peer": name, "sharing": sharing}) if one["seconds"]]
-    if not reference:
-        return float("nan"), float("nan"), float("nan")
-    # The curve is rounded to 0.001 nats.
-    bound, curve = float(reference[0]["bound"]) - 0.01, curves.of(key)
-    seconds, cpu_seconds = (time_to_reach(curve, bound, clock) for clock in ("seconds", "cpu_seconds"))
-    return seconds, float(reference[0]["seconds"]) / seconds, float(reference[0]["cpu_seconds"]) / cpu_seconds
-
-
-def summarise(table: Table, curves: Table) -> None:
-    """Medians over seeds."""
-    titles = ("seeds", "seconds", "cpu s", "to bound", "faster", "by cpu", "bound/row", "Error", "NLPD")
-    for dataset, model in dict.fromkeys((row["dataset"], row["model"]) for row in table.rows):
-        own = table.of({"dataset": dataset, "model": model})
-        print(f"\n{dataset}, {model}\n{'':27s}sharing" + "".join(f"{title:>10s}" for title in titles) + "  stop")
-        for peer, sharing in dict.fromkeys((row["peer"], row["sharing"]) for row in own):
-            rows = [row for row in own if (row["peer"], row["sharing"]) == (peer, sharing)]
-            done = [row for row in rows if row["seconds"]]
-            if not done:
-                print(f"{peer:27s}{sharing:7s}{len(rows):10d}  {rows[0]['stop']}")
-                continue
-            to_bound, faster, by_cpu = np.median([comparison(row, table, curves) for row in done], axis=0)
-            seconds, cpu, error, nlpd = (
-                np.median([float(row[name]) for row in done])
-                for name in ("seconds", "cpu_seconds", "error_mean", "nlpd")
-            )
-            per_row = np.median([float(row["bound"]) / int(row["n_train"]) for row in done])
-            print(
-                f"{peer:27s}{sharing:7s}{len(done):10d}{seconds:10.2f}{cpu:10.2f}{to_bound:10.2f}{faster:10.1f}"
-                f"{by_cpu:10.1f}{per_row:10.3f}{error:10.5f}{nlpd:10.2f}  {done[0]['stop']}"
-            )
-    print(f"\nto bound: seconds until the last bound of {REFERENCE[0]} per output was reached (its noise from 0.01);")
-    print("faster: all its seconds over those; by cpu: the same in seconds of the processor, over all threads")
-
-
 def arguments() -> argparse.Namespace:
     parser = harness.argument_parser(
-        __doc__,
-        quick="a small pendulum in seconds",
-        seeds="seeds 0, 1, ...; default: 1",
-        systems=SYSTEMS,
-        in_processes=False,
+        __doc__, quick="small data in half a minute", seeds="seeds or splits 0, 1, ...; default: 1", in_processes=False
     )
-    parser.set_defaults(seeds=1)
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
+    parser.add_argument("--datasets", nargs="+", choices=DATASETS, metavar="NAME", help=f"of {', '.join(DATASETS)}")
+    parser.add_argument("--data-folder", type=Path, help="with the tables; default: they are left out")
     parser.add_argument("--peers", nargs="+", choices=PEERS, metavar="PEER", help=f"of {', '.join(PEERS)}")
-    parser.add_argument("--sharing", nargs="+", choices=("none", "all"), default=["none", "all"], help="default: both")
+    parser.add_argument("--sharing", nargs="+", choices=("none", "all", "default"), help="default: all")
+    parser.add_argument("--all-splits", action="store_true", help="other defaults: the tables, 10 splits, no curves")
+    said = "times before the end at which a fit of the first seed is looked at, 0 and more; default: 12"
+    parser.add_argument("--checkpoints", type=int, help=said)
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch")
     parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
     options = parser.parse_args()
-    options.output = harness.output_path(options, "against_peers")
-    if options.peers is None:
-        options.peers = list(QUICK_PEERS if options.quick else PEERS)
+    name = "splits" if options.all_splits else "against_peers"
+    for option, value in DEFAULTS["against_peers_quick" if options.quick else name].items():
+        if getattr(options, option) is None:
+            setattr(options, option, value)
+            if option == "datasets" and options.data_folder is None:
+                options.datasets = [name for name in value if name not in _TABLES]
+    known = QUICK if options.quick else DATASETS
+    options.datasets = {name: known[name] for name in options.datasets if name in known}
+    options.output = harness.output_path(options, name)
     return options
+
+
+def sharings(peer: str, dataset: DataSet, chosen: list[str] | None) -> list[str]:
+    """With one output there is nothing to share."""
+    if not dataset.several:
+        return ["none"]
+    return [sharing for sharing in PEERS[peer].sharing if chosen is None or sharing in chosen]
+
+
+def run_missing(
+    name: str, seed: int, pythons: dict[str, str], options: argparse.Namespace, table: Table, curves: Table
+) -> None:
+    """All fits of a data set that the tables do not have."""
+    dataset: DataSet = options.datasets[name]
+    keys = [
+        dict(zip(KEY, (peer, name, sharing, str(seed)), strict=True))
+        for peer in pythons
+        for sharing in sharings(peer, dataset, options.sharing)
+    ]
+    keys = [key for key in keys if options.redo or not table.of(key)]
+    data = Data.of(dataset, seed, options.data_folder) if keys else None
+    for key in keys:
+        peer = key["peer"]
+        options.agree()
+        rows = data.rows(PEERS[peer].points == "rows", seed)
+        job = Job(
+            data.sets.X[rows],
+            data.sets.Y[rows],
+            data.sets.X_test,
+            data.inducing_points,
+            data.lengthscales,
+            dataset.first_noise,
+            key["sharing"],
+            0 if PEERS[peer].own_rule and not options.quick else dataset.max_iter,
+            options.time_limit,
+            seed,
+            options.checkpoints if seed == 0 else 0,
+        )
+        print(f"{name}, seed {seed}: {peer}, sharing {key['sharing']} ...", end=" ", flush=True)
+        row, curve = run(pythons[peer], peer, data, job, key)
+        table.replace(key, [row])
+        curves.replace(key, curve)
+        said = "RMSE {:.4f}, NLPD {:.4f} in {:.2f} s,"
+        numbers = [float(row[name]) for name in ("rmse", "nlpd", "seconds") if row["seconds"]]
+        print(said.format(*numbers) if numbers else "", row["stop"], flush=True)
 
 
 def main() -> None:
     options = arguments()
-    pythons = interpreters(options.peers, options.peer_python)
+    try:
+        harness.pyplot()  # before the fits, not after them
+    except ImportError as problem:
+        raise SystemExit(f"No picture could be drawn ({problem}): pip install matplotlib") from problem
     table = Table(options.output, COLUMNS)
     curves = Table(options.output.with_name(f"{options.output.stem}_curves.csv"), CURVE_COLUMNS)
-    systems = [QUICK] if options.quick else [SYSTEMS[name] for name in options.systems]
-    for system, model, seed in ((s, m, i) for s in systems for m in options.models for i in range(options.seeds)):
-        data = Data.of(system, model, seed)
-        for peer, python in pythons.items():
-            for sharing in (sharing for sharing in PEERS[peer].sharing if sharing in options.sharing):
-                n_train = len(data.X[data.rows(peer, seed)])
-                m = n_train if PEERS[peer].subset else len(data.inducing_points)
-                key = dict(zip(KEY, map(str, (peer, system.name, model, sharing, m, n_train, seed)), strict=True))
-                if table.of(key) and not options.redo:
-                    continue
-                print(f"{system.name} {model} seed {seed}: {peer}, sharing {sharing} ...", end=" ", flush=True)
-                row, curve = run(python, peer, system, data, key, options.time_limit)
-                table.replace(key, [row])
-                curves.replace(key, curve)
-                said = f"{float(row['seconds']):.2f} s, error {float(row['error_mean']):.5f}" if row["seconds"] else ""
-                print(said, row["stop"], flush=True)
-    summarise(table, curves)
-    if find_spec("matplotlib") is None:
-        print("No picture: pip install matplotlib")
-        return
-    from peers.picture import draw
-
-    draw(table.rows, curves.rows, options.output.with_suffix(".png"))
+    pythons = interpreters(options.peers, options.peer_python)
+    options.agree = cache(partial(agreement.check, pythons, work))  # once, before the first fit
+    for name in options.datasets:
+        for seed in range(options.seeds):
+            run_missing(name, seed, pythons, options, table, curves)
+    against_peers_report.draw(table.rows, curves.rows, options.output.with_suffix(".png"))
+    harness.write_report(against_peers_report.paragraphs(table.rows, curves.rows), options.output)
 
 
 if __name__ == "__main__":

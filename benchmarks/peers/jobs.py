@@ -6,9 +6,12 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+
+# X_test -> (mean, std), with noise.
+Predict = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 
 class Archive:
@@ -33,13 +36,17 @@ class Job(Archive):
     X, Y, X_test : ndarray of shape (n, d), (n, o), (n_test, d)
     inducing_points : ndarray of shape (m, d)
     lengthscales : ndarray of shape (d,)
-    sharing : {"none", "all"}
-        Independent models per output, or one for all of them.
+    noise : float
+        Where the noise variance of other peers than skevgp starts, a share of the mean square of the targets.
+    sharing : {"none", "all", "default"}
+        Independent models per output, one for all of them, or what the peer does by itself.
     max_iter : int
         Of L-BFGS, per model; 0 leaves skevgp to its own rule.
     time_limit : float
         Seconds for all outputs; then the fit ends with what it has.
     seed : int
+    n_checkpoints : int
+        Times before the end at which the fit is looked at.
     """
 
     X: np.ndarray
@@ -47,10 +54,12 @@ class Job(Archive):
     X_test: np.ndarray
     inducing_points: np.ndarray
     lengthscales: np.ndarray
+    noise: float
     sharing: str
     max_iter: int
     time_limit: float
     seed: int
+    n_checkpoints: int = 0
 
 
 @dataclass(frozen=True)
@@ -59,34 +68,74 @@ class Result(Archive):
 
     Attributes
     ----------
-    mean, std : ndarray of shape (n_test, o)
-        With noise.
-    seconds, cpu_seconds, predict_seconds : float
-        Wall-clock; of the processor, over all threads; wall-clock.
+    mean, std : ndarray of shape (1 + k, n_test, o)
+        With noise: at the end, and at up to ``n_checkpoints`` times before.
+    seconds, cpu_seconds, bound : ndarray of shape (1 + k,)
+        Wall-clock; of the processor, over all threads; the sum of the models' bounds, NaN if there is none.
+    predict_seconds : float
     iterations, evaluations : float
         Over all models; NaN if unknown.
     bounds : ndarray
-        On the log marginal likelihood of each model, nats; empty if there is none.
+        On the log marginal likelihood of each model at the end, nats; empty if there is none.
     stop : str
         Why each model's fit ended, joined by spaces.
-    curve_seconds, curve_cpu_seconds, curve_bound : ndarray of shape (k,)
-        The sum of the models' best bounds so far; a model that has not begun counts with its first bound.
+    curve : ndarray of shape (3, k)
+        Wall-clock and processor's seconds, and the sum of the models' best bounds so far; a model that has not begun
+        counts with its first bound. Empty for a peer of which only the checkpoints tell.
     versions : str
     """
 
     mean: np.ndarray
     std: np.ndarray
-    seconds: float
-    cpu_seconds: float
+    seconds: np.ndarray
+    cpu_seconds: np.ndarray
+    bound: np.ndarray
     predict_seconds: float
     iterations: float
     evaluations: float
     bounds: np.ndarray
     stop: str
-    curve_seconds: np.ndarray
-    curve_cpu_seconds: np.ndarray
-    curve_bound: np.ndarray
+    curve: np.ndarray
     versions: str
+
+
+@dataclass(frozen=True)
+class Fixed(Archive):
+    """A model without anything to fit, by which libraries are compared.
+
+    Attributes
+    ----------
+    kernel : {"rbf", "matern52"}
+    X, y, X_test : ndarray of shape (n, d), (n,), (n_test, d)
+    inducing_points : ndarray of shape (m, d)
+        As many as rows: then they are the rows, and the bound is the likelihood.
+    lengthscales : ndarray of shape (d,)
+    signal, noise : float
+        Variances.
+    """
+
+    kernel: str
+    X: np.ndarray
+    y: np.ndarray
+    X_test: np.ndarray
+    inducing_points: np.ndarray
+    lengthscales: np.ndarray
+    signal: float
+    noise: float
+
+    @property
+    def exact(self) -> bool:
+        """Whether an exact GP says the same."""
+        return len(self.inducing_points) == len(self.X)
+
+
+@dataclass(frozen=True)
+class Said(Archive):
+    """What a library says of a `Fixed`: its bound, and its prediction with noise."""
+
+    bound: float
+    mean: np.ndarray
+    variance: np.ndarray
 
 
 class TimeUpError(Exception):
@@ -116,27 +165,50 @@ class Watch:
     def record(self, model: int, bound: float) -> None:
         self.records.append((self.seconds, self.cpu_seconds, model, bound))
 
-    def curve(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Seconds, those of the processor, and the sum of the best bounds so far."""
+    def curve(self) -> np.ndarray:
+        """Seconds, those of the processor, and the sum of the best bounds so far: (3, k)."""
         best: dict[int, float] = {}
         for *_, model, bound in self.records:
             best.setdefault(model, bound)
-        sums = []
-        for *_, model, bound in self.records:
+        points = []
+        for seconds, cpu_seconds, model, bound in self.records:
             best[model] = max(best[model], bound)
-            sums.append(sum(best.values()))
-        return np.array([r[0] for r in self.records]), np.array([r[1] for r in self.records]), np.array(sums)
+            points.append((seconds, cpu_seconds, sum(best.values())))
+        return np.array(points).reshape(-1, 3).T
+
+
+class Checkpoint(NamedTuple):
+    """A fit as it was at a time."""
+
+    seconds: float
+    cpu_seconds: float
+    bound: float
+    predict: Predict
 
 
 @dataclass
 class Fitted:
-    """A fitted peer: X_test -> (mean, std), and how the fit went."""
+    """A fitted peer and how the fit went.
 
-    predict: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+    Attributes
+    ----------
+    predict : callable
+    bounds : list of float
+    stop : str
+    iterations, evaluations : float
+    at : callable, optional
+        seconds -> `Checkpoint`: what there was at about that time. It is called when the clock has been read.
+    curve : ndarray of shape (3, k), optional
+        As of `Watch.curve`.
+    """
+
+    predict: Predict
     bounds: list[float]
     stop: str
     iterations: float = np.nan
     evaluations: float = np.nan
+    at: Callable[[float], Checkpoint] | None = None
+    curve: np.ndarray | None = None
 
 
 class Scaled:
@@ -155,7 +227,7 @@ class Scaled:
         """Of the targets in their own units."""
         return bound - len(self.X) * float(np.log(self.unit[columns]).sum())
 
-    def predictor(self, models: list[Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]]) -> Callable[..., Any]:
+    def predictor(self, models: list[Predict]) -> Predict:
         """(mean, std) of all outputs from each model's."""
 
         def predict(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -164,3 +236,16 @@ class Scaled:
             return mean * self.unit, np.broadcast_to(std, mean.shape) * self.unit
 
         return predict
+
+    def fitted(self, ways: list[list[tuple[float, Predict]]], watch: Watch, **said: Any) -> Fitted:
+        """Of models that kept each step on their way: (seconds, how it predicts), the start first, the best last."""
+        curve = watch.curve()
+
+        def at(seconds: float) -> Checkpoint:
+            index = max(int(np.searchsorted(curve[0], seconds, side="right")) - 1, 0)
+            steps = [
+                max((step for step in way if step[0] <= seconds), default=way[0], key=lambda s: s[0]) for way in ways
+            ]
+            return Checkpoint(*curve[:, index], self.predictor([predict for _, predict in steps]))
+
+        return Fitted(self.predictor([way[-1][1] for way in ways]), at=at, curve=curve, **said)
