@@ -40,8 +40,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     Parameters
     ----------
     feature_map : transformer, default=None
-        x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
-        it. None has no explicit features.
+        x -> h(x), for example `InertiaForceGravity("pendulum")`, of X as given: do not scale its columns. None: none.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
         Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
         a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
@@ -78,8 +77,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
         folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
         from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
         are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
-        Put one trajectory after the other; in random order, or where rows are independent, hardly anything changes. It
-        takes two passes over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
+        Put one trajectory after the other; where rows are independent, hardly anything changes. It takes two passes
+        over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
@@ -108,13 +107,12 @@ class EVGPRegressor(ExplicitGaussianProcess):
 
     Attributes
     ----------
-    coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
-        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
-        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
-        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
-    coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations. Only with a ``feature_map``.
+    coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Posterior means and standard deviations of the weights. Only with a ``feature_map``: they are per feature of
+        it, not per column of X. Where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example
+        ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and
+        columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
+        of outputs then.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
@@ -128,9 +126,10 @@ class EVGPRegressor(ExplicitGaussianProcess):
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
-    lower_bound_ : float
-        On the log marginal likelihood; nats, summed over outputs. With ``noise_cv`` it is below that of the last
-        iteration: the noise has moved since.
+    lower_bound_, upper_bound_ : float
+        On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
+        points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
+        With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration (of Adam: a mini-batch's estimate).
     n_iter_ : int
@@ -150,6 +149,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     ----------
     - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes.
     - M. K. Titsias (2009): Variational Learning of Inducing Variables in Sparse Gaussian Processes.
+    - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
     - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
     - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
 
@@ -294,7 +294,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
 
         The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to
         its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
-        ``lower_bound_`` is good to about a nat.
+        ``lower_bound_`` and ``upper_bound_`` are good to about a nat.
 
         Parameters
         ----------
@@ -394,7 +394,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         fitted = self._fitted
         points = np.array([group.points for group in self._predictor.groups])
         self.inducing_points_ = points[0] if fitted.sharing == "all" or self._single_output else points
-        self.lower_bound_ = fitted.lower_bound
+        self.lower_bound_, self.upper_bound_ = fitted.lower_bound, fitted.upper_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter
         self.n_parameters_ = fitted.n_parameters

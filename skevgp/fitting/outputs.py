@@ -110,6 +110,11 @@ class FittedOutputs:
         return sum(one.bound for one in self.learned) - self._shift
 
     @property
+    def upper_bound(self) -> float:
+        """On the log marginal likelihood, in nats, summed over outputs."""
+        return sum(one.upper_bound for one in self.learned) - self._shift
+
+    @property
     def n_iter(self) -> int:
         """Iterations of the longest fit."""
         return max(len(one.loss_curve) for one in self.learned)

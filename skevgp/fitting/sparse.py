@@ -137,8 +137,8 @@ class Learned:
         Of the model's parameters, in internal units.
     statistics : list of SufficientStatistics
         At ``values``, one for each set of inducing points.
-    bound : float
-        In nats, of the residuals in internal units.
+    bound, upper_bound : float
+        On the log marginal likelihood, in nats, of the residuals in internal units.
     predictor : Predictor
         In internal units.
     loss_curve : list of float
@@ -151,6 +151,7 @@ class Learned:
     values: Values
     statistics: list[SufficientStatistics]
     bound: float
+    upper_bound: float
     predictor: Predictor
     loss_curve: list[float]
     message: str
@@ -170,6 +171,7 @@ class Learned:
             statistics,
             # Summed row by row, which keeps its digits where the noise is low.
             fit.bound if np.isfinite(fit.bound) else bound,
+            task.model.upper_bound(fit.values, statistics, task.blocks),
             predictor if fit.predictor is None else fit.predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
@@ -234,8 +236,10 @@ class Learned:
         limits = table["noise"].value_limits()
         noise = calibrated_noise(self.model, self.values, self.statistics, rows, limits, n_folds)
         noise = np.where(table["noise"].free, noise, self.values["noise"])
-        return replace(self, values=self.values | {"noise": noise})._at_optimum()
+        blocks = rows.blocks(self.model.kernel, self.values["inducing_points"].shape[1])
+        return replace(self, values=self.values | {"noise": noise})._at_optimum(blocks)
 
-    def _at_optimum(self) -> Learned:
+    def _at_optimum(self, blocks: Blocks | None = None) -> Learned:
         bound, predictor = self.model.at_optimum(self.values, self.statistics)
-        return replace(self, bound=bound, predictor=predictor)
+        upper_bound = self.model.upper_bound(self.values, self.statistics, blocks)
+        return replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)

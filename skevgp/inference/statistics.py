@@ -179,6 +179,29 @@ class _FirstPass:
         return V @ V.T, V @ block.linear_of(self.outputs), self.whitening.unexplained(block.prepared, V).sum()
 
 
+def _with_errors(block: Block, V: np.ndarray, outputs: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, e] of a block (n, p + o), and the e in it."""
+    linear, m = block.linear_of(outputs).copy(), len(V)
+    e = linear[:, block.n_features :]
+    e -= V.T @ weights[:m]
+    e -= block.features @ weights[m:]
+    return linear, e
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Block -> eᵀe of each output and V e."""
+
+    whitening: Whitening
+    outputs: slice
+    weights: np.ndarray
+
+    def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
+        _, V = self.whitening.project(block.prepared)
+        _, e = _with_errors(block, V, self.outputs, self.weights)
+        return np.einsum("no,no->o", e, e), V @ e
+
+
 @dataclass(frozen=True)
 class _SecondPass:
     """Block -> what it adds to the kernel's pull-back, eᵀe of each output and V e.
@@ -198,10 +221,7 @@ class _SecondPass:
             _, U, V = block.kept
         else:
             U, V = self.whitening.project(block.prepared)
-        linear, p, m = block.linear_of(self.outputs).copy(), block.n_features, len(V)
-        e = linear[:, p:]
-        e -= V.T @ self.weights[:m]
-        e -= block.features @ self.weights[m:]
+        linear, e = _with_errors(block, V, self.outputs, self.weights)
         U_bar = self.from_whitened @ V
         U_bar += self.from_linear @ linear.T
         rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
@@ -236,6 +256,11 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
         linear.RR[outputs],
         float(unexplained),
     )
+
+
+def errors(blocks: Blocks, whitening: Whitening, outputs: slice, weights: np.ndarray) -> Residuals:
+    """What weights (m + p, o) leave over, row by row: a pass without a gradient; arguments as of `pull_back`."""
+    return Residuals(*blocks.sum(_Errors(whitening, outputs, weights)))
 
 
 def pull_back(

@@ -45,6 +45,7 @@ def assert_same_model(actual, expected, rtol=1e-6):
     ):
         np.testing.assert_allclose(part, whole, rtol=rtol)
     np.testing.assert_allclose(actual.lower_bound_, expected.lower_bound_, rtol=rtol)
+    np.testing.assert_allclose(actual.upper_bound_, expected.upper_bound_, rtol=rtol)
 
 
 @pytest.fixture(scope="module")
