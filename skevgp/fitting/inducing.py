@@ -15,6 +15,8 @@ from ..inference.statistics import Kernel, Whitening
 from ..rows.source import Moments
 from .start import column_scale
 
+# Points that there are first if their number is to be found.
+_FIRST = 10
 # On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
 # The greedy search keeps so many numbers at most, 80 MB.
@@ -35,16 +37,21 @@ class Placement:
         ``"auto"`` starts as ``"k-means"``; or the points themselves, in the same units as the inputs.
     n_inducing : int
         At most so many points; an array brings its own number.
+    max_inducing : int, optional
+        At most so many in the end, if their number is to be found.
     """
 
     method: Literal["auto", "k-means", "greedy"] | np.ndarray
     n_inducing: int
+    max_inducing: int | None = None
 
     @classmethod
-    def of(cls, inducing_init: Any, n_inducing: int, n_columns: int) -> Placement:
-        """What ``inducing_init`` says, for inputs of so many columns; points are checked."""
+    def of(cls, inducing_init: Any, n_inducing: int | str, max_inducing: int, n_columns: int) -> Placement:
+        """What the arguments of these names say, for inputs of so many columns; points are checked."""
+        most = max_inducing if isinstance(n_inducing, str) else None
+        first = min(_FIRST, max_inducing) if isinstance(n_inducing, str) else n_inducing
         if isinstance(inducing_init, str):
-            return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), n_inducing)
+            return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), first, most)
         points = as_floats(inducing_init, "inducing_init")
         if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
             raise ValueError(
@@ -54,7 +61,7 @@ class Placement:
         if not np.isfinite(points).all():
             raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
         check_magnitude(points, "inducing_init")
-        return cls(points, len(points))
+        return cls(points, len(points), most)
 
     @property
     def anew(self) -> Placement | None:
