@@ -169,13 +169,14 @@ class SparseTask:
         """The exact model of a sample of the rows; None if the kernel is fixed."""
         if self.max_iter == 0 or not self.table["hyperparameters"].free.any():
             return None
+        sample = self.rows.sample(_SAMPLE, self.rng)
         return Unhindered.of(
             self.model.kernel,
             self.model.prior,
-            self.rows.sample(_SAMPLE, self.rng),
+            sample,
             self.table.without("inducing_points"),
             self.rows.scatter(),
-            ExactOptions(self.solver.rules, self.max_iter, self.tol, 0),
+            ExactOptions(self.solver.rules, self.max_iter, max(self.tol, _COARSE * sample.targets.size), 0),
             self.rng,
             self.monitor.silent(),
         )
