@@ -245,6 +245,8 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
 
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
+    Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
+    j, and a row that comes often makes that so many times larger.
 
     Parameters
     ----------
@@ -257,7 +259,10 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
     bound : float
         In nats.
     """
-    statistics, noise = group.statistics, group.noise + group.signal * group.statistics.unexplained
+    statistics, left_over = group.statistics, group.statistics.unexplained
+    if group.complete:
+        left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+    noise = group.noise + group.signal * left_over
     # The likelihood with this noise and without a trace term, but for its determinant.
     wide = BoundAtOptimum(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)), "full")
     left = wide.residuals() if blocks is None else errors(blocks, group.whitening, group.outputs, wide.weights)

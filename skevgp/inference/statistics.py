@@ -17,6 +17,8 @@ from .._linalg import JITTER, Jitter, cholesky_of_covariance, cholesky_pullback,
 from ..rows.blocks import Block, Blocks
 
 _ROUNDING = 4.0 * np.finfo(float).eps
+# Relative to the diagonal: above rounding, and below any jitter.
+_NO_JITTER = 1e-13
 
 
 class KernelAt(Protocol):
@@ -79,6 +81,12 @@ class Whitening:
         covariance = kernel.at(np.log(hyperparameters), inducing_points)
         L = cholesky_of_covariance(covariance.matrix(), jitter)
         return cls(covariance, L, triangular_inverse(L))
+
+    def jitter(self) -> float:
+        """The most that was added to the diagonal of K; 0 if it is rounding."""
+        diagonal = np.diagonal(self.covariance.matrix())
+        added = np.einsum("ij,ij->i", self.L, self.L) - diagonal
+        return float(np.max(added, where=added > _NO_JITTER * diagonal, initial=0.0))
 
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""

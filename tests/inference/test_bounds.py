@@ -1,9 +1,11 @@
+from dataclasses import replace
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd import grad
 
-from skevgp._linalg import NotPositiveDefiniteError
+from skevgp._linalg import Jitter, NotPositiveDefiniteError
 from skevgp.fitting.start import starting_table
 from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound, upper_bound
@@ -214,6 +216,29 @@ def test_with_points_at_all_rows_both_bounds_are_the_log_likelihood(p, copies):
     lower, upper = bounds_of(model, rows, values)
     exact = dense_bounds(*dense_arguments(values), rows, model.prior)[1]
     np.testing.assert_allclose((lower, upper), exact, rtol=1e-8)
+
+
+def test_a_jitter_is_known_from_the_factor():
+    model, _, values = on_rows()
+    (whitening,) = model.whitenings(values)
+    assert whitening.jitter() == 0.0
+    twice = values | {"inducing_points": np.repeat(values["inducing_points"], 2, axis=1)}
+    (whitening,) = replace(model, jitter=Jitter(1e-9)).whitenings(twice)
+    assert whitening.jitter() == pytest.approx(1e-9, rel=1e-3)
+
+
+def test_with_points_at_all_rows_a_jitter_does_not_take_the_upper_bound_below_the_log_likelihood():
+    """Of residuals rougher than the kernel, which a jitter as large as the noise makes less likely."""
+    model, rows, values = on_rows(p=0)
+    values |= {"hyperparameters": np.full(3, 3.0), "noise": np.full(2, 1e-6), "signal": np.full(2, 25.0)}
+    rows.residuals[:] = 0.01 * np.random.RandomState(0).randn(*rows.residuals.shape)
+    jittered = replace(model, jitter=Jitter(1e-6, 0.1))
+    few = values | {"inducing_points": rows.inputs[np.newaxis, :3]}
+    exact = dense_bounds(*dense_arguments(few), rows, model.prior)[1]
+    lower, upper = bounds_of(jittered, rows, values)
+    assert lower < exact - 0.5
+    # Nearer than with the trace, which holds for any points.
+    assert exact < upper < bounds_of(replace(jittered, complete=False), rows, values)[1] - 1.0
 
 
 def longdouble_upper_bound(model, rows, values):
