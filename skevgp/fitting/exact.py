@@ -108,10 +108,13 @@ class Unhindered:
     ----------
     model : ExactModel
     fit : Fit
+    n_parameters : int
+        That were fitted.
     """
 
     model: ExactModel
     fit: Fit
+    n_parameters: int
 
     @classmethod
     def of(
@@ -127,15 +130,18 @@ class Unhindered:
     ) -> Unhindered:
         """Fit it; arguments as of `ExactModel` and `ExactTask`."""
         model = ExactModel(kernel, prior, np.zeros(prior.scale.shape, dtype=bool), rows)
-        return cls(model, search(ExactTask(model, table, scatter, options, rng, monitor)))
+        return cls(model, search(ExactTask(model, table, scatter, options, rng, monitor)), table.size)
 
     def missed_by(self, values: Values) -> float:
-        """How much less likely the rows are under other values, in nats per row and output."""
+        """How much less likely the rows are under other values, in nats per row and output.
+
+        Less what the fit has gained by chance, on average half a nat for each parameter (Wilks 1938).
+        """
         try:
             likelihood = sum(output.log_likelihood for output in self.model.outputs(values)[1])
         except NotPositiveDefiniteError:
             return np.inf
-        return (self.fit.bound - likelihood) / self.model.rows.targets.size
+        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / self.model.rows.targets.size
 
 
 @dataclass(frozen=True)
