@@ -217,9 +217,10 @@ def say(row: dict[str, Any]) -> str:
 MODELS = ("exact", "100", "auto", "grid")
 
 
-def mean_of(rows: Sequence[harness.Row], name: str, model: str, value: str) -> float:
-    """Over seeds; not a number where there is none."""
-    own = [row for row in rows if (row["name"], row["model"]) == (name, model)]
+def mean_of(rows: Sequence[harness.Row], name: str, model: str, value: str, beside: str = "auto") -> float:
+    """Over the seeds that another model has too; not a number where there is none."""
+    seeds = {row["seed"] for row in rows if (row["name"], row["model"]) == (name, beside)}
+    own = [row for row in rows if (row["name"], row["model"]) == (name, model) and row["seed"] in seeds]
     return float(np.mean(harness.column(own, value))) if own else np.nan
 
 
@@ -231,8 +232,8 @@ def report(rows: Sequence[harness.Row]) -> Iterator[str]:
     lines, near, lean = [], 0, 0
     for name in names:
         of = partial(mean_of, rows, name)
-        lost = {model: of(model, "nlpd") - of("exact", "nlpd") for model in ("100", "auto")}
-        ratio = of("auto", "m") / of("grid", "m")
+        lost = {model: of(model, "nlpd") - of("exact", "nlpd", model) for model in ("100", "auto")}
+        ratio = of("auto", "m", "grid") / of("grid", "m")
         near, lean = near + bool(lost["auto"] <= ENOUGH), lean + bool(ratio <= 2.0)
         seconds = (f"{of(model, 'seconds'):.1f}" for model in ("exact", "100", "auto"))
         numbers = (of("exact", "nlpd"), lost["100"], lost["auto"])
