@@ -50,6 +50,12 @@ class Monitor:
         part._outputs = self._outputs if outputs is None else outputs
         return part
 
+    def silent(self) -> Monitor:
+        """The same monitor for a part of the fit of which nobody is told; it ends like the others."""
+        part = copy(self)
+        part._report = None
+        return part
+
     def iteration(self, number: int, loss: float) -> None:
         """Tell of an iteration; raises KeyboardInterrupt once the fit has been told to stop.
 

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from contextlib import closing
-from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
@@ -15,17 +13,17 @@ from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
-from ._base import ExplicitGaussianProcess
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
-from ._validation import check_magnitude, unchanged_if_it_fails
+from ._sparse import SparseGaussianProcess
+from ._validation import unchanged_if_it_fails
 from .fitting.inducing import Placement
-from .fitting.outputs import FittedOutputs, Request, fit_outputs
-from .rows.threads import BlockMap, single_threaded_libraries
+from .fitting.outputs import Request, fit_outputs
+from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, resolved
 
 
-class EVGPRegressor(ExplicitGaussianProcess):
+class EVGPRegressor(SparseGaussianProcess):
     r"""Sparse variational Gaussian process with explicit features (EVGP).
 
     The model of each output is
@@ -40,8 +38,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     Parameters
     ----------
     feature_map : transformer, default=None
-        x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
-        it. None has no explicit features.
+        x -> h(x), for example `InertiaForceGravity("pendulum")`, of X as given: do not scale its columns. None: none.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
         Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
         a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
@@ -50,16 +47,22 @@ class EVGPRegressor(ExplicitGaussianProcess):
         None is an RBF with a length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
-    n_inducing : int, default=100
-        Inducing points; fewer if there are fewer distinct rows.
+    n_inducing : int or "auto", default=100
+        Inducing points; fewer if there are fewer distinct rows. ``"auto"``, for L-BFGS, begins with 10 (or those of
+        ``inducing_init``; in a warm start those of the last fit) and adds half as many again until that raises the
+        bound by less than 0.01 nats per row and output, and no better kernel is known: up to 1,000 rows are fitted
+        exactly, for few points can hide what there is to learn.
+    max_inducing : int, default=1000
+        The most that ``n_inducing="auto"`` adds points up to.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
         Where inducing points start. ``"k-means"``: at cluster centres of the kernel's inputs. ``"greedy"``: one after
         the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
         ``"auto"``: at cluster centres, and with L-BFGS after 100 iterations once more, greedily under the kernel
         learned so far; 100 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
         placed). They are not placed anew with ``max_iter`` up to 100, a kernel that is fixed, or a warm start. Or at
-        given points in the space of ``kernel_map``, whose number then replaces ``n_inducing``. With ``max_iter=0``, or
-        where they are all rows (and ``posterior="full"``), they stay where they start.
+        given points in the space of ``kernel_map``, whose number then replaces ``n_inducing`` (with ``"auto"``, more
+        are added). With ``max_iter=0``, or where they are all rows (and ``posterior="full"``), they stay where they
+        start.
     sharing : {"all", "kernel", "none"}, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Signal variance, noise and weights are always per output.
@@ -78,8 +81,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
         folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
         from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
         are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
-        Put one trajectory after the other; in random order, or where rows are independent, hardly anything changes. It
-        takes two passes over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
+        Put one trajectory after the other; where rows are independent, hardly anything changes. It takes two passes
+        over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
@@ -89,6 +92,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     max_iter : int, default=None
         The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
+        Those with fewer inducing points, on the way of ``n_inducing="auto"``, do not count.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.003 % of what the fit has gained over
@@ -109,13 +113,12 @@ class EVGPRegressor(ExplicitGaussianProcess):
 
     Attributes
     ----------
-    coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
-        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
-        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
-        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
-    coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations. Only with a ``feature_map``.
+    coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Posterior means and standard deviations of the weights. Only with a ``feature_map``: they are per feature of
+        it, not per column of X. Where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example
+        ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and
+        columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
+        of outputs then.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Their posterior covariances. Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
@@ -123,15 +126,17 @@ class EVGPRegressor(ExplicitGaussianProcess):
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     inducing_points_ : ndarray of shape (m, d) or, for several outputs unless ``sharing="all"``, (n_outputs, m, d)
-        In the space of ``kernel_map``.
+        In the space of ``kernel_map``. A list of arrays where ``n_inducing="auto"`` found other numbers for other
+        outputs, which share nothing.
     kernel_ : Kernel, or list of Kernel for several outputs
         Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
-    lower_bound_ : float
-        On the log marginal likelihood; nats, summed over outputs. With ``noise_cv`` it is below that of the last
-        iteration: the noise has moved since.
+    lower_bound_, upper_bound_ : float
+        On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
+        points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
+        With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration (of Adam: a mini-batch's estimate).
     n_iter_ : int
@@ -151,6 +156,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
     ----------
     - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes.
     - M. K. Titsias (2009): Variational Learning of Inducing Variables in Sparse Gaussian Processes.
+    - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
     - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
     - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
 
@@ -169,8 +175,9 @@ class EVGPRegressor(ExplicitGaussianProcess):
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
-        **ExplicitGaussianProcess._parameter_constraints,
-        "n_inducing": [Interval(Integral, 1, None, closed="left")],
+        **SparseGaussianProcess._parameter_constraints,
+        "n_inducing": [Interval(Integral, 1, None, closed="left"), StrOptions({"auto"})],
+        "max_inducing": [Interval(Integral, 1, None, closed="left")],
         "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none"})],
         "posterior": [StrOptions({"full", "diagonal"})],
@@ -183,16 +190,14 @@ class EVGPRegressor(ExplicitGaussianProcess):
         "n_jobs": [Integral, None],
     }
 
-    _fitted: FittedOutputs
-    _training_data: tuple[Any, Any, np.ndarray] | None = None
-
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
         kernel: Kernel | Callable[..., Any] | None = None,
         *,
         kernel_map: TransformerMixin | None = None,
-        n_inducing: int = 100,
+        n_inducing: int | Literal["auto"] = 100,
+        max_inducing: int = 1000,
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Literal["all", "kernel", "none"] = "all",
         posterior: Literal["full", "diagonal"] = "full",
@@ -214,6 +219,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
         self.kernel = kernel
         self.kernel_map = kernel_map
         self.n_inducing = n_inducing
+        self.max_inducing = max_inducing
         self.inducing_init = inducing_init
         self.sharing = sharing
         self.posterior = posterior
@@ -265,6 +271,8 @@ class EVGPRegressor(ExplicitGaussianProcess):
             ended at a bound of it. It says what to change.
         """
         solver = resolved(self.solver, self.posterior)
+        if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
+            raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         with unchanged_if_it_fails(self), single_threaded_libraries():
             problem = self._problem(X, y)
             self._training_data = problem.data
@@ -276,7 +284,7 @@ class EVGPRegressor(ExplicitGaussianProcess):
                 problem.spec,
                 self.sharing,
                 self.posterior,
-                Placement.of(self.inducing_init, self.n_inducing, problem.n_columns),
+                Placement.of(self.inducing_init, self.n_inducing, self.max_inducing, problem.n_columns),
                 solver,
                 solver.default_max_iter if self.max_iter is None else self.max_iter,
                 None if isinstance(self.tol, str) else self.tol,
@@ -289,87 +297,6 @@ class EVGPRegressor(ExplicitGaussianProcess):
             self._set_attributes()
         self._warn_of(self._fitted.messages)
         return self
-
-    @fit_context(prefer_skip_nested_validation=False)
-    def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
-        """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
-
-        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to
-        its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
-        ``lower_bound_`` is good to about a nat.
-
-        Parameters
-        ----------
-        X : array-like or dask.array.Array of shape (n_samples, n_features)
-            The first rows should be like all: they place the inducing points (no more than there are rows), kernel and
-            noise.
-        y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
-            With as many outputs as in the first call.
-
-        Returns
-        -------
-        self : EVGPRegressor
-            The estimator itself, with the new rows in its posterior.
-
-        Raises
-        ------
-        ValueError, TypeError
-            As `fit`, and if y does not have the outputs of the first call.
-        """
-        if not hasattr(self, "_fitted"):
-            return self.fit(X, y)
-        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
-        with unchanged_if_it_fails(self), single_threaded_libraries():
-            given, X, y = self._validated(X, y)
-            n_outputs = 1 if y.ndim == 1 else y.shape[1]
-            if n_outputs != self._n_outputs:
-                raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
-            source = self._source(given, X, y)
-            residuals = self._fitted.units.rows(source).residuals
-            check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
-            self._fitted = self._fitted.updated(source, self.forgetting_factor)
-            self._training_data = None
-            self._set_attributes()
-        return self
-
-    def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
-        """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
-
-        With q at its optimum, for the rows of the last `fit`, as they now are. The model refers to them, which keeps
-        them in memory (not in pickles and copies).
-
-        Parameters
-        ----------
-        theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
-            Logarithms of the free hyperparameters, as ``kernel_.theta``; of several outputs one row each, which need
-            not agree in what the fitted kernels share. None means the fitted ones.
-        eval_gradient : bool, default=False
-            Whether to return the gradient too; only with a ``theta``.
-
-        Returns
-        -------
-        bound : float
-            In nats, summed over outputs.
-        gradient : ndarray of the shape of ``theta``
-            If ``eval_gradient``. For what outputs share add up its rows.
-
-        Raises
-        ------
-        ValueError
-            If ``theta`` has another shape or is out of range, a gradient is asked for without it, or the rows are gone:
-            after `partial_fit`, and in copies and pickles, which leave them out.
-        """
-        self._check_gradient_of(theta, eval_gradient)
-        if theta is None:
-            return self.lower_bound_
-        if self._training_data is None:
-            raise ValueError(
-                "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
-                "and pickles of a model leave them out. Call fit, or lower_bound() for the fitted kernel."
-            )
-        with closing(BlockMap(effective_n_jobs(self.n_jobs))) as threads, single_threaded_libraries():
-            rows = self._fitted.units.rows(self._source(*self._training_data), threads)
-            return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
 
     def set_params(self, **params: Any) -> Self:
         """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.
@@ -387,16 +314,3 @@ class EVGPRegressor(ExplicitGaussianProcess):
         if isinstance(self.solver, str) and any(name.startswith("solver__") for name in params):
             self.solver = resolved(self.solver, self.posterior)
         return super().set_params(**params)
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
-
-    def _set_attributes(self) -> None:
-        self._set_common_attributes()
-        fitted = self._fitted
-        points = np.array([group.points for group in self._predictor.groups])
-        self.inducing_points_ = points[0] if fitted.sharing == "all" or self._single_output else points
-        self.lower_bound_ = fitted.lower_bound
-        self.loss_curve_ = fitted.loss_curve
-        self.n_iter_ = fitted.n_iter
-        self.n_parameters_ = fitted.n_parameters

@@ -93,6 +93,7 @@ def test_q_is_at_its_optimum_for_the_new_noise(solver, posterior):
     for part, expected in zip(m.predict(X_NEW, return_std=True), again.predict(X_NEW, return_std=True), strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-6, atol=1e-8)
     assert m.lower_bound_ == pytest.approx(again.lower_bound_, rel=1e-8)
+    assert m.upper_bound_ == pytest.approx(again.upper_bound_, rel=1e-8)
 
 
 def test_what_the_user_fixes_stays():

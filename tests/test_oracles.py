@@ -128,6 +128,61 @@ def test_bounds_are_ordered(data):
     assert exact_bound > bounds["full"] > bounds["diagonal"]
 
 
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+@pytest.mark.parametrize("options", [{}, {"posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str)
+def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, sharing, options):
+    X, Y, _ = data
+    unit = np.array([1.0, 100.0])
+    prior = {"coef_mean": MEAN * unit[:, np.newaxis], "coef_scale": SCALE * unit[:, np.newaxis]}
+    model = EVGPRegressor(
+        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, tol=1.0, **prior, **options
+    ).fit(X, Y * unit)
+    mean = np.mean(Y, axis=0) if "normalize_y" in options else np.zeros(2)
+    likelihood = 0.0
+    for o in range(2):
+        kernel = model.kernel_[o] + Linear(tuple(unit[o] * SCALE[o]))
+        gpr = GaussianProcessRegressor(kernel, alpha=model.noise_variance_[o], optimizer=None)
+        left = Y[:, o] - mean[o] - PolynomialFeatures(1).fit_transform(X) @ MEAN[o]
+        likelihood += gpr.fit(X, unit[o] * left).log_marginal_likelihood_value_
+    assert model.lower_bound_ < likelihood < model.upper_bound_
+
+
+@pytest.mark.parametrize("noise", [1e-2, 1e-8])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+def test_points_at_all_rows_leave_nothing_between_the_bounds(data, sharing, noise):
+    """Some of the rows twice: a kernel matrix that is singular without noise."""
+    X = np.vstack([data[0], data[0][:20]])
+    Y = drawn(X, noise)
+    model = EVGPRegressor(
+        kernel=fixed_kernel() + WhiteKernel(noise, "fixed"), n_inducing=70, sharing=sharing, max_iter=0
+    ).fit(X, Y)
+    # At the lower noise a jitter counts a little.
+    assert model.upper_bound_ == pytest.approx(model.lower_bound_, abs=1e-3 if noise > 1e-4 else 1.0)
+    gprs = (GaussianProcessRegressor(fixed_kernel(), alpha=noise, optimizer=None).fit(X, y) for y in Y.T)
+    likelihood = sum(gpr.log_marginal_likelihood_value_ for gpr in gprs)
+    assert model.lower_bound_ == pytest.approx(likelihood, abs=0.01)
+    assert model.upper_bound_ >= likelihood - 1e-6
+
+
+def drawn(X, noise):
+    """Two targets as likely as any under the kernel."""
+    root = np.linalg.cholesky(fixed_kernel()(X) + noise * np.eye(len(X)))
+    return root @ np.random.RandomState(1).randn(len(X), 2)
+
+
+@pytest.mark.parametrize("noise", [1e-4, 1e-8])
+def test_the_upper_bound_comes_down_to_the_likelihood_as_points_are_added(data, noise):
+    X, Y = data[0], drawn(data[0], noise)
+    kernel = fixed_kernel() + WhiteKernel(noise, "fixed")
+    likelihood = GaussianProcessRegressor(fixed_kernel(), alpha=noise, optimizer=None).fit(X, Y[:, 0])
+    upper = [
+        EVGPRegressor(kernel=kernel, inducing_init=X[:m], max_iter=0).fit(X, Y[:, 0]).upper_bound_
+        for m in (5, 20, 50, 65, 70)
+    ]
+    assert (np.diff(upper) < 0.0).all()
+    assert upper[-1] == pytest.approx(likelihood.log_marginal_likelihood_value_, abs=0.1)
+
+
 def test_the_fitted_kernel_is_the_exact_counterparts(data):
     X, Y, X_new = data
     model = EVGPRegressor(n_inducing=70, random_state=0, tol=1.0).fit(X, Y[:, 0])

@@ -364,6 +364,7 @@ def test_partial_fit_is_fit_with_the_same_kernel_and_points(sharing, posterior):
         other.predict(X_NEW, return_std=True)[1], m.predict(X_NEW, return_std=True)[1], rtol=1e-7
     )
     assert other.lower_bound_ == pytest.approx(m.lower_bound_, rel=1e-9)
+    assert other.upper_bound_ == pytest.approx(m.upper_bound_, rel=1e-9)
     assert m.lower_bound_ > bound
 
 
@@ -380,6 +381,7 @@ def test_partial_fit_equals_a_fit_of_all_rows():
     np.testing.assert_allclose(parts.predict(X_NEW), whole.predict(X_NEW), atol=1e-8)
     np.testing.assert_allclose(parts.coef_cov_, whole.coef_cov_, atol=1e-8)
     assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
+    assert parts.upper_bound_ == pytest.approx(whole.upper_bound_, rel=1e-8)
 
 
 def test_forgetting_weighs_earlier_rows_as_fewer():

@@ -6,13 +6,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
+from ..inference.bounds import CoefficientPrior
 from ..inference.exact import ExactModel
 from ..inference.posterior import Predictor
+from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs
-from ..optimizers.parameters import ParameterTable
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
+from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
 from .start import checked_variance, column_centre, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
@@ -94,6 +98,50 @@ class ExactTask:
             minimum.converged,
             how_it_ended(minimum, minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
         )
+
+
+@dataclass(frozen=True)
+class Unhindered:
+    """What a kernel would be without inducing points: the exact model of some rows, fitted.
+
+    Attributes
+    ----------
+    model : ExactModel
+    fit : Fit
+    n_parameters : int
+        That were fitted.
+    """
+
+    model: ExactModel
+    fit: Fit
+    n_parameters: int
+
+    @classmethod
+    def of(
+        cls,
+        kernel: Kernel,
+        prior: CoefficientPrior,
+        rows: RawRows,
+        table: ParameterTable,
+        scatter: np.ndarray,
+        options: ExactOptions,
+        rng: np.random.RandomState,
+        monitor: Monitor,
+    ) -> Unhindered:
+        """Fit it; arguments as of `ExactModel` and `ExactTask`."""
+        model = ExactModel(kernel, prior, np.zeros(prior.scale.shape, dtype=bool), rows)
+        return cls(model, search(ExactTask(model, table, scatter, options, rng, monitor)), table.size)
+
+    def missed_by(self, values: Values) -> float:
+        """How much less likely the rows are under other values, in nats per row and output.
+
+        Less what the fit has gained by chance, on average half a nat for each parameter (Wilks 1938).
+        """
+        try:
+            likelihood = sum(output.log_likelihood for output in self.model.outputs(values)[1])
+        except NotPositiveDefiniteError:
+            return np.inf
+        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / self.model.rows.targets.size
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,12 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from .._validation import as_floats, check_magnitude
-from ..inference.statistics import Kernel
+from ..inference.statistics import Kernel, Whitening
 from ..rows.source import Moments
 from .start import column_scale
 
+# Points that there are first if their number is to be found.
+_FIRST = 10
 # On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
 MAX_SAMPLE = 10_000
 # The greedy search keeps so many numbers at most, 80 MB.
@@ -35,16 +37,21 @@ class Placement:
         ``"auto"`` starts as ``"k-means"``; or the points themselves, in the same units as the inputs.
     n_inducing : int
         At most so many points; an array brings its own number.
+    max_inducing : int, optional
+        At most so many in the end, if their number is to be found.
     """
 
     method: Literal["auto", "k-means", "greedy"] | np.ndarray
     n_inducing: int
+    max_inducing: int | None = None
 
     @classmethod
-    def of(cls, inducing_init: Any, n_inducing: int, n_columns: int) -> Placement:
-        """What ``inducing_init`` says, for inputs of so many columns; points are checked."""
+    def of(cls, inducing_init: Any, n_inducing: int | str, max_inducing: int, n_columns: int) -> Placement:
+        """What the arguments of these names say, for inputs of so many columns; points are checked."""
+        most = max_inducing if isinstance(n_inducing, str) else None
+        first = min(_FIRST, max_inducing) if isinstance(n_inducing, str) else n_inducing
         if isinstance(inducing_init, str):
-            return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), n_inducing)
+            return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), first, most)
         points = as_floats(inducing_init, "inducing_init")
         if points.ndim != 2 or len(points) == 0 or points.shape[1] != n_columns:
             raise ValueError(
@@ -54,7 +61,7 @@ class Placement:
         if not np.isfinite(points).all():
             raise ValueError("inducing_init must be finite; it contains NaN or infinity.")
         check_magnitude(points, "inducing_init")
-        return cls(points, len(points))
+        return cls(points, len(points), most)
 
     @property
     def anew(self) -> Placement | None:
@@ -66,7 +73,7 @@ class Placement:
     def sample_size(self) -> int:
         """How many rows are enough to choose from."""
         if isinstance(self.method, str) and self.method == "greedy":
-            return max(2 * self.n_inducing, min(MAX_SAMPLE, LARGEST_SEARCH // self.n_inducing))
+            return greedy_sample_size(self.n_inducing)
         return max(MAX_SAMPLE, 10 * self.n_inducing)
 
     def points(
@@ -91,13 +98,53 @@ class Placement:
         """
         if isinstance(self.method, np.ndarray):
             return self.method
-        _, first = np.unique(_rounded(inputs, Moments.of(inputs)), axis=0, return_index=True)
-        distinct = inputs[np.sort(first)]
+        distinct = distinct_rows(inputs)
         if len(distinct) <= self.n_inducing:
             return distinct
         if self.method == "greedy":
             return _least_known(distinct[rng.permutation(len(distinct))], self.n_inducing, kernel, hyperparameters)
         return _cluster_centres(inputs, self.n_inducing, rng)
+
+
+def greedy_sample_size(n_inducing: int) -> int:
+    """How many rows are enough for a greedy search of so many points."""
+    return max(2 * n_inducing, min(MAX_SAMPLE, LARGEST_SEARCH // n_inducing))
+
+
+def distinct_rows(inputs: np.ndarray) -> np.ndarray:
+    """Rows in the order of their first appearance; those that differ by rounding only are one."""
+    _, first = np.unique(_rounded(inputs, Moments.of(inputs)), axis=0, return_index=True)
+    return inputs[np.sort(first)]
+
+
+def with_more(
+    points: np.ndarray, n_inducing: int, inputs: np.ndarray, kernel: Kernel, hyperparameters: np.ndarray
+) -> np.ndarray:
+    """Inducing points, and after them the rows that are least known from all before.
+
+    Parameters
+    ----------
+    points : ndarray of shape (m, d)
+        Those that are there.
+    n_inducing : int
+        How many there are to be.
+    inputs : ndarray of shape (n, d)
+        Rows to choose from; of rows that are equally little known the first is taken.
+    kernel : Kernel
+    hyperparameters : ndarray of shape (n_hyper,)
+        As the kernel takes them.
+
+    Returns
+    -------
+    inducing_points : ndarray of shape (m + k, d)
+        With k = n_inducing - m, or less where fewer rows are distinct from each other and from the points.
+    """
+    moments = Moments.of(inputs)
+    _, first = np.unique(_rounded(np.vstack([points, inputs]), moments), axis=0, return_index=True)
+    new = inputs[np.sort(first[first >= len(points)]) - len(points)]
+    if len(new) > n_inducing - len(points):
+        new = _least_known(new, n_inducing - len(points), kernel, hyperparameters, points)
+    return np.vstack([points, new])
 
 
 def are_all_rows(points: np.ndarray, inputs: np.ndarray) -> bool:
@@ -128,12 +175,19 @@ def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomS
     return centres[np.sort(first)]
 
 
-def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparameters: np.ndarray) -> np.ndarray:
+def _least_known(
+    inputs: np.ndarray,
+    n_inducing: int,
+    kernel: Kernel,
+    hyperparameters: np.ndarray,
+    given: np.ndarray | None = None,
+) -> np.ndarray:
     """One after the other the row whose variance given the rows before, k(x, x) - q(x, x), is the largest.
 
     (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in Gaussian process regression",
     section 4.2.3: the greedy maximum of the determinant of k(X_m, X_m).) A Cholesky factorisation with pivots, O(n m²).
-    Once every row follows from the chosen ones but for rounding, the row farthest from them is next.
+    Once every row follows from the chosen ones but for rounding, the row farthest from them is next. Points that are
+    given count as chosen before: the Cholesky factor begins with their rows.
 
     Parameters
     ----------
@@ -143,6 +197,8 @@ def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparam
         m < n.
     kernel : Kernel
     hyperparameters : ndarray of shape (n_hyper,)
+    given : ndarray of shape (k, d), optional
+        Points that are none of the rows.
 
     Returns
     -------
@@ -154,10 +210,17 @@ def _least_known(inputs: np.ndarray, n_inducing: int, kernel: Kernel, hyperparam
     moments = Moments.of(inputs)
     scaled = (inputs - moments.mean) / column_scale(moments)
     distance = np.full(len(inputs), np.inf)
-    rows, chosen = np.empty((n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
-    for count in range(n_inducing):
+    n_given = 0 if given is None else len(given)
+    rows, chosen = np.empty((n_given + n_inducing, len(inputs))), np.empty(n_inducing, dtype=int)
+    if given is not None:
+        whitening = Whitening.of(kernel, np.exp(hyperparameters), given)
+        whitening.project(prepared, out=rows[:n_given])
+        variance = whitening.unexplained(prepared, rows[:n_given])
+        for point in (given - moments.mean) / column_scale(moments):
+            distance = np.minimum(distance, ((scaled - point) ** 2).sum(axis=1))
+    for count in range(n_given, n_given + n_inducing):
         known = count > 0 and not variance.max() > enough
-        pivot = chosen[count] = int(np.argmax(distance if known else variance))
+        pivot = chosen[count - n_given] = int(np.argmax(distance if known else variance))
         distance = np.minimum(distance, ((scaled - scaled[pivot]) ** 2).sum(axis=1))
         if known:
             variance[:] = 0.0

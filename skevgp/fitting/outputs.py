@@ -21,7 +21,7 @@ from ..rows.source import Source
 from ..rows.threads import BlockMap, thread_pool
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
-from .sparse import Learned, Solver, SparseTask
+from .sparse import Learned, Solver, SparseTask, grown
 from .start import checked_variance, column_centre, starting_table
 from .strategy import search
 from .units import Units
@@ -79,8 +79,6 @@ class FittedOutputs:
     sharing : {"all", "kernel", "none"}
     outputs : tuple of slice
         Of each model.
-    tables : tuple of ParameterTable
-        Where each model started, and its limits.
     learned : tuple of Learned
         Each model, in internal units.
     messages : tuple of str
@@ -90,7 +88,6 @@ class FittedOutputs:
     units: Units
     sharing: Sharing
     outputs: tuple[slice, ...]
-    tables: tuple[ParameterTable, ...]
     learned: tuple[Learned, ...]
     messages: tuple[str, ...]
 
@@ -110,6 +107,11 @@ class FittedOutputs:
         return sum(one.bound for one in self.learned) - self._shift
 
     @property
+    def upper_bound(self) -> float:
+        """On the log marginal likelihood, in nats, summed over outputs."""
+        return sum(one.upper_bound for one in self.learned) - self._shift
+
+    @property
     def n_iter(self) -> int:
         """Iterations of the longest fit."""
         return max(len(one.loss_curve) for one in self.learned)
@@ -126,17 +128,17 @@ class FittedOutputs:
     def n_parameters(self) -> int:
         """Free parameters of kernels, noise, inducing points and q."""
         total = 0
-        for table, one in zip(self.tables, self.learned, strict=True):
+        for one in self.learned:
             n_outputs, p = one.model.prior.scale.shape
             size = one.values["inducing_points"].shape[1] + p
             q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
-            total += table.size + q * n_outputs
+            total += one.table.size + q * n_outputs
         return total
 
     def limits(self, name: str, output: int) -> np.ndarray:
         """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
         index, within = self._place_of(output)
-        limits = self.tables[index][name].value_limits()
+        limits = self.learned[index].table[name].value_limits()
         return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
@@ -222,8 +224,7 @@ def fit_outputs(
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
     outputs = tuple(outputs for outputs, _ in _models(request))
-    tables = tuple(task.table for task in tasks)
-    return FittedOutputs(request.units, request.sharing, outputs, tables, tuple(learned), tuple(messages))
+    return FittedOutputs(request.units, request.sharing, outputs, tuple(learned), tuple(messages))
 
 
 def plan(
@@ -250,8 +251,6 @@ def plan(
     hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
     inputs = rows.sample(placement.sample_size, rng).inputs
     points = placement.points(inputs, kernel, hyperparameters, rng)
-    # Where they are all rows the bound is the likelihood: no other places are better.
-    stay = request.family == "full" and len(inputs) == len(rows) and are_all_rows(points, inputs)
     first = starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
@@ -264,7 +263,10 @@ def plan(
             warm = previous.values_in(units, rows, kernel, index)
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
-        table = table_of(outputs, np.repeat(points[np.newaxis], len(groups), axis=0), variance)
+        sets = _first_sets(points, len(groups), placement, warm)
+        table = table_of(outputs, sets, variance)
+        # Where they are all rows the bound is the likelihood: no other places are better.
+        stay = request.family == "full" and len(inputs) == len(rows) and all(are_all_rows(own, inputs) for own in sets)
         if stay:
             table = table.with_fixed("inducing_points")
         shift = len(rows) * units.log_unit(outputs)
@@ -288,6 +290,12 @@ def plan(
     return tasks
 
 
+def _first_sets(points: np.ndarray, n_groups: int, placement: Placement, warm: Values | None) -> np.ndarray:
+    """Inducing points (g, m, d) of each group; where their number is to be found, those of the fit before go on."""
+    found = None if warm is None or placement.max_inducing is None else warm.get("inducing_points")
+    return np.repeat(points[np.newaxis], n_groups, axis=0) if found is None or len(found) != n_groups else found
+
+
 def _models(request: Request) -> list[tuple[slice, tuple[slice, ...]]]:
     """The outputs of each independent model, and of these the outputs of each set of inducing points."""
     n_outputs = len(request.units.target_unit)
@@ -300,7 +308,9 @@ def _models(request: Request) -> list[tuple[slice, tuple[slice, ...]]]:
 def _fit_one(task: SparseTask) -> Learned:
     # A copy, with which the blocks of rows are forgotten.
     task = replace(task)
-    return Learned.of(task, search(task))
+    if task.placement.max_inducing is None:
+        return Learned.of(task, search(task))
+    return Learned.of(*grown(task))
 
 
 def _side_by_side(one: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int, monitor: Monitor) -> list[Result]:

@@ -20,8 +20,17 @@ from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from .advice import far_from_prior, learned_too_little
 from .calibration import calibrated_noise
-from .inducing import Placement
-from .strategy import Attempt, Fit, Rules, Strategy, drawn
+from .exact import ExactOptions, Unhindered
+from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
+from .strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
+
+# By what factor inducing points become more, until that raises the bound by less than so many nats per row and output.
+_GROWTH, _GAIN = 1.5, 0.01
+# Points limit the kernel if it makes so many rows, a sample, less likely than their own kernel does, by so many nats
+# per row and output.
+_SAMPLE, _MISSED = 1000, 0.02
+# On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
+_ITERATIONS, _COARSE = 60, 2e-4
 
 
 class Solver(Protocol):
@@ -154,6 +163,84 @@ class SparseTask:
         points = placement.points(inputs, self.model.kernel, np.log(values["hyperparameters"]), self.rng)
         return values | {"inducing_points": np.repeat(points[np.newaxis], len(self.model.groups), axis=0)}
 
+    def placed_under(self, values: Values) -> Values:
+        """Values of a kernel, with as many inducing points as the task has, placed greedily; all rows if they stay."""
+        table = self.table
+        if not table["inducing_points"].free.any():
+            return values | {"inducing_points": table["inducing_points"].start}
+        return self._placed(values, Placement("greedy", self.n_inducing))
+
+    def with_more(self, values: Values) -> SparseTask | None:
+        """The task of half as many points again, those of a fit among them; None if there can be no more."""
+        most = self.placement.max_inducing
+        if most is None or self.n_inducing >= most:
+            return None
+        wanted = min(int(np.ceil(_GROWTH * self.n_inducing)), most)
+        inputs = self.rows.sample(greedy_sample_size(wanted), self.rng).inputs
+        distinct, points = distinct_rows(inputs), values["inducing_points"]
+        everything = len(inputs) == len(self.rows) and len(distinct) <= wanted
+        if everything:
+            sets = [distinct] * len(points)
+        else:
+            hyperparameters = np.log(values["hyperparameters"])
+            sets = [with_more(own, wanted, inputs, self.model.kernel, hyperparameters) for own in points]
+        n_inducing = min(map(len, sets))
+        if n_inducing <= self.n_inducing:
+            return None
+        table = self.table.with_start("inducing_points", np.array([own[:n_inducing] for own in sets]))
+        if everything and self.model.family == "full":
+            # The bound is then the likelihood: no other places are better.
+            table = table.with_fixed("inducing_points")
+            return replace(self, table=table, model=replace(self.model, complete=True))
+        return replace(self, table=table)
+
+    def unhindered(self) -> Unhindered | None:
+        """The exact model of a sample of the rows; None if the kernel is fixed."""
+        if self.max_iter == 0 or not self.table["hyperparameters"].free.any():
+            return None
+        sample = self.rows.sample(_SAMPLE, self.rng)
+        return Unhindered.of(
+            self.model.kernel,
+            self.model.prior,
+            sample,
+            self.table.without("inducing_points"),
+            self.rows.scatter(),
+            ExactOptions(self.solver.rules, self.max_iter, max(self.tol or 0.0, _COARSE * sample.targets.size), 0),
+            self.rng,
+            self.monitor.silent(),
+        )
+
+
+def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
+    """A fit whose number of inducing points has been found, and the task that it is of.
+
+    Half as many points again are added, the rows that are least known from those before, and the fit goes on for a few
+    iterations; until that raises the bound by less than `_GAIN`. The fit before then goes on to its end.
+
+    With few points the noise may explain so much that half as many again show nothing of what there is to learn. Hence
+    a second opinion, the kernel of the exact model of a sample: while it makes the sample likelier than the fit's by
+    `_MISSED`, growth does not end, and it is tried at each step.
+    """
+    nats = len(task.rows) * len(task.rows.scatter())
+    coarse = replace(task, max_iter=min(task.max_iter, _ITERATIONS), tol=max(task.tol or 0.0, _COARSE * nats))
+    fit = search(coarse)
+    with task.monitor.keeping_the_best():
+        unhindered = None if task.monitor.stopped else task.unhindered()
+        while not task.monitor.stopped and (more := coarse.with_more(fit.values)) is not None:
+            starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
+            if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
+                starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
+            # Where they start: nothing is optimised.
+            start = max((more.minimise(Attempt(values, 0)) for values in starts), key=lambda tried: tried.bound)
+            larger = more.minimise(Attempt(start.values, coarse.max_iter))
+            if larger.bound - fit.bound < _GAIN * nats and not limited:
+                break
+            coarse, fit = more, larger
+    task = replace(coarse, max_iter=task.max_iter, tol=task.tol)
+    if fit.n_iter < task.max_iter and not task.monitor.stopped:
+        fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter, fit)))
+    return task, fit
+
 
 @dataclass(frozen=True)
 class Learned:
@@ -162,12 +249,14 @@ class Learned:
     Attributes
     ----------
     model : SparseModel
+    table : ParameterTable
+        Where it started, and its limits.
     values : dict
         Of the model's parameters, in internal units.
     statistics : list of SufficientStatistics
         At ``values``, one for each set of inducing points.
-    bound : float
-        In nats, of the residuals in internal units.
+    bound, upper_bound : float
+        On the log marginal likelihood, in nats, of the residuals in internal units.
     predictor : Predictor
         In internal units.
     loss_curve : list of float
@@ -177,9 +266,11 @@ class Learned:
     """
 
     model: SparseModel
+    table: ParameterTable
     values: Values
     statistics: list[SufficientStatistics]
     bound: float
+    upper_bound: float
     predictor: Predictor
     loss_curve: list[float]
     message: str
@@ -195,17 +286,19 @@ class Learned:
             advice.append(learned_too_little(task.model.kernel, fit.values, task.table, task.rows))
         learned = cls(
             task.model,
+            task.table,
             fit.values,
             statistics,
             # Summed row by row, which keeps its digits where the noise is low.
             fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound,
+            task.model.upper_bound(fit.values, statistics, task.blocks),
             predictor if fit.predictor is None else fit.predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
         )
         if task.noise_cv is not None and free_noise and not task.monitor.stopped:
             with task.monitor.keeping_the_best():
-                learned = learned.calibrated(task.table, task.rows, task.noise_cv)
+                learned = learned.calibrated(task.rows, task.noise_cv)
         return learned
 
     def bound_at(
@@ -258,13 +351,15 @@ class Learned:
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
         return replace(self, model=model, statistics=statistics)._at_optimum()
 
-    def calibrated(self, table: ParameterTable, rows: Rows, n_folds: int) -> Learned:
+    def calibrated(self, rows: Rows, n_folds: int) -> Learned:
         """The noise that is free from cross-validation, and q at its optimum for it."""
-        limits = table["noise"].value_limits()
+        limits = self.table["noise"].value_limits()
         noise = calibrated_noise(self.model, self.values, self.statistics, rows, limits, n_folds)
-        noise = np.where(table["noise"].free, noise, self.values["noise"])
-        return replace(self, values=self.values | {"noise": noise})._at_optimum()
+        noise = np.where(self.table["noise"].free, noise, self.values["noise"])
+        blocks = rows.blocks(self.model.kernel, self.values["inducing_points"].shape[1])
+        return replace(self, values=self.values | {"noise": noise})._at_optimum(blocks)
 
-    def _at_optimum(self) -> Learned:
+    def _at_optimum(self, blocks: Blocks | None = None) -> Learned:
         bound, predictor = self.model.at_optimum(self.values, self.statistics)
-        return replace(self, bound=bound, predictor=predictor)
+        upper_bound = self.model.upper_bound(self.values, self.statistics, blocks)
+        return replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)

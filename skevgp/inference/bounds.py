@@ -11,14 +11,14 @@ sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
-from ..rows.blocks import LinearStatistics
-from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening
+from ..rows.blocks import Blocks, LinearStatistics
+from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
 
@@ -65,6 +65,11 @@ class WhitenedPosterior:
     root: np.ndarray
     root_inv: np.ndarray
     mean: np.ndarray
+
+    @property
+    def log_det(self) -> float:
+        """log|B|."""
+        return 2.0 * float(np.log(diagonal_of(self.root)).sum())
 
 
 @dataclass(frozen=True)
@@ -187,7 +192,7 @@ class BoundAtOptimum:
             q = optimal_posterior(group, o)
             self.posteriors.append(q)
             self.weights[:m, o], self.weights[m:, o] = s * q.mean[:m], scale * q.mean[m:]
-            log_det = 2.0 * float(np.log(diagonal_of(q.root)).sum())
+            log_det = q.log_det
             penalty = float(q.mean @ q.mean)
             if p:
                 penalty += float(prior.reference[o] @ (2.0 * q.mean[m:] + prior.reference[o]))
@@ -228,6 +233,41 @@ class BoundAtOptimum:
         signal = self._log_signal + 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
         noise = self._log_noise + 0.5 * residuals.squares / self.group.noise
         return self.value(residuals), {"signal": signal, "noise": noise}
+
+
+def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
+    """No less than the log marginal likelihood at these parameters, summed over outputs, whatever q is.
+
+    With Q = UᵀK⁻¹U + HΣ_βHᵀ, r = y - Hμ_β and t = Σ(k(x, x) - q(x, x)), the trace of what the inducing points leave of
+    the covariance, which is no less than its largest eigenvalue,
+
+        -½ [N log 2π + log|Q + σ²I| + rᵀ (Q + (σ² + t) I)⁻¹ r]
+
+    (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
+    The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
+    Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
+    j, and a row that comes often makes that so many times larger.
+
+    Parameters
+    ----------
+    group : Group
+    blocks : Blocks, default=None
+        The rows, for errors summed row by row (see `BoundAtOptimum`); None takes them from the statistics.
+
+    Returns
+    -------
+    bound : float
+        In nats.
+    """
+    statistics, left_over = group.statistics, group.statistics.unexplained
+    if group.complete:
+        left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+    noise = group.noise + group.signal * left_over
+    # The likelihood with this noise and without a trace term, but for its determinant.
+    wide = BoundAtOptimum(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)), "full")
+    left = wide.residuals() if blocks is None else errors(blocks, group.whitening, group.outputs, wide.weights)
+    log_dets = [q.log_det - optimal_posterior(group, o).log_det for o, q in enumerate(wide.posteriors)]
+    return wide.value(left) + 0.5 * float((statistics.n_rows * np.log(noise / group.noise) + log_dets).sum())
 
 
 def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: CoefficientPrior) -> float:

@@ -10,7 +10,7 @@ import numpy as np
 from .._linalg import JITTER, Jitter
 from ..optimizers.parameters import Values
 from ..rows.blocks import Blocks
-from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances
+from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances, upper_bound
 from .posterior import Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
@@ -89,6 +89,20 @@ class SparseModel:
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
         return total, self.predictor(values, whitenings, mean, root)
+
+    def upper_bound(
+        self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None
+    ) -> float:
+        """No less than the log marginal likelihood: a pass over the rows for each group, if they are still there.
+
+        Parameters
+        ----------
+        values, statistics
+            As of `at_optimum`.
+        blocks : Blocks, default=None
+            All rows; without them digits cancel at high signal-to-noise ratios.
+        """
+        return sum(upper_bound(group, blocks) for group in self.groups_of(values, statistics))
 
     def predictor(
         self,

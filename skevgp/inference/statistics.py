@@ -17,6 +17,8 @@ from .._linalg import JITTER, Jitter, cholesky_of_covariance, cholesky_pullback,
 from ..rows.blocks import Block, Blocks
 
 _ROUNDING = 4.0 * np.finfo(float).eps
+# Relative to the diagonal: above rounding, and below any jitter.
+_NO_JITTER = 1e-13
 
 
 class KernelAt(Protocol):
@@ -79,6 +81,12 @@ class Whitening:
         covariance = kernel.at(np.log(hyperparameters), inducing_points)
         L = cholesky_of_covariance(covariance.matrix(), jitter)
         return cls(covariance, L, triangular_inverse(L))
+
+    def jitter(self) -> float:
+        """The most that was added to the diagonal of K; 0 if it is rounding."""
+        diagonal = np.diagonal(self.covariance.matrix())
+        added = np.einsum("ij,ij->i", self.L, self.L) - diagonal
+        return float(np.max(added, where=added > _NO_JITTER * diagonal, initial=0.0))
 
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""
@@ -179,6 +187,29 @@ class _FirstPass:
         return V @ V.T, V @ block.linear_of(self.outputs), self.whitening.unexplained(block.prepared, V).sum()
 
 
+def _with_errors(block: Block, V: np.ndarray, outputs: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """[H, e] of a block (n, p + o), and the e in it."""
+    linear, m = block.linear_of(outputs).copy(), len(V)
+    e = linear[:, block.n_features :]
+    e -= V.T @ weights[:m]
+    e -= block.features @ weights[m:]
+    return linear, e
+
+
+@dataclass(frozen=True)
+class _Errors:
+    """Block -> eᵀe of each output and V e."""
+
+    whitening: Whitening
+    outputs: slice
+    weights: np.ndarray
+
+    def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
+        _, V = self.whitening.project(block.prepared)
+        _, e = _with_errors(block, V, self.outputs, self.weights)
+        return np.einsum("no,no->o", e, e), V @ e
+
+
 @dataclass(frozen=True)
 class _SecondPass:
     """Block -> what it adds to the kernel's pull-back, eᵀe of each output and V e.
@@ -198,10 +229,7 @@ class _SecondPass:
             _, U, V = block.kept
         else:
             U, V = self.whitening.project(block.prepared)
-        linear, p, m = block.linear_of(self.outputs).copy(), block.n_features, len(V)
-        e = linear[:, p:]
-        e -= V.T @ self.weights[:m]
-        e -= block.features @ self.weights[m:]
+        linear, e = _with_errors(block, V, self.outputs, self.weights)
         U_bar = self.from_whitened @ V
         U_bar += self.from_linear @ linear.T
         rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
@@ -236,6 +264,11 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
         linear.RR[outputs],
         float(unexplained),
     )
+
+
+def errors(blocks: Blocks, whitening: Whitening, outputs: slice, weights: np.ndarray) -> Residuals:
+    """What weights (m + p, o) leave over, row by row: a pass without a gradient; arguments as of `pull_back`."""
+    return Residuals(*blocks.sum(_Errors(whitening, outputs, weights)))
 
 
 def pull_back(

@@ -108,6 +108,14 @@ class ParameterTable:
             ]
         )
 
+    def with_start(self, name: str, start: np.ndarray) -> ParameterTable:
+        """The same table with another start of a parameter, perhaps of another shape."""
+        return ParameterTable([replace(own, start=start) if own.name == name else own for own in self.parameters])
+
+    def without(self, name: str) -> ParameterTable:
+        """The same table without a parameter."""
+        return ParameterTable([own for own in self.parameters if own.name != name])
+
     def with_fixed(self, name: str) -> ParameterTable:
         """The same table with a parameter that stays where it starts."""
         return ParameterTable([replace(own, fixed=True if own.name == name else own.fixed) for own in self.parameters])

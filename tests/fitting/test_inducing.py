@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scipy.spatial.distance import cdist
 
-from skevgp.fitting.inducing import LARGEST_SEARCH, MAX_SAMPLE, Placement, are_all_rows
+from skevgp.fitting.inducing import LARGEST_SEARCH, MAX_SAMPLE, Placement, are_all_rows, distinct_rows, with_more
 from skevgp.kernels.stationary import SquaredExponential
 
 
@@ -114,3 +114,47 @@ def test_greedy_goes_on_where_the_kernel_is_exhausted_or_every_row_a_stranger(le
 def test_given_points_are_taken_as_they_are():
     Z = np.array([[1.0, 2.0], [1.0, 2.0], [0.0, -5.0]])
     np.testing.assert_array_equal(points(np.random.RandomState(0).randn(50, 2), 10, Z), Z)
+
+
+# --- more points ---------------------------------------------------------------------------------------------------
+
+
+def more(Z, n_inducing, X, lengthscale=1.5):
+    return with_more(Z, n_inducing, X, SquaredExponential(X.shape[1]), np.log(np.full(X.shape[1], lengthscale)))
+
+
+@pytest.mark.parametrize("lengthscale", [1e4, 1.5, 1e-4])
+def test_more_points_are_those_that_a_greedy_search_would_have_gone_on_with(lengthscale):
+    X = np.random.RandomState(0).randn(200, 3)
+    whole = points(X, 20, "greedy", lengthscale)
+    if lengthscale == 1.5:
+        np.testing.assert_array_equal(more(whole[:8], 20, X, lengthscale), whole)
+    np.testing.assert_array_equal(more(whole[:8], 9, X, lengthscale)[:8], whole[:8])
+    assert len(np.unique(more(whole[:8], 20, X, lengthscale), axis=0)) == 20
+
+
+def test_more_points_are_the_least_known_from_points_that_are_no_rows():
+    X, Z = np.random.RandomState(0).randn(200, 3), np.random.RandomState(1).randn(7, 3)
+    chosen = more(Z, 15, X)
+
+    def k(A, B):
+        return np.exp(-0.5 * cdist(A / 1.5, B / 1.5, "sqeuclidean"))
+
+    np.testing.assert_array_equal(chosen[:7], Z)
+    for count in range(7, 15):
+        known = chosen[:count]
+        left = 1.0 - np.einsum("ij,ij->j", k(known, X), np.linalg.solve(k(known, known), k(known, X)))
+        np.testing.assert_array_equal(chosen[count], X[np.argmax(left)])
+
+
+@pytest.mark.parametrize("scale", [1e-9, 1.0, 1e9])
+def test_no_more_points_than_there_are_distinct_rows(scale):
+    X = scale * np.random.RandomState(0).randn(20, 2)
+    twice = np.vstack([X, X * (1.0 + 4e-16)])
+    np.testing.assert_array_equal(distinct_rows(twice), X)
+    grown = more(X[5:15], 100, twice, scale)
+    assert grown.shape == (20, 2)
+    assert are_all_rows(grown, X)
+    np.testing.assert_array_equal(more(X, 30, twice, scale), X)
+    beside = X[:3] + 0.1 * scale
+    assert more(beside, 100, twice, scale).shape == (23, 2)

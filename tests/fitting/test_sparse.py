@@ -9,7 +9,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from skevgp._progress import Monitor
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import plan
-from skevgp.fitting.sparse import Learned
+from skevgp.fitting.sparse import Learned, SparseTask, grown
 from skevgp.fitting.strategy import Attempt, Fit
 from skevgp.inference.bounds import features_alone_bound
 from skevgp.rows.threads import BlockMap
@@ -231,8 +231,106 @@ def test_a_calibrated_noise_is_that_of_the_folds_and_q_is_at_its_optimum_for_it(
     assert (learned.values["noise"] != fit.values["noise"]).all()
     for name in ("hyperparameters", "signal", "inducing_points"):
         np.testing.assert_array_equal(learned.values[name], fit.values[name])
-    np.testing.assert_array_equal(plain.calibrated(task.table, task.rows, 5).values["noise"], learned.values["noise"])
+    np.testing.assert_array_equal(plain.calibrated(task.rows, 5).values["noise"], learned.values["noise"])
     bound, predictor = task.model.at_optimum(learned.values, learned.statistics)
     assert learned.bound == bound
     np.testing.assert_array_equal(learned.predictor.groups[0].mean, predictor.groups[0].mean)
     assert learned.loss_curve == plain.loss_curve
+
+
+# --- more inducing points ------------------------------------------------------------------------------------------
+
+
+def growing(most=1000, first=8, **changes):
+    return task_of(placement=Placement("k-means", first, most), **changes)
+
+
+@pytest.mark.parametrize("sharing", ["all", "kernel"])
+def test_half_as_many_points_again_come_after_those_of_a_fit(sharing):
+    task = growing(sharing=sharing)
+    values = task.table.values_at_start()
+    values["inducing_points"] = values["inducing_points"] + 0.1
+    more = task.with_more(values)
+    start = more.table["inducing_points"].start
+    assert start.shape == (1 if sharing == "all" else 2, 12, 2)
+    np.testing.assert_array_equal(start[:, :8], values["inducing_points"])
+    assert np.isin(start[:, 8:], X).all()
+    assert more.n_inducing == 12
+    assert more.table["inducing_points"].free.all()
+    assert not more.model.complete
+
+
+def test_no_more_points_than_allowed_nor_without_leave():
+    assert growing(most=10).with_more(growing().table.values_at_start()).n_inducing == 10
+    assert growing(most=8).with_more(growing().table.values_at_start()) is None
+    assert task_of(n_inducing=8).with_more(growing().table.values_at_start()) is None
+
+
+@pytest.mark.parametrize("family", ["full", "diagonal"])
+def test_points_as_many_as_rows_become_the_rows(family):
+    task = growing(first=45, family=family)
+    more = task.with_more(task.table.values_at_start())
+    np.testing.assert_array_equal(more.table["inducing_points"].start, X[np.newaxis])
+    assert more.model.complete == (family == "full")
+    assert more.table["inducing_points"].free.any() == (family == "diagonal")
+    assert more.with_more(more.table.values_at_start()) is None
+
+
+def test_the_exact_model_of_a_sample_knows_what_other_values_miss():
+    task = growing()
+    unhindered = task.unhindered()
+    by_chance = -0.5 * (2 + 2 * O) / (N * O)
+    assert unhindered.missed_by(unhindered.fit.values) == pytest.approx(by_chance, rel=1e-6)
+    assert unhindered.missed_by(task.table.values_at_start()) > 0.0
+    assert unhindered.missed_by(task.table.values_at_start() | {"signal": np.full(2, np.nan)}) == np.inf
+
+
+def test_a_kernel_that_is_fixed_or_not_to_be_optimised_is_not_fitted_exactly():
+    assert growing(max_iter=0).unhindered() is None
+    assert growing(kernel=ConstantKernel() * RBF([1.0, 1.0], "fixed")).unhindered() is None
+
+
+def test_points_are_added_until_they_gain_nothing():
+    """A fit with half as many again has a bound that is higher by less than 0.01 nats per row and output."""
+    task, fit = grown(growing(max_iter=100))
+    assert fit.values["inducing_points"].shape == (1, task.n_inducing, 2)
+    assert 8 < task.n_inducing < N
+    more = replace(task.with_more(fit.values), max_iter=100)
+    values = fit.values | {"inducing_points": more.table["inducing_points"].start}
+    assert fit.bound <= more.minimise(Attempt(values, 100)).bound < fit.bound + 0.01 * N * O
+    fewer = LBFGS().run(growing(max_iter=100), Attempt(growing().table.values_at_start(), 100))
+    assert fit.bound > fewer.bound + 0.01 * N * O
+
+
+def test_few_points_do_not_hide_what_there_is_to_learn(monkeypatch):
+    """Of a fast wave, ten and fifteen points show nothing: to them it is noise."""
+    rng = np.random.RandomState(0)
+    x = np.sort(rng.uniform(0.0, 6.0, (200, 1)), axis=0)
+    wave = {"X": x, "H": np.empty((200, 0)), "Y": np.sin(15.0 * x) + 0.1 * rng.randn(200, 1)}
+    task = growing(**wave, units=units_of(**wave), first=10, max_iter=200)
+    found, fit = grown(task)
+    assert found.n_inducing > 30
+    assert fit.values["noise"] < 0.1 * task.rows.scatter()
+    monkeypatch.setattr(SparseTask, "unhindered", lambda self: None)
+    found, fit = grown(task)
+    assert found.n_inducing == 10
+    assert fit.values["noise"] > 0.9 * task.rows.scatter()
+
+
+def test_a_fit_that_was_stopped_gets_no_more_points():
+    def stop(*told):
+        raise StopIteration
+
+    task = growing(monitor=Monitor(stop))
+    same, fit = grown(task)
+    assert same.n_inducing == 8
+    assert np.isfinite(fit.bound)
+
+
+def test_without_iterations_points_are_added_under_the_kernel_as_it_starts():
+    task, fit = grown(growing(most=30, max_iter=0))
+    assert 8 < task.n_inducing <= 30
+    first = growing().table.values_at_start()
+    for name in ("hyperparameters", "signal", "noise"):
+        np.testing.assert_array_equal(fit.values[name], first[name])
+    np.testing.assert_array_equal(fit.values["inducing_points"][:, :8], first["inducing_points"])

@@ -1,19 +1,21 @@
+from dataclasses import replace
+
 import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd import grad
 
-from skevgp._linalg import NotPositiveDefiniteError
+from skevgp._linalg import Jitter, NotPositiveDefiniteError
 from skevgp.fitting.start import starting_table
 from skevgp.fitting.strategy import Rules
-from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound
+from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound, upper_bound
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import Moments
 
-from ..oracle import central_differences, collapsed_bound, problem, relative_error, whitened
+from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, whitened
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)
@@ -161,3 +163,123 @@ def test_a_noise_far_below_the_signal_costs_no_digits(family):
     loss = plain_loss(model, rows, small)
     np.testing.assert_allclose(value, loss(small.start()), rtol=1e-6)
     assert relative_error(gradient, grad(loss)(small.start())) < 1e-5
+
+
+# --- the upper bound -----------------------------------------------------------------------------------------------
+
+
+def bounds_of(model, rows, values, from_rows=True):
+    """The lower and the upper bound."""
+    blocks = rows.blocks(model.kernel, 17)
+    statistics = model.statistics(values, blocks)
+    return model.at_optimum(values, statistics)[0], model.upper_bound(values, statistics, blocks if from_rows else None)
+
+
+@pytest.mark.parametrize("from_rows", [True, False])
+@pytest.mark.parametrize("p", [0, 3])
+@pytest.mark.parametrize("shared", SHARED)
+def test_the_log_likelihood_lies_between_the_bounds_and_these_are_those_of_dense_matrices(shared, p, from_rows):
+    model, rows, table = problem(shared=shared, p=p, n=150)
+    values = table.values_at_start()
+    found = bounds_of(model, rows, values, from_rows)
+    lower, exact, upper = dense_bounds(*dense_arguments(values), rows, model.prior)
+    np.testing.assert_allclose(found, (lower, upper), rtol=1e-9)
+    assert lower < exact < upper
+
+
+def dense_arguments(values):
+    return (values[name] for name in ("hyperparameters", "signal", "noise", "inducing_points"))
+
+
+def test_the_upper_bound_does_not_ask_for_the_family():
+    """It is of the likelihood, whatever q is."""
+    bounds = {}
+    for family in FAMILIES:
+        model, rows, table = problem(family)
+        bounds[family] = bounds_of(model, rows, table.values_at_start())[1]
+    assert bounds["diagonal"] == bounds["full"]
+
+
+def on_rows(copies=1, n=30, p=3):
+    """A problem in which each distinct row is an inducing point."""
+    model, rows, table = problem(n=n, m=2, d=3, p=p)
+    points = rows.inputs
+    rows = type(rows)(*(np.repeat(own, copies, axis=0) for own in (points, rows.features, rows.residuals)))
+    model = SparseModel(model.kernel, model.prior, "full", model.groups, complete=True)
+    return model, rows, table.values_at_start() | {"inducing_points": points[np.newaxis]}
+
+
+@pytest.mark.parametrize("copies", [1, 3])
+@pytest.mark.parametrize("p", [0, 3])
+def test_with_points_at_all_rows_both_bounds_are_the_log_likelihood(p, copies):
+    model, rows, values = on_rows(copies, p=p)
+    lower, upper = bounds_of(model, rows, values)
+    exact = dense_bounds(*dense_arguments(values), rows, model.prior)[1]
+    np.testing.assert_allclose((lower, upper), exact, rtol=1e-8)
+
+
+def test_a_jitter_is_known_from_the_factor():
+    model, _, values = on_rows()
+    (whitening,) = model.whitenings(values)
+    assert whitening.jitter() == 0.0
+    twice = values | {"inducing_points": np.repeat(values["inducing_points"], 2, axis=1)}
+    (whitening,) = replace(model, jitter=Jitter(1e-9)).whitenings(twice)
+    assert whitening.jitter() == pytest.approx(1e-9, rel=1e-3)
+
+
+def test_with_points_at_all_rows_a_jitter_does_not_take_the_upper_bound_below_the_log_likelihood():
+    """Of residuals rougher than the kernel, which a jitter as large as the noise makes less likely."""
+    model, rows, values = on_rows(p=0)
+    values |= {"hyperparameters": np.full(3, 3.0), "noise": np.full(2, 1e-6), "signal": np.full(2, 25.0)}
+    rows.residuals[:] = 0.01 * np.random.RandomState(0).randn(*rows.residuals.shape)
+    jittered = replace(model, jitter=Jitter(1e-6, 0.1))
+    few = values | {"inducing_points": rows.inputs[np.newaxis, :3]}
+    exact = dense_bounds(*dense_arguments(few), rows, model.prior)[1]
+    lower, upper = bounds_of(jittered, rows, values)
+    assert lower < exact - 0.5
+    # Nearer than with the trace, which holds for any points.
+    assert exact < upper < bounds_of(replace(jittered, complete=False), rows, values)[1] - 1.0
+
+
+def longdouble_upper_bound(model, rows, values):
+    """With twice the digits where they cancel: the ridge solution at σ² + t by refinement, and |e|² from it."""
+    total, Z = 0.0, values["inducing_points"]
+    for o in range(len(model.prior.scale)):
+        _, V = whitened(values["hyperparameters"], Z[o % len(Z)], rows.inputs)
+        signal, noise, scale = values["signal"][o], values["noise"][o], model.prior.scale[o]
+        P = np.hstack([np.sqrt(signal) * V.T, rows.features * scale]).astype(np.longdouble)
+        r = (rows.residuals[:, o] + rows.features @ (scale * model.prior.reference[o])).astype(np.longdouble)
+        wide = noise + signal * np.sum(1.0 - np.sum(V**2, axis=0))
+        stacked = np.vstack([P.astype(float), np.sqrt(wide) * np.eye(P.shape[1])])
+        omega = np.zeros(P.shape[1], dtype=np.longdouble)
+        for _ in range(5):
+            left = np.concatenate([r - P @ omega, -np.sqrt(wide) * omega])
+            omega += np.linalg.lstsq(stacked, left.astype(float), rcond=None)[0]
+        e = r - P @ omega
+        singular = np.linalg.svd(P.astype(float), compute_uv=False)
+        log_det = len(r) * np.log(noise) + np.log1p(singular**2 / noise).sum()
+        total -= 0.5 * (len(r) * np.log(2 * np.pi) + log_det + float(e @ e / wide + omega @ omega))
+    return total
+
+
+@pytest.mark.parametrize("m", [6, 40])
+def test_a_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
+    model, rows, table = problem(m=m, d=1 if m == 6 else 3, n=120)
+    values = table.values_at_start() | {
+        "noise": np.full(2, 1e-8),
+        "hyperparameters": np.full(rows.inputs.shape[1], 0.7),
+    }
+    found = bounds_of(model, rows, values)[1]
+    assert found == pytest.approx(longdouble_upper_bound(model, rows, values), rel=1e-7)
+
+
+def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():
+    model, rows, table = problem()
+    values = table.values_at_start()
+    parts = [
+        type(rows)(rows.inputs[own], rows.features[own], rows.residuals[own]) for own in (slice(25), slice(25, 60))
+    ]
+    first, second = (model.statistics(values, part.blocks(model.kernel, 20))[0] for part in parts)
+    assert model.upper_bound(values, [first + second]) == pytest.approx(bounds_of(model, rows, values)[1], rel=1e-9)
+    (group,) = model.groups_of(values, [first + second])
+    assert upper_bound(group) == model.upper_bound(values, [first + second])

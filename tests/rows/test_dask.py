@@ -45,6 +45,7 @@ def assert_same_model(actual, expected, rtol=1e-6):
     ):
         np.testing.assert_allclose(part, whole, rtol=rtol)
     np.testing.assert_allclose(actual.lower_bound_, expected.lower_bound_, rtol=rtol)
+    np.testing.assert_allclose(actual.upper_bound_, expected.upper_bound_, rtol=rtol)
 
 
 @pytest.fixture(scope="module")
@@ -252,3 +253,11 @@ def test_what_needs_all_rows_at_once_says_so():
         fitted.predict(rows.to_delayed().ravel()[0])
     with pytest.raises(ValueError, match="X must have 2 dimensions"):
         fitted.predict(rows[:, 0])
+
+
+def test_as_many_inducing_points_are_found_for_chunks():
+    parameters = {"n_inducing": "auto", "max_iter": 0}
+    whole, chunks = model(**parameters).fit(X, Y), model(**parameters).fit(*chunked(X, Y))
+    assert len(whole.inducing_points_) > 20
+    np.testing.assert_allclose(chunks.inducing_points_, whole.inducing_points_, rtol=1e-10)
+    assert_same_model(chunks, whole)

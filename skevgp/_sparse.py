@@ -1,0 +1,124 @@
+"""What is done with a fitted sparse model: new rows are folded in, and another kernel is tried."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from functools import partial
+from typing import Any, Self
+
+import numpy as np
+from joblib import effective_n_jobs
+from numpy.typing import ArrayLike
+
+from ._base import ExplicitGaussianProcess
+from ._sklearn import fit_context
+from ._validation import check_magnitude, unchanged_if_it_fails
+from .fitting.outputs import FittedOutputs
+from .rows.threads import BlockMap, single_threaded_libraries
+
+
+class SparseGaussianProcess(ExplicitGaussianProcess):
+    """A Gaussian process with explicit features and inducing points, however it is fitted."""
+
+    forgetting_factor: float
+    n_jobs: int | None
+
+    _fitted: FittedOutputs
+    _training_data: tuple[Any, Any, np.ndarray] | None = None
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+        """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
+
+        The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to
+        its optimum. The rows seen before are known by their sums only: where the noise is below 1e-8 of the signal,
+        ``lower_bound_`` and ``upper_bound_`` are good to about a nat.
+
+        Parameters
+        ----------
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            The first rows should be like all: they place the inducing points (no more than there are rows), kernel and
+            noise.
+        y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
+            With as many outputs as in the first call.
+
+        Returns
+        -------
+        self : object
+            The estimator itself, with the new rows in its posterior.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `fit`, and if y does not have the outputs of the first call.
+        """
+        if not hasattr(self, "_fitted"):
+            return self.fit(X, y)
+        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        with unchanged_if_it_fails(self), single_threaded_libraries():
+            given, X, y = self._validated(X, y)
+            n_outputs = 1 if y.ndim == 1 else y.shape[1]
+            if n_outputs != self._n_outputs:
+                raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
+            source = self._source(given, X, y)
+            residuals = self._fitted.units.rows(source).residuals
+            check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
+            self._fitted = self._fitted.updated(source, self.forgetting_factor)
+            self._training_data = None
+            self._set_attributes()
+        return self
+
+    def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
+        """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
+
+        With q at its optimum, for the rows of the last `fit`, as they now are. The model refers to them, which keeps
+        them in memory (not in pickles and copies).
+
+        Parameters
+        ----------
+        theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
+            Logarithms of the free hyperparameters, as ``kernel_.theta``; of several outputs one row each, which need
+            not agree in what the fitted kernels share. None means the fitted ones.
+        eval_gradient : bool, default=False
+            Whether to return the gradient too; only with a ``theta``.
+
+        Returns
+        -------
+        bound : float
+            In nats, summed over outputs.
+        gradient : ndarray of the shape of ``theta``
+            If ``eval_gradient``. For what outputs share add up its rows.
+
+        Raises
+        ------
+        ValueError
+            If ``theta`` has another shape or is out of range, a gradient is asked for without it, or the rows are gone:
+            after `partial_fit`, and in copies and pickles, which leave them out.
+        """
+        self._check_gradient_of(theta, eval_gradient)
+        if theta is None:
+            return self.lower_bound_
+        if self._training_data is None:
+            raise ValueError(
+                "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
+                "and pickles of a model leave them out. Call fit, or lower_bound() for the fitted kernel."
+            )
+        with closing(BlockMap(effective_n_jobs(self.n_jobs))) as threads, single_threaded_libraries():
+            rows = self._fitted.units.rows(self._source(*self._training_data), threads)
+            return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
+
+    def _set_attributes(self) -> None:
+        self._set_common_attributes()
+        fitted = self._fitted
+        points = [group.points for group in self._predictor.groups]
+        same = len({len(own) for own in points}) == 1
+        self.inducing_points_: Any = np.array(points) if same else points
+        if fitted.sharing == "all" or self._single_output:
+            self.inducing_points_ = points[0]
+        self.lower_bound_, self.upper_bound_ = fitted.lower_bound, fitted.upper_bound
+        self.loss_curve_ = fitted.loss_curve
+        self.n_iter_ = fitted.n_iter
+        self.n_parameters_ = fitted.n_parameters
