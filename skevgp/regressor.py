@@ -57,9 +57,9 @@ class EVGPRegressor(SparseGaussianProcess):
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
         Where inducing points start. ``"k-means"``: at cluster centres of the kernel's inputs. ``"greedy"``: one after
         the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
-        ``"auto"``: at cluster centres, and with L-BFGS after 100 iterations once more, greedily under the kernel
-        learned so far; 100 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
-        placed). They are not placed anew with ``max_iter`` up to 100, a kernel that is fixed, or a warm start. Or at
+        ``"auto"``: at cluster centres, and with L-BFGS after 25 iterations once more, greedily under the kernel
+        learned so far; 25 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
+        placed). They are not placed anew with ``max_iter`` up to 25, a kernel that is fixed, or a warm start. Or at
         given points in the space of ``kernel_map``, whose number then replaces ``n_inducing`` (with ``"auto"``, more
         are added). With ``max_iter=0``, or where they are all rows (and ``posterior="full"``), they stay where they
         start.
