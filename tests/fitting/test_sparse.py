@@ -10,10 +10,10 @@ from skevgp._progress import Monitor
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import plan
 from skevgp.fitting.sparse import Learned, SparseTask, grown
-from skevgp.fitting.strategy import Attempt, Fit
+from skevgp.fitting.strategy import Attempt, Fit, search
 from skevgp.inference.bounds import features_alone_bound
 from skevgp.rows.threads import BlockMap
-from skevgp.solvers import LBFGS
+from skevgp.solvers import LBFGS, Adam
 
 from .cases import NO_FEATURES, H, N, O, X, Y, request, source_of, units_of
 
@@ -334,3 +334,57 @@ def test_without_iterations_points_are_added_under_the_kernel_as_it_starts():
     for name in ("hyperparameters", "signal", "noise"):
         np.testing.assert_array_equal(fit.values[name], first[name])
     np.testing.assert_array_equal(fit.values["inducing_points"][:, :8], first["inducing_points"])
+
+
+# --- samples of the rows --------------------------------------------------------------------------------------------
+
+
+def sampled(**changes):
+    """A task whose fit begins with 15, then 30 of its rows."""
+    rules = replace(LBFGS.rules, sample=(15, 1), growth=2, stage=5)
+    solver = type("LBFGS", (LBFGS,), {"rules": rules})()
+    return task_of(n_inducing=5, solver=solver, **changes)
+
+
+def test_the_smaller_sample_is_part_of_the_larger_one():
+    task = sampled()
+    assert task.samples == (15, 30)
+    assert task.strategy.samples == task.samples
+    for size in task.samples:
+        assert task.blocks_of(size).linear.n_rows == size
+        assert task.blocks_of(size) is task.blocks_of(size)
+    assert task.blocks_of(None) is task.blocks
+    fewer, more = (task.blocks_of(size).linear for size in task.samples[:2])
+    assert (more.RR >= fewer.RR).all()
+    assert (task.blocks.linear.RR >= more.RR).all()
+
+
+def test_points_that_are_all_rows_are_not_fitted_to_a_sample():
+    assert task_of(n_inducing=len(X), solver=sampled().solver).samples == ()
+    assert task_of(solver=Adam(), max_iter=1).samples == ()
+
+
+def test_a_fit_that_begins_with_samples_ends_with_all_rows():
+    task = sampled(max_iter=200)
+    plain = replace(task, solver=type("LBFGS", (LBFGS,), {"rules": replace(LBFGS.rules, sample=None)})())
+    fits = [Learned.of(own, search(own)) for own in (task, plain)]
+    assert fits[0].bound > fits[1].bound - 0.02 * (fits[1].bound - task.alone)
+    at = task.model.statistics(fits[0].values, task.blocks)
+    assert fits[0].bound == pytest.approx(task.model.at_optimum(fits[0].values, at)[0], rel=1e-6)
+    assert fits[0].loss_curve[-1] == pytest.approx(-fits[0].bound, rel=1e-9)
+
+
+def test_a_fit_that_ctrl_c_ended_on_a_sample_has_the_bound_of_all_rows():
+    seen = []
+
+    def interrupt(iteration, loss, outputs):
+        seen.append(iteration)
+        if len(seen) == 4:
+            raise KeyboardInterrupt
+
+    task = sampled(monitor=Monitor(interrupt))
+    fit = search(task)
+    assert fit.n_rows == 15
+    learned = Learned.of(task, fit)
+    at = task.model.statistics(fit.values, task.blocks)
+    assert learned.bound == pytest.approx(task.model.at_optimum(fit.values, at)[0])

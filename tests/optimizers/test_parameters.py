@@ -98,3 +98,18 @@ def test_a_parameter_without_entries_is_no_trouble():
     table = ParameterTable([Parameter("none", np.empty(0), "log"), Parameter("points", np.arange(2.0))])
     assert table.size == 2
     assert table.values(table.start())["none"].shape == (0,)
+
+
+def test_points_of_one_column_are_alike_and_nothing_else():
+    table = ParameterTable(
+        [
+            Parameter("lengthscales", np.ones(2), "log"),
+            Parameter("noise", np.ones(3), "log", fixed=np.array([False, True, False])),
+            Parameter("points", np.zeros((2, 4, 2))),
+        ]
+    )
+    alike = table.alike()
+    assert len(alike) == table.size == 2 + 2 + 16
+    assert len(set(alike[:4])) == 4
+    assert len(set(alike[4::2])) == len(set(alike[5::2])) == 1
+    assert len(set(alike)) == 4 + 2

@@ -113,3 +113,15 @@ def test_batches_follow_the_generator():
     )
     np.testing.assert_array_equal(first, again)
     assert (first != other).any()
+
+
+def test_a_sample_is_some_of_the_rows_once_each_in_random_order():
+    sample = rows().sampled(60, np.random.RandomState(3))
+    got = sample.some(np.arange(60))
+    found = [int(np.flatnonzero((one == X).all(axis=1))[0]) for one in got.inputs]
+    assert len(set(found)) == 60
+    assert found != sorted(found)
+    np.testing.assert_array_equal(got.features, H[found])
+    np.testing.assert_array_equal(got.targets, 0.5 * Y[found])
+    # Its beginning is a sample, too.
+    np.testing.assert_array_equal(sample.part(0, 20, 1.0).some(np.arange(20)).inputs, got.inputs[:20])
