@@ -349,8 +349,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 float(self._predictor.signal[o]),
                 fitted.limits("signal", o),
             )
-            for group in self._predictor.groups
-            for o in range(len(prior.mean))[group.outputs]
+            for o, group in enumerate(self._predictor.by_output)
         ]
         self.kernel_ = kernels[0] if self._single_output else kernels
 
@@ -365,8 +364,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return list(
             dict.fromkeys(
                 message
-                for group in self._predictor.groups
-                for o in range(len(noise))[group.outputs]
+                for o, group in enumerate(self._predictor.by_output)
                 for message in self._spec.at_bounds(group.hyperparameters, float(signal[o]), float(noise[o]))
             )
         )

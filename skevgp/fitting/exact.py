@@ -120,7 +120,7 @@ class ExactFit:
 
     def predictor(self) -> Predictor:
         """Of all outputs, in the user's units."""
-        return self.units.predictor([self.model.predictor(self.fit.values)])
+        return self.units.predictor([self.model.predictor(self.fit.values)], [list(range(len(self.units.target_unit)))])
 
     @property
     def log_marginal_likelihood(self) -> float:

@@ -1,34 +1,40 @@
-"""Several outputs: plan which of them share what, run their fits, collect what is kept."""
+"""Several outputs: plan which of them share what, and run their fits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from functools import cached_property
+from itertools import chain, combinations
+from operator import index
+from typing import Literal
 
 import numpy as np
 
 from .._progress import Monitor
-from ..inference.bounds import PosteriorFamily
+from ..inference.bounds import PosteriorFamily, features_alone_bound
 from ..inference.model import SparseModel
-from ..inference.posterior import Predictor
-from ..inference.statistics import Kernel
+from ..inference.objectives import BoundObjective
 from ..kernels.parse import KernelSpec
+from ..optimizers.lbfgs import lbfgs
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
-from ..rows.source import Source
-from ..rows.threads import BlockMap, thread_pool
+from ..rows.source import LocalSource, Source
+from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
-from .sparse import Learned, Solver, SparseTask
+from .sparse import FittedOutputs, Learned, Solver, SparseTask
 from .start import checked_variance, column_centre, starting_table
 from .strategy import search
 from .units import Units
 
-Sharing = Literal["all", "kernel", "none"]
-Job = TypeVar("Job")
-Result = TypeVar("Result")
+Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
+# Of what its own Gaussian process gains an output over features and noise.
+_LARGEST_LOSS = 0.01
+# By which groups are found: at most so many rows and points; iterations of the first fit and of others; in nats.
+_SAMPLE, _POINTS = 2000, 100
+_FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
 
 
 @dataclass(frozen=True)
@@ -42,7 +48,7 @@ class Request:
     units : Units
     spec : KernelSpec
         What the user says of kernel and noise.
-    sharing : {"all", "kernel", "none"}
+    sharing : {"all", "kernel", "none", "auto"} or sequence of sequence of int
     family : {"full", "diagonal"}
     placement : Placement
         Of the inducing points.
@@ -69,127 +75,6 @@ class Request:
     n_threads: int
 
 
-@dataclass(frozen=True)
-class FittedOutputs:
-    """Fitted sparse models of consecutive outputs.
-
-    Attributes
-    ----------
-    units : Units
-    sharing : {"all", "kernel", "none"}
-    outputs : tuple of slice
-        Of each model.
-    tables : tuple of ParameterTable
-        Where each model started, and its limits.
-    learned : tuple of Learned
-        Each model, in internal units.
-    messages : tuple of str
-        What the user should know of how the fits ended.
-    """
-
-    units: Units
-    sharing: Sharing
-    outputs: tuple[slice, ...]
-    tables: tuple[ParameterTable, ...]
-    learned: tuple[Learned, ...]
-    messages: tuple[str, ...]
-
-    def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
-        """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
-        rows = self.units.rows(source)
-        learned = (one.updated(rows.outputs(own), weight) for own, one in zip(self.outputs, self.learned, strict=True))
-        return replace(self, learned=tuple(learned))
-
-    def predictor(self) -> Predictor:
-        """Of all outputs, in the user's units."""
-        return self.units.predictor([one.predictor for one in self.learned])
-
-    @property
-    def lower_bound(self) -> float:
-        """In nats, summed over outputs."""
-        return sum(one.bound for one in self.learned) - self._shift
-
-    @property
-    def n_iter(self) -> int:
-        """Iterations of the longest fit."""
-        return max(len(one.loss_curve) for one in self.learned)
-
-    @property
-    def loss_curve(self) -> np.ndarray:
-        """Minus the bound per iteration, (n_iter,); a model that is done keeps its last value."""
-        curves = [one.loss_curve for one in self.learned]
-        if not all(curves):
-            return np.empty(0)
-        return np.sum([np.pad(curve, (0, self.n_iter - len(curve)), "edge") for curve in curves], axis=0) + self._shift
-
-    @property
-    def n_parameters(self) -> int:
-        """Free parameters of kernels, noise, inducing points and q."""
-        total = 0
-        for table, one in zip(self.tables, self.learned, strict=True):
-            n_outputs, p = one.model.prior.scale.shape
-            size = one.values["inducing_points"].shape[1] + p
-            q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
-            total += table.size + q * n_outputs
-        return total
-
-    def limits(self, name: str, output: int) -> np.ndarray:
-        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
-        index, within = self._place_of(output)
-        limits = self.tables[index][name].value_limits()
-        return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
-
-    def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
-        """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
-
-        Parameters
-        ----------
-        rows : Rows
-            Those of the fit.
-        output : int
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        signal : float
-            s², in the user's units.
-
-        Returns
-        -------
-        bound : float
-            In nats, in the user's units.
-        gradient : ndarray of shape (n_hyper + 1,)
-            That in log s² last.
-        """
-        (index, within), own = self._place_of(output), slice(output, output + 1)
-        internal = signal / self.units.target_unit[own] ** 2
-        bound, gradient = self.learned[index].bound_at(rows.outputs(own), within, hyperparameters, internal)
-        return bound - len(rows) * self.units.log_unit(own), gradient
-
-    def _place_of(self, output: int) -> tuple[int, int]:
-        """Which model an output belongs to, and which of the model's it is."""
-        index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
-        return index, output - self.outputs[index].start
-
-    def values_in(self, units: Units, rows: Rows, kernel: Kernel, index: int) -> Values:
-        """A model's values in other internal units, as far as they can serve another fit."""
-        one, inputs = self.learned[index], rows.inputs
-        values, points = one.values, one.values["inducing_points"]
-        lowest, highest = inputs.lowest, inputs.highest
-        if points.shape[2] != len(inputs.mean):
-            return {}
-        if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
-            return {}
-        ratio = (self.units.target_unit[self.outputs[index]] / units.target_unit[self.outputs[index]]) ** 2
-        found = {"noise": values["noise"] * ratio, "inducing_points": points}
-        if one.model.kernel == kernel:
-            found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
-        return found
-
-    @property
-    def _shift(self) -> float:
-        """From internal units to the user's, for a loss of all rows."""
-        return self.learned[0].statistics[0].n_rows * self.units.log_unit(slice(None))
-
-
 def fit_outputs(
     request: Request, rng: np.random.RandomState, monitor: Monitor, previous: FittedOutputs | None = None
 ) -> FittedOutputs:
@@ -209,21 +94,30 @@ def fit_outputs(
     -------
     fitted : FittedOutputs
     """
+    sharing = request.sharing
+    if isinstance(sharing, str) and sharing == "auto":
+        if previous is not None and previous.found_groups(len(request.units.target_unit)):
+            request = replace(request, sharing=previous.outputs)
+        else:
+            # A fit with these groups given is the same fit.
+            silent = Monitor()
+            request = replace(request, sharing=found_groups(request, deepcopy(rng), silent))
+            if silent.stopped:  # there is nothing yet to keep
+                raise KeyboardInterrupt
     # One model has all threads for its blocks of rows; several have one each.
     n_models = len(_models(request))
     at_once = min(request.n_threads, n_models)
     threads = BlockMap(request.n_threads if n_models == 1 else 1)
     try:
         tasks = plan(request, rng, monitor, threads, previous)
-        learned = _side_by_side(_fit_one, tasks, at_once, monitor)
+        learned = side_by_side(_fit_one, tasks, at_once, monitor)
     finally:
         threads.close()
     messages = sorted({one.message for one in learned if one.message})
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
-    outputs = tuple(outputs for outputs, _ in _models(request))
-    tables = tuple(task.table for task in tasks)
-    return FittedOutputs(request.units, request.sharing, outputs, tables, tuple(learned), tuple(messages))
+    outputs, tables = [outputs for outputs, _ in _models(request)], tuple(task.table for task in tasks)
+    return FittedOutputs(request.units, sharing, outputs, tables, tuple(learned), tuple(messages))
 
 
 def plan(
@@ -239,14 +133,14 @@ def plan(
     rows = units.rows(request.source, threads)
     kernel = request.spec.covariance.centred(column_centre(rows.inputs))
 
-    def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
+    def table_of(outputs: list[int], points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
         return starting_table(
             rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
         )
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
-    alone = table_of(slice(0, 1), np.empty((1, 0, len(rows.inputs.mean))))
+    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean))))
     hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
     inputs = rows.sample(placement.sample_size, rng).inputs
     points = placement.points(inputs, kernel, hyperparameters, rng)
@@ -256,12 +150,12 @@ def plan(
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
     seed = rng.randint(np.iinfo(np.int32).max)
-    goes_on = previous is not None and previous.outputs == tuple(outputs for outputs, _ in models)
+    goes_on = previous is not None and previous.outputs == [outputs for outputs, _ in models]
     share, tasks = 1.0 / min(request.n_threads, len(models)), []
-    for index, (outputs, groups) in enumerate(models):
+    for i, (outputs, groups) in enumerate(models):
         warm: Values | None = None
         if goes_on and previous is not None:
-            warm = previous.values_in(units, rows, kernel, index)
+            warm = previous.values_in(units, rows, kernel, i)
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
         table = table_of(outputs, np.repeat(points[np.newaxis], len(groups), axis=0), variance)
@@ -281,45 +175,194 @@ def plan(
                 request.tol,
                 request.noise_cv,
                 seed,
-                monitor.seen_as(shift=shift, outputs=range(outputs.start, outputs.stop)),
+                monitor.seen_as(shift=shift, outputs=_as_columns(outputs)),
                 None if warm is None else table.started_at(warm).values_at_start(),
             )
         )
     return tasks
 
 
-def _models(request: Request) -> list[tuple[slice, tuple[slice, ...]]]:
-    """The outputs of each independent model, and of these the outputs of each set of inducing points."""
-    n_outputs = len(request.units.target_unit)
-    each = tuple(slice(o, o + 1) for o in range(n_outputs))
-    if request.sharing == "none":
-        return [(outputs, (slice(0, 1),)) for outputs in each]
-    return [(slice(0, n_outputs), (slice(0, n_outputs),) if request.sharing == "all" else each)]
+def _models(request: Request) -> list[tuple[list[int], tuple[slice, ...]]]:
+    """The outputs of each independent model, and which of these each set of inducing points serves."""
+    outputs = partition_of(request.sharing, len(request.units.target_unit))
+    if isinstance(request.sharing, str) and request.sharing == "kernel":
+        return [(own, tuple(slice(o, o + 1) for o in range(len(own)))) for own in outputs]
+    return [(own, (slice(0, len(own)),)) for own in outputs]
+
+
+def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:
+    """The outputs of each independent model, both in ascending order."""
+    everything = list(range(n_outputs))
+    if isinstance(sharing, str):
+        return [[o] for o in everything] if sharing == "none" else [everything]
+    try:
+        groups = sorted(sorted(index(o) for o in group) for group in sharing)
+    except TypeError:
+        groups = []
+    if not all(groups) or sorted(chain(*groups)) != everything:
+        raise ValueError(
+            f"sharing={sharing!r} must be 'all', 'kernel', 'none', 'auto' or a partition of the outputs, such as "
+            f"{[everything[:1], everything[1:]] if n_outputs > 1 else [everything]}: each of range({n_outputs}) in one "
+            "group."
+        )
+    return groups
+
+
+def _as_columns(outputs: list[int]) -> Sequence[int]:
+    """A range if they follow each other, else a tuple."""
+    columns = range(outputs[0], outputs[-1] + 1)
+    return columns if len(columns) == len(outputs) else tuple(outputs)
+
+
+def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
+    """Which outputs to fit together: those that one kernel serves, each nearly as well as one of its own.
+
+    (The sum of their bounds, which a fit maximises, does not show it: outputs with little noise rule it.) What a kernel
+    is worth is seen in short fits to a sample of the rows. The first is of all outputs. Its inducing points then stay,
+    so that what follows is a matter of the kernel and not of luck: from there each output is fitted alone, and all
+    together. If that costs one of them too much (`_LARGEST_LOSS`), each becomes a group, and of all pairs of groups
+    those with the kernels most alike are tried first, and joined if it costs no output too much, until none is left.
+
+    Parameters
+    ----------
+    request : Request
+    rng : RandomState
+    monitor : Monitor
+        Which Ctrl-C stops.
+
+    Returns
+    -------
+    groups : list of list of int
+        A partition of the outputs.
+    """
+    everything = list(range(len(request.units.target_unit)))
+    if len(everything) == 1 or request.max_iter == 0:
+        return [everything]
+    fits = _ShortFits.of(request, rng, monitor)
+    if fits.n_free == 0:
+        return [everything]
+    found = side_by_side(fits.alone, everything, request.n_threads, monitor)
+    own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
+    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978).
+    bearable = np.maximum(_LARGEST_LOSS * (own - fits.without), 0.5 * fits.n_free * np.log(fits.n_rows))
+
+    def suits(outputs: list[int], shared: list[Values]) -> bool:
+        bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
+        return bool((own[outputs] - bounds <= bearable[outputs]).all())
+
+    if suits(everything, fits.further(everything, fits.together)):
+        return [everything]
+    groups, apart = [[o] for o in everything], np.eye(len(everything), dtype=bool)
+    while True:
+        shapes = [fits.shape(found[group[0]]) for group in groups]
+        pairs = [
+            (float(shapes[i] @ shapes[j]), i, j)
+            for i, j in combinations(range(len(groups)), 2)
+            if not apart[np.ix_(groups[i], groups[j])].any()
+        ]
+        if not pairs:
+            return groups
+        _, i, j = max(pairs)
+        outputs = sorted(groups[i] + groups[j])
+        shared = fits.further(outputs, found)
+        if suits(outputs, shared):
+            groups[i] = outputs
+            del groups[j]
+            for o, values in zip(outputs, shared, strict=True):
+                found[o] = values
+        else:
+            apart[np.ix_(groups[i], groups[j])] = True
+
+
+@dataclass(frozen=True)
+class _ShortFits:
+    """Fits to a sample of the rows, all with the inducing points where a first one of all outputs ended.
+
+    A fit is told as the values of each of its outputs.
+
+    Attributes
+    ----------
+    request : Request
+        Of the sample and the points.
+    together : list of dict
+        Where the first ended.
+    monitor : Monitor
+    """
+
+    request: Request
+    together: list[Values]
+    monitor: Monitor
+
+    @classmethod
+    def of(cls, request: Request, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
+        """With the first fit."""
+        raw = Rows(request.source, lambda rows: rows).sample(_SAMPLE, rng)
+        source = LocalSource.of(raw.inputs, raw.features, raw.targets)
+        placement = Placement("k-means", min(request.placement.n_inducing, _POINTS))
+        request = replace(request, source=source, placement=placement, sharing="all", family="full")
+        (task,) = plan(request, rng, monitor, BlockMap())
+        together = _short_fit(task, task.table, _FIRST_ITERATIONS, monitor)
+        points = together[0]["inducing_points"][0]
+        return cls(replace(request, placement=Placement(points, len(points))), together, monitor)
+
+    @property
+    def n_rows(self) -> int:
+        return self.request.source.n_rows
+
+    @property
+    def n_free(self) -> int:
+        """Parameters of k̃ that are not fixed."""
+        return int(self._each[0].table["hyperparameters"].free.sum())
+
+    @property
+    def without(self) -> np.ndarray:
+        """The bound (o,) of each output without a Gaussian process."""
+        return np.array([features_alone_bound(task.blocks.linear, task.model.prior) for task in self._each])
+
+    def alone(self, output: int) -> Values:
+        """An output, from where the first fit ended."""
+        return self.further([output], self.together)[0]
+
+    def further(self, outputs: list[int], starts: list[Values]) -> list[Values]:
+        """Some outputs, from the values of all: from the mean of their kernels."""
+        others = [[o] for o in range(len(starts)) if o not in outputs]
+        (task,) = (task for task in self._planned([outputs, *others]) if task.rows.columns == outputs)
+        own = [starts[o] for o in outputs]
+        values = {name: np.concatenate([one[name] for one in own]) for name in ("signal", "noise")}
+        values["hyperparameters"] = np.exp(np.mean([np.log(one["hyperparameters"]) for one in own], axis=0))
+        return _short_fit(task, task.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
+
+    def bound(self, output: int, values: Values) -> float:
+        """Of an output with its values."""
+        task = self._each[output]
+        loss, _ = BoundObjective(task.model, task.table, task.blocks)(task.table.started_at(values).start())
+        return -self.n_rows * loss
+
+    def shape(self, values: Values) -> np.ndarray:
+        """k̃ at the points, as a vector of length 1: products are alignments (Cristianini et al. 2001)."""
+        kernel, (points,) = self._each[0].model.kernel, values["inducing_points"]
+        K = kernel.at(np.log(values["hyperparameters"]), points).matrix()
+        return np.ravel(K) / np.linalg.norm(K)
+
+    @cached_property
+    def _each(self) -> list[SparseTask]:
+        return self._planned([[o] for o in range(len(self.together))])
+
+    def _planned(self, groups: list[list[int]]) -> list[SparseTask]:
+        tasks = plan(replace(self.request, sharing=groups), np.random.RandomState(0), Monitor(), BlockMap())
+        return [replace(task, table=task.table.with_fixed("inducing_points")) for task in tasks]
+
+
+def _short_fit(task: SparseTask, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
+    """The values of each output where so many iterations lead."""
+    n_rows = len(task.rows)
+    objective = BoundObjective(task.model, table, task.blocks)
+    values = table.values(lbfgs(objective, table.start(), table.limits(), n_iter, _SHORT_TOL / n_rows, monitor).x)
+    each = range(len(values["noise"]))
+    return [values | {name: values[name][[o]] for name in ("signal", "noise")} for o in each]
 
 
 def _fit_one(task: SparseTask) -> Learned:
     # A copy, with which the blocks of rows are forgotten.
     task = replace(task)
     return Learned.of(task, search(task))
-
-
-def _side_by_side(one: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int, monitor: Monitor) -> list[Result]:
-    """Each job's result; Ctrl-C stops the monitor, upon which jobs end with what they have."""
-    results: list[Result] = []
-    if n_threads < 2:
-        for job in jobs:
-            results.append(one(job))
-        return results
-    futures: list[Future[Result]] = []
-    with thread_pool(n_threads) as pool:
-        with monitor.keeping_the_best():
-            for job in jobs:
-                futures.append(pool.submit(one, job))
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            if any(future.exception() for future in done):
-                # The error is the result: nobody waits for the others.
-                monitor.stop()
-                pool.shutdown(wait=False, cancel_futures=True)
-                next(future for future in futures if future in done and future.exception()).result()
-        futures += [pool.submit(one, job) for job in jobs[len(futures) :]]
-        return [future.result() for future in futures]

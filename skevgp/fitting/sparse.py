@@ -1,4 +1,4 @@
-"""A sparse model to be fitted, and what is kept of it when that is done."""
+"""A sparse model to be fitted, and what is kept of it, and of the models of all outputs, when that is done."""
 
 from __future__ import annotations
 
@@ -14,14 +14,16 @@ from ..inference.bounds import BoundAtOptimum, features_alone_bound
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
-from ..inference.statistics import SufficientStatistics
+from ..inference.statistics import Kernel, SufficientStatistics
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
+from ..rows.source import Source
 from .advice import far_from_prior, learned_too_little
 from .calibration import calibrated_noise
 from .inducing import Placement
 from .strategy import Attempt, Fit, Rules, Strategy, drawn
+from .units import Units
 
 
 class Solver(Protocol):
@@ -239,3 +241,131 @@ class Learned:
     def _at_optimum(self) -> Learned:
         bound, predictor = self.model.at_optimum(self.values, self.statistics)
         return replace(self, bound=bound, predictor=predictor)
+
+
+@dataclass(frozen=True)
+class FittedOutputs:
+    """The fitted sparse models of all outputs.
+
+    Attributes
+    ----------
+    units : Units
+    sharing : {"all", "kernel", "none", "auto"} or sequence of sequence of int
+        What was asked for.
+    outputs : list of list of int
+        Of each model.
+    tables : tuple of ParameterTable
+        Where each model started, and its limits.
+    learned : tuple of Learned
+        Each model, in internal units.
+    messages : tuple of str
+        What the user should know of how the fits ended.
+    """
+
+    units: Units
+    sharing: object
+    outputs: list[list[int]]
+    tables: tuple[ParameterTable, ...]
+    learned: tuple[Learned, ...]
+    messages: tuple[str, ...]
+
+    def found_groups(self, n_outputs: int) -> bool:
+        """Whether groups of so many outputs were found, not given."""
+        found = isinstance(self.sharing, str) and self.sharing == "auto"
+        return found and sum(map(len, self.outputs)) == n_outputs
+
+    def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
+        """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
+        rows = self.units.rows(source)
+        learned = (one.updated(rows.outputs(own), weight) for own, one in zip(self.outputs, self.learned, strict=True))
+        return replace(self, learned=tuple(learned))
+
+    def predictor(self) -> Predictor:
+        """Of all outputs, in the user's units."""
+        return self.units.predictor([one.predictor for one in self.learned], self.outputs)
+
+    @property
+    def lower_bound(self) -> float:
+        """In nats, summed over outputs."""
+        return sum(one.bound for one in self.learned) - self._shift
+
+    @property
+    def n_iter(self) -> int:
+        """Iterations of the longest fit."""
+        return max(len(one.loss_curve) for one in self.learned)
+
+    @property
+    def loss_curve(self) -> np.ndarray:
+        """Minus the bound per iteration, (n_iter,); a model that is done keeps its last value."""
+        curves = [one.loss_curve for one in self.learned]
+        if not all(curves):
+            return np.empty(0)
+        return np.sum([np.pad(curve, (0, self.n_iter - len(curve)), "edge") for curve in curves], axis=0) + self._shift
+
+    @property
+    def n_parameters(self) -> int:
+        """Free parameters of kernels, noise, inducing points and q."""
+        total = 0
+        for table, one in zip(self.tables, self.learned, strict=True):
+            n_outputs, p = one.model.prior.scale.shape
+            size = one.values["inducing_points"].shape[1] + p
+            q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
+            total += table.size + q * n_outputs
+        return total
+
+    def limits(self, name: str, output: int) -> np.ndarray:
+        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+        index, within = self._place_of(output)
+        limits = self.tables[index][name].value_limits()
+        return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
+
+    def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
+        """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
+
+        Parameters
+        ----------
+        rows : Rows
+            Those of the fit.
+        output : int
+        hyperparameters : ndarray of shape (n_hyper,)
+            Of k̃.
+        signal : float
+            s², in the user's units.
+
+        Returns
+        -------
+        bound : float
+            In nats, in the user's units.
+        gradient : ndarray of shape (n_hyper + 1,)
+            That in log s² last.
+        """
+        (index, within), own = self._place_of(output), [output]
+        internal = signal / self.units.target_unit[own] ** 2
+        bound, gradient = self.learned[index].bound_at(rows.outputs(own), within, hyperparameters, internal)
+        return bound - len(rows) * self.units.log_unit(own), gradient
+
+    def _place_of(self, output: int) -> tuple[int, int]:
+        """Which model an output belongs to, and which of the model's it is."""
+        index = next(i for i, own in enumerate(self.outputs) if output in own)
+        return index, self.outputs[index].index(output)
+
+    def values_in(self, units: Units, rows: Rows, kernel: Kernel, index: int) -> Values:
+        """A model's values in other internal units, as far as they can serve another fit."""
+        one, inputs = self.learned[index], rows.inputs
+        values, points = one.values, one.values["inducing_points"]
+        lowest, highest = inputs.lowest, inputs.highest
+        if points.shape[2] != len(inputs.mean):
+            return {}
+        if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
+            return {}
+        own = self.outputs[index]
+        ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2
+        found = {"noise": values["noise"] * ratio, "inducing_points": points}
+        if one.model.kernel == kernel:
+            found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
+        return found
+
+    @property
+    def _shift(self) -> float:
+        """From internal units to the user's, for a loss of all rows."""
+        return self.learned[0].statistics[0].n_rows * self.units.log_unit(slice(None))

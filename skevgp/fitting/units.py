@@ -10,7 +10,7 @@ import numpy as np
 from ..inference.bounds import CoefficientPrior
 from ..inference.posterior import Predictor
 from ..rows.internal import Rows
-from ..rows.source import Moments, RawRows, Source
+from ..rows.source import Columns, Moments, RawRows, Source
 from ..rows.threads import BlockMap
 from .start import features_alone, unit_of
 
@@ -61,10 +61,10 @@ class Units:
         unit = self.target_unit[:, np.newaxis]
         return CoefficientPrior(self.prior.mean / unit, self.prior.scale / unit, self.prior.reference)
 
-    def log_unit(self, outputs: slice) -> float:
+    def log_unit(self, outputs: Columns) -> float:
         """What one row of some outputs adds to the loss on the way to the user's units."""
         return float(np.log(self.target_unit[outputs]).sum())
 
-    def predictor(self, parts: Sequence[Predictor]) -> Predictor:
-        """Predictors of consecutive outputs in internal units -> one in the user's."""
-        return Predictor.joined(parts, self.target_unit, self.prior.offset, self.target_mean)
+    def predictor(self, parts: Sequence[Predictor], outputs: Sequence[list[int]]) -> Predictor:
+        """Predictors of some outputs each, in internal units -> one of all in the user's."""
+        return Predictor.joined(parts, outputs, self.target_unit, self.prior.offset, self.target_mean)

@@ -370,7 +370,7 @@ def test_models_run_at_once_if_there_are_threads():
 def test_an_error_in_one_model_is_the_fits(n_threads):
     class Broken(LBFGS):
         def run(self, task, attempt):
-            if len(task.rows.scatter()) and task.rows.columns.start == 1:
+            if len(task.rows.scatter()) and task.rows.columns == [1]:
                 raise ZeroDivisionError("the second")
             return super().run(task, attempt)
 

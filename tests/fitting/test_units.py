@@ -83,7 +83,7 @@ def test_predictions_are_of_y():
             "inducing_points": X[np.newaxis, :20],
         }
         parts.append(model.at_optimum(values, model.statistics(values, rows.outputs(own).blocks(kernel, 20)))[1])
-    predictor = units.predictor(parts)
+    predictor = units.predictor(parts, [[0], [1]])
     mean, variance = predictor.predict(X, H, return_variance=True)
     np.testing.assert_allclose(predictor.noise, 0.01 * units.target_unit**2)
     assert (np.abs(Y - mean) < 4.0 * np.sqrt(variance + predictor.noise)).all()
