@@ -12,6 +12,7 @@ from typing import Literal
 
 import numpy as np
 
+from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from ..inference.bounds import PosteriorFamily, features_alone_bound
 from ..inference.model import SparseModel
@@ -243,16 +244,19 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
         return [everything]
     found = side_by_side(fits.alone, everything, request.n_threads, monitor)
     own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
-    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978).
-    bearable = np.maximum(_LARGEST_LOSS * (own - fits.without), 0.5 * fits.n_free * np.log(fits.n_rows))
+    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978): what gains less can be in
+    # any group.
+    gain, chance = own - fits.without, 0.5 * fits.n_free * np.log(fits.n_rows)
+    bearable = np.maximum(_LARGEST_LOSS * gain, chance)
+    learned = [o for o in everything if gain[o] > chance]
 
     def suits(outputs: list[int], shared: list[Values]) -> bool:
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
         return bool((own[outputs] - bounds <= bearable[outputs]).all())
 
-    if suits(everything, fits.further(everything, fits.together)):
+    if not learned or suits(learned, fits.further(learned, fits.together)):
         return [everything]
-    groups, apart = [[o] for o in everything], np.eye(len(everything), dtype=bool)
+    groups, apart = [[o] for o in learned], np.eye(len(everything), dtype=bool)
     while True:
         shapes = [fits.shape(found[group[0]]) for group in groups]
         pairs = [
@@ -261,7 +265,7 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
             if not apart[np.ix_(groups[i], groups[j])].any()
         ]
         if not pairs:
-            return groups
+            return [sorted({*groups[0], *everything}.difference(*groups[1:])), *groups[1:]]
         _, i, j = max(pairs)
         outputs = sorted(groups[i] + groups[j])
         shared = fits.further(outputs, found)
@@ -333,10 +337,13 @@ class _ShortFits:
         return _short_fit(task, task.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
 
     def bound(self, output: int, values: Values) -> float:
-        """Of an output with its values."""
+        """Of an output with its values; very low where it cannot be computed."""
         task = self._each[output]
-        loss, _ = BoundObjective(task.model, task.table, task.blocks)(task.table.started_at(values).start())
-        return -self.n_rows * loss
+        try:
+            loss, _ = BoundObjective(task.model, task.table, task.blocks)(task.table.started_at(values).start())
+        except NotPositiveDefiniteError:
+            loss = np.inf
+        return -self.n_rows * loss if np.isfinite(loss) else -np.finfo(float).max
 
     def shape(self, values: Values) -> np.ndarray:
         """k̃ at the points, as a vector of length 1: products are alignments (Cristianini et al. 2001)."""

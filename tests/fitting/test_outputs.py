@@ -5,11 +5,15 @@ from threading import Event, get_ident
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern, WhiteKernel
 
+from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
+from skevgp.fitting import outputs
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
-from skevgp.fitting.outputs import fit_outputs, plan
+from skevgp.fitting.outputs import fit_outputs, found_groups, partition_of, plan
+from skevgp.optimizers.lbfgs import lbfgs
+from skevgp.rows.source import LocalSource
 from skevgp.rows.threads import BlockMap
 from skevgp.solvers import LBFGS, Adam
 
@@ -92,8 +96,8 @@ def test_each_model_tells_of_its_outputs_in_the_users_units(sharing):
     for task in tasks:
         task.monitor.iteration(3, 10.0)
     columns = [range(0, 1), range(1, 2)] if sharing == "none" else [range(0, 2)]
-    for (number, loss, outputs), expected in zip(told, columns, strict=True):
-        assert (number, outputs) == (3, expected)
+    for (number, loss, own), expected in zip(told, columns, strict=True):
+        assert (number, own) == (3, expected)
         assert loss == pytest.approx(10.0 + N * np.log(unit[list(expected)]).sum())
 
 
@@ -397,3 +401,207 @@ def test_what_several_models_say_alike_is_said_once():
     done = fitted(sharing="none", max_iter=2, tol=1e-9)
     assert len(done.messages) == 1
     assert "still rising after max_iter=2" in done.messages[0]
+
+
+# --- groups --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sharing", "n_outputs", "partition"),
+    [
+        ("all", 3, [[0, 1, 2]]),
+        ("kernel", 3, [[0, 1, 2]]),
+        ("none", 3, [[0], [1], [2]]),
+        ([[2, 0], [1]], 3, [[0, 2], [1]]),
+        (((1,), (2, 0)), 3, [[0, 2], [1]]),
+        (np.array([[3, 1], [0, 2]]), 4, [[0, 2], [1, 3]]),
+        ([[0]], 1, [[0]]),
+    ],
+    ids=str,
+)
+def test_a_partition_has_one_order(sharing, n_outputs, partition):
+    assert partition_of(sharing, n_outputs) == partition
+
+
+@pytest.mark.parametrize(
+    "sharing",
+    [[[0, 1]], [[0, 1], [1, 2]], [[0, 1], [2], []], [[0, 1], [3]], [[-1, 0], [1]], [0, 1, 2], [[0.0, 1.0], [2.0]], []],
+    ids=str,
+)
+def test_what_is_no_partition_is_named(sharing):
+    with pytest.raises(ValueError, match=r"sharing=\[.*must be .* partition of the outputs.*each of range\(3\)"):
+        partition_of(sharing, 3)
+
+
+def data_of(Y, X=X):
+    """Targets without features."""
+    H = np.empty((len(X), 0))
+    return {"X": X, "H": H, "Y": Y, "units": units_of(X, H, Y)}
+
+
+FOUR = data_of(np.column_stack([Y, 3.0 * Y[:, ::-1] + X]))
+
+
+def of_four(columns):
+    return data_of(FOUR["Y"][:, columns])
+
+
+def test_groups_are_models_of_their_outputs():
+    """Of columns that do not follow each other too; a callback is told which."""
+    told = []
+    tasks = planned(Monitor(lambda *what: told.append(what)), sharing=[[2, 0], [3, 1]], **FOUR)
+    for task, own in zip(tasks, ([0, 2], [1, 3]), strict=True):
+        assert task.model.groups == (slice(0, 2),)
+        rows = FOUR["units"].to_internal(source_of(Y=FOUR["Y"], H=NO_FEATURES).take(np.arange(N)))
+        np.testing.assert_array_equal(task.rows.some(np.arange(N)).targets, rows.targets[:, own])
+        assert task.table["inducing_points"].start.shape == (1, 8, 2)
+        task.monitor.iteration(1, 0.0)
+    assert [columns for _, _, columns in told] == [(0, 2), (1, 3)]
+    assert [loss for _, loss, _ in told] == [
+        pytest.approx(N * np.log(FOUR["units"].target_unit[own]).sum()) for own in ([0, 2], [1, 3])
+    ]
+
+
+def test_groups_are_fitted_as_they_would_be_alone():
+    done = fitted(sharing=[[1, 3], [0, 2]], max_iter=8, **FOUR)
+    mean, variance = done.predictor().predict(X, NO_FEATURES, return_variance=True)
+    total = 0.0
+    for own in ([0, 2], [1, 3]):
+        alone = fitted(max_iter=8, **of_four(own))
+        expected_mean, expected = alone.predictor().predict(X, NO_FEATURES, return_variance=True)
+        np.testing.assert_allclose(mean[:, own], expected_mean, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(variance[:, own], expected, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(done.predictor().noise[own], alone.predictor().noise, rtol=1e-5)
+        total += alone.lower_bound
+    assert done.lower_bound == pytest.approx(total, rel=1e-6)
+
+
+def test_limits_and_bounds_of_groups_are_those_of_the_outputs():
+    done = fitted(sharing=[[0, 2], [1, 3]], max_iter=3, **FOUR)
+    rows, predictor = FOUR["units"].rows(source_of(Y=FOUR["Y"], H=NO_FEATURES)), done.predictor()
+    bounds = [
+        done.bound_at(rows, o, group.hyperparameters, float(predictor.signal[o]))[0]
+        for o, group in enumerate(predictor.by_output)
+    ]
+    assert sum(bounds) == pytest.approx(done.lower_bound, rel=1e-9)
+    for o in range(4):
+        alone = fitted(max_iter=0, **of_four([o]))
+        np.testing.assert_allclose(done.limits("signal", o), alone.limits("signal", 0), rtol=1e-10)
+
+
+# --- groups that are found -------------------------------------------------------------------------------------------
+
+
+def waves(frequencies, noise=0.01, n=400, seed=0):
+    """Sums of a few waves of random directions and phases: each output as rough as its frequency says."""
+    rng = np.random.RandomState(seed)
+    X = rng.uniform(-2.0, 2.0, (n, 2))
+    columns = []
+    for frequency in frequencies:
+        directions = rng.randn(2, 5)
+        directions *= frequency / np.linalg.norm(directions, axis=0)
+        columns.append(np.sin(X @ directions + rng.uniform(0.0, 6.0, 5)).sum(axis=1))
+    Y = np.column_stack(columns)
+    return data_of(Y + noise * rng.randn(*Y.shape), X)
+
+
+AUTO = {"sharing": "auto", "n_inducing": 40, "kernel": RBF(1.0)}
+
+
+def found(n_threads=1, rng=0, **changes):
+    asked = request(**{**AUTO, "n_threads": n_threads} | changes)
+    return found_groups(asked, np.random.RandomState(rng), Monitor())
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_outputs_of_like_smoothness_are_joined(seed):
+    """Whatever their scale, and though they are functions of their own."""
+    data = waves([0.5, 3.0, 0.5, 3.0], seed=seed)
+    scaled = data_of(data["Y"] * [1.0, 1e-3, 1e4, 1.0], data["X"])
+    assert found(**data) == found(**scaled) == [[0, 2], [1, 3]]
+    assert found(**waves([0.5, 0.5, 0.5], seed=seed)) == [[0, 1, 2]]
+
+
+def test_the_groups_do_not_depend_on_threads():
+    data = waves([0.5, 3.0, 0.5, 1.5])
+    assert found(1, **data) == found(3, **data)
+
+
+def test_constant_outputs_and_noise_are_no_groups_of_their_own():
+    """They lose nothing with whichever kernel."""
+    data = waves([0.5, 3.0])
+    X, Y, zeros = data["X"], data["Y"], np.zeros((len(data["Y"]), 1))
+    noise = np.random.RandomState(5).randn(len(Y), 1)
+    assert found(**data_of(np.hstack([Y, zeros, noise]), X)) == [[0, 2, 3], [1]]
+    assert found(**data_of(np.hstack([noise, Y, zeros]), X)) == [[0, 1, 3], [2]]
+    assert found(**data_of(np.hstack([noise, zeros]), X)) == [[0, 1]]
+    assert found(**data_of(np.hstack([zeros, zeros + 7.0]), X)) in ([[0, 1]], [[0], [1]])
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"max_iter": 0},
+        {"kernel": ConstantKernel() * RBF(1.0, "fixed")},
+        {"kernel": ConstantKernel() * DotProduct(1.0, "fixed")},
+    ],
+    ids=["no iterations", "fixed", "nothing to learn"],
+)
+def test_kernels_that_stay_where_they_start_are_shared(changes):
+    assert found(**waves([0.5, 3.0]), **changes) == [[0, 1]]
+
+
+def test_a_single_output_is_not_looked_at():
+    def load(rows):
+        raise AssertionError("nobody needs the rows")
+
+    data = waves([0.5])
+    asked = request(**data, source=LocalSource(load, N), sharing="auto", max_iter=5)
+    assert found_groups(asked, np.random.RandomState(0), Monitor()) == [[0]]
+
+
+def test_a_fit_with_found_groups_is_the_fit_with_these_given():
+    data = waves([0.5, 3.0, 0.5])
+    auto = fitted(**AUTO, **data)
+    assert auto.outputs == [[0, 2], [1]]
+    given = fitted(**AUTO | {"sharing": auto.outputs}, **data)
+    np.testing.assert_array_equal(
+        auto.predictor().predict(data["X"], data["H"])[0], given.predictor().predict(data["X"], data["H"])[0]
+    )
+    assert auto.lower_bound == given.lower_bound
+
+
+def test_groups_that_were_found_are_kept_and_others_are_not():
+    rough, smooth = waves([0.5, 3.0]), waves([0.5, 0.5])
+    first = fitted(**AUTO, **rough)
+    assert first.outputs == [[0], [1]]
+    assert fitted(previous=first, **AUTO, **smooth).outputs == [[0], [1]]
+    assert fitted(**AUTO, **smooth).outputs == [[0, 1]]
+    assert fitted(previous=fitted(sharing="none", **rough), **AUTO, **smooth).outputs == [[0, 1]]
+    assert fitted(previous=first, **AUTO, **waves([0.5])).outputs == [[0]]
+
+
+def test_ctrl_c_while_groups_are_looked_for_reaches_the_user(monkeypatch):
+    """There is no fit yet to keep; and nobody is told of these fits."""
+
+    def interrupted(*arguments):
+        arguments[-1].stop()
+        return lbfgs(*arguments)
+
+    monkeypatch.setattr(outputs, "lbfgs", interrupted)
+    told = []
+    with pytest.raises(KeyboardInterrupt):
+        fitted(Monitor(lambda *what: told.append(what)), sharing="auto", **waves([0.5, 3.0]))
+    assert not told
+
+
+@pytest.mark.parametrize("raises", [True, False])
+def test_bounds_that_cannot_be_computed_do_not_end_the_fit(monkeypatch, raises):
+    class Broken(outputs.BoundObjective):
+        def __call__(self, flat):
+            if raises:
+                raise NotPositiveDefiniteError
+            return np.nan, np.full_like(flat, np.nan)
+
+    monkeypatch.setattr(outputs, "BoundObjective", Broken)
+    assert found(**waves([0.5, 3.0])) == [[0, 1]]
