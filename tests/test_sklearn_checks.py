@@ -11,7 +11,15 @@ MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), No
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.
 QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=500, tol=1e9)
-ESTIMATORS = [EVGPRegressor(), EVGPRegressor(noise_cv=3), EGPRegressor(), QUICK_NETWORK, *RESIDUALS, *MAPS]
+ESTIMATORS = [
+    EVGPRegressor(),
+    EVGPRegressor(noise_cv=3),
+    EVGPRegressor(sharing="auto"),
+    EGPRegressor(),
+    QUICK_NETWORK,
+    *RESIDUALS,
+    *MAPS,
+]
 
 
 @parametrize_with_checks(ESTIMATORS)
