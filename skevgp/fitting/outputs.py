@@ -34,7 +34,7 @@ Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 # Of what its own Gaussian process gains an output over features and noise.
 _LARGEST_LOSS = 0.01
 # By which groups are found: at most so many rows and points; iterations of the first fit and of others; in nats.
-_SAMPLE, _POINTS = 2000, 100
+_SAMPLE, _POINTS = 1000, 100
 _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
 
 
