@@ -95,16 +95,16 @@ def fit_outputs(
     -------
     fitted : FittedOutputs
     """
-    sharing = request.sharing
-    if isinstance(sharing, str) and sharing == "auto":
-        if previous is not None and previous.found_groups(len(request.units.target_unit)):
-            request = replace(request, sharing=previous.outputs)
-        else:
-            # A fit with these groups given is the same fit.
-            silent = Monitor()
-            request = replace(request, sharing=found_groups(request, deepcopy(rng), silent))
-            if silent.stopped:  # there is nothing yet to keep
-                raise KeyboardInterrupt
+    found = isinstance(request.sharing, str) and request.sharing == "auto"
+    n_outputs = len(request.units.target_unit)
+    if found and previous is not None and previous.found and len(previous.units.target_unit) == n_outputs:
+        request = replace(request, sharing=previous.outputs)
+    elif found:
+        # With a copy: a fit with these groups given is the same fit.
+        silent = Monitor()
+        request = replace(request, sharing=found_groups(request, deepcopy(rng), silent))
+        if silent.stopped:  # there is nothing yet to keep
+            raise KeyboardInterrupt
     # One model has all threads for its blocks of rows; several have one each.
     n_models = len(_models(request))
     at_once = min(request.n_threads, n_models)
@@ -118,7 +118,7 @@ def fit_outputs(
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
     outputs, tables = [outputs for outputs, _ in _models(request)], tuple(task.table for task in tasks)
-    return FittedOutputs(request.units, sharing, outputs, tables, tuple(learned), tuple(messages))
+    return FittedOutputs(request.units, outputs, found, tables, tuple(learned), tuple(messages))
 
 
 def plan(
@@ -216,7 +216,7 @@ def _as_columns(outputs: list[int]) -> Sequence[int]:
 
 
 def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
-    """Which outputs to fit together: those that one kernel serves, each nearly as well as one of its own.
+    """Which outputs to fit together: those that one kernel serves, each of them nearly as well as one of its own.
 
     (The sum of their bounds, which a fit maximises, does not show it: outputs with little noise rule it.) What a kernel
     is worth is seen in short fits to a sample of the rows. The first is of all outputs. Its inducing points then stay,

@@ -250,10 +250,10 @@ class FittedOutputs:
     Attributes
     ----------
     units : Units
-    sharing : {"all", "kernel", "none", "auto"} or sequence of sequence of int
-        What was asked for.
     outputs : list of list of int
         Of each model.
+    found : bool
+        Whether which outputs share a model was found and not given.
     tables : tuple of ParameterTable
         Where each model started, and its limits.
     learned : tuple of Learned
@@ -263,16 +263,11 @@ class FittedOutputs:
     """
 
     units: Units
-    sharing: object
     outputs: list[list[int]]
+    found: bool
     tables: tuple[ParameterTable, ...]
     learned: tuple[Learned, ...]
     messages: tuple[str, ...]
-
-    def found_groups(self, n_outputs: int) -> bool:
-        """Whether groups of so many outputs were found, not given."""
-        found = isinstance(self.sharing, str) and self.sharing == "auto"
-        return found and sum(map(len, self.outputs)) == n_outputs
 
     def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
         """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
