@@ -30,7 +30,7 @@ from ._validation import (
     validate_frame,
     words_of,
 )
-from .fitting.units import Units
+from .fitting.start import Units
 from .inference.posterior import Predictor
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
@@ -349,8 +349,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 float(self._predictor.signal[o]),
                 fitted.limits("signal", o),
             )
-            for group in self._predictor.groups
-            for o in range(len(prior.mean))[group.outputs]
+            for o, group in enumerate(self._predictor.by_output)
         ]
         self.kernel_ = kernels[0] if self._single_output else kernels
 
@@ -365,8 +364,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         return list(
             dict.fromkeys(
                 message
-                for group in self._predictor.groups
-                for o in range(len(noise))[group.outputs]
+                for o, group in enumerate(self._predictor.by_output)
                 for message in self._spec.at_bounds(group.hyperparameters, float(signal[o]), float(noise[o]))
             )
         )

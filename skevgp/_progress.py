@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from threading import Event
 
 # Called once per iteration, with its number (from 1), the loss, and the columns of y that it is of.
-Report = Callable[[int, float, range], object]
+Report = Callable[[int, float, Sequence[int]], object]
 
 
 class Monitor:
@@ -27,10 +27,11 @@ class Monitor:
     def __init__(self, report: Report | None = None):
         self._report = report
         self._stop = Event()
-        self._n_before, self._factor, self._shift, self._outputs = 0, 1.0, 0.0, range(0)
+        self._n_before, self._factor, self._shift = 0, 1.0, 0.0
+        self._outputs: Sequence[int] = range(0)
 
     def seen_as(
-        self, n_before: int = 0, factor: float = 1.0, shift: float = 0.0, outputs: range | None = None
+        self, n_before: int = 0, factor: float = 1.0, shift: float = 0.0, outputs: Sequence[int] | None = None
     ) -> Monitor:
         """The same monitor for a part of the fit: after so many iterations, its loss in other units.
 
@@ -40,7 +41,7 @@ class Monitor:
             Iterations before the part's first.
         factor, shift : float, default=1, 0
             The part's loss, times ``factor`` plus ``shift``, is the loss of the whole.
-        outputs : range, default=None
+        outputs : sequence of int, default=None
             The columns of y that the part is of, if it knows better.
         """
         part = copy(self)
@@ -99,7 +100,7 @@ class Progress:
         self._verbose = verbose
         self._start = self._last = time.monotonic()
 
-    def __call__(self, iteration: int, loss: float, outputs: range) -> None:
+    def __call__(self, iteration: int, loss: float, outputs: Sequence[int]) -> None:
         now = time.monotonic()
         if iteration > 1 and self._verbose < 2 and now - self._last < 1.0:
             return
@@ -113,7 +114,7 @@ def monitor_of(verbose: int, callback: Report | None = None) -> Monitor:
     if callback is None:
         return Monitor(progress)
 
-    def report(iteration: int, loss: float, outputs: range) -> None:
+    def report(iteration: int, loss: float, outputs: Sequence[int]) -> None:
         if progress is not None:
             progress(iteration, loss, outputs)
         callback(iteration, -loss, outputs)

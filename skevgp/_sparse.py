@@ -113,11 +113,12 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
     def _set_attributes(self) -> None:
         self._set_common_attributes()
         fitted = self._fitted
-        points = [group.points for group in self._predictor.groups]
+        points = [group.points for group in self._predictor.by_output]
         same = len({len(own) for own in points}) == 1
         self.inducing_points_: Any = np.array(points) if same else points
-        if fitted.sharing == "all" or self._single_output:
+        if len(self._predictor.groups) == 1:
             self.inducing_points_ = points[0]
+        self.sharing_ = [group.copy() for group in fitted.outputs]
         self.lower_bound_, self.upper_bound_ = fitted.lower_bound, fitted.upper_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter

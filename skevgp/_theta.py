@@ -47,15 +47,14 @@ def value_at(
     if not (np.abs(thetas) <= np.log(LARGEST)).all():
         raise ValueError(f"theta must be logarithms of numbers from {1 / LARGEST:g} to {LARGEST:g}; got {theta!r}.")
     total, gradient = 0.0, np.zeros((n_outputs, len(order)))
-    for group in predictor.groups:
-        for o in range(n_outputs)[group.outputs]:
-            kernel = np.append(group.hyperparameters, predictor.signal[o])
-            kernel[order] = np.exp(thetas.reshape(gradient.shape)[o])
-            try:
-                with np.errstate(over="ignore", invalid="ignore"):
-                    value, bars = of_kernel(o, kernel[:-1], float(kernel[-1]))
-            except NotPositiveDefiniteError:
-                return (-np.inf, np.zeros(shape)) if eval_gradient else -np.inf
-            total += value
-            gradient[o] = bars[order]
+    for o, group in enumerate(predictor.by_output):
+        kernel = np.append(group.hyperparameters, predictor.signal[o])
+        kernel[order] = np.exp(thetas.reshape(gradient.shape)[o])
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                value, bars = of_kernel(o, kernel[:-1], float(kernel[-1]))
+        except NotPositiveDefiniteError:
+            return (-np.inf, np.zeros(shape)) if eval_gradient else -np.inf
+        total += value
+        gradient[o] = bars[order]
     return (total, gradient.reshape(shape)) if eval_gradient else total

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -29,7 +29,7 @@ _LEAST_TOL = 0.01
 # Length of the natural gradients' steps for q: the first, and the least.
 _NATURAL_RATES = 0.3, 0.02
 
-Callback = Callable[[int, float, range], object]
+Callback = Callable[[int, float, Sequence[int]], object]
 
 
 class LBFGS(BaseEstimator):
@@ -42,11 +42,18 @@ class LBFGS(BaseEstimator):
         ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
         start. Each takes the time of a fit.
     callback : callable, default=None
+<<<<<<< HEAD
         callback(iteration, lower_bound, outputs), once per iteration; on a sample of the rows the bound is that of the
         sample, times the number of rows over its size; ``outputs`` is the range of y's columns that the
         bound is of: where outputs share nothing, each has fits of its own. A StopIteration or KeyboardInterrupt that
         it raises ends the fit with the best parameters so far, as Ctrl-C does. ``clone`` copies a callable object, and
         leaves a function what it is.
+=======
+        callback(iteration, lower_bound, outputs), once per iteration; ``outputs`` are the columns of y that the bound
+        is of, a range or, of a group with gaps, a tuple: where outputs share nothing, each has fits of its own, and
+        with groups each group. A StopIteration or KeyboardInterrupt that it raises ends the fit with the best
+        parameters so far, as Ctrl-C does. ``clone`` copies a callable object, and leaves a function what it is.
+>>>>>>> 88ccdffcf1704cc87d65bd09ea45e75796e1326d
 
     Attributes
     ----------

@@ -208,7 +208,7 @@ def ways(**arguments):
     return solver.ways
 
 
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none", [[1], [0]], "auto"], ids=str)
 def test_the_walk_of_a_fit_to_the_bound_is_short(sharing):
     for waiting, way in ways(sharing=sharing):
         assert waiting == []
@@ -277,11 +277,11 @@ def test_private_names_of_scikit_learn_are_found(source, found):
 @pytest.mark.parametrize(
     ("source", "found"),
     [
-        ("from ..fitting.units import _scale, Frame", {"skevgp.fitting.units._scale"}),
-        ("from skevgp.fitting.units import _scale", {"skevgp.fitting.units._scale"}),
+        ("from ..fitting.start import _scale, Frame", {"skevgp.fitting.start._scale"}),
+        ("from skevgp.fitting.start import _scale", {"skevgp.fitting.start._scale"}),
         ("from .._linalg import _jitter", {"skevgp._linalg._jitter"}),
         ("from .. import _linalg\n_linalg._jitter", {"_linalg._jitter"}),
-        ("from ..fitting import units as u\nu._scale()", {"u._scale"}),
+        ("from ..fitting import start as u\nu._scale()", {"u._scale"}),
         ("def f():\n    from ..plotting import _style", {"skevgp.plotting._style"}),
         ("from ..plotting._style import axes", {"skevgp.plotting._style.axes"}),
         ("from .threads import _pool\nfrom . import threads\nthreads._pool", set()),

@@ -38,7 +38,7 @@ def nasty(seed):
     arguments = {
         "feature_map": [None, PolynomialFeatures(1), PolynomialFeatures(2)][rng.randint(3)],
         "n_inducing": int(rng.choice([1, 5, 20, 200])),
-        "sharing": str(rng.choice(["all", "kernel", "none"])),
+        "sharing": str(rng.choice(["all", "kernel", "none", "auto"])),
         "posterior": str(rng.choice(["full", "diagonal"])),
         "normalize_y": bool(rng.rand() < 0.5),
         "solver": str(rng.choice(["lbfgs", "lbfgs", "lbfgs", "adam"])),

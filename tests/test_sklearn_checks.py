@@ -11,7 +11,12 @@ MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), No
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.
 QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=500, tol=1e9)
-SPARSE = [EVGPRegressor(), EVGPRegressor(noise_cv=3), EVGPRegressor(n_inducing="auto", max_inducing=20)]
+SPARSE = [
+    EVGPRegressor(),
+    EVGPRegressor(noise_cv=3),
+    EVGPRegressor(n_inducing="auto", max_inducing=20),
+    EVGPRegressor(sharing="auto"),
+]
 ESTIMATORS = [*SPARSE, EGPRegressor(), QUICK_NETWORK, *RESIDUALS, *MAPS]
 
 

@@ -18,9 +18,8 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
-from .start import checked_variance, column_centre, starting_table
+from .start import Units, checked_variance, column_centre, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
-from .units import Units
 
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
@@ -168,7 +167,7 @@ class ExactFit:
 
     def predictor(self) -> Predictor:
         """Of all outputs, in the user's units."""
-        return self.units.predictor([self.model.predictor(self.fit.values)])
+        return self.units.predictor([self.model.predictor(self.fit.values)], [list(range(len(self.units.target_unit)))])
 
     @property
     def log_marginal_likelihood(self) -> float:

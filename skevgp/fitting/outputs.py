@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Literal, TypeVar
+from itertools import chain
+from operator import index
+from typing import Literal
 
 import numpy as np
 
@@ -18,17 +19,14 @@ from ..kernels.parse import KernelSpec
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import Source
-from ..rows.threads import BlockMap, thread_pool
+from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask, grown
-from .start import checked_variance, column_centre, starting_table
+from .start import Units, checked_variance, column_centre, starting_table
 from .strategy import search
-from .units import Units
 
-Sharing = Literal["all", "kernel", "none"]
-Job = TypeVar("Job")
-Result = TypeVar("Result")
+Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 
 
 @dataclass(frozen=True)
@@ -42,7 +40,8 @@ class Request:
     units : Units
     spec : KernelSpec
         What the user says of kernel and noise.
-    sharing : {"all", "kernel", "none"}
+    sharing : {"all", "kernel", "none", "auto"} or sequence of sequence of int
+        `sharing.with_groups` turns ``"auto"`` into groups.
     family : {"full", "diagonal"}
     placement : Placement
         Of the inducing points.
@@ -54,6 +53,8 @@ class Request:
         Folds of consecutive rows by which the noise is calibrated.
     n_threads : int
         For independent models, or else for blocks of rows.
+    found : bool, default=False
+        Whether the groups were found and not given.
     """
 
     source: Source
@@ -67,18 +68,20 @@ class Request:
     tol: float | None
     noise_cv: int | None
     n_threads: int
+    found: bool = False
 
 
 @dataclass(frozen=True)
 class FittedOutputs:
-    """Fitted sparse models of consecutive outputs.
+    """The fitted sparse models of all outputs.
 
     Attributes
     ----------
     units : Units
-    sharing : {"all", "kernel", "none"}
-    outputs : tuple of slice
+    outputs : list of list of int
         Of each model.
+    found : bool
+        Whether which outputs share a model was found and not given.
     learned : tuple of Learned
         Each model, in internal units.
     messages : tuple of str
@@ -86,8 +89,8 @@ class FittedOutputs:
     """
 
     units: Units
-    sharing: Sharing
-    outputs: tuple[slice, ...]
+    outputs: list[list[int]]
+    found: bool
     learned: tuple[Learned, ...]
     messages: tuple[str, ...]
 
@@ -99,7 +102,7 @@ class FittedOutputs:
 
     def predictor(self) -> Predictor:
         """Of all outputs, in the user's units."""
-        return self.units.predictor([one.predictor for one in self.learned])
+        return self.units.predictor([one.predictor for one in self.learned], self.outputs)
 
     @property
     def lower_bound(self) -> float:
@@ -137,8 +140,8 @@ class FittedOutputs:
 
     def limits(self, name: str, output: int) -> np.ndarray:
         """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
-        index, within = self._place_of(output)
-        limits = self.learned[index].table[name].value_limits()
+        model, within = self._place_of(output)
+        limits = self.learned[model].table[name].value_limits()
         return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
@@ -161,26 +164,25 @@ class FittedOutputs:
         gradient : ndarray of shape (n_hyper + 1,)
             That in log s² last.
         """
-        (index, within), own = self._place_of(output), slice(output, output + 1)
+        (model, within), own = self._place_of(output), [output]
         internal = signal / self.units.target_unit[own] ** 2
-        bound, gradient = self.learned[index].bound_at(rows.outputs(own), within, hyperparameters, internal)
+        bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, hyperparameters, internal)
         return bound - len(rows) * self.units.log_unit(own), gradient
 
     def _place_of(self, output: int) -> tuple[int, int]:
         """Which model an output belongs to, and which of the model's it is."""
-        index = next(i for i, own in enumerate(self.outputs) if own.start <= output < own.stop)
-        return index, output - self.outputs[index].start
+        return next((i, own.index(output)) for i, own in enumerate(self.outputs) if output in own)
 
-    def values_in(self, units: Units, rows: Rows, kernel: Kernel, index: int) -> Values:
+    def values_in(self, units: Units, rows: Rows, kernel: Kernel, model: int) -> Values:
         """A model's values in other internal units, as far as they can serve another fit."""
-        one, inputs = self.learned[index], rows.inputs
+        one, own, inputs = self.learned[model], self.outputs[model], rows.inputs
         values, points = one.values, one.values["inducing_points"]
         lowest, highest = inputs.lowest, inputs.highest
         if points.shape[2] != len(inputs.mean):
             return {}
         if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
             return {}
-        ratio = (self.units.target_unit[self.outputs[index]] / units.target_unit[self.outputs[index]]) ** 2
+        ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2
         found = {"noise": values["noise"] * ratio, "inducing_points": points}
         if one.model.kernel == kernel:
             found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
@@ -217,14 +219,14 @@ def fit_outputs(
     threads = BlockMap(request.n_threads if n_models == 1 else 1)
     try:
         tasks = plan(request, rng, monitor, threads, previous)
-        learned = _side_by_side(_fit_one, tasks, at_once, monitor)
+        learned = side_by_side(_fit_one, tasks, at_once, monitor)
     finally:
         threads.close()
     messages = sorted({one.message for one in learned if one.message})
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
-    outputs = tuple(outputs for outputs, _ in _models(request))
-    return FittedOutputs(request.units, request.sharing, outputs, tuple(learned), tuple(messages))
+    outputs = [outputs for outputs, _ in _models(request)]
+    return FittedOutputs(request.units, outputs, request.found, tuple(learned), tuple(messages))
 
 
 def plan(
@@ -240,14 +242,14 @@ def plan(
     rows = units.rows(request.source, threads)
     kernel = request.spec.covariance.centred(column_centre(rows.inputs))
 
-    def table_of(outputs: slice, points: np.ndarray, variance: float = 1.0) -> ParameterTable:
+    def table_of(outputs: list[int], points: np.ndarray, variance: float = 1.0) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
         return starting_table(
             rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
         )
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
-    alone = table_of(slice(0, 1), np.empty((1, 0, len(rows.inputs.mean))))
+    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean))))
     hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
     inputs = rows.sample(placement.sample_size, rng).inputs
     points = placement.points(inputs, kernel, hyperparameters, rng)
@@ -255,12 +257,12 @@ def plan(
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
     seed = rng.randint(np.iinfo(np.int32).max)
-    goes_on = previous is not None and previous.outputs == tuple(outputs for outputs, _ in models)
+    goes_on = previous is not None and previous.outputs == [outputs for outputs, _ in models]
     share, tasks = 1.0 / min(request.n_threads, len(models)), []
-    for index, (outputs, groups) in enumerate(models):
+    for i, (outputs, groups) in enumerate(models):
         warm: Values | None = None
         if goes_on and previous is not None:
-            warm = previous.values_in(units, rows, kernel, index)
+            warm = previous.values_in(units, rows, kernel, i)
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
         sets = _first_sets(points, len(groups), placement, warm)
@@ -283,7 +285,7 @@ def plan(
                 request.tol,
                 request.noise_cv,
                 seed,
-                monitor.seen_as(shift=shift, outputs=range(outputs.start, outputs.stop)),
+                monitor.seen_as(shift=shift, outputs=_as_columns(outputs)),
                 None if warm is None else table.started_at(warm).values_at_start(),
             )
         )
@@ -296,13 +298,36 @@ def _first_sets(points: np.ndarray, n_groups: int, placement: Placement, warm: V
     return np.repeat(points[np.newaxis], n_groups, axis=0) if found is None or len(found) != n_groups else found
 
 
-def _models(request: Request) -> list[tuple[slice, tuple[slice, ...]]]:
-    """The outputs of each independent model, and of these the outputs of each set of inducing points."""
-    n_outputs = len(request.units.target_unit)
-    each = tuple(slice(o, o + 1) for o in range(n_outputs))
-    if request.sharing == "none":
-        return [(outputs, (slice(0, 1),)) for outputs in each]
-    return [(slice(0, n_outputs), (slice(0, n_outputs),) if request.sharing == "all" else each)]
+def _models(request: Request) -> list[tuple[list[int], tuple[slice, ...]]]:
+    """The outputs of each independent model, and which of these each set of inducing points serves."""
+    outputs = partition_of(request.sharing, len(request.units.target_unit))
+    if isinstance(request.sharing, str) and request.sharing == "kernel":
+        return [(own, tuple(slice(o, o + 1) for o in range(len(own)))) for own in outputs]
+    return [(own, (slice(0, len(own)),)) for own in outputs]
+
+
+def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:
+    """The outputs of each independent model, both in ascending order."""
+    everything = list(range(n_outputs))
+    if isinstance(sharing, str):
+        return [[o] for o in everything] if sharing == "none" else [everything]
+    try:
+        groups = sorted(sorted(index(o) for o in group) for group in sharing)
+    except TypeError:
+        groups = []
+    if not all(groups) or sorted(chain(*groups)) != everything:
+        raise ValueError(
+            f"sharing={sharing!r} must be 'all', 'kernel', 'none', 'auto' or a partition of the outputs, such as "
+            f"{[everything[:1], everything[1:]] if n_outputs > 1 else [everything]}: each of range({n_outputs}) in one "
+            "group."
+        )
+    return groups
+
+
+def _as_columns(outputs: list[int]) -> Sequence[int]:
+    """A range if they follow each other, else a tuple."""
+    columns = range(outputs[0], outputs[-1] + 1)
+    return columns if len(columns) == len(outputs) else tuple(outputs)
 
 
 def _fit_one(task: SparseTask) -> Learned:
@@ -311,25 +336,3 @@ def _fit_one(task: SparseTask) -> Learned:
     if task.placement.max_inducing is None:
         return Learned.of(task, search(task))
     return Learned.of(*grown(task))
-
-
-def _side_by_side(one: Callable[[Job], Result], jobs: Sequence[Job], n_threads: int, monitor: Monitor) -> list[Result]:
-    """Each job's result; Ctrl-C stops the monitor, upon which jobs end with what they have."""
-    results: list[Result] = []
-    if n_threads < 2:
-        for job in jobs:
-            results.append(one(job))
-        return results
-    futures: list[Future[Result]] = []
-    with thread_pool(n_threads) as pool:
-        with monitor.keeping_the_best():
-            for job in jobs:
-                futures.append(pool.submit(one, job))
-            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
-            if any(future.exception() for future in done):
-                # The error is the result: nobody waits for the others.
-                monitor.stop()
-                pool.shutdown(wait=False, cancel_futures=True)
-                next(future for future in futures if future in done and future.exception()).result()
-        futures += [pool.submit(one, job) for job in jobs[len(futures) :]]
-        return [future.result() for future in futures]

@@ -18,6 +18,7 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..rows.blocks import Blocks, LinearStatistics
+from ..rows.source import Columns
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -45,7 +46,7 @@ class CoefficientPrior:
         """The coefficients (o, p) that the residuals are taken from."""
         return self.mean + self.scale * self.reference
 
-    def outputs(self, columns: slice) -> CoefficientPrior:
+    def outputs(self, columns: Columns) -> CoefficientPrior:
         """The prior of some of the outputs."""
         return CoefficientPrior(self.mean[columns], self.scale[columns], self.reference[columns])
 

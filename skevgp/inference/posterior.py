@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from ..rows.source import Columns
 from .statistics import Kernel, Whitening
 
 # Of the deviations of all outputs at once.
@@ -19,7 +20,7 @@ class PredictorGroup:
 
     Attributes
     ----------
-    outputs : slice
+    outputs : slice or list of int
         o of them.
     hyperparameters : ndarray of shape (n_hyper,)
         Of k̃.
@@ -34,7 +35,7 @@ class PredictorGroup:
         model.
     """
 
-    outputs: slice
+    outputs: Columns
     hyperparameters: np.ndarray
     points: np.ndarray
     whitening: Whitening
@@ -45,7 +46,7 @@ class PredictorGroup:
     @classmethod
     def of(
         cls,
-        outputs: slice,
+        outputs: Columns,
         hyperparameters: np.ndarray,
         points: np.ndarray,
         whitening: Whitening,
@@ -91,7 +92,7 @@ class Predictor:
     kernel : Kernel
         k̃.
     groups : tuple of PredictorGroup
-        Of all outputs, in their order.
+        Of all outputs, each in one of them.
     noise : ndarray of shape (o,)
         σ².
     offset : ndarray of shape (o, p)
@@ -108,16 +109,20 @@ class Predictor:
 
     @classmethod
     def joined(
-        cls, parts: Sequence[Predictor], unit: np.ndarray, offset: np.ndarray, intercept: np.ndarray
+        cls,
+        parts: Sequence[Predictor],
+        outputs: Sequence[list[int]],
+        unit: np.ndarray,
+        offset: np.ndarray,
+        intercept: np.ndarray,
     ) -> Predictor:
-        """Predictors of consecutive outputs as one, each output times ``unit``, with another offset and intercept."""
-        groups, first = [], 0
-        for part in parts:
+        """Predictors of some ``outputs`` each as one: each output times ``unit``, with another offset and intercept."""
+        groups, noise = [], np.empty(len(unit))
+        for part, columns in zip(parts, outputs, strict=True):
+            noise[columns] = part.noise * unit[columns] ** 2
             for group in part.groups:
-                outputs = slice(first, first + len(group.signal))
-                groups.append(replace(group.scaled(unit[outputs]), outputs=outputs))
-                first = outputs.stop
-        noise = np.concatenate([part.noise for part in parts]) * unit**2
+                own = np.array(columns)[group.outputs].tolist()
+                groups.append(replace(group.scaled(unit[own]), outputs=own))
         return cls(parts[0].kernel, tuple(groups), noise, offset, intercept)
 
     @property
@@ -129,7 +134,13 @@ class Predictor:
     @property
     def signal(self) -> np.ndarray:
         """s² of each output, (o,)."""
-        return np.concatenate([group.signal for group in self.groups])
+        return self._in_order(group.signal for group in self.groups)
+
+    @property
+    def by_output(self) -> list[PredictorGroup]:
+        """The group of each output."""
+        found = {o: group for group in self.groups for o in np.arange(len(self.noise))[group.outputs]}
+        return [found[o] for o in range(len(self.noise))]
 
     def predict(
         self, inputs: np.ndarray, features: np.ndarray, return_variance: bool = False
@@ -152,41 +163,49 @@ class Predictor:
         prepared, means, variances = self.kernel.prepare(inputs), [], []
         for group in self.groups:
             P, unexplained = group.project(prepared, features)
-            means.append((group.mean @ P).T)
+            means.append(group.mean @ P)
             if return_variance:
                 o, k, size = group.root.shape
                 deviation = group.root.reshape(o * k, size) @ P
                 np.multiply(deviation, deviation, out=deviation)
                 squares = deviation.reshape(o, k, len(inputs)).sum(axis=1)
-                variances.append((np.outer(group.signal, unexplained) + squares).T)
-        mean = _side_by_side(means)
+                variances.append(np.outer(group.signal, unexplained) + squares)
+        mean = self._in_order(means).T
         mean += features @ self.offset.T
         mean += self.intercept
-        return mean, _side_by_side(variances) if return_variance else None
+        return mean, self._in_order(variances).T if return_variance else None
 
     def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o)."""
         mean, _ = self.predict(inputs, features)
-        covariance, prepared = [], self.kernel.prepare(inputs)
+        covariance, prepared = np.empty((len(mean), *mean.shape)), self.kernel.prepare(inputs)
         for group in self.groups:
             P, _ = group.project(prepared, features)
             V = P[: len(group.points)]
             unexplained = self.kernel.at(np.log(group.hyperparameters), inputs).matrix() - V.T @ V
-            for signal, root in zip(group.signal, group.root, strict=True):
+            outputs = np.arange(len(self.noise))[group.outputs]
+            for o, signal, root in zip(outputs, group.signal, group.root, strict=True):
                 deviation = root @ P
-                covariance.append(signal * unexplained + deviation.T @ deviation)
-        return mean, np.stack(covariance, axis=2)
+                covariance[:, :, o] = signal * unexplained + deviation.T @ deviation
+        return mean, covariance
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
-        mean, covariance = self.offset.copy(), []
+        (o, p), mean = self.offset.shape, self.offset.copy()
+        covariance = np.empty((o, p, p))
         for group in self.groups:
             m = len(group.points)
             mean[group.outputs] += group.mean[:, m:]
             deviation = group.root[:, :, m:]
-            covariance.append(deviation.transpose(0, 2, 1) @ deviation)
-        return mean, np.concatenate(covariance)
+            covariance[group.outputs] = deviation.transpose(0, 2, 1) @ deviation
+        return mean, covariance
 
-
-def _side_by_side(columns: list[np.ndarray]) -> np.ndarray:
-    return columns[0] if len(columns) == 1 else np.hstack(columns)
+    def _in_order(self, parts: Iterable[np.ndarray]) -> np.ndarray:
+        """What each group has of its outputs, (o, ...) each, as one array of all outputs."""
+        first, *others = parts
+        if not others:
+            return first
+        found = np.empty((len(self.noise), *first.shape[1:]))
+        for group, part in zip(self.groups, (first, *others), strict=True):
+            found[group.outputs] = part
+        return found

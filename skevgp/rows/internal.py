@@ -12,7 +12,7 @@ import numpy as np
 from sklearn.utils.random import sample_without_replacement
 
 from .blocks import Batch, Block, Blocks
-from .source import LocalSource, Moments, RawRows, Source
+from .source import Columns, LocalSource, Moments, RawRows, Source
 from .threads import BlockMap
 
 # Mini-batches are drawn from so many rows at a time: shuffling needs memory.
@@ -36,7 +36,7 @@ class MakeBlock:
 
     kernel: Preparer
     to_internal: ToInternal
-    outputs: slice = field(default_factory=lambda: slice(None))
+    outputs: Columns = field(default_factory=lambda: slice(None))
 
     def __call__(self, raw: RawRows) -> Block:
         rows = self.to_internal(raw)
@@ -65,7 +65,7 @@ class Rows:
         In the user's units.
     to_internal : callable
         From there to residuals in place of targets: y minus the reference linear part, in units of its own size.
-    columns : slice
+    columns : slice or list of int
         The outputs that count.
     share : float
         Of the memory for blocks, for one of several fits at once.
@@ -75,7 +75,7 @@ class Rows:
 
     source: Source
     to_internal: ToInternal
-    columns: slice = field(default_factory=lambda: slice(None))
+    columns: Columns = field(default_factory=lambda: slice(None))
     share: float = 1.0
     threads: BlockMap = field(default_factory=BlockMap)
 
@@ -143,6 +143,6 @@ class Rows:
         """Consecutive rows, with a share of the memory."""
         return replace(self, source=self.source.part(first, end), share=self.share * share)
 
-    def outputs(self, columns: slice, share: float = 1.0) -> Rows:
+    def outputs(self, columns: Columns, share: float = 1.0) -> Rows:
         """The same rows with some of the outputs."""
         return replace(self, columns=columns, share=share)

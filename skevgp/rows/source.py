@@ -12,6 +12,8 @@ from .blocks import Block, Blocks, LocalBlocks
 from .threads import BlockMap, ordered_sum
 
 Total = TypeVar("Total")
+# Of targets: which outputs.
+Columns = slice | list[int]
 
 # Rows that a pass over raw rows sees at once.
 PASS_ROWS = 16_384

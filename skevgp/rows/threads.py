@@ -1,16 +1,18 @@
-"""Sums in a fixed order, in threads that hold BLAS and OpenMP to one thread each."""
+"""Sums in a fixed order and jobs side by side, in threads that hold BLAS and OpenMP to one thread each."""
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from itertools import islice
 from threading import Lock
 from typing import Any, TypeVar
 
 from threadpoolctl import OpenBLASController, ThreadpoolController, threadpool_limits
+
+from .._progress import Monitor
 
 Part = TypeVar("Part")
 Total = TypeVar("Total")
@@ -110,3 +112,25 @@ class BlockMap:
     def close(self) -> None:
         if self._pool is not None:
             self._pool.shutdown()
+
+
+def side_by_side(one: Callable[[Part], Total], jobs: Sequence[Part], n_threads: int, monitor: Monitor) -> list[Total]:
+    """Each job's result; Ctrl-C stops the monitor, upon which jobs end with what they have."""
+    results: list[Total] = []
+    if n_threads < 2:
+        for job in jobs:
+            results.append(one(job))
+        return results
+    futures: list[Future[Total]] = []
+    with thread_pool(n_threads) as pool:
+        with monitor.keeping_the_best():
+            for job in jobs:
+                futures.append(pool.submit(one, job))
+            done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+            if any(future.exception() for future in done):
+                # The error is the result: nobody waits for the others.
+                monitor.stop()
+                pool.shutdown(wait=False, cancel_futures=True)
+                next(future for future in futures if future in done and future.exception()).result()
+        futures += [pool.submit(one, job) for job in jobs[len(futures) :]]
+        return [future.result() for future in futures]

@@ -4,7 +4,7 @@ import numpy as np
 
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import Request
-from skevgp.fitting.units import Units
+from skevgp.fitting.start import Units
 from skevgp.kernels.parse import parse_kernel
 from skevgp.rows.source import LocalSource, Moments
 from skevgp.solvers import LBFGS
@@ -23,11 +23,17 @@ def source_of(X=X, H=H, Y=Y):
     return LocalSource.of(X, H, Y)
 
 
-def units_of(X=X, H=H, Y=Y, target_mean=(0.0, 0.0)):
+def units_of(X=X, H=H, Y=Y, target_mean=0.0):
     """With both features, or with none if H has no columns."""
     o, p = Y.shape[1], H.shape[1]
-    prior = COEF_MEAN[:o, :p], COEF_SCALE[:o, :p]
-    return Units.of(source_of(X, H, Y), Moments.of(Y), np.array(target_mean)[:o], *prior)
+    prior = (own[np.arange(o) % 2, :p] for own in (COEF_MEAN, COEF_SCALE))
+    return Units.of(source_of(X, H, Y), Moments.of(Y), np.broadcast_to(target_mean, o), *prior)
+
+
+def data_of(Y, X=X):
+    """Targets without features."""
+    H = np.empty((len(X), 0))
+    return {"X": X, "H": H, "Y": Y, "units": units_of(X, H, Y)}
 
 
 def request(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):

@@ -9,11 +9,11 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 
 from skevgp._progress import Monitor
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
-from skevgp.fitting.outputs import fit_outputs, plan
+from skevgp.fitting.outputs import fit_outputs, partition_of, plan
 from skevgp.rows.threads import BlockMap
 from skevgp.solvers import LBFGS, Adam
 
-from .cases import NO_FEATURES, H, N, O, X, Y, request, source_of, units_of
+from .cases import NO_FEATURES, H, N, O, X, Y, data_of, request, source_of, units_of
 
 SHARING = ("all", "kernel", "none")
 
@@ -92,8 +92,8 @@ def test_each_model_tells_of_its_outputs_in_the_users_units(sharing):
     for task in tasks:
         task.monitor.iteration(3, 10.0)
     columns = [range(0, 1), range(1, 2)] if sharing == "none" else [range(0, 2)]
-    for (number, loss, outputs), expected in zip(told, columns, strict=True):
-        assert (number, outputs) == (3, expected)
+    for (number, loss, own), expected in zip(told, columns, strict=True):
+        assert (number, own) == (3, expected)
         assert loss == pytest.approx(10.0 + N * np.log(unit[list(expected)]).sum())
 
 
@@ -370,7 +370,7 @@ def test_models_run_at_once_if_there_are_threads():
 def test_an_error_in_one_model_is_the_fits(n_threads):
     class Broken(LBFGS):
         def run(self, task, attempt):
-            if len(task.rows.scatter()) and task.rows.columns.start == 1:
+            if len(task.rows.scatter()) and task.rows.columns == [1]:
                 raise ZeroDivisionError("the second")
             return super().run(task, attempt)
 
@@ -397,3 +397,83 @@ def test_what_several_models_say_alike_is_said_once():
     done = fitted(sharing="none", max_iter=2, tol=1e-9)
     assert len(done.messages) == 1
     assert "still rising after max_iter=2" in done.messages[0]
+
+
+# --- groups --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("sharing", "n_outputs", "partition"),
+    [
+        ("all", 3, [[0, 1, 2]]),
+        ("kernel", 3, [[0, 1, 2]]),
+        ("none", 3, [[0], [1], [2]]),
+        ([[2, 0], [1]], 3, [[0, 2], [1]]),
+        (((1,), (2, 0)), 3, [[0, 2], [1]]),
+        (np.array([[3, 1], [0, 2]]), 4, [[0, 2], [1, 3]]),
+        ([[0]], 1, [[0]]),
+    ],
+    ids=str,
+)
+def test_a_partition_has_one_order(sharing, n_outputs, partition):
+    assert partition_of(sharing, n_outputs) == partition
+
+
+@pytest.mark.parametrize(
+    "sharing",
+    [[[0, 1]], [[0, 1], [1, 2]], [[0, 1], [2], []], [[0, 1], [3]], [[-1, 0], [1]], [0, 1, 2], [[0.0, 1.0], [2.0]], []],
+    ids=str,
+)
+def test_what_is_no_partition_is_named(sharing):
+    with pytest.raises(ValueError, match=r"sharing=\[.*must be .* partition of the outputs.*each of range\(3\)"):
+        partition_of(sharing, 3)
+
+
+FOUR = data_of(np.column_stack([Y, 3.0 * Y[:, ::-1] + X]))
+
+
+def of_four(columns):
+    return data_of(FOUR["Y"][:, columns])
+
+
+def test_groups_are_models_of_their_outputs():
+    """Of columns that do not follow each other too; a callback is told which."""
+    told = []
+    tasks = planned(Monitor(lambda *what: told.append(what)), sharing=[[2, 0], [3, 1]], **FOUR)
+    for task, own in zip(tasks, ([0, 2], [1, 3]), strict=True):
+        assert task.model.groups == (slice(0, 2),)
+        rows = FOUR["units"].to_internal(source_of(Y=FOUR["Y"], H=NO_FEATURES).take(np.arange(N)))
+        np.testing.assert_array_equal(task.rows.some(np.arange(N)).targets, rows.targets[:, own])
+        assert task.table["inducing_points"].start.shape == (1, 8, 2)
+        task.monitor.iteration(1, 0.0)
+    assert [columns for _, _, columns in told] == [(0, 2), (1, 3)]
+    assert [loss for _, loss, _ in told] == [
+        pytest.approx(N * np.log(FOUR["units"].target_unit[own]).sum()) for own in ([0, 2], [1, 3])
+    ]
+
+
+def test_groups_are_fitted_as_they_would_be_alone():
+    done = fitted(sharing=[[1, 3], [0, 2]], max_iter=8, **FOUR)
+    mean, variance = done.predictor().predict(X, NO_FEATURES, return_variance=True)
+    total = 0.0
+    for own in ([0, 2], [1, 3]):
+        alone = fitted(max_iter=8, **of_four(own))
+        expected_mean, expected = alone.predictor().predict(X, NO_FEATURES, return_variance=True)
+        np.testing.assert_allclose(mean[:, own], expected_mean, rtol=1e-5, atol=1e-6)
+        np.testing.assert_allclose(variance[:, own], expected, rtol=1e-5, atol=1e-8)
+        np.testing.assert_allclose(done.predictor().noise[own], alone.predictor().noise, rtol=1e-5)
+        total += alone.lower_bound
+    assert done.lower_bound == pytest.approx(total, rel=1e-6)
+
+
+def test_limits_and_bounds_of_groups_are_those_of_the_outputs():
+    done = fitted(sharing=[[0, 2], [1, 3]], max_iter=3, **FOUR)
+    rows, predictor = FOUR["units"].rows(source_of(Y=FOUR["Y"], H=NO_FEATURES)), done.predictor()
+    bounds = [
+        done.bound_at(rows, o, group.hyperparameters, float(predictor.signal[o]))[0]
+        for o, group in enumerate(predictor.by_output)
+    ]
+    assert sum(bounds) == pytest.approx(done.lower_bound, rel=1e-9)
+    for o in range(4):
+        alone = fitted(max_iter=0, **of_four([o]))
+        np.testing.assert_allclose(done.limits("signal", o), alone.limits("signal", 0), rtol=1e-10)

@@ -3,11 +3,15 @@ import pytest
 
 from skevgp.fitting.start import alike_neighbours, features_alone, parameter_of, starting_table, unit_of
 from skevgp.fitting.strategy import Rules
+from skevgp.inference.model import SparseModel
 from skevgp.kernels.parse import Start, Starts
+from skevgp.kernels.stationary import SquaredExponential
 from skevgp.optimizers.parameters import ParameterTable
 from skevgp.rows.source import LocalSource, Moments
+from skevgp.rows.threads import BlockMap
 
 from ..oracle import identity_rows
+from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, N, X, Y, source_of, units_of
 
 
 def weights_alone(H, r, scale):
@@ -106,3 +110,96 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     np.testing.assert_allclose([lower["hyperparameters"], upper["hyperparameters"]], [0.1 * sigma, 10.0 * root * sigma])
     np.testing.assert_allclose([lower["signal"], upper["signal"]], [[1e-3] * 2, [1e3] * 2])
     np.testing.assert_allclose([lower["noise"], upper["noise"]], [1e-10 * scatter, [50.0] * 2])
+
+
+# --- there and back between the user's units and the internal ones ---------------------------------------------------
+
+ROWS = source_of().take(np.arange(N))
+
+
+@pytest.mark.parametrize("features", [H, NO_FEATURES], ids=["features", "none"])
+@pytest.mark.parametrize("target_mean", [(0.0, 0.0), (3.0, -20.0)])
+def test_targets_come_back(target_mean, features):
+    units = units_of(H=features, target_mean=target_mean)
+    raw = source_of(H=features).take(np.arange(N))
+    internal = units.to_internal(raw)
+    assert internal.inputs is raw.inputs
+    assert internal.features is raw.features
+    back = units.target_mean + raw.features @ units.prior.offset.T + internal.targets * units.target_unit
+    np.testing.assert_allclose(back, Y, rtol=1e-12)
+
+
+def test_residuals_are_of_order_one_whatever_the_units():
+    for factor in (1.0, 1e-9, 1e9):
+        scaled = {"H": NO_FEATURES, "Y": factor * Y}
+        residuals = units_of(**scaled).to_internal(source_of(**scaled).take(np.arange(N))).targets
+        np.testing.assert_allclose(np.mean(residuals**2, axis=0), 1.0, rtol=1e-9)
+
+
+def test_the_features_leave_as_little_as_they_can_at_the_reference():
+    """Least squares of y on them, the priors being wide."""
+    fitted = np.linalg.lstsq(H, Y, rcond=None)[0]
+    left = np.sqrt(np.mean((Y - H @ fitted) ** 2, axis=0))
+    np.testing.assert_allclose(units_of().target_unit, left, rtol=1e-2)
+    assert (units_of().target_unit < units_of(H=NO_FEATURES).target_unit).all()
+
+
+def test_the_prior_is_that_of_the_user():
+    prior = units_of().prior
+    np.testing.assert_array_equal(prior.mean, COEF_MEAN)
+    np.testing.assert_array_equal(prior.scale, COEF_SCALE)
+
+
+def test_the_internal_prior_is_that_of_weights_in_units_of_their_target():
+    units = units_of()
+    internal, unit = units.internal_prior(), units.target_unit[:, np.newaxis]
+    np.testing.assert_allclose(internal.mean * unit, COEF_MEAN)
+    np.testing.assert_allclose(internal.scale * unit, COEF_SCALE)
+    np.testing.assert_allclose(internal.offset * unit, units.prior.offset)
+
+
+def test_rows_are_in_internal_units():
+    units, threads = units_of(), BlockMap()
+    rows = units.rows(source_of(), threads)
+    assert rows.threads is threads
+    np.testing.assert_array_equal(rows.some(np.array([4, 2])).targets, units.to_internal(ROWS).targets[[4, 2]])
+    np.testing.assert_allclose(rows.scatter(), units.to_internal(ROWS).targets.var(axis=0), rtol=1e-12)
+
+
+def test_a_density_per_row_goes_to_the_users_units_by_the_logarithm_of_the_unit():
+    """log N(y | μ, s²) = log N(y / u | μ / u, (s / u)²) - log u."""
+    units = units_of()
+    assert units.log_unit(slice(0, 2)) == pytest.approx(np.log(units.target_unit).sum())
+    assert units.log_unit(slice(1, 2)) == pytest.approx(np.log(units.target_unit[1]))
+
+
+def test_predictions_are_of_y():
+    """A model of internal residuals, one output at a time, speaks of y: its mean, its noise and its weights."""
+    units = units_of(target_mean=(3.0, -20.0))
+    kernel, prior, rows = SquaredExponential(2), units.internal_prior(), units.rows(source_of())
+    parts = []
+    for o in range(2):
+        own = slice(o, o + 1)
+        model = SparseModel(kernel, prior.outputs(own), "full", (slice(0, 1),))
+        values = {
+            "hyperparameters": np.ones(2),
+            "signal": np.ones(1),
+            "noise": np.full(1, 0.01),
+            "inducing_points": X[np.newaxis, :20],
+        }
+        parts.append(model.at_optimum(values, model.statistics(values, rows.outputs(own).blocks(kernel, 20)))[1])
+    predictor = units.predictor(parts, [[0], [1]])
+    mean, variance = predictor.predict(X, H, return_variance=True)
+    np.testing.assert_allclose(predictor.noise, 0.01 * units.target_unit**2)
+    assert (np.abs(Y - mean) < 4.0 * np.sqrt(variance + predictor.noise)).all()
+    for o, part in enumerate(parts):
+        internal, spread = part.predict(X, H, return_variance=True)
+        left_over = internal[:, 0] - H @ prior.offset[o]
+        in_units = units.target_mean[o] + H @ units.prior.offset[o] + units.target_unit[o] * left_over
+        np.testing.assert_allclose(mean[:, o], in_units, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(variance[:, o], units.target_unit[o] ** 2 * spread[:, 0], rtol=1e-10)
+        coef, covariance = part.coefficients()
+        np.testing.assert_allclose(predictor.coefficients()[0][o], units.target_unit[o] * coef[0], rtol=1e-9)
+        np.testing.assert_allclose(
+            predictor.coefficients()[1][o], units.target_unit[o] ** 2 * covariance[0], rtol=1e-10
+        )

@@ -107,7 +107,8 @@ def test_the_intercept_is_part_of_the_mean_only():
 @pytest.mark.parametrize("shared", [True, False])
 def test_scaled_outputs_are_predicted_in_their_units(shared):
     predictor, factor = some_posterior(shared)[0], np.array([10.0, 0.01])
-    joined = Predictor.joined([predictor], factor, factor[:, np.newaxis] * predictor.offset, np.zeros(O))
+    offset = factor[:, np.newaxis] * predictor.offset
+    joined = Predictor.joined([predictor], [[0, 1]], factor, offset, np.zeros(O))
     mean, covariance = predictor.covariance(X_NEW, H_NEW)
     found_mean, found = joined.covariance(X_NEW, H_NEW)
     np.testing.assert_allclose(found_mean, mean * factor, rtol=1e-12)
@@ -116,8 +117,9 @@ def test_scaled_outputs_are_predicted_in_their_units(shared):
     np.testing.assert_allclose(joined.signal, predictor.signal * factor**2, rtol=1e-15)
 
 
-def test_predictors_of_single_outputs_are_joined_side_by_side():
-    """Each with its own points; units, offset and intercept are those of the whole."""
+@pytest.mark.parametrize("order", [[0, 1], [1, 0]])
+def test_predictors_of_single_outputs_are_joined_each_to_its_own(order):
+    """In whatever order they come, each with its own points; units, offset and intercept are those of the whole."""
     whole, mean, _, values, model = some_posterior(shared=False)
     rng = np.random.RandomState(3)
     root = (rng.randn(O, M + P), 0.5 * rng.randn(O, M + P, M + P))[1]
@@ -129,8 +131,13 @@ def test_predictors_of_single_outputs_are_joined_side_by_side():
         of_output["hyperparameters"] = values["hyperparameters"]
         parts.append(alone.predictor(of_output, list(alone.whitenings(of_output)), mean[own], root[own]))
     unit, offset, intercept = np.array([2.0, 30.0]), RNG.randn(O, P), np.array([1.0, -4.0])
-    joined, expected = (Predictor.joined(own, unit, offset, intercept) for own in (parts, [whole]))
-    assert [group.outputs for group in joined.groups] == [slice(0, 1), slice(1, 2)]
+    joined = Predictor.joined([parts[o] for o in order], [[o] for o in order], unit, offset, intercept)
+    expected = Predictor.joined([whole], [[0, 1]], unit, offset, intercept)
+    assert [group.outputs for group in joined.groups] == [[o] for o in order]
+    for group, of_whole in zip(joined.by_output, expected.by_output, strict=True):
+        np.testing.assert_array_equal(group.points, of_whole.points)
+    np.testing.assert_array_equal(joined.signal, expected.signal)
+    np.testing.assert_array_equal(joined.noise, expected.noise)
     for found, of_whole in zip(joined.covariance(X_NEW, H_NEW), expected.covariance(X_NEW, H_NEW), strict=True):
         np.testing.assert_allclose(found, of_whole, rtol=1e-10, atol=1e-10)
     for found, of_whole in zip(joined.coefficients(), expected.coefficients(), strict=True):

@@ -57,7 +57,7 @@ def cluster():
         yield cluster
 
 
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+@pytest.mark.parametrize("sharing", ["all", "kernel", "none", [[1], [0]], "auto"], ids=str)
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)])
 def test_fit_to_chunks_is_fit_to_arrays(sharing, feature_map):
     parameters = {"sharing": sharing, "feature_map": feature_map, "max_iter": 5}
