@@ -42,18 +42,11 @@ class LBFGS(BaseEstimator):
         ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
         start. Each takes the time of a fit.
     callback : callable, default=None
-<<<<<<< HEAD
         callback(iteration, lower_bound, outputs), once per iteration; on a sample of the rows the bound is that of the
-        sample, times the number of rows over its size; ``outputs`` is the range of y's columns that the
-        bound is of: where outputs share nothing, each has fits of its own. A StopIteration or KeyboardInterrupt that
-        it raises ends the fit with the best parameters so far, as Ctrl-C does. ``clone`` copies a callable object, and
-        leaves a function what it is.
-=======
-        callback(iteration, lower_bound, outputs), once per iteration; ``outputs`` are the columns of y that the bound
-        is of, a range or, of a group with gaps, a tuple: where outputs share nothing, each has fits of its own, and
-        with groups each group. A StopIteration or KeyboardInterrupt that it raises ends the fit with the best
-        parameters so far, as Ctrl-C does. ``clone`` copies a callable object, and leaves a function what it is.
->>>>>>> 88ccdffcf1704cc87d65bd09ea45e75796e1326d
+        sample, times the number of rows over its size. ``outputs`` are the columns of y that the bound is of, a range
+        or, of a group with gaps, a tuple: where outputs share nothing, each has fits of its own, and with groups each
+        group. A StopIteration or KeyboardInterrupt that it raises ends the fit with the best parameters so far, as
+        Ctrl-C does. ``clone`` copies a callable object, and leaves a function what it is.
 
     Attributes
     ----------
