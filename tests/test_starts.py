@@ -136,6 +136,7 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places():
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore:The bound was still rising")
 @pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
 def test_points_stay_where_they_have_a_reason_to(why):
     """The same fit as from clusters, or from the user's points, which are not placed anew."""

@@ -162,6 +162,8 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
 
 
 @pytest.mark.slow
+# Some hyperparameters may end at their limit, and the user is told.
+@pytest.mark.filterwarnings("ignore:The optimal value found")
 @pytest.mark.parametrize("name", TREES)
 def test_a_fit_gains_and_comes_back_as_the_same_tree(name):
     kernel = TREES[name]
