@@ -67,7 +67,7 @@ class EVGPRegressor(SparseGaussianProcess):
     sharing : {"all", "kernel", "none", "auto"} or list of list of int, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Groups, as ``[[0, 1], [2, 3]]``, share as ``"all"`` inside, and nothing with each other;
-        ``"auto"`` finds them by short fits to up to 1,000 rows: sharing costs none of their outputs more than 1 % of
+        ``"auto"`` finds them by short fits to up to 1,000 rows: on these it costs none of their outputs more than 1 % of
         what its own Gaussian process gains, in nats, over features and noise. Signal variance, noise and weights are
         always per output.
     posterior : {"full", "diagonal"}, default="full"
@@ -144,7 +144,7 @@ class EVGPRegressor(SparseGaussianProcess):
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
         With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
-        Minus the bound per iteration (of Adam: a mini-batch's estimate).
+        Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate).
     n_iter_ : int
         Iterations of the start that was kept (a fit whose noise comes to explain everything is tried from others).
     n_parameters_ : int

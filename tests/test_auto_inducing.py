@@ -126,3 +126,20 @@ def test_other_values_are_refused(wrong):
 def test_adam_is_told_a_number(solver):
     with pytest.raises(ValueError, match=r'n_inducing="auto" needs solver="lbfgs"'):
         model(solver=solver).fit(X, Y)
+
+
+def test_a_warm_start_has_no_more_points_than_it_may():
+    m = EVGPRegressor(n_inducing="auto", warm_start=True, random_state=0)
+    X = np.random.RandomState(0).uniform(-3.0, 3.0, (200, 2))
+    y = np.sin(2.0 * X[:, 0]) * np.cos(X[:, 1]) + 0.1 * X[:, 1]
+    assert len(m.fit(X, y).inducing_points_) > 15
+    assert len(m.set_params(max_inducing=15).fit(X, y).inducing_points_) <= 15
+    assert len(m.set_params(max_inducing=1000).fit(X[:12], y[:12]).inducing_points_) <= 12
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_a_kernel_that_could_not_learn_is_no_reason_for_more_points():
+    X = np.random.RandomState(0).uniform(-3.0, 3.0, (200, 2))
+    y = np.sin(X[:, 0]) + X[:, 1]
+    m = EVGPRegressor(n_inducing="auto", max_iter=1, random_state=0).fit(X, y)
+    assert len(m.inducing_points_) < 100

@@ -42,7 +42,7 @@ def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None
             f"noise. The best parameters are kept; a larger tol{', fewer inducing points' if sparse else ''} or a "
             "WhiteKernel with a lower bound on the noise end sooner."
         )
-    sooner = "a tol" if tol is None else f"a larger tol (now {tol})"
+    sooner = 'a number for tol (now "auto")' if tol is None else f"a larger tol (now {tol})"
     return (
         f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
         f"max_iter, or stop earlier on purpose with {sooner}."

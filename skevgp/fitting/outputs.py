@@ -265,7 +265,7 @@ def plan(
             warm = previous.values_in(units, rows, kernel, i)
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
-        sets = _first_sets(points, len(groups), placement, warm)
+        sets = _first_sets(points, len(groups), placement, warm, len(rows))
         table = table_of(outputs, sets, variance)
         # Where they are all rows the bound is the likelihood: no other places are better.
         stay = request.family == "full" and len(inputs) == len(rows) and all(are_all_rows(own, inputs) for own in sets)
@@ -292,10 +292,14 @@ def plan(
     return tasks
 
 
-def _first_sets(points: np.ndarray, n_groups: int, placement: Placement, warm: Values | None) -> np.ndarray:
+def _first_sets(
+    points: np.ndarray, n_groups: int, placement: Placement, warm: Values | None, n_rows: int
+) -> np.ndarray:
     """Inducing points (g, m, d) of each group; where their number is to be found, those of the fit before go on."""
-    found = None if warm is None or placement.max_inducing is None else warm.get("inducing_points")
-    return np.repeat(points[np.newaxis], n_groups, axis=0) if found is None or len(found) != n_groups else found
+    found, most = None if warm is None else warm.get("inducing_points"), placement.max_inducing
+    if found is None or most is None or len(found) != n_groups or found.shape[1] > min(most, n_rows):
+        return np.repeat(points[np.newaxis], n_groups, axis=0)
+    return found
 
 
 def _models(request: Request) -> list[tuple[list[int], tuple[slice, ...]]]:

@@ -101,7 +101,11 @@ class SparseTask:
     def samples(self) -> tuple[int, ...]:
         """The sizes of the samples that the fit begins with."""
         interpolates = self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
-        return () if interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing)
+        return (
+            ()
+            if interpolates
+            else self.solver.rules.samples(len(self.rows), self.n_inducing + self.model.prior.scale.shape[1])
+        )
 
     @cached_property
     def _largest_sample(self) -> Rows:
@@ -228,7 +232,9 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
         unhindered = None if task.monitor.stopped else task.unhindered()
         while not task.monitor.stopped and (more := coarse.with_more(fit.values)) is not None:
             starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
-            if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
+            # A kernel that has had few iterations is not limited by its points.
+            enough = fit.converged or fit.n_iter >= _ITERATIONS
+            if unhindered is not None and enough and unhindered.missed_by(fit.values) > _MISSED:
                 starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
             # Where they start: nothing is optimised.
             start = max((more.minimise(Attempt(values, 0)) for values in starts), key=lambda tried: tried.bound)
@@ -293,7 +299,8 @@ class Learned:
             fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound,
             task.model.upper_bound(fit.values, statistics, task.blocks),
             predictor if fit.predictor is None else fit.predictor,
-            fit.loss_curve,
+            # That of a sample is not of these rows.
+            fit.loss_curve if fit.n_rows is None else [],
             " ".join(part for part in advice if part),
         )
         if task.noise_cv is not None and free_noise and not task.monitor.stopped:

@@ -60,7 +60,8 @@ class Rules:
         Iterations after which inducing points are placed anew, and so many again until it shows whether that was
         better; also those on each larger sample. None leaves the points.
     sample : (int, int), optional
-        Rows, and rows per inducing point: so many are enough to begin with, the larger number counts. None takes all.
+        Rows, and rows per inducing point and feature: so many are enough to begin with, the larger number counts. None
+        takes all.
     growth : int
         A sample is followed by one so many times larger, and those of more than half or `LARGEST_SAMPLE` of the rows by
         all.
@@ -83,11 +84,14 @@ class Rules:
     growth: int = 4
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
-    def samples(self, n_rows: int, n_inducing: int) -> tuple[int, ...]:
-        """The sizes of the samples that a fit begins with, of ``n_rows`` rows; none if there are too few."""
+    def samples(self, n_rows: int, n_weights: int) -> tuple[int, ...]:
+        """The sizes of the samples that a fit begins with, of ``n_rows`` rows; none if there are too few.
+
+        ``n_weights`` is the number of inducing points and features.
+        """
         if self.sample is None:
             return ()
-        sizes, size = [], max(self.sample[0], self.sample[1] * n_inducing)
+        sizes, size = [], max(self.sample[0], self.sample[1] * n_weights)
         while size <= min(n_rows // 2, LARGEST_SAMPLE):
             sizes.append(size)
             size *= self.growth
@@ -252,7 +256,8 @@ class Strategy:
         assert best is not None
         if self.collapsed(best):
             return (yield from self._staged(values, self.max_iter))
-        return (yield Attempt(best.values, self.max_iter))
+        fit = yield Attempt(best.values, self.max_iter)
+        return better(fit, (yield from self._staged(values, self.max_iter))) if self.collapsed(fit) else fit
 
     def _staged(self, values: Values, max_iter: int, n_rows: int | None = None) -> Attempts:
         """A fit whose inducing points are placed anew under the kernel that the first iterations learned.

@@ -322,3 +322,11 @@ def test_after_ctrl_c_on_a_sample_its_best_fit_counts():
     assert len(made) == 2
     assert best.n_rows == 1000
     assert best.bound == 2.0
+
+
+def test_what_collapses_on_all_rows_only_starts_anew_there():
+    rules = replace(RULES, other_starts=(), much_noise=None)
+    made, best = drive(strategy(rules=rules, samples=(1000,)), (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
+    assert [attempt.n_rows for attempt in made] == [1000, None, None]
+    np.testing.assert_allclose(made[2].values["noise"], 1e-4)
+    assert best.bound == 3.0
