@@ -67,9 +67,9 @@ class EVGPRegressor(SparseGaussianProcess):
     sharing : {"all", "kernel", "none", "auto"} or list of list of int, default="all"
         What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only (the
         paper's), or nothing. Groups, as ``[[0, 1], [2, 3]]``, share as ``"all"`` inside, and nothing with each other;
-        ``"auto"`` finds them by short fits to up to 1,000 rows: on these it costs none of their outputs more than 1 % of
-        what its own Gaussian process gains, in nats, over features and noise. Signal variance, noise and weights are
-        always per output.
+        ``"auto"`` finds them by short fits to up to 1,000 rows: on these it costs no output more than 1 % of what its
+        own Gaussian process gains, in nats, over features and noise. Signal variance, noise and weights are always per
+        output.
     posterior : {"full", "diagonal"}, default="full"
         q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
     coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"

@@ -135,11 +135,3 @@ def test_a_warm_start_has_no_more_points_than_it_may():
     assert len(m.fit(X, y).inducing_points_) > 15
     assert len(m.set_params(max_inducing=15).fit(X, y).inducing_points_) <= 15
     assert len(m.set_params(max_inducing=1000).fit(X[:12], y[:12]).inducing_points_) <= 12
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_a_kernel_that_could_not_learn_is_no_reason_for_more_points():
-    X = np.random.RandomState(0).uniform(-3.0, 3.0, (200, 2))
-    y = np.sin(X[:, 0]) + X[:, 1]
-    m = EVGPRegressor(n_inducing="auto", max_iter=1, random_state=0).fit(X, y)
-    assert len(m.inducing_points_) < 100

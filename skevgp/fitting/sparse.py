@@ -101,11 +101,8 @@ class SparseTask:
     def samples(self) -> tuple[int, ...]:
         """The sizes of the samples that the fit begins with."""
         interpolates = self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
-        return (
-            ()
-            if interpolates
-            else self.solver.rules.samples(len(self.rows), self.n_inducing + self.model.prior.scale.shape[1])
-        )
+        n_weights = self.n_inducing + self.model.prior.scale.shape[1]
+        return () if interpolates else self.solver.rules.samples(len(self.rows), n_weights)
 
     @cached_property
     def _largest_sample(self) -> Rows:
@@ -232,9 +229,7 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
         unhindered = None if task.monitor.stopped else task.unhindered()
         while not task.monitor.stopped and (more := coarse.with_more(fit.values)) is not None:
             starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
-            # A kernel that has had few iterations is not limited by its points.
-            enough = fit.converged or fit.n_iter >= _ITERATIONS
-            if unhindered is not None and enough and unhindered.missed_by(fit.values) > _MISSED:
+            if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
                 starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
             # Where they start: nothing is optimised.
             start = max((more.minimise(Attempt(values, 0)) for values in starts), key=lambda tried: tried.bound)
