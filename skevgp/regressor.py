@@ -144,7 +144,8 @@ class EVGPRegressor(SparseGaussianProcess):
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
         With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
-        Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate).
+        Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
+        sample of the rows: the sample's, times the number of rows over its size).
     n_iter_ : int
         Iterations of the start that was kept (a fit whose noise comes to explain everything is tried from others).
     n_parameters_ : int

@@ -294,8 +294,7 @@ class Learned:
             fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound,
             task.model.upper_bound(fit.values, statistics, task.blocks),
             predictor if fit.predictor is None else fit.predictor,
-            # That of a sample is not of these rows.
-            fit.loss_curve if fit.n_rows is None else [],
+            fit.loss_curve,
             " ".join(part for part in advice if part),
         )
         if task.noise_cv is not None and free_noise and not task.monitor.stopped:
