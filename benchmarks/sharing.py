@@ -13,8 +13,6 @@ from __future__ import annotations
 
 import itertools
 import sys
-import time
-import warnings
 from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -24,13 +22,11 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))  # for what the scripts share
 
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import harness
 from harness import Row
-from paper.models import QUICK_TRAJECTORIES, Fit, build, fitted_part, measures
+from paper.models import QUICK_TRAJECTORIES, Fit, build, fitted_part, measures, timed
 from skevgp.datasets import make_dynamics
 
 N_OUTPUTS = {"pendulum": 2, "cartpole": 4, "acrobot": 4}
@@ -97,12 +93,7 @@ def run(cell: Cell) -> dict[str, Any]:
     regressor = build(Fit(cell.system, cell.model, "skevgp", cell.seed, cell.size, cell.max_iter))
     sharing = cell.sharing if cell.sharing in ("auto", "kernel") else groups_of(cell.sharing)
     regressor.set_params(**{"regressor__sharing" if cell.model == "RES-VGP" else "sharing": sharing})
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        start = time.process_time()
-        regressor.fit(train.data, train.target)
-        seconds = time.process_time() - start
-        mean, std = regressor.predict(test.data, return_std=True)
+    mean, std, seconds, _ = timed(regressor, train, test)
     fitted = fitted_part(regressor)
     return {
         **{name: getattr(cell, name) for name in ("system", "model", "seed", "sharing", "size")},

@@ -138,7 +138,7 @@ class LBFGS(BaseEstimator):
             self._tolerance(task),
             task.monitor.seen_as(spent, n_rows),
             self.descent,
-            None if attempt.cold else self._units(task, table, attempt),
+            None if attempt.cold else self._units(task, table),
         )
         return Fit(
             table.values(minimum.x),
@@ -155,7 +155,7 @@ class LBFGS(BaseEstimator):
             return Tolerance(task.tol / n_rows)
         return Tolerance(_LEAST_TOL / n_rows, self.descent.enough, -task.alone / n_rows)
 
-    def _units(self, task: SparseTask, table: ParameterTable, attempt: Attempt) -> Callable[[np.ndarray], np.ndarray]:
+    def _units(self, task: SparseTask, table: ParameterTable) -> Callable[[np.ndarray], np.ndarray]:
         """From the curvature on the smallest sample, or on the rows that are fitted."""
         objective = BoundObjective(task.model, table, task.blocks_of(task.samples[0] if task.samples else None))
         return lambda x: curvature_units(objective, x, table.alike(), self.descent.probes)

@@ -53,16 +53,21 @@ def test_finite_data_never_fail(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = EVGPRegressor(**arguments, max_iter=30, random_state=0).fit(X, Y)
-    mean, std = model.predict(np.vstack([X, X + X.std(axis=0)]), return_std=True)
-    assert np.isfinite(mean).all()
-    assert np.isfinite(std).all()
-    assert (std > 0).all()
+    assert_finite(model, X)
     assert np.isfinite(model.lower_bound_)
     assert np.isfinite(model.upper_bound_)
     if arguments["solver"] == "lbfgs":
         # Adam's lower bound is summed in another way, of which rounding at 1e8 leaves other digits.
         assert_above(model.upper_bound_, model.lower_bound_)
     assert np.isfinite(model.sample_y(X[:3])).all()
+
+
+def assert_finite(model, X):
+    """Predictions near the rows."""
+    mean, std = model.predict(np.vstack([X, X + X.std(axis=0)]), return_std=True)
+    assert np.isfinite(mean).all()
+    assert np.isfinite(std).all()
+    assert (std > 0).all()
 
 
 def assert_above(upper, lower):
@@ -77,10 +82,7 @@ def test_finite_data_never_fail_however_many_points_there_are_to_be(seed):
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = EVGPRegressor(**arguments, max_iter=20, random_state=0).fit(X, Y)
-    mean, std = model.predict(np.vstack([X, X + X.std(axis=0)]), return_std=True)
-    assert np.isfinite(mean).all()
-    assert np.isfinite(std).all()
-    assert (std > 0).all()
+    assert_finite(model, X)
     assert_above(model.upper_bound_, model.lower_bound_)
 
 

@@ -177,6 +177,17 @@ def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str,
     }
 
 
+def timed(regressor: Any, train: Bunch, test: Bunch) -> tuple[np.ndarray, np.ndarray, float, list[Any]]:
+    """Fit it: mean and std (n, o) on the test rows, processor seconds of one thread, and the fit's warnings."""
+    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", ConvergenceWarning)
+        start = time.process_time()
+        regressor.fit(train.data, train.target)
+        seconds = time.process_time() - start
+        mean, std = regressor.predict(test.data, return_std=True)
+    return mean, std, seconds, caught
+
+
 def fitted_row(
     fit: Fit, train: Bunch, test: Bunch, changes: dict[str, Any] | None = None, **columns: Any
 ) -> dict[str, Any]:
@@ -199,12 +210,7 @@ def fitted_row(
     """
     changes = changes or {}
     regressor, max_iter = build(fit).set_params(**changes), changes.get("max_iter", fit.max_iter)
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ConvergenceWarning)
-        start = time.process_time()
-        regressor.fit(train.data, train.target)
-        seconds = time.process_time() - start
-        mean, std = regressor.predict(test.data, return_std=True)
+    mean, std, seconds, caught = timed(regressor, train, test)
     fitted = fitted_part(regressor)
     return {
         **{name: getattr(fit, name) for name in ("system", "model", "setting", "seed")},

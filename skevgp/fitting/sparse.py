@@ -100,26 +100,22 @@ class SparseTask:
     @cached_property
     def samples(self) -> tuple[int, ...]:
         """The sizes of the samples that the fit begins with."""
-        interpolates = self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
         n_weights = self.n_inducing + self.model.prior.scale.shape[1]
-        return () if interpolates else self.solver.rules.samples(len(self.rows), n_weights)
-
-    @cached_property
-    def _largest_sample(self) -> Rows:
-        return self.rows.sampled(self.samples[-1], self.rng)
-
-    def blocks_of(self, n_rows: int | None) -> Blocks:
-        """A sample of so many rows, of which the smaller ones are parts; None means all."""
-        if n_rows is None:
-            return self.blocks
-        if n_rows not in self._sampled:
-            part = self._largest_sample.part(0, n_rows, 1.0)
-            self._sampled[n_rows] = part.blocks(self.model.kernel, self.n_inducing)
-        return self._sampled[n_rows]
+        return () if self.interpolates else self.solver.rules.samples(len(self.rows), n_weights)
 
     @cached_property
     def _sampled(self) -> dict[int, Blocks]:
-        return {}
+        largest = self.rows.sampled(self.samples[-1], self.rng)
+        return {n: largest.part(0, n, 1.0).blocks(self.model.kernel, self.n_inducing) for n in self.samples}
+
+    def blocks_of(self, n_rows: int | None) -> Blocks:
+        """A sample of so many rows, of which the smaller ones are parts; None means all."""
+        return self.blocks if n_rows is None else self._sampled[n_rows]
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether there are as many inducing points as rows; points that stay are all rows, some perhaps the same."""
+        return self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
 
     @cached_property
     def alone(self) -> float:
@@ -142,8 +138,7 @@ class SparseTask:
             self.solver.n_restarts,
             self.rows.scatter(),
             alone=self.alone,
-            # Points that stay are all rows, some of them perhaps the same.
-            interpolates=self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any(),
+            interpolates=self.interpolates,
             samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),
             restart=lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),

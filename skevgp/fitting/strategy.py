@@ -9,7 +9,7 @@ prevents, and the test that fails without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol
 
 import numpy as np
@@ -247,17 +247,18 @@ class Strategy:
         stage = self.rules.stage
         if stage is None or not self.samples or self.max_iter == 0:
             return (yield from self._staged(values, self.max_iter))
-        best: Fit | None = None
-        for n_rows in self.samples:
-            if best is None or self.collapsed(best):
-                best = yield from self._staged(values, min(2 * stage, self.max_iter), n_rows)
+        few, (smallest, *larger) = min(2 * stage, self.max_iter), self.samples
+        best = yield from self._staged(values, few, smallest)
+        for n_rows in larger:
+            if self.collapsed(best):
+                best = yield from self._staged(values, few, n_rows)
             else:
                 best = yield Attempt(best.values, min(stage, self.max_iter), n_rows=n_rows)
-        assert best is not None
-        if self.collapsed(best):
-            return (yield from self._staged(values, self.max_iter))
-        fit = yield Attempt(best.values, self.max_iter)
-        return better(fit, (yield from self._staged(values, self.max_iter))) if self.collapsed(fit) else fit
+        if not self.collapsed(best):
+            best = yield Attempt(best.values, self.max_iter)
+            if not self.collapsed(best):
+                return best
+        return better(best, (yield from self._staged(values, self.max_iter)))
 
     def _staged(self, values: Values, max_iter: int, n_rows: int | None = None) -> Attempts:
         """A fit whose inducing points are placed anew under the kernel that the first iterations learned.
@@ -289,19 +290,18 @@ class Strategy:
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Attempts:
         """A fit from these values; from other starts too where it may have ended in a bad optimum."""
 
-        def cold(values: Values) -> Attempt:
-            return Attempt(values, until, n_rows=n_rows, cold=True)
+        def start(values: Values, cold: bool = True) -> Attempt:
+            return Attempt(values, until, n_rows=n_rows, cold=cold)
 
-        best = yield cold(values)
+        best = yield start(values)
         if until == 0 or not self.table["noise"].free.any():
             return best
         if (self.interpolates or n_rows is not None) and self.rules.much_noise is not None:
-            high = cold(moved(values, 1.0, self.rules.much_noise))
-            best = better(best, (yield replace(high, cold=n_rows is None)))
+            best = better(best, (yield start(moved(values, 1.0, self.rules.much_noise), cold=n_rows is None)))
         for factors in self.rules.other_starts:
             if not self.collapsed(best):
                 break
-            best = better(best, (yield cold(moved(values, *factors))))
+            best = better(best, (yield start(moved(values, *factors))))
         return best
 
 

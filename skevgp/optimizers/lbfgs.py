@@ -168,10 +168,9 @@ def lbfgs(
             left = max_iter - minimum.n_iter
             ends = {"maxiter": left, "maxfun": 20 * left + 100, "ftol": 0.0, "gtol": descent.gradient}
             box = np.column_stack([limit / guarded.unit for limit in limits])
-            start = x / guarded.unit
             result = minimize(
                 guarded,
-                start,
+                x / guarded.unit,
                 jac=True,
                 method="L-BFGS-B",
                 bounds=box,
