@@ -23,6 +23,8 @@ from .sparse import SparseTask
 
 # Of what its own Gaussian process gains an output over features and noise.
 _LARGEST_LOSS = 0.01
+# In squared internal units: rounding.
+_CONSTANT = 1e-12
 # By which groups are found: at most so many rows and points; iterations of the first fit and of others; in nats.
 _SAMPLE, _POINTS = 1000, 100
 _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
@@ -70,6 +72,7 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
     so that what follows is a matter of the kernel and not of luck: from there each output is fitted alone, and all
     together. If that costs one of them too much (`_LARGEST_LOSS`), each becomes a group, and of all pairs of groups
     those with the kernels most alike are tried first, and joined if it costs no output too much, until none is left.
+    Outputs that learned nothing from the sample are the last group.
 
     Parameters
     ----------
@@ -91,8 +94,8 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
         return [everything]
     found = side_by_side(fits.alone, everything, request.n_threads, monitor)
     own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
-    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978): what gains less can be in
-    # any group.
+    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978): of what gains less, the
+    # sample shows nothing.
     gain, chance = own - fits.without, 0.5 * fits.n_free * np.log(fits.n_rows)
     bearable = np.maximum(_LARGEST_LOSS * gain, chance)
     learned = [o for o in everything if gain[o] > chance]
@@ -101,8 +104,18 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
         return bool((own[outputs] - bounds <= bearable[outputs]).all())
 
-    if not learned or suits(learned, fits.further(learned, fits.together)):
+    if not learned:
         return [everything]
+    # Rows that were not drawn may show it, and then the others must not rule its kernel: a group of its own.
+    varies = Rows(request.source, request.units.to_internal).residuals.variance > _CONSTANT
+    hidden = [o for o in everything if o not in learned and varies[o]]
+    constant = [o for o in everything if o not in learned and not varies[o]]
+
+    def completed(groups: list[list[int]]) -> list[list[int]]:
+        return [sorted([*groups[0], *constant]), *groups[1:], *([hidden] if hidden else [])]
+
+    if suits(learned, fits.further(learned, fits.together)):
+        return completed([learned])
     groups, apart = [[o] for o in learned], np.eye(len(everything), dtype=bool)
     while True:
         shapes = [fits.shape(found[group[0]]) for group in groups]
@@ -112,7 +125,7 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
             if not apart[np.ix_(groups[i], groups[j])].any()
         ]
         if not pairs:
-            return [sorted({*groups[0], *everything}.difference(*groups[1:])), *groups[1:]]
+            return completed(groups)
         _, i, j = max(pairs)
         outputs = sorted(groups[i] + groups[j])
         shared = fits.further(outputs, found)
