@@ -109,6 +109,11 @@ def test_an_interrupted_fit_keeps_the_best():
     assert np.isfinite(m.predict(X_NEW)).all()
 
 
+def test_who_looks_on_is_told_how_many_points_there_are(capsys):
+    m = model(verbose=1, max_iter=30, tol=1.0).fit(X, Y[:, 1])
+    assert capsys.readouterr().out.startswith(f"{len(m.inducing_points_)} points, all rows, iteration ")
+
+
 def test_it_is_a_parameter_like_others():
     m = clone(model(max_inducing=30))
     assert (m.n_inducing, m.get_params()["max_inducing"]) == ("auto", 30)

@@ -285,7 +285,7 @@ def plan(
                 request.tol,
                 request.noise_cv,
                 seed,
-                monitor.seen_as(shift=shift, outputs=_as_columns(outputs)),
+                monitor.seen_as(shift=shift, outputs=_as_columns(outputs), about=_shown(outputs, len(models))),
                 None if warm is None else table.started_at(warm).values_at_start(),
             )
         )
@@ -332,6 +332,11 @@ def _as_columns(outputs: list[int]) -> Sequence[int]:
     """A range if they follow each other, else a tuple."""
     columns = range(outputs[0], outputs[-1] + 1)
     return columns if len(columns) == len(outputs) else tuple(outputs)
+
+
+def _shown(outputs: list[int], n_models: int) -> str:
+    """Whose line it is, where there are several models."""
+    return "" if n_models == 1 else f"y[:, {outputs[0] if len(outputs) == 1 else outputs}]"
 
 
 def _fit_one(task: SparseTask) -> Learned:

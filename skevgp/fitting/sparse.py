@@ -218,7 +218,12 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     `_MISSED`, growth does not end, and it is tried at each step.
     """
     nats = len(task.rows) * len(task.rows.scatter())
-    coarse = replace(task, max_iter=min(task.max_iter, _ITERATIONS), tol=max(task.tol or 0.0, _COARSE * nats))
+    coarse = replace(
+        task,
+        max_iter=min(task.max_iter, _ITERATIONS),
+        tol=max(task.tol or 0.0, _COARSE * nats),
+        monitor=task.monitor.seen_as(is_last=False),
+    )
     fit = search(coarse)
     with task.monitor.keeping_the_best():
         unhindered = None if task.monitor.stopped else task.unhindered()
@@ -232,7 +237,7 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
             if larger.bound - fit.bound < _GAIN * nats and not limited:
                 break
             coarse, fit = more, larger
-    task = replace(coarse, max_iter=task.max_iter, tol=task.tol)
+    task = replace(coarse, max_iter=task.max_iter, tol=task.tol, monitor=task.monitor)
     if fit.n_iter < task.max_iter and not task.monitor.stopped:
         fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter, fit)))
     return task, fit

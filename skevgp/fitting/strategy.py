@@ -153,6 +153,8 @@ class Attempt:
         Of the sample that is fitted; None means all rows.
     cold : bool, default=False
         Whether the values are a first guess, where the curvature of the bound says little of that at the end.
+    is_first : bool, default=False
+        Whether another start follows anyway.
     """
 
     values: Values
@@ -160,6 +162,12 @@ class Attempt:
     after: Fit | None = None
     n_rows: int | None = None
     cold: bool = False
+    is_first: bool = False
+
+    @property
+    def is_last(self) -> bool:
+        """Whether a fit that ends well ends with it, restarts aside."""
+        return self.n_rows is None and not self.is_first
 
     @property
     def loss_curve(self) -> list[float]:
@@ -290,14 +298,16 @@ class Strategy:
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Attempts:
         """A fit from these values; from other starts too where it may have ended in a bad optimum."""
 
-        def start(values: Values, cold: bool = True) -> Attempt:
-            return Attempt(values, until, n_rows=n_rows, cold=cold)
+        def start(values: Values, cold: bool = True, is_first: bool = False) -> Attempt:
+            return Attempt(values, until, n_rows=n_rows, cold=cold, is_first=is_first)
 
-        best = yield start(values)
-        if until == 0 or not self.table["noise"].free.any():
+        free = bool(self.table["noise"].free.any())
+        much = self.rules.much_noise if free and (self.interpolates or n_rows is not None) else None
+        best = yield start(values, is_first=much is not None)
+        if until == 0 or not free:
             return best
-        if (self.interpolates or n_rows is not None) and self.rules.much_noise is not None:
-            best = better(best, (yield start(moved(values, 1.0, self.rules.much_noise), cold=n_rows is None)))
+        if much is not None:
+            best = better(best, (yield start(moved(values, 1.0, much), cold=n_rows is None)))
         for factors in self.rules.other_starts:
             if not self.collapsed(best):
                 break
