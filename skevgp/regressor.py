@@ -96,7 +96,7 @@ class EVGPRegressor(SparseGaussianProcess):
     max_iter : int, default=None
         The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
-        Those with fewer inducing points, on the way of ``n_inducing="auto"``, do not count.
+        Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.003 % of what the fit has gained over

@@ -249,10 +249,9 @@ def plan(
         )
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
-    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean))))
-    hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
+    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean)))).values_at_start()
     inputs = rows.sample(placement.sample_size, rng).inputs
-    points = placement.points(inputs, kernel, hyperparameters, rng)
+    points = placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng)
     first = starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
@@ -287,6 +286,7 @@ def plan(
                 seed,
                 monitor.seen_as(shift=shift, outputs=_as_columns(outputs), about=_shown(outputs, len(models))),
                 None if warm is None else table.started_at(warm).values_at_start(),
+                warm is not None and sets is warm.get("inducing_points"),
             )
         )
     return tasks

@@ -210,6 +210,8 @@ class Strategy:
         () -> first values drawn at random.
     warm : dict, optional
         First values from another fit.
+    placed : bool
+        Whether the table's inducing points are from that fit.
     """
 
     rules: Rules
@@ -223,6 +225,7 @@ class Strategy:
     place: Callable[[Values], Values] | None = None
     restart: Callable[[], Values] | None = None
     warm: Values | None = None
+    placed: bool = False
 
     def attempts(self) -> Generator[Attempt, Fit, None]:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
@@ -231,8 +234,8 @@ class Strategy:
             yield from self._climbing(first)
         else:
             # Inducing points that another fit moved have found their places.
-            same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
-            again = self._climbing if same_points else self._once
+            moved_before = self.placed or not np.array_equal(self.warm["inducing_points"], first["inducing_points"])
+            again = self._once if moved_before else self._climbing
             fit = yield from again(first | self.warm)
             if self.max_iter > 0 and self.collapsed(fit):
                 yield from self._climbing(first)
