@@ -23,8 +23,6 @@ from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
 
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
-# On so many of the rows a second opinion begins: half of them cost an eighth. (On 250 it may miss what there is.)
-_FEW_ROWS = 500
 
 
 @dataclass(frozen=True)
@@ -129,16 +127,9 @@ class Unhindered:
         rng: np.random.RandomState,
         monitor: Monitor,
     ) -> Unhindered:
-        """Fit it, to some of the rows first; arguments as of `ExactModel` and `ExactTask`."""
+        """Fit it; arguments as of `ExactModel` and `ExactTask`."""
         model = ExactModel(kernel, prior, np.zeros(prior.scale.shape, dtype=bool), rows)
-        task = ExactTask(model, table, scatter, options, rng, monitor)
-        if len(rows.inputs) > _FEW_ROWS:
-            own = rng.permutation(len(rows.inputs))[:_FEW_ROWS]
-            few = RawRows(rows.inputs[own], rows.features[own], rows.targets[own])
-            first = search(replace(task, model=replace(model, rows=few)))
-            if not monitor.stopped and not task.strategy.collapsed(first):
-                return cls(model, task.minimise(Attempt(first.values, options.max_iter)), table.size)
-        return cls(model, search(task), table.size)
+        return cls(model, search(ExactTask(model, table, scatter, options, rng, monitor)), table.size)
 
     def missed_by(self, values: Values) -> float:
         """How much less likely the rows are under other values, in nats per row and output.

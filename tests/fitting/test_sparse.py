@@ -324,17 +324,6 @@ def test_few_iterations_do_not_ask_for_points():
     assert fit.n_iter <= 3
 
 
-def test_a_second_opinion_begins_on_some_of_the_rows(monkeypatch):
-    """And ends where it would have on all of them, if what is learned there is not nothing."""
-    task = growing()
-    directly = task.unhindered().fit
-    monkeypatch.setattr("skevgp.fitting.exact._FEW_ROWS", N // 2)
-    fit = task.unhindered().fit
-    assert fit.bound == pytest.approx(directly.bound, abs=0.02 * N * O)
-    monkeypatch.setattr("skevgp.fitting.exact._FEW_ROWS", 2)
-    assert task.unhindered().fit.bound == pytest.approx(directly.bound, abs=0.02 * N * O)
-
-
 def test_a_fit_that_was_stopped_gets_no_more_points():
     def stop(*told):
         raise StopIteration
