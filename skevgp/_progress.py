@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import shutil
+import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
-from threading import Event
+from math import log
+from threading import Event, Lock
+from typing import TextIO
 
 # Called once per iteration, with its number (from 1), the loss, and the columns of y that it is of.
 Report = Callable[[int, float, Sequence[int]], object]
+# Seconds between two looks of a line: on a terminal, and in a log.
+_LIVE, _LOG = 0.5, 10.0
+# A third of the fewest iterations that tell when the others end; L-BFGS needs about as many to see that it stalls.
+_FEW = 4
 
 
 class Monitor:
@@ -22,16 +30,25 @@ class Monitor:
     ----------
     report : callable, default=None
         report(iteration, loss, outputs), once per iteration.
+    progress : Progress, default=None
+        Told the same and more.
     """
 
-    def __init__(self, report: Report | None = None):
-        self._report = report
+    def __init__(self, report: Report | None = None, progress: Progress | None = None):
+        self._report, self._progress = report, progress
         self._stop = Event()
         self._n_before, self._factor, self._shift = 0, 1.0, 0.0
+        self._about, self._is_last = tuple[str, ...](), True
         self._outputs: Sequence[int] = range(0)
 
     def seen_as(
-        self, n_before: int = 0, factor: float = 1.0, shift: float = 0.0, outputs: Sequence[int] | None = None
+        self,
+        n_before: int = 0,
+        factor: float = 1.0,
+        shift: float = 0.0,
+        outputs: Sequence[int] | None = None,
+        about: str = "",
+        is_last: bool = True,
     ) -> Monitor:
         """The same monitor for a part of the fit: after so many iterations, its loss in other units.
 
@@ -43,30 +60,50 @@ class Monitor:
             The part's loss, times ``factor`` plus ``shift``, is the loss of the whole.
         outputs : sequence of int, default=None
             The columns of y that the part is of, if it knows better.
+        about : str, default=""
+            What part it is, for whoever looks on.
+        is_last : bool, default=True
+            Whether the whole is done when the part is.
         """
         part = copy(self)
         part._n_before += n_before
         part._shift += shift * self._factor
         part._factor *= factor
         part._outputs = self._outputs if outputs is None else outputs
+        part._about += (about,) if about else ()
+        part._is_last &= is_last
         return part
 
     def silent(self) -> Monitor:
         """The same monitor for a part of the fit of which nobody is told; it ends like the others."""
         part = copy(self)
-        part._report = None
+        part._report = part._progress = None
         return part
 
-    def iteration(self, number: int, loss: float) -> None:
+    def iteration(self, number: int, loss: float, most: int | None = None, enough: float | None = None) -> None:
         """Tell of an iteration; raises KeyboardInterrupt once the fit has been told to stop.
 
         A StopIteration, by which callbacks of SciPy's optimisers end them, tells it to.
+
+        Parameters
+        ----------
+        number : int
+        loss : float
+        most : int, default=None
+            The most iterations.
+        enough : float, default=None
+            The optimiser ends before that when iterations gain less.
         """
         if self.stopped:
             raise KeyboardInterrupt
+        number, loss = self._n_before + number, self._factor * loss + self._shift
+        if self._progress is not None:
+            most = self._n_before + most if self._is_last and most is not None else None
+            enough = None if enough is None else self._factor * enough
+            self._progress(number, loss, self._outputs, ", ".join(self._about), most, enough)
         if self._report is not None:
             try:
-                self._report(self._n_before + number, self._factor * loss + self._shift, self._outputs)
+                self._report(number, loss, self._outputs)
             except StopIteration:
                 raise KeyboardInterrupt from None
 
@@ -88,35 +125,114 @@ class Monitor:
             self.stop()
 
 
+class _Way:
+    """The iterations from one start, and how long they will go on."""
+
+    def __init__(self, about: str):
+        self.about, self.number = about, 0
+        self.times, self.losses = list[float](), list[float]()
+
+    def left(self, most: int | None, enough: float | None) -> float | None:
+        """In seconds; None as long as that cannot be known.
+
+        Gains fall as they fell from one third of the iterations to the next, the last, until they are small enough.
+        """
+        window = (len(self.losses) - 1) // 3
+        if most is None or window < _FEW:
+            return None
+        n_left = float(most - self.number)
+        if enough:
+            before = self.losses[-1 - 2 * window] - self.losses[-1 - window]
+            now, least = self.losses[-1 - window] - self.losses[-1], enough * window
+            if now > least and not now < before:
+                return None
+            windows = log(now / least) / log(before / now) - 0.5 if now > least else 0.0
+            n_left = min(n_left, max(windows, 0.0) * window + _FEW)
+        return n_left * (self.times[-1] - self.times[-1 - window]) / window
+
+
 class Progress:
-    """Print iteration, bound and time: about once a second at verbosity 1, at each iteration from 2.
+    """Print iteration, bound and time: at verbosity 1 in one live line, at each iteration from 2.
+
+    The line also tells the part of the fit and, once it can be known, about how much time is left for it. Where outputs
+    have fits of their own it is of the one that has just had an iteration. What is no terminal gets a line each ten
+    seconds, and the last.
 
     Parameters
     ----------
     verbose : int
+    stream : file, default=None
+        None means the standard output.
+    clock : callable
+        Seconds.
     """
 
-    def __init__(self, verbose: int):
-        self._verbose = verbose
-        self._start = self._last = time.monotonic()
+    def __init__(self, verbose: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic):
+        self._verbose, self._clock = verbose, clock
+        self._stream = sys.stdout if stream is None else stream
+        self._is_live = verbose == 1 and self._stream is not None and self._stream.isatty()
+        self._start = self._last = clock()
+        self._lock, self._ways = Lock(), dict[tuple[int, ...], _Way]()
+        self._text: Callable[[], str] | None = None
+        self._width = 0
 
-    def __call__(self, iteration: int, loss: float, outputs: Sequence[int]) -> None:
-        now = time.monotonic()
-        if iteration > 1 and self._verbose < 2 and now - self._last < 1.0:
+    def __call__(
+        self, number: int, loss: float, outputs: Sequence[int], about: str, most: int | None, enough: float | None
+    ) -> None:
+        """Tell of an iteration; arguments as of `Monitor`."""
+        with self._lock:
+            now = self._clock()
+            if self._verbose > 1:
+                print(f"iteration {number:6d}   bound {-loss:16.3f}   {now - self._start:8.1f} s", file=self._stream)
+                return
+            way = self._ways.get(tuple(outputs))
+            if way is None or (way.about, way.number + 1) != (about, number):
+                way = self._ways[tuple(outputs)] = _Way(about)
+            way.number = number
+            way.times.append(now)
+            way.losses.append(loss)
+
+            def text() -> str:
+                left = way.left(most, enough)
+                parts = [about, f"iteration {number}", f"bound {-loss:.3f}", f"{now - self._start:.0f} s"]
+                return ", ".join(filter(None, [*parts, "" if left is None else f"about {_rounded(left)} left"]))
+
+            self._text = text
+            if now - self._last >= (_LIVE if self._is_live else _LOG):
+                self._last = now
+                self._show()
+
+    def close(self) -> None:
+        """The fit is done: the line is the last."""
+        with self._lock:
+            self._show()
+            if self._width > 0:
+                print(file=self._stream)
+            self._width = 0
+
+    def _show(self) -> None:
+        if self._text is None:
             return
-        self._last = now
-        print(f"iteration {iteration:6d}   bound {-loss:16.3f}   {now - self._start:8.1f} s")
+        line, self._text = self._text(), None
+        if self._is_live:
+            # One longer than the terminal could not be written over.
+            line = line[: shutil.get_terminal_size().columns - 1]
+            print("\r" + line.ljust(self._width), end="", file=self._stream, flush=True)
+            self._width = len(line)
+        else:
+            print(line, file=self._stream, flush=True)
 
 
-def monitor_of(verbose: int, callback: Report | None = None) -> Monitor:
+def _rounded(seconds: float) -> str:
+    return f"{float(f'{max(seconds, 1.0):.1g}'):.0f} s" if seconds < 95.0 else f"{seconds / 60.0:.0f} min"
+
+
+@contextmanager
+def monitor_of(verbose: int, callback: Report | None = None) -> Iterator[Monitor]:
     """The monitor of a fit that prints as ``verbose`` says, and calls callback(iteration, bound, outputs)."""
     progress = Progress(verbose) if verbose else None
-    if callback is None:
-        return Monitor(progress)
-
-    def report(iteration: int, loss: float, outputs: Sequence[int]) -> None:
+    try:
+        yield Monitor(callback and (lambda number, loss, outputs: callback(number, -loss, outputs)), progress)
+    finally:
         if progress is not None:
-            progress(iteration, loss, outputs)
-        callback(iteration, -loss, outputs)
-
-    return Monitor(report)
+            progress.close()

@@ -69,7 +69,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
     random_state : int, RandomState instance or None, default=None
         Draws first weights, mini-batches, pre-activations, rows held back and the weights behind predictions.
     verbose : int, default=0
-        1 prints step, bound per row and time about once a second, 2 at each step.
+        As of `EVGPRegressor`: iterations are steps, and the bound is that per row.
 
     Attributes
     ----------
@@ -300,21 +300,21 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         start = network.start(rng)
         if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
             scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
-        monitor = monitor_of(self.verbose)
-        training = train(
-            network,
-            start,
-            scaling.inputs(inputs),
-            scaling.targets(targets),
-            rng,
-            n_held_back=n_held_back,
-            max_iter=max_iter,
-            batch_size=batch_size,
-            learning_rate=self.learning_rate_init,
-            tol=self.tol,
-            patience=self.n_iter_no_change,
-            monitor=monitor.seen_as(shift=scaling.log_unit),
-        )
+        with monitor_of(self.verbose) as monitor:
+            training = train(
+                network,
+                start,
+                scaling.inputs(inputs),
+                scaling.targets(targets),
+                rng,
+                n_held_back=n_held_back,
+                max_iter=max_iter,
+                batch_size=batch_size,
+                learning_rate=self.learning_rate_init,
+                tol=self.tol,
+                patience=self.n_iter_no_change,
+                monitor=monitor.seen_as(shift=scaling.log_unit),
+            )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
         self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit

@@ -66,7 +66,7 @@ class EGPRegressor(ExplicitGaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0
-        1 prints iteration, log marginal likelihood and time about once a second, 2 at each iteration.
+        As of `EVGPRegressor`; its bound is the log marginal likelihood.
 
     Attributes
     ----------
@@ -188,7 +188,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
-        with unchanged_if_it_fails(self), single_threaded_libraries():
+        with unchanged_if_it_fails(self), single_threaded_libraries(), monitor_of(self.verbose) as monitor:
             problem = self._problem(X, y, allow_vague=True)
             rows = problem.units.rows(problem.source)
             options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)
@@ -199,7 +199,7 @@ class EGPRegressor(ExplicitGaussianProcess):
                 problem.vague,
                 options,
                 check_random_state(self.random_state),
-                monitor_of(self.verbose),
+                monitor,
             )
             self._set_common_attributes()
             if problem.vague.any():

@@ -96,7 +96,7 @@ class EVGPRegressor(SparseGaussianProcess):
     max_iter : int, default=None
         The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
-        Those with fewer inducing points, on the way of ``n_inducing="auto"``, do not count.
+        Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.003 % of what the fit has gained over
@@ -113,7 +113,9 @@ class EVGPRegressor(SparseGaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Places inducing points, draws mini-batches and restarts.
     verbose : int, default=0
-        1 prints iteration, bound and time about once a second, 2 at each iteration.
+        1 shows one live line: the rows that are fitted, iteration, bound, seconds so far and, once it can be known,
+        about how many are left for these outputs. (What is no terminal gets a line each ten seconds, and the last.) 2
+        prints a line at each iteration.
 
     Attributes
     ----------
@@ -280,7 +282,8 @@ class EVGPRegressor(SparseGaussianProcess):
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        with unchanged_if_it_fails(self), single_threaded_libraries():
+        progress = monitor_of(self.verbose, solver.callback)
+        with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y)
             self._training_data = problem.data
             if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
@@ -299,7 +302,7 @@ class EVGPRegressor(SparseGaussianProcess):
                 effective_n_jobs(self.n_jobs),
             )
             previous = getattr(self, "_fitted", None) if self.warm_start else None
-            monitor, rng = monitor_of(self.verbose, solver.callback), check_random_state(self.random_state)
+            rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)
             self._fitted = fit_outputs(request, rng, monitor, previous)
             self._set_attributes()

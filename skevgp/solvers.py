@@ -130,13 +130,17 @@ class LBFGS(BaseEstimator):
         """
         table = task.table.started_at(attempt.values)
         spent, n_rows = len(attempt.loss_curve), len(task.rows)
+        rows = "all rows" if attempt.n_rows is None else f"{attempt.n_rows:,} of {n_rows:,} rows"
+        if task.placement.max_inducing is not None:
+            rows = f"{task.n_inducing} points, {rows}"
+        is_last = attempt.is_last and attempt.until >= task.max_iter and self.n_restarts == 0
         minimum = lbfgs(
             self.objective(task, table, attempt.n_rows),
             table.start(),
             table.limits(),
             attempt.until - spent,
             self._tolerance(task),
-            task.monitor.seen_as(spent, n_rows),
+            task.monitor.seen_as(spent, n_rows, about=rows, is_last=is_last),
             self.descent,
             None if attempt.cold else self._units(task, table),
         )
@@ -261,7 +265,7 @@ class Adam(BaseEstimator):
             attempt.until,
             self.learning_rate,
             tol / n_rows,
-            task.monitor.seen_as(factor=n_rows),
+            task.monitor.seen_as(factor=n_rows, is_last=self.n_restarts == 0),
             elbo.pace,
         )
         # A mini-batch's loss does not tell which point is best: the bound on all rows does.

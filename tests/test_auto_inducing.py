@@ -1,5 +1,7 @@
 """n_inducing="auto": as many inducing points as the data ask for."""
 
+import re
+
 import numpy as np
 import pytest
 from sklearn.base import clone
@@ -107,6 +109,11 @@ def test_an_interrupted_fit_keeps_the_best():
     assert len(bounds) == 150
     assert m.lower_bound_ > bounds[0]
     assert np.isfinite(m.predict(X_NEW)).all()
+
+
+def test_who_looks_on_is_told_how_many_points_there_are(capsys):
+    model(verbose=1, max_iter=30, tol=1.0).fit(X, Y[:, 1])
+    assert re.match(r"\d+ points, all rows, iteration ", capsys.readouterr().out.splitlines()[-1])
 
 
 def test_it_is_a_parameter_like_others():

@@ -483,11 +483,18 @@ def test_verbose_prints_iteration_bound_and_time(capsys):
     assert len(lines) >= m.n_iter_
     assert lines[-1].startswith(f"iteration {m.n_iter_:6d}   bound")
     assert float(lines[-1].split()[3]) == pytest.approx(m.lower_bound_, abs=1e-2)
-    model(verbose=1, tol=1e9).fit(X, Y)
-    # The first iteration of each start; the others follow within a second.
-    printed = capsys.readouterr().out.splitlines()
-    assert printed
-    assert all(line.startswith("iteration      1 ") for line in printed)
+
+
+def test_a_log_ends_with_the_line_of_the_last_iteration(capsys):
+    m = model(verbose=1).fit(X, Y)
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith(f"all rows, iteration {m.n_iter_}, bound ")
+    assert float(line.split(", ")[2].split()[1]) == pytest.approx(m.lower_bound_, abs=1e-2)
+
+
+def test_outputs_with_fits_of_their_own_are_named(capsys):
+    model(verbose=1, sharing="none", max_iter=5, tol=1e9).fit(X, Y)
+    assert capsys.readouterr().out.splitlines()[-1].startswith("y[:, 1], all rows, iteration ")
 
 
 def test_too_few_iterations_warn_and_say_what_to_change():

@@ -88,7 +88,7 @@ class ExactTask:
             likelihood, gradient = self.model.log_likelihood(table.values(flat))
             return -likelihood / n, -table.gradient(gradient) / n
 
-        monitor = self.monitor.seen_as(factor=n)
+        monitor = self.monitor.seen_as(factor=n, is_last=attempt.is_last and self.options.n_restarts == 0)
         minimum = lbfgs(loss, table.start(), table.limits(), attempt.until, self.options.tol / n, monitor)
         return Fit(
             table.values(minimum.x),

@@ -249,10 +249,9 @@ def plan(
         )
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
-    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean))))
-    hyperparameters = np.log(alone.values(alone.start())["hyperparameters"])
+    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean)))).values_at_start()
     inputs = rows.sample(placement.sample_size, rng).inputs
-    points = placement.points(inputs, kernel, hyperparameters, rng)
+    points = placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng)
     first = starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
@@ -285,8 +284,9 @@ def plan(
                 request.tol,
                 request.noise_cv,
                 seed,
-                monitor.seen_as(shift=shift, outputs=_as_columns(outputs)),
+                monitor.seen_as(shift=shift, outputs=_as_columns(outputs), about=_shown(outputs, len(models))),
                 None if warm is None else table.started_at(warm).values_at_start(),
+                warm is not None and sets is warm.get("inducing_points"),
             )
         )
     return tasks
@@ -332,6 +332,11 @@ def _as_columns(outputs: list[int]) -> Sequence[int]:
     """A range if they follow each other, else a tuple."""
     columns = range(outputs[0], outputs[-1] + 1)
     return columns if len(columns) == len(outputs) else tuple(outputs)
+
+
+def _shown(outputs: list[int], n_models: int) -> str:
+    """Whose line it is, where there are several models."""
+    return "" if n_models == 1 else f"y[:, {outputs[0] if len(outputs) == 1 else outputs}]"
 
 
 def _fit_one(task: SparseTask) -> Learned:

@@ -73,6 +73,8 @@ class SparseTask:
         Told of the bound in the user's units.
     warm : dict, optional
         Where another fit ended.
+    placed : bool
+        Whether the table's inducing points are from that fit.
     """
 
     model: SparseModel
@@ -86,6 +88,7 @@ class SparseTask:
     seed: int
     monitor: Monitor
     warm: Values | None = None
+    placed: bool = False
 
     @cached_property
     def rng(self) -> np.random.RandomState:
@@ -143,6 +146,7 @@ class SparseTask:
             place=None if anew is None else partial(self._placed, placement=anew),
             restart=lambda: self._placed(drawn(self.table, rules, self.rng), self.placement),
             warm=self.warm,
+            placed=self.placed,
         )
 
     @property
@@ -201,7 +205,7 @@ class SparseTask:
             sample,
             self.table.without("inducing_points"),
             self.rows.scatter(),
-            ExactOptions(self.solver.rules, self.max_iter, max(self.tol or 0.0, _COARSE * sample.targets.size), 0),
+            ExactOptions(self.solver.rules, _ITERATIONS, max(self.tol or 0.0, _COARSE * sample.targets.size), 0),
             self.rng,
             self.monitor.silent(),
         )
@@ -211,14 +215,20 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     """A fit whose number of inducing points has been found, and the task that it is of.
 
     Half as many points again are added, the rows that are least known from those before, and the fit goes on for a few
-    iterations; until that raises the bound by less than `_GAIN`. The fit before then goes on to its end.
+    iterations; until that raises the bound by less than `_GAIN`. The fit before then goes on to its end. Only there
+    `max_iter` counts: after too few iterations on the way, points would be credited with what further ones gain.
 
     With few points the noise may explain so much that half as many again show nothing of what there is to learn. Hence
     a second opinion, the kernel of the exact model of a sample: while it makes the sample likelier than the fit's by
     `_MISSED`, growth does not end, and it is tried at each step.
     """
     nats = len(task.rows) * len(task.rows.scatter())
-    coarse = replace(task, max_iter=min(task.max_iter, _ITERATIONS), tol=max(task.tol or 0.0, _COARSE * nats))
+    coarse = replace(
+        task,
+        max_iter=_ITERATIONS if task.max_iter > 0 else 0,
+        tol=max(task.tol or 0.0, _COARSE * nats),
+        monitor=task.monitor.seen_as(is_last=False),
+    )
     fit = search(coarse)
     with task.monitor.keeping_the_best():
         unhindered = None if task.monitor.stopped else task.unhindered()
@@ -232,9 +242,9 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
             if larger.bound - fit.bound < _GAIN * nats and not limited:
                 break
             coarse, fit = more, larger
-    task = replace(coarse, max_iter=task.max_iter, tol=task.tol)
-    if fit.n_iter < task.max_iter and not task.monitor.stopped:
-        fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter, fit)))
+    task = replace(coarse, max_iter=task.max_iter, tol=task.tol, monitor=task.monitor)
+    if task.max_iter > 0 and not task.monitor.stopped:
+        fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter)))
     return task, fit
 
 

@@ -153,6 +153,8 @@ class Attempt:
         Of the sample that is fitted; None means all rows.
     cold : bool, default=False
         Whether the values are a first guess, where the curvature of the bound says little of that at the end.
+    is_first : bool, default=False
+        Whether another start follows anyway.
     """
 
     values: Values
@@ -160,6 +162,12 @@ class Attempt:
     after: Fit | None = None
     n_rows: int | None = None
     cold: bool = False
+    is_first: bool = False
+
+    @property
+    def is_last(self) -> bool:
+        """Whether a fit that ends well ends with it, restarts aside."""
+        return self.n_rows is None and not self.is_first
 
     @property
     def loss_curve(self) -> list[float]:
@@ -202,6 +210,8 @@ class Strategy:
         () -> first values drawn at random.
     warm : dict, optional
         First values from another fit.
+    placed : bool
+        Whether the table's inducing points are from that fit.
     """
 
     rules: Rules
@@ -215,6 +225,7 @@ class Strategy:
     place: Callable[[Values], Values] | None = None
     restart: Callable[[], Values] | None = None
     warm: Values | None = None
+    placed: bool = False
 
     def attempts(self) -> Generator[Attempt, Fit, None]:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
@@ -223,8 +234,8 @@ class Strategy:
             yield from self._climbing(first)
         else:
             # Inducing points that another fit moved have found their places.
-            same_points = np.array_equal(self.warm["inducing_points"], first["inducing_points"])
-            again = self._climbing if same_points else self._once
+            moved_before = self.placed or not np.array_equal(self.warm["inducing_points"], first["inducing_points"])
+            again = self._once if moved_before else self._climbing
             fit = yield from again(first | self.warm)
             if self.max_iter > 0 and self.collapsed(fit):
                 yield from self._climbing(first)
@@ -290,14 +301,16 @@ class Strategy:
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Attempts:
         """A fit from these values; from other starts too where it may have ended in a bad optimum."""
 
-        def start(values: Values, cold: bool = True) -> Attempt:
-            return Attempt(values, until, n_rows=n_rows, cold=cold)
+        def start(values: Values, cold: bool = True, is_first: bool = False) -> Attempt:
+            return Attempt(values, until, n_rows=n_rows, cold=cold, is_first=is_first)
 
-        best = yield start(values)
-        if until == 0 or not self.table["noise"].free.any():
+        free = bool(self.table["noise"].free.any())
+        much = self.rules.much_noise if free and (self.interpolates or n_rows is not None) else None
+        best = yield start(values, is_first=much is not None)
+        if until == 0 or not free:
             return best
-        if (self.interpolates or n_rows is not None) and self.rules.much_noise is not None:
-            best = better(best, (yield start(moved(values, 1.0, self.rules.much_noise), cold=n_rows is None)))
+        if much is not None:
+            best = better(best, (yield start(moved(values, 1.0, much), cold=n_rows is None)))
         for factors in self.rules.other_starts:
             if not self.collapsed(best):
                 break

@@ -224,6 +224,17 @@ def test_given_points_are_where_the_user_says():
     np.testing.assert_allclose(task.warm["inducing_points"], [X[:8]])
 
 
+@pytest.mark.parametrize("most", [20, 8])
+def test_points_whose_number_was_found_are_not_placed_anew(most):
+    """Though the table starts at them, as it does at first points; also where they are as many as first points."""
+    changes = {"placement": Placement("auto", 8, most), "max_iter": 100}
+    first = fitted(**changes)
+    (task,), (cold,) = planned(previous=first, **changes), planned(**changes)
+    attempt = next(task.strategy.attempts())
+    np.testing.assert_allclose(attempt.values["inducing_points"], first.learned[0].values["inducing_points"])
+    assert attempt.until == 100 > next(cold.strategy.attempts()).until
+
+
 @pytest.mark.parametrize("why", ["nothing before", "other sharing", "one output"])
 def test_a_fit_that_cannot_go_on_starts_cold(why):
     first = fitted(sharing="kernel")

@@ -317,6 +317,13 @@ def test_few_points_do_not_hide_what_there_is_to_learn(monkeypatch):
     assert fit.values["noise"] > 0.9 * task.rows.scatter()
 
 
+def test_few_iterations_do_not_ask_for_points():
+    """What further iterations gain is not credited to points; those on the way to their number do not count."""
+    (few, fit), (many, _) = (grown(growing(max_iter=max_iter)) for max_iter in (3, 200))
+    assert few.n_inducing == many.n_inducing < N
+    assert fit.n_iter <= 3
+
+
 def test_a_fit_that_was_stopped_gets_no_more_points():
     def stop(*told):
         raise StopIteration

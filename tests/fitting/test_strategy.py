@@ -170,6 +170,12 @@ def test_a_warm_start_whose_points_have_moved_is_not_placed_anew():
     np.testing.assert_allclose(made[0].values["noise"], 0.3)
 
 
+@pytest.mark.parametrize("placed", [True, False])
+def test_points_that_the_table_has_from_another_fit_count_as_moved(placed):
+    own = strategy(warm={"inducing_points": PLACES}, placed=placed, place=place)
+    assert (next(own.attempts()).until == own.max_iter) == placed
+
+
 def test_a_warm_start_that_leads_nowhere_is_left_for_a_cold_one():
     warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
     own = strategy(warm=warm, rules=replace(RULES, other_starts=()))
