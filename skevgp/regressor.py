@@ -99,7 +99,7 @@ class EVGPRegressor(SparseGaussianProcess):
         Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
-        than this, and stops when a fresh start gains no more. ``"auto"`` is 0.003 % of what the fit has gained over
+        than this, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained over
         features and noise alone, and at least 0.01. Adam goes over to its last steps, as many as before, when the loss
         stays flat: when its median over the last third of the steps differs from that over the third before by less
         than this (``"auto"``: 0.01), or by no more than chance, which mostly decides.

@@ -139,7 +139,7 @@ class LBFGS(BaseEstimator):
             table.start(),
             table.limits(),
             attempt.until - spent,
-            self._tolerance(task),
+            self._tolerance(task, attempt),
             task.monitor.seen_as(spent, n_rows, about=rows, is_last=is_last),
             self.descent,
             None if attempt.cold else self._units(task, table),
@@ -153,9 +153,9 @@ class LBFGS(BaseEstimator):
             n_rows=attempt.n_rows,
         )
 
-    def _tolerance(self, task: SparseTask) -> Tolerance:
+    def _tolerance(self, task: SparseTask, attempt: Attempt) -> Tolerance:
         n_rows = len(task.rows)
-        if task.tol is not None:
+        if task.tol is not None and attempt.n_rows is None:
             return Tolerance(task.tol / n_rows)
         return Tolerance(_LEAST_TOL / n_rows, self.descent.enough, -task.alone / n_rows)
 

@@ -103,8 +103,8 @@ class SparseTask:
     @cached_property
     def samples(self) -> tuple[int, ...]:
         """The sizes of the samples that the fit begins with."""
-        n_weights = self.n_inducing + self.model.prior.scale.shape[1]
-        return () if self.interpolates else self.solver.rules.samples(len(self.rows), n_weights)
+        (o, p), d = self.model.prior.scale.shape, self.table["inducing_points"].start.shape[2]
+        return () if self.interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing + p, d + p + o)
 
     @cached_property
     def _sampled(self) -> dict[int, Blocks]:

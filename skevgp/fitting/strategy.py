@@ -19,8 +19,8 @@ from .._progress import Monitor
 from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
 
-# Rows: samples are held in memory.
-LARGEST_SAMPLE = 40_000
+# Numbers: samples are held in memory.
+LARGEST_SAMPLE = 2_000_000
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,13 @@ class Rules:
         to that plateau; a high one finds much noise sooner.
     stage : int, optional
         Iterations after which inducing points are placed anew, and so many again until it shows whether that was
-        better; also those on each larger sample. None leaves the points.
+        better; on all rows, or on the smallest sample. None leaves the points.
     sample : (int, int), optional
         Rows, and rows per inducing point and feature: so many are enough to begin with, the larger number counts. None
         takes all.
     growth : int
-        A sample is followed by one so many times larger, and those of more than half or `LARGEST_SAMPLE` of the rows by
-        all.
+        A sample is followed by one so many times larger; one of more than half of the rows, or of more numbers than
+        `LARGEST_SAMPLE`, is left out.
     restart_factors : dict
         A restart multiplies the first values by numbers between 1 / factor and the factor, drawn log-uniformly.
     """
@@ -84,15 +84,26 @@ class Rules:
     growth: int = 4
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
-    def samples(self, n_rows: int, n_weights: int) -> tuple[int, ...]:
-        """The sizes of the samples that a fit begins with, of ``n_rows`` rows; none if there are too few.
+    def samples(self, n_rows: int, n_weights: int, width: int) -> tuple[int, ...]:
+        """The sizes of the samples that a fit begins with; none if there are too few rows.
 
-        ``n_weights`` is the number of inducing points and features.
+        Parameters
+        ----------
+        n_rows : int
+            In all.
+        n_weights : int
+            Inducing points and features.
+        width : int
+            Numbers in a row.
+
+        Returns
+        -------
+        sizes : tuple of int
         """
         if self.sample is None:
             return ()
         sizes, size = [], max(self.sample[0], self.sample[1] * n_weights)
-        while size <= min(n_rows // 2, LARGEST_SAMPLE):
+        while size <= min(n_rows // 2, LARGEST_SAMPLE // width):
             sizes.append(size)
             size *= self.growth
         return tuple(sizes)
@@ -264,7 +275,7 @@ class Strategy:
             if self.collapsed(best):
                 best = yield from self._staged(values, few, n_rows)
             else:
-                best = yield Attempt(best.values, min(stage, self.max_iter), n_rows=n_rows)
+                best = yield Attempt(best.values, self.max_iter, n_rows=n_rows)
         if not self.collapsed(best):
             best = yield Attempt(best.values, self.max_iter)
             if not self.collapsed(best):

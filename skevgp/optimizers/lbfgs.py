@@ -39,7 +39,7 @@ class Descent:
     memory: int = 100
     gradient: float = 1e-9
     patience: int = 3
-    enough: float = 3e-5
+    enough: float = 1.5e-5
     probes: int = 8
 
 

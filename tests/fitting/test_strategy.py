@@ -252,21 +252,22 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
 
 
 @pytest.mark.parametrize(
-    ("n_rows", "n_inducing", "sizes"),
+    ("n_rows", "n_inducing", "width", "sizes"),
     [
-        (1999, 10, ()),
-        (2000, 10, (1000,)),
-        (36_000, 256, (5120,)),
-        (36_000, 100, (2000, 8000)),
-        (10**7, 10, (1000, 4000, 16_000)),
+        (1999, 10, 9, ()),
+        (2000, 10, 9, (1000,)),
+        (36_000, 256, 9, (5120,)),
+        (36_000, 100, 9, (2000, 8000)),
+        (10**7, 10, 9, (1000, 4000, 16_000, 64_000)),
+        (10**7, 10, 100, (1000, 4000, 16_000)),
     ],
 )
-def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, sizes):
-    assert replace(RULES, sample=(1000, 20)).samples(n_rows, n_inducing) == sizes
+def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, width, sizes):
+    assert replace(RULES, sample=(1000, 20)).samples(n_rows, n_inducing, width) == sizes
 
 
 def test_without_a_rule_there_are_no_samples():
-    assert RULES.samples(10**6, 10) == ()
+    assert RULES.samples(10**6, 10, 9) == ()
 
 
 def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
@@ -276,7 +277,7 @@ def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
     )
     # Two noises, points placed anew and the old ones; then the better on more rows, and on all.
     assert [attempt.n_rows for attempt in made] == [1000, 1000, 1000, 1000, 4000, None]
-    assert [attempt.until for attempt in made] == [100, 100, 200, 200, 100, 1000]
+    assert [attempt.until for attempt in made] == [100, 100, 200, 200, 1000, 1000]
     np.testing.assert_allclose(made[1].values["noise"], 0.1)
     assert made[0].cold
     assert not any(attempt.cold for attempt in made[1:])
