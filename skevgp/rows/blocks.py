@@ -37,12 +37,13 @@ class Block:
     prepared : object
         The kernel's inputs, as its ``prepare`` returns them.
     linear : ndarray of shape (n, p + o)
-        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums.
+        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums; best
+        in Fortran's order.
     n_features : int
         p.
     may_keep : bool
         Whether there is room for ``kept``.
-    kept : (whitening, k(X_m, X), V) or None
+    kept : (whitening, k(X_m, X), [V; Hᵀ; rᵀ]) or None
         What the first pass left for the second.
     """
 
