@@ -13,7 +13,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from .._linalg import JITTER, Jitter, cholesky_of_covariance, cholesky_pullback, diagonal_of, triangular_inverse
+from .._linalg import (
+    JITTER,
+    Jitter,
+    cholesky_of_covariance,
+    cholesky_pullback,
+    diagonal_of,
+    triangular_inverse,
+    triangular_product,
+)
 from ..rows.blocks import Block, Blocks
 
 _ROUNDING = 4.0 * np.finfo(float).eps
@@ -91,7 +99,7 @@ class Whitening:
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""
         U = self.covariance.cross(prepared)
-        return U, np.matmul(self.L_inv, U, out=out)
+        return U, triangular_product(self.L_inv, U, np.empty(U.shape) if out is None else out)
 
     def unexplained(self, prepared: Any, V: np.ndarray) -> np.ndarray:
         """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0."""
