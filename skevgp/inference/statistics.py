@@ -239,8 +239,9 @@ class _SecondPass:
     weights: np.ndarray
 
     def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
-        if block.kept is not None and block.kept[0] is self.whitening:
-            _, U, P = block.kept
+        kept, block.kept = block.kept, None  # frees memory that is in the cache
+        if kept is not None and kept[0] is self.whitening:
+            _, U, P = kept
         else:
             U, P = _projected(block, self.whitening, self.outputs)
         e = _put_errors(block, P, self.outputs, self.weights)
