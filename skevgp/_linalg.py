@@ -138,7 +138,7 @@ def cholesky_pullback(L: np.ndarray, L_inv: np.ndarray, L_bar: np.ndarray) -> np
     K_bar : ndarray of shape (n, n)
         Symmetric: d scalar = sum(K_bar * dK) for symmetric dK.
     """
-    phi = np.tril(L.T @ np.tril(L_bar))
+    phi = np.tril(L.T @ L_bar)  # whose lower triangle takes nothing from above the diagonal of L̄
     phi = phi + phi.T
     diagonal_of(phi)[...] *= 0.5
     return 0.5 * (L_inv.T @ phi @ L_inv)

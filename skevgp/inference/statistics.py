@@ -9,6 +9,7 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
@@ -146,6 +147,15 @@ class SufficientStatistics:
     HR: np.ndarray
     RR: np.ndarray
     unexplained: Any
+
+    @cached_property
+    def joint(self) -> np.ndarray:
+        """[V; Hᵀ] [Vᵀ, H], (m + p, m + p)."""
+        m, p = self.VH.shape
+        joint = np.empty((m + p, m + p))
+        joint[:m, :m], joint[:m, m:], joint[m:, m:] = self.VV, self.VH, self.HH
+        joint[m:, :m] = self.VH.T
+        return joint
 
     def __add__(self, other: SufficientStatistics) -> SufficientStatistics:
         return SufficientStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
@@ -322,4 +332,4 @@ def pull_back(
     second = _SecondPass(whitening, outputs, back, gradient.unexplained, weights)
     rows_bar, squares, VE = blocks.sum(second)
     VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
-    return whitening.pull_back(rows_bar, gradient.L - np.tril(L_inv.T @ VbarV)), Residuals(squares, VE)
+    return whitening.pull_back(rows_bar, gradient.L - L_inv.T @ VbarV), Residuals(squares, VE)

@@ -76,17 +76,14 @@ class StationaryAt(CovarianceAt):
     def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
         lengthscales = np.exp(hyperparameters[profile.n_parameters :])
         self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.lengthscales = np.broadcast_to(lengthscales, points.shape[1:])
         self.isotropic = len(lengthscales) < points.shape[1]
-        self.points = points
+        d, self.points = points.shape[1], points
+        self.lengthscales = np.full(d, lengthscales)
         precision = self.lengthscales**-2.0
-        self._exponent = np.hstack(
-            [
-                points * precision,
-                -0.5 * (points**2 @ precision)[:, np.newaxis],
-                np.broadcast_to(-0.5 * precision, points.shape),
-            ]
-        )
+        self._exponent = np.empty((len(points), 2 * d + 1))
+        self._exponent[:, :d] = points * precision
+        self._exponent[:, d] = -0.5 * (points**2 @ precision)
+        self._exponent[:, d + 1 :] = -0.5 * precision
 
     def matrix(self) -> np.ndarray:
         return self.profile.value(self._exponents_within(), self.parameters)
