@@ -216,7 +216,7 @@ def _projected(block: Block, whitening: Whitening, outputs: slice) -> tuple[np.n
 
 
 def _put_errors(block: Block, P: np.ndarray, outputs: slice, weights: np.ndarray) -> np.ndarray:
-    """e (o, n) of a block's rows, which takes the place of r in [V; Hᵀ; rᵀ]."""
+    """What the weights leave over, eᵀ (o, n), which takes the place of rᵀ in [V; Hᵀ; rᵀ]."""
     e = P[len(weights) :]
     return np.subtract(block.residuals[:, outputs].T, weights.T @ P[: len(weights)], out=e)
 
