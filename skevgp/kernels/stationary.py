@@ -116,10 +116,9 @@ class StationaryAt(CovarianceAt):
         """Gradients in log ℓ and X_m, from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
         Z, d = self.points, self.points.shape[1]
         WX, W, WXX = rows[:, :d], rows[:, d, np.newaxis], rows[:, d + 1 :]
-        row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
-        Z_bar = WX - W * Z + 2.0 * (within_Z - row_sum * Z)
-        length_bar = (WXX - 2.0 * Z * WX + W * Z**2 + 2.0 * Z * (row_sum * Z - within_Z)).sum(axis=0)
+        Z_bar = WX - W * Z + 2.0 * (within @ Z - within.sum(axis=1, keepdims=True) * Z)
+        length_bar = (WXX - Z * (WX + Z_bar)).sum(axis=0)
         precision = self.lengthscales**-2.0
         length_bar = length_bar * precision
         return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision
