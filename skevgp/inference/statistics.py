@@ -249,9 +249,9 @@ class _SecondPass:
     weights: np.ndarray
 
     def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
-        kept, block.kept = block.kept, None  # frees memory that is in the cache
-        if kept is not None and kept[0] is self.whitening:
-            _, U, P = kept
+        # It stays until the next first pass replaces it: all of it, let go, would be given back to the system.
+        if block.kept is not None and block.kept[0] is self.whitening:
+            _, U, P = block.kept
         else:
             U, P = _projected(block, self.whitening, self.outputs)
         e = _put_errors(block, P, self.outputs, self.weights)
