@@ -12,6 +12,7 @@ from skevgp._linalg import (
     jittered_cholesky,
     symmetric_inverse,
     triangular_inverse,
+    triangular_product,
 )
 
 
@@ -142,4 +143,17 @@ def test_the_factors_pull_back_agrees_with_autograd():
     A, weights = positive_definite(4), np.tril(np.random.RandomState(1).randn(4, 4))
     expected = grad(lambda A: anp.sum(weights * anp.linalg.cholesky(0.5 * (A + A.T))))(A)
     L = np.linalg.cholesky(A)
-    np.testing.assert_allclose(cholesky_pullback(L, triangular_inverse(L), weights), expected, rtol=1e-9, atol=1e-15)
+    above = np.triu(np.full((4, 4), 1e3), 1)
+    for L_bar in (weights, weights + above):
+        np.testing.assert_allclose(cholesky_pullback(L, triangular_inverse(L), L_bar), expected, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("m", [0, 1, 47, 48, 49, 130])
+def test_a_triangular_product_leaves_out_nothing_but_zeros(m):
+    rng = np.random.RandomState(m)
+    L, B, out = np.tril(rng.randn(m, m)), rng.randn(m, 5), np.full((m + 2, 5), np.nan)
+    found = triangular_product(L, B, out[:m])
+    assert found.base is out
+    np.testing.assert_allclose(found, L @ B, rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(triangular_product(np.asfortranarray(L), B, out[:m]), L @ B, rtol=1e-12, atol=1e-12)
+    assert np.isnan(out[m:]).all()

@@ -12,6 +12,7 @@ sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -101,21 +102,22 @@ class Group:
     prior: CoefficientPrior
     complete: bool = False
 
+    @cached_property
+    def scales(self) -> np.ndarray:
+        """What makes Pᵀ of [V; Hᵀ] for each output, (o, m + p)."""
+        (o, p), m = self.prior.scale.shape, len(self.statistics.VV)
+        scales = np.empty((o, m + p))
+        scales[:, :m] = np.sqrt(self.signal)[:, np.newaxis]
+        scales[:, m:] = self.prior.scale
+        return scales
+
 
 def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
     """PᵀP (m + p, m + p) and Pᵀr (m + p,) of a group's output."""
-    statistics, signal, scale = group.statistics, group.signal[index], group.prior.scale[index]
-    m, s = len(statistics.VV), np.sqrt(signal)
-    size = m + len(scale)
-    PP, Pr = np.empty((size, size)), np.empty(size)
-    np.multiply(statistics.VV, signal, out=PP[:m, :m])
-    np.multiply(statistics.VR[:, index], s, out=Pr[:m])
-    if len(scale):
-        np.multiply(statistics.VH, s * scale, out=PP[:m, m:])
-        PP[m:, :m] = PP[:m, m:].T
-        np.multiply(statistics.HH, np.multiply.outer(scale, scale), out=PP[m:, m:])
-        np.multiply(statistics.HR[:, index], scale, out=Pr[m:])
-    return PP, Pr
+    statistics, scales = group.statistics, group.scales[index]
+    PP = np.multiply.outer(scales, scales)
+    PP *= statistics.joint
+    return PP, scales * np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
 
 
 def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
@@ -174,47 +176,41 @@ class BoundAtOptimum:
     """
 
     def __init__(self, group: Group, family: PosteriorFamily):
-        statistics, signal, noise, prior = group.statistics, group.signal, group.noise, group.prior
-        m, p = statistics.VH.shape
+        statistics, scales, noise = group.statistics, group.scales, group.noise
+        joint, m = statistics.joint, len(statistics.VV)
         self.group = group
-        self.posteriors: list[WhitenedPosterior] = []
-        self.weights = np.empty((m + p, len(signal)))
-        self.gradient = StatisticsGradient(
-            np.zeros((m, m)),
-            np.zeros((m, p)),
-            np.empty((m, len(signal))),
-            0.0 if group.complete else -0.5 * (signal / noise).sum(),
-            np.zeros((m, m)),
-        )
-        # Terms of each output that do not depend on e, and their derivatives in log s² and log σ².
-        self._value, self._log_signal, self._log_noise = np.empty((3, len(signal)))
-        for o, (s2, sigma2) in enumerate(zip(signal, noise, strict=True)):
-            s, scale = np.sqrt(s2), prior.scale[o]
-            q = optimal_posterior(group, o)
-            self.posteriors.append(q)
-            self.weights[:m, o], self.weights[m:, o] = s * q.mean[:m], scale * q.mean[m:]
-            log_det = q.log_det
-            penalty = float(q.mean @ q.mean)
-            if p:
-                penalty += float(prior.reference[o] @ (2.0 * q.mean[m:] + prior.reference[o]))
-            unexplained = s2 * statistics.unexplained / sigma2
-            value = -0.5 * (statistics.n_rows * (LOG_2PI + np.log(sigma2)) + log_det + penalty + unexplained)
+        self.posteriors = [optimal_posterior(group, o) for o in range(len(noise))]
+        mean = np.array([q.mean for q in self.posteriors])
+        self.weights = (scales * mean).T
+        joint_bar, L_bar = np.zeros(joint.shape), np.zeros((m, m))
+        # Of each output: log|B| (and twice the gap), and derivatives of the bound in log s² and log 1/σ² by way of B.
+        log_det, from_signal, from_noise = np.empty((3, len(noise)))
+        for o, q in enumerate(self.posteriors):
+            log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
-                gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det, B_bar, group.whitening)
-                value -= gap
+                gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det[o], B_bar, group.whitening)
+                log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
-                self.gradient.L[...] -= gap_L_bar
-            VV_bar, VH_bar = B_bar[:m, :m] * (s2 / sigma2), B_bar[:m, m:] * scale * (2.0 * s / sigma2)
-            self.gradient.VV[...] += VV_bar
-            self.gradient.VH[...] += VH_bar
-            self.gradient.VE[:, o] = q.mean[:m] * (s / sigma2)
-            self._value[o] = value
-            self._log_signal[o] = (
-                np.vdot(VV_bar, statistics.VV) + 0.5 * np.vdot(VH_bar, statistics.VH) - 0.5 * unexplained
-            )
-            from_B = np.vdot(B_bar, q.B) - diagonal_of(B_bar).sum()
-            self._log_noise[o] = 0.5 * (unexplained - statistics.n_rows) - from_B
+                L_bar -= gap_L_bar
+            B_bar *= np.multiply.outer(scales[o] / noise[o], scales[o])
+            joint_bar += B_bar
+            from_signal[o], from_noise[o] = np.vdot(B_bar[:m], joint[:m]), np.vdot(B_bar, joint)
+        unexplained_bar = -0.5 * group.signal / noise
+        self.gradient = StatisticsGradient(
+            joint_bar[:m, :m],
+            2.0 * joint_bar[:m, m:],
+            self.weights[:m] / noise,
+            0.0 if group.complete else unexplained_bar.sum(),
+            L_bar,
+        )
+        unexplained = unexplained_bar * statistics.unexplained
+        mean[:, m:] += group.prior.reference
+        penalty = np.einsum("ok,ok->o", mean, mean)
+        # What does not depend on e, and its derivatives in log s² and log σ².
+        self._value = unexplained - 0.5 * (statistics.n_rows * (LOG_2PI + np.log(noise)) + log_det + penalty)
+        self._log_signal = from_signal + unexplained
+        self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
 
     def residuals(self) -> Residuals:
         """eᵀe and V e from the statistics: good while the signal is not above about 1e4 times the noise."""

@@ -56,7 +56,7 @@ def evaluate(
     NotPositiveDefiniteError
         If a matrix is not finite.
     """
-    total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
+    total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
     for index, group in enumerate(model.groups_on(values, blocks)):
         terms = terms_of(group)
         (hyper_bar, Z_bar), residuals = pull_back(

@@ -9,11 +9,20 @@ explicit features, Rasmussen & Williams 2006 section 2.7). Rows are whitened ins
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
+from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
 
-from .._linalg import JITTER, Jitter, cholesky_of_covariance, cholesky_pullback, diagonal_of, triangular_inverse
+from .._linalg import (
+    JITTER,
+    Jitter,
+    cholesky_of_covariance,
+    cholesky_pullback,
+    diagonal_of,
+    triangular_inverse,
+    triangular_product,
+)
 from ..rows.blocks import Block, Blocks
 
 _ROUNDING = 4.0 * np.finfo(float).eps
@@ -91,7 +100,7 @@ class Whitening:
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""
         U = self.covariance.cross(prepared)
-        return U, np.matmul(self.L_inv, U, out=out)
+        return U, triangular_product(self.L_inv, U, np.empty(U.shape) if out is None else out)
 
     def unexplained(self, prepared: Any, V: np.ndarray) -> np.ndarray:
         """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0."""
@@ -139,6 +148,15 @@ class SufficientStatistics:
     RR: np.ndarray
     unexplained: Any
 
+    @cached_property
+    def joint(self) -> np.ndarray:
+        """[V; Hᵀ] [Vᵀ, H], (m + p, m + p)."""
+        m, p = self.VH.shape
+        joint = np.empty((m + p, m + p))
+        joint[:m, :m], joint[:m, m:], joint[m:, m:] = self.VV, self.VH, self.HH
+        joint[m:, :m] = self.VH.T
+        return joint
+
     def __add__(self, other: SufficientStatistics) -> SufficientStatistics:
         return SufficientStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
 
@@ -182,18 +200,25 @@ class _FirstPass:
     outputs: slice
 
     def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray, float]:
-        U, V = self.whitening.project(block.prepared)
-        block.kept = (self.whitening, U, V) if block.may_keep else None
-        return V @ V.T, V @ block.linear_of(self.outputs), self.whitening.unexplained(block.prepared, V).sum()
+        U, P = _projected(block, self.whitening, self.outputs)
+        block.kept = (self.whitening, U, P) if block.may_keep else None
+        V, linear = P[: len(U)], P[len(U) :]
+        return V @ V.T, V @ linear.T, self.whitening.unexplained(block.prepared, V).sum()
 
 
-def _with_errors(block: Block, V: np.ndarray, outputs: slice, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """[H, e] of a block (n, p + o), and the e in it."""
-    linear, m = block.linear_of(outputs).copy(), len(V)
-    e = linear[:, block.n_features :]
-    e -= V.T @ weights[:m]
-    e -= block.features @ weights[m:]
-    return linear, e
+def _projected(block: Block, whitening: Whitening, outputs: slice) -> tuple[np.ndarray, np.ndarray]:
+    """U (m, n), and [V; Hᵀ; rᵀ] of shape (m + p + o, n): one array, which one product multiplies."""
+    linear, m = block.linear_of(outputs), len(whitening.L)
+    P = np.empty((m + linear.shape[1], len(linear)))
+    U, _ = whitening.project(block.prepared, out=P[:m])
+    P[m:] = linear.T
+    return U, P
+
+
+def _put_errors(block: Block, P: np.ndarray, outputs: slice, weights: np.ndarray) -> np.ndarray:
+    """What the weights leave over, eᵀ (o, n), which takes the place of rᵀ in [V; Hᵀ; rᵀ]."""
+    e = P[len(weights) :]
+    return np.subtract(block.residuals[:, outputs].T, weights.T @ P[: len(weights)], out=e)
 
 
 @dataclass(frozen=True)
@@ -205,35 +230,34 @@ class _Errors:
     weights: np.ndarray
 
     def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        _, V = self.whitening.project(block.prepared)
-        _, e = _with_errors(block, V, self.outputs, self.weights)
-        return np.einsum("no,no->o", e, e), V @ e
+        U, P = _projected(block, self.whitening, self.outputs)
+        e = _put_errors(block, P, self.outputs, self.weights)
+        return np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
 
 
 @dataclass(frozen=True)
 class _SecondPass:
     """Block -> what it adds to the kernel's pull-back, eᵀe of each output and V e.
 
-    Ū = (L⁻ᵀ symmetric) V + (L⁻ᵀ linear_bar) [H, e]ᵀ: the m-sized products came first.
+    Ū = back [V; Hᵀ; eᵀ]: the m-sized products came first.
     """
 
     whitening: Whitening
     outputs: slice
-    from_whitened: np.ndarray
-    from_linear: np.ndarray
+    back: np.ndarray
     unexplained_bar: float
     weights: np.ndarray
 
     def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
+        # It stays until the next first pass replaces it: all of it, let go, would be given back to the system.
         if block.kept is not None and block.kept[0] is self.whitening:
-            _, U, V = block.kept
+            _, U, P = block.kept
         else:
-            U, V = self.whitening.project(block.prepared)
-        linear, e = _with_errors(block, V, self.outputs, self.weights)
-        U_bar = self.from_whitened @ V
-        U_bar += self.from_linear @ linear.T
+            U, P = _projected(block, self.whitening, self.outputs)
+        e = _put_errors(block, P, self.outputs, self.weights)
+        U_bar = self.back @ P
         rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
-        return rows_bar, np.einsum("no,no->o", e, e), V @ e
+        return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
 
 
 def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientStatistics:
@@ -304,14 +328,8 @@ def pull_back(
     L_inv = whitening.L_inv
     symmetric = gradient.VV + gradient.VV.T
     diagonal_of(symmetric)[...] -= 2.0 * gradient.unexplained
-    second = _SecondPass(
-        whitening,
-        outputs,
-        L_inv.T @ symmetric,
-        L_inv.T @ np.hstack([gradient.VH, gradient.VE]),
-        gradient.unexplained,
-        weights,
-    )
+    back = L_inv.T @ np.hstack([symmetric, gradient.VH, gradient.VE])
+    second = _SecondPass(whitening, outputs, back, gradient.unexplained, weights)
     rows_bar, squares, VE = blocks.sum(second)
     VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
-    return whitening.pull_back(rows_bar, gradient.L - np.tril(L_inv.T @ VbarV)), Residuals(squares, VE)
+    return whitening.pull_back(rows_bar, gradient.L - L_inv.T @ VbarV), Residuals(squares, VE)

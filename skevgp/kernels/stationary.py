@@ -76,17 +76,14 @@ class StationaryAt(CovarianceAt):
     def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
         lengthscales = np.exp(hyperparameters[profile.n_parameters :])
         self.profile, self.parameters = profile, hyperparameters[: profile.n_parameters]
-        self.lengthscales = np.broadcast_to(lengthscales, points.shape[1:])
         self.isotropic = len(lengthscales) < points.shape[1]
-        self.points = points
+        d, self.points = points.shape[1], points
+        self.lengthscales = np.full(d, lengthscales)
         precision = self.lengthscales**-2.0
-        self._exponent = np.hstack(
-            [
-                points * precision,
-                -0.5 * (points**2 @ precision)[:, np.newaxis],
-                np.broadcast_to(-0.5 * precision, points.shape),
-            ]
-        )
+        self._exponent = np.empty((len(points), 2 * d + 1))
+        self._exponent[:, :d] = points * precision
+        self._exponent[:, d] = -0.5 * (points**2 @ precision)
+        self._exponent[:, d + 1 :] = -0.5 * precision
 
     def matrix(self) -> np.ndarray:
         return self.profile.value(self._exponents_within(), self.parameters)
@@ -119,10 +116,9 @@ class StationaryAt(CovarianceAt):
         """Gradients in log ℓ and X_m, from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
         Z, d = self.points, self.points.shape[1]
         WX, W, WXX = rows[:, :d], rows[:, d, np.newaxis], rows[:, d + 1 :]
-        row_sum, within_Z = within.sum(axis=1, keepdims=True), within @ Z
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
-        Z_bar = WX - W * Z + 2.0 * (within_Z - row_sum * Z)
-        length_bar = (WXX - 2.0 * Z * WX + W * Z**2 + 2.0 * Z * (row_sum * Z - within_Z)).sum(axis=0)
+        Z_bar = WX - W * Z + 2.0 * (within @ Z - within.sum(axis=1, keepdims=True) * Z)
+        length_bar = (WXX - Z * (WX + Z_bar)).sum(axis=0)
         precision = self.lengthscales**-2.0
         length_bar = length_bar * precision
         return length_bar.sum(keepdims=True) if self.isotropic else length_bar, Z_bar * precision

@@ -15,8 +15,10 @@ from .threads import BlockMap, add, ordered_sum
 _BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**16, 512, 8192
 # Blocks that are made already are kept within this many bytes; the others are made again at each pass.
 CACHE_BYTES = 48 * 2**20
-# If k(X_m, X) and V of all rows fit in this many bytes, they are kept from the first pass for the second.
+# If k(X_m, X) and [V; Hᵀ; rᵀ] of all rows fit in this many bytes, they are kept from the first pass for the second.
 KEEP_BYTES = 128 * 2**20
+# Once a block of memory as large as this was freed, glibc keeps what is freed later: 32 MiB is the most that it heeds.
+_FREED_BYTES = 2**25 - 2**14
 # Below this size of k(X_m, X), handing blocks to threads costs more than it saves.
 _WORTH_THREADS = 2**17
 # Blocks are summed in at most so many groups, and the groups in order, whatever the number of threads.
@@ -37,12 +39,13 @@ class Block:
     prepared : object
         The kernel's inputs, as its ``prepare`` returns them.
     linear : ndarray of shape (n, p + o)
-        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums.
+        h(x), then r: y minus the reference linear part, per output. One array, so that one product serves both sums;
+        best in Fortran's order.
     n_features : int
         p.
     may_keep : bool
         Whether there is room for ``kept``.
-    kept : (whitening, k(X_m, X), V) or None
+    kept : (whitening, k(X_m, X), [V; Hᵀ; rᵀ]) or None
         What the first pass left for the second.
     """
 
@@ -150,13 +153,17 @@ class LocalBlocks:
         keep: bool = True,
         size: int | None = None,
     ):
+        # A block frees arrays as large as the next one needs: given back to the system, they come again page by page,
+        # which takes a quarter of the time.
+        np.empty(_FREED_BYTES, dtype=np.uint8)
         size = block_rows(n_inducing) if size is None else size
         self._make = make
         self._slices = [slice(first, min(first + size, n_rows)) for first in range(0, n_rows, size)]
         first = make(self._slices[0])
         self._n_cached = int(share * CACHE_BYTES / max(_nbytes((first.prepared, first.linear)), 1))
         all_cached = self._n_cached >= len(self._slices)
-        self._may_keep = first.may_keep = keep and all_cached and 16 * n_inducing * n_rows <= share * KEEP_BYTES
+        kept_bytes = 8 * (2 * n_inducing + first.linear.shape[1]) * n_rows
+        self._may_keep = first.may_keep = keep and all_cached and kept_bytes <= share * KEEP_BYTES
         self._made = {0: first}
         per_group = -(-len(self._slices) // _MAX_GROUPS)
         blocks = range(len(self._slices))

@@ -40,7 +40,8 @@ class MakeBlock:
 
     def __call__(self, raw: RawRows) -> Block:
         rows = self.to_internal(raw)
-        linear = np.hstack([rows.features, rows.targets[:, self.outputs]])
+        # A column's numbers side by side: products and errors take the columns, not the rows.
+        linear = np.asfortranarray(np.hstack([rows.features, rows.targets[:, self.outputs]]))
         return Block(self.kernel.prepare(rows.inputs), linear, rows.features.shape[1])
 
 
