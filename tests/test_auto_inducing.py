@@ -19,7 +19,7 @@ X_NEW = RNG.uniform(-2.0, 2.0, (40, 2))
 
 
 def model(**arguments):
-    return EVGPRegressor(**{"n_inducing": "auto", "random_state": 0} | arguments)
+    return EVGPRegressor(**{"n_inducing": "auto", "sharing": "all", "random_state": 0} | arguments)
 
 
 def test_it_is_as_good_as_the_exact_model_with_fewer_points_than_rows():

@@ -30,7 +30,7 @@ X_NEW, Y_NEW = smooth(80, seed=1)
 
 
 def model(**arguments):
-    return EVGPRegressor(**{"n_inducing": 20, "random_state": 0} | arguments)
+    return EVGPRegressor(**{"n_inducing": 20, "sharing": "all", "random_state": 0} | arguments)
 
 
 # --- shapes ------------------------------------------------------------------------------------------------------
@@ -584,7 +584,7 @@ def test_adam_that_diverges_says_so_and_ends_no_lower_than_it_started(learning_r
     with pytest.warns(ConvergenceWarning, match=r"Adam (diverged|ended with).* [Ll]ower learning_rate \(now"):
         m.fit(X, Y)
     start = model(max_iter=0, posterior="diagonal", solver="adam").fit(X, Y)
-    assert m.lower_bound_ >= start.lower_bound_
+    assert m.lower_bound_ >= start.lower_bound_ - 1e-9 * abs(start.lower_bound_)
     assert np.isfinite(m.predict(X_NEW)).all()
 
 

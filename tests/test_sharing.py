@@ -27,7 +27,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceW
 
 
 def model(**parameters):
-    return EVGPRegressor(**{"n_inducing": 10, "max_iter": 6, "random_state": 0} | parameters)
+    return EVGPRegressor(**{"n_inducing": 10, "sharing": "all", "max_iter": 6, "random_state": 0} | parameters)
 
 
 def assert_same(one, other, X_NEW=X_NEW):

@@ -21,7 +21,7 @@ few_iterations = pytest.mark.filterwarnings("ignore::sklearn.exceptions.Converge
 
 
 def model(**arguments):
-    return EVGPRegressor(**{"n_inducing": 10, "max_iter": 5, "random_state": 0, **arguments})
+    return EVGPRegressor(**{"n_inducing": 10, "sharing": "all", "max_iter": 5, "random_state": 0, **arguments})
 
 
 # --- records of options --------------------------------------------------------------------------------------------

@@ -101,8 +101,13 @@ DATASETS = {
     **{name: DataSet(partial(tabular, name), 256, from_folder=True) for name in ("airfoil", "elevators", "kin40k")},
     "smooth": DataSet(partial(smooth, 10_000), 256),
     **{
-        name: DataSet(partial(dynamics, name), n_inducing, first_noise=0.01, several=True)
-        for name, n_inducing in (("pendulum", 40), ("cartpole", 100), ("acrobot", 250), ("iiwa14", 500))
+        name: DataSet(partial(dynamics, name), n_inducing, max_iter, first_noise=0.01, several=True)
+        for name, n_inducing, max_iter in (
+            ("pendulum", 40, 120),
+            ("cartpole", 100, 120),
+            ("acrobot", 250, 200),
+            ("iiwa14", 500, 120),
+        )
     },
 }
 QUICK = {
