@@ -22,11 +22,11 @@ state is learned.
 The kernel is a squared exponential with a lengthscale per column, the prior mean 0; signal variance and noise are of
 each output, or shared as the peer does it: skevgp keeps them per output, the others share them too. skevgp has its
 defaults; the noise of the others starts at all of the variance (GPflow's own start), of systems at a hundredth, and
-they have 120 iterations of L-BFGS (GPflow; of the acrobot 200), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its tutorial's 0.01 gets nowhere
-in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from 5-fold cross-validation
-outside the clock. Each fit has a process of its own on two cores. The clock starts with the arrays in memory and the
-libraries imported, so that TensorFlow's tracing is part of a fit; it does not run while a fit is looked at. Of skevgp,
-what there was at an earlier time is what a fit returns that is ended then, with its time.
+they have 120 iterations of L-BFGS (GPflow; of the acrobot 200), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its
+tutorial's 0.01 gets nowhere in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from
+5-fold cross-validation outside the clock. Each fit has a process of its own on two cores. The clock starts with the
+arrays in memory and the libraries imported, so that TensorFlow's tracing is part of a fit; it does not run while a fit
+is looked at. Of skevgp, what there was at an earlier time is what a fit returns that is ended then, with its time.
 """
 
 from __future__ import annotations
