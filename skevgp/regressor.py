@@ -271,6 +271,8 @@ class EVGPRegressor(SparseGaussianProcess):
         ValueError, TypeError
             If an argument is out of its range, the data are not finite, or shapes do not fit; the message names the
             argument, the value and what is allowed.
+        KeyboardInterrupt
+            Upon Ctrl-C before there is anything to keep, as while ``sharing="auto"`` looks for groups.
 
         Warns
         -----

@@ -15,6 +15,7 @@ REFERENCE = ("GPflow SGPR", "none")
 STYLES = {
     ("skevgp", "none"): ("#0072B2", "-", "skevgp"),
     ("skevgp", "default"): ("#56B4E9", "-", "skevgp, default sharing"),
+    ("skevgp", "all"): ("#56B4E9", "--", "skevgp, shared"),
     ("skevgp, same limit", "none"): ("#0072B2", ":", "skevgp, 120 iterations"),
     ("GPflow SGPR", "none"): ("#D55E00", "-", "GPflow SGPR"),
     ("GPflow SGPR", "all"): ("#E69F00", "-", "GPflow SGPR, shared"),

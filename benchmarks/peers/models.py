@@ -75,7 +75,7 @@ _GPFLOW = with_gpflow.at_fixed, with_gpflow.JITTER
 _GPYTORCH = with_gpytorch.at_fixed, with_gpytorch.JITTER
 _GPR = with_sklearn.GPR_MODULES, with_sklearn.fit_gpr, with_sklearn.at_fixed, with_sklearn.JITTER
 PEERS = {
-    "skevgp": Peer(*_SKEVGP, ("default", "none"), own_rule=True),
+    "skevgp": Peer(*_SKEVGP, ("default", "none", "all"), own_rule=True),
     "skevgp, same limit": Peer(*_SKEVGP, ("default", "none")),
     "GPflow SGPR": Peer(with_gpflow.MODULES, with_gpflow.fit, *_GPFLOW, ("none", "all")),
     "GPyTorch SGPR": Peer(with_gpytorch.MODULES, lambda job, watch: with_gpytorch.fit(job, watch, False), *_GPYTORCH),
