@@ -107,13 +107,17 @@ class SparseTask:
         return () if self.interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing + p, d + p + o)
 
     @cached_property
-    def _sampled(self) -> dict[int, Blocks]:
-        largest = self.rows.sampled(self.samples[-1], self.rng)
-        return {n: largest.part(0, n, 1.0).blocks(self.model.kernel, self.n_inducing) for n in self.samples}
+    def _sample(self) -> Rows:
+        return self.rows.sampled(self.samples[-1], self.rng)
 
     def blocks_of(self, n_rows: int | None) -> Blocks:
-        """A sample of so many rows, of which the smaller ones are parts; None means all."""
-        return self.blocks if n_rows is None else self._sampled[n_rows]
+        """A sample of so many rows, of which the smaller ones are parts; None means all.
+
+        Made anew each time: what a sample keeps from one pass to the next goes with it.
+        """
+        if n_rows is None:
+            return self.blocks
+        return self._sample.part(0, n_rows, 1.0).blocks(self.model.kernel, self.n_inducing)
 
     @property
     def interpolates(self) -> bool:

@@ -359,9 +359,9 @@ def test_the_smaller_sample_is_part_of_the_larger_one():
     assert task.strategy.samples == task.samples
     for size in task.samples:
         assert task.blocks_of(size).linear.n_rows == size
-        assert task.blocks_of(size) is task.blocks_of(size)
     assert task.blocks_of(None) is task.blocks
-    fewer, more = (task.blocks_of(size).linear for size in task.samples[:2])
+    fewer, again, more = (task.blocks_of(size).linear for size in (15, 15, 30))
+    np.testing.assert_array_equal(fewer.RR, again.RR)
     assert (more.RR >= fewer.RR).all()
     assert (task.blocks.linear.RR >= more.RR).all()
 
