@@ -176,7 +176,8 @@ class Adam(BaseEstimator):
         The first step size; it falls to zero along half a cosine: over ``max_iter`` steps, or over the last steps.
     natural_gradient : bool, default=False
         Only with ``posterior="full"``: whether q moves by natural gradients (Hensman et al. 2013), the last one on all
-        rows, so that Adam is left with kernel, noise and inducing points.
+        rows, so that Adam is left with kernel, noise and inducing points. For a million rows this is the fastest way to
+        a good bound: ``Adam(batch_size=2000, natural_gradient=True)`` with ``max_iter=20000``, 40 epochs.
     n_restarts : int, default=0
         As of `LBFGS`.
     callback : callable, default=None
