@@ -207,7 +207,7 @@ def run(cell: Cell) -> dict[str, Any]:
     convergence = [str(warning.message) for warning in caught if issubclass(warning.category, ConvergenceWarning)]
     return {
         **{name: getattr(cell, name) for name in ("system", "model", "n_rows", "seed")},
-        "m": len(regressor.inducing_points_) if isinstance(regressor, EVGPRegressor) else "",
+        "m": regressor.inducing_points_.shape[-2] if isinstance(regressor, EVGPRegressor) else "",
         "fit_seconds": fit_seconds,
         "predict_seconds": 1000.0 * predict_seconds / len(test.X),
         "memory_mb": memory(),

@@ -17,12 +17,15 @@ _BLOCK_NUMBERS, _MIN_BLOCK_ROWS, _MAX_BLOCK_ROWS = 2**16, 512, 8192
 CACHE_BYTES = 48 * 2**20
 # If k(X_m, X) and [V; Hᵀ; rᵀ] of all rows fit in this many bytes, they are kept from the first pass for the second.
 KEEP_BYTES = 128 * 2**20
-# Once a block of memory as large as this was freed, glibc keeps what is freed later: 32 MiB is the most that it heeds.
-_FREED_BYTES = 2**25 - 2**14
 # Below this size of k(X_m, X), handing blocks to threads costs more than it saves.
 _WORTH_THREADS = 2**17
 # Blocks are summed in at most so many groups, and the groups in order, whatever the number of threads.
 _MAX_GROUPS = 64
+
+# A block frees arrays as large as the next one needs: given back to the system, they come again page by page, which
+# takes a quarter of the time. Once memory as large as this, of which nothing is touched, was freed, glibc keeps what is
+# freed later; 32 MiB is the most that it heeds.
+np.empty(2**25 - 2**14, dtype=np.uint8)
 
 
 def block_rows(n_inducing: int) -> int:
@@ -153,9 +156,6 @@ class LocalBlocks:
         keep: bool = True,
         size: int | None = None,
     ):
-        # A block frees arrays as large as the next one needs: given back to the system, they come again page by page,
-        # which takes a quarter of the time.
-        np.empty(_FREED_BYTES, dtype=np.uint8)
         size = block_rows(n_inducing) if size is None else size
         self._make = make
         self._slices = [slice(first, min(first + size, n_rows)) for first in range(0, n_rows, size)]

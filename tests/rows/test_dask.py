@@ -142,8 +142,8 @@ def test_nothing_of_the_size_of_the_data_reaches_the_client(monkeypatch):
     monkeypatch.setattr("dask.compute", counting)
     big = da.random.default_rng(0).normal(size=(200_000, 2), chunks=(50_000, 2))
     fitted = model(max_iter=1).fit(big, da.sin(big[:, 0]))
-    # The largest is the sample that the fit begins with: 16,000 rows of inputs and target.
-    assert 8 * 3 * 16_000 < max(sizes) < 1.1 * 8 * 3 * 16_000
+    # The largest is the sample that the fit begins with: 64,000 rows of inputs and target.
+    assert 8 * 3 * 64_000 < max(sizes) < 1.1 * 8 * 3 * 64_000
     assert len(sizes) > 10
     assert fitted.predict(big).npartitions == 4
 
