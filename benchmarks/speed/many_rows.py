@@ -2,11 +2,12 @@
 
 8 columns, a smooth function plus noise, in memory-mapped files (those of `scaling.py`); 100 inducing points, two
 threads, each fit in a fresh process. "gained" is what the bound gains over noise alone, as a share of what the
-thousand iterations gain. Writes one row per fit to a CSV; what is there already is not fitted again.
+thousand iterations gain. Writes one row per fit to a CSV (what is there already is not
+fitted again), and once there is the reference a page.
 
-    python benchmarks/speed/many_rows.py                          # the default and Adam: some minutes of two cores
-    python benchmarks/speed/many_rows.py --fits reference   # an hour more
-    python benchmarks/speed/many_rows.py --quick                  # 10,000 rows, 30 iterations
+    python benchmarks/speed/many_rows.py                   # L-BFGS and Adam: some minutes of two cores
+    python benchmarks/speed/many_rows.py --fits reference  # a thousand iterations: much longer
+    python benchmarks/speed/many_rows.py --quick           # 10,000 rows, 30 iterations
 """
 
 from __future__ import annotations
