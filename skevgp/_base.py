@@ -6,7 +6,7 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from numbers import Integral, Real
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -32,11 +32,12 @@ from ._validation import (
 )
 from .fitting.start import Units
 from .inference.posterior import Predictor
+from .inference.prior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
-from .rows.mapped import MappedRows, map_rows
+from .rows.mapped import MappedRows, RowShapes, check_shapes, map_rows
 from .rows.maps import fit_map, take_rows
-from .rows.source import LocalSource, Source, moments_of_rows
+from .rows.source import LocalSource, Moments, Source, moments_of_rows
 
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
 _VAGUE = 1e3
@@ -59,6 +60,8 @@ class Problem:
         Which weights have an infinite prior scale; in ``units.prior`` theirs is very wide.
     n_columns : int
         Width of the kernel's inputs.
+    per_output : bool
+        Whether outputs have inputs or features of their own.
     """
 
     data: tuple[Any, Any, np.ndarray]
@@ -67,6 +70,7 @@ class Problem:
     spec: KernelSpec
     vague: np.ndarray
     n_columns: int
+    per_output: bool
 
 
 class Fitted(Protocol):
@@ -111,6 +115,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         "kernel_map": "no_validation",
         "coef_mean": ["array-like", Real, StrOptions({"auto"})],
         "coef_scale": ["array-like", Real, StrOptions({"auto"})],
+        "coef_cov": ["array-like", None],
+        "share_coef": ["boolean", StrOptions({"auto"})],
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
         "normalize_y": ["boolean"],
         "max_iter": [Interval(Integral, 0, None, closed="left")],
@@ -124,6 +130,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
     kernel_map: TransformerMixin | None
     coef_mean: ArrayLike | str
     coef_scale: ArrayLike | str
+    coef_cov: ArrayLike | None
+    share_coef: bool | Literal["auto"]
     noise_variance: float | None
     normalize_y: bool
 
@@ -131,9 +139,14 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
 
     _fitted: Fitted
     _spec: KernelSpec
+    _row_shapes: RowShapes
 
     def predict(
-        self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
+        self,
+        X: ArrayLike,
+        return_std: bool = False,
+        return_cov: bool | Literal["joint"] = False,
+        include_noise: bool = True,
     ) -> Any:
         """Predict y.
 
@@ -143,8 +156,9 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             For a Dask array the results are lazy Dask arrays of the same chunks.
         return_std : bool, default=False
             Whether to return the standard deviation too.
-        return_cov : bool, default=False
-            Whether to return the covariance between rows too.
+        return_cov : bool or "joint", default=False
+            Whether to return the covariance between rows too, of each output; ``"joint"`` also between outputs, which
+            depend on each other if they share their weights.
         include_noise : bool, default=True
             Whether they are of y, with the learned noise, or of the noise-free g(x).
 
@@ -155,7 +169,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         std : ndarray of the same shape
             If ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            If ``return_cov``.
+            If ``return_cov``. If that is ``"joint"``, of shape (n_samples * n_outputs, n_samples * n_outputs), in the
+            order of ``mean.ravel()``.
 
         Raises
         ------
@@ -163,6 +178,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
             of the rows of a Dask array.
         """
+        if return_cov not in (False, True, "joint"):
+            raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
         if not hasattr(self, "_predictor"):
@@ -179,9 +196,12 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         if not is_plain(self, X):
             given, array, _ = self._validated(X)
         noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
-        if return_cov:
-            mean, cov = self._predictor.covariance(*self._inputs_and_features(given, array, slice(None)))
+        if return_cov is not False:
+            rows = self._inputs_and_features(given, array, slice(None))
+            mean, cov = self._predictor.covariance(*rows)
             cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
+            if return_cov == "joint":
+                return like_y(mean), self._predictor.jointly(cov, *rows)
             return like_y(mean), like_y(cov)
         means, deviations = [], []
         size = self._predictor.rows_at_once
@@ -232,10 +252,19 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1
         mean, cov = mean.reshape(len(mean), -1), cov.reshape(len(mean), len(mean), -1)
+        common = np.empty((0, *mean.shape))
+        if self._predictor.shared:
+            given, array, _ = self._validated(X)
+            common = self._predictor.common(*self._inputs_and_features(given, array, slice(None)))
+        # Of outputs that share their weights, what comes from these is one draw; all else is independent.
+        weights = rng.standard_normal((len(common), n_samples)) if len(common) else np.empty((0, n_samples))
         samples = np.stack(
             [
-                rng.multivariate_normal(mean[:, o], cov[:, :, o], n_samples, check_valid="ignore").T
-                for o in range(mean.shape[1])
+                rng.multivariate_normal(
+                    mean[:, o], cov[:, :, o] - own.T @ own, n_samples, check_valid="ignore"
+                ).T
+                + own.T @ weights
+                for o, own in enumerate(np.moveaxis(common, 2, 0))
             ],
             axis=1,
         )
@@ -260,7 +289,15 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
-        spec = parse_kernel(self.kernel, len(inputs.mean))
+        per_output = inputs.mean.ndim == 2 or features.mean.ndim == 2
+        for name, moments in (("kernel_map", inputs), ("feature_map", features)):
+            if moments.mean.ndim == 2 and len(moments.mean) != len(targets.mean):
+                raise ValueError(
+                    f"{name}={getattr(self, name)!r} returns a row for each of {len(moments.mean)} outputs, but y has "
+                    f"{len(targets.mean)}."
+                )
+        n_columns = inputs.mean.shape[-1]
+        spec = parse_kernel(self.kernel, n_columns)
         if self.noise_variance is not None:
             if spec.starts.noise.value is not None:
                 raise ValueError(
@@ -268,16 +305,38 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
                     f"kernel={self.kernel!r}; give one of them."
                 )
             spec = spec.with_noise(self.noise_variance)
-        wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest)
-        mean, scale = resolve_coef_prior(
-            self.coef_mean, self.coef_scale, self.feature_map_, given, wide, allow_vague=allow_vague
+        prior, vague = self._prior(given, features, targets, allow_vague)
+        target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
+        units = Units.of(source, targets, target_mean, prior)
+        self._spec, self._row_shapes = spec, (inputs.mean.shape, features.mean.shape)
+        return Problem((given, X, y), source, units, spec, vague, n_columns, per_output)
+
+    def _prior(
+        self, given: Any, features: Moments, targets: Moments, allow_vague: bool
+    ) -> tuple[CoefficientPrior, np.ndarray]:
+        """The weights' prior, in the user's units, and which of them (o, p) are vague."""
+        o, shared = len(targets.mean), self.share_coef
+        if isinstance(shared, str):
+            shared = bool(getattr(self.feature_map_, "share_coef", False))
+        shared = shared and o > 1 and self.feature_map_ is not None
+        wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest, shared)
+        mean, scale, root = resolve_coef_prior(
+            self.coef_mean,
+            self.coef_scale,
+            self.feature_map_,
+            given,
+            wide,
+            coef_cov=self.coef_cov,
+            n_outputs=o,
+            allow_vague=allow_vague,
         )
         vague = np.isinf(scale)
-        unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest)
-        target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
-        units = Units.of(source, targets, target_mean, mean, np.where(vague, unit, scale))
-        self._spec = spec
-        return Problem((given, X, y), source, units, spec, vague, len(inputs.mean))
+        unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest, shared)
+        scale = np.where(vague, unit, scale)
+        if shared:
+            mean, scale = (np.repeat(values, o, axis=0) for values in (mean, scale))
+            root, vague = None if root is None else np.repeat(root, o, axis=0), np.repeat(vague, o, axis=0)
+        return CoefficientPrior(mean, scale, np.zeros(scale.shape), root, shared), vague
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
@@ -320,13 +379,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """The kernel's inputs and the features of rows."""
         array = take_rows(X, rows)
         given = array if given is X else take_rows(given, rows)
-        return map_rows(given, array, self.feature_map_, self.kernel_map_)
+        inputs, features = map_rows(given, array, self.feature_map_, self.kernel_map_)
+        check_shapes((inputs, features), self._row_shapes)
+        return inputs, features
 
-    def _source(self, given: Any, X: Any, y: np.ndarray) -> Source:
-        """The rows through the maps."""
+    def _source(self, given: Any, X: Any, y: np.ndarray, shapes: RowShapes | None = None) -> Source:
+        """The rows through the maps, which may have to be of certain shapes."""
+        maps = self.feature_map_, self.kernel_map_
         if is_dask(X):
-            return DaskSource(X, y, self.feature_map_, self.kernel_map_)
-        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
+            return DaskSource(X, y, *maps, shapes)
+        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), *maps, shapes), len(X))
 
     def _set_common_attributes(self) -> None:
         """What is known of weights, if there are any, noise and kernel."""
@@ -338,6 +400,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 self.__dict__.pop(name, None)
         if self.feature_map_ is not None:
             mean, covariance = self._predictor.coefficients()
+            first = 0 if prior.shared else first
             self.coef_, self.coef_cov_ = mean[first], covariance[first]
             self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()

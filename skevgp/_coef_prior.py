@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -15,6 +15,24 @@ from ._validation import as_floats, check_magnitude
 
 # Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
 _WIDE = 10.0
+# Of correlations.
+_ROUNDING = 1e-8
+
+
+class CoefPrior(NamedTuple):
+    """β ~ N(mean, Σ) for each output; k rows, one for each output, or a single one if they share their weights.
+
+    Attributes
+    ----------
+    mean, scale : ndarray of shape (k, p)
+        With ``scale`` the standard deviations.
+    root : ndarray of shape (k, p, p), or None
+        C with Σ = C Cᵀ; None if weights are independent.
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    root: np.ndarray | None
 
 
 def resolve_coef_prior(
@@ -24,41 +42,54 @@ def resolve_coef_prior(
     X: Any,
     wide: np.ndarray,
     *,
+    coef_cov: ArrayLike | None = None,
+    n_outputs: int | None = None,
     allow_vague: bool = False,
-) -> tuple[np.ndarray, np.ndarray]:
-    """Prior mean and standard deviation of the weights.
+) -> CoefPrior:
+    """Prior mean and covariance of the weights.
 
     Parameters
     ----------
-    coef_mean, coef_scale : array-like of shape (o, p), scalar or "auto"
-        ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; unions concatenate those of their parts. A part
+    coef_mean, coef_scale : array-like of shape (k, p), scalar or "auto"
+        ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``, which returns the mean and either the standard
+        deviations or the covariance (k, p, p), or one (p, p) for all; unions concatenate those of their parts. A part
         without one, and entries of a scale that are NaN, get mean 0 and the scale ``wide``.
     feature_map : transformer or None
         Fitted.
     X : array-like of shape (n, d)
         What the map takes; only its first row is used, to learn the widths of the parts of a union.
-    wide : ndarray of shape (o, p)
+    wide : ndarray of shape (k, p)
         `wide_scale`.
+    coef_cov : array-like of shape (p, p) or (k, p, p), default=None
+        In place of ``coef_scale``.
+    n_outputs : int, default=None
+        What ``coef_prior`` is asked for; None is k.
     allow_vague : bool, default=False
         Whether a scale may be infinite.
 
     Returns
     -------
-    mean, scale : ndarray of shape (o, p)
+    prior : CoefPrior
 
     Raises
     ------
     ValueError
-        If a shape does not fit, a value is not finite or a scale is negative.
+        If a shape does not fit, a value is not finite, a scale is negative, or a covariance is none.
     """
     shape = wide.shape
-    auto_mean, auto_scale = np.zeros(shape), wide
+    if coef_cov is not None and _word(coef_scale) != "auto":
+        raise ValueError(f"coef_cov and coef_scale={coef_scale!r} both say how far weights may be; give one of them.")
+    auto_mean, auto_scale, correlation = np.zeros(shape), wide, _independent(shape)
     if feature_map is not None and "auto" in (_word(coef_mean), _word(coef_scale)):
         first = safe_indexing(X, slice(0, 1))
-        mean, scale = _map_prior(feature_map, first, shape[0], shape[1])
-        auto_mean, auto_scale = mean, np.where(np.isnan(scale), auto_scale, scale)
+        auto_mean, scale, correlation = _map_prior(feature_map, first, n_outputs or shape[0], shape)
+        auto_scale = np.where(np.isnan(scale), auto_scale, scale)
     mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)
-    scale = auto_scale if _word(coef_scale) == "auto" else _as_table(coef_scale, "coef_scale", shape)
+    scale = auto_scale
+    if _word(coef_scale) != "auto":
+        scale, correlation = _as_table(coef_scale, "coef_scale", shape), _independent(shape)
+    if coef_cov is not None:
+        scale, correlation = _of_covariance(coef_cov, "coef_cov", shape)
     finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
     for name, values in (("coef_mean", mean), ("coef_scale", finite)):
         if not np.isfinite(values).all():
@@ -66,7 +97,49 @@ def resolve_coef_prior(
         check_magnitude(values, name)
     if (scale < 0).any():
         raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
-    return mean.astype(float), scale.astype(float)
+    if (correlation == _independent(shape)).all():
+        return CoefPrior(mean.astype(float), scale.astype(float), None)
+    eigenvalues, vectors = np.linalg.eigh(correlation)
+    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, np.newaxis]
+    return CoefPrior(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
+
+
+def _independent(shape: tuple[int, int]) -> np.ndarray:
+    """The correlation (k, p, p) of independent weights."""
+    return np.repeat(np.eye(shape[1])[np.newaxis], shape[0], axis=0)
+
+
+def _of_covariance(covariance: ArrayLike, name: str, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+    """Standard deviations (k, p) and correlation (k, p, p) of a covariance, checked."""
+    k, p = shape
+    values = as_floats(covariance, name)
+    if values.shape not in ((p, p), (k, p, p)):
+        raise ValueError(
+            f"{name} must be of the shape (n_features_out, n_features_out) = {(p, p)}, or one such for each output, "
+            f"{(k, p, p)}; got the shape {values.shape}."
+        )
+    values = np.broadcast_to(values, (k, p, p))
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
+    variance = np.diagonal(values, axis1=1, axis2=2)
+    if (variance < 0.0).any():
+        raise ValueError(f"{name} must have no negative variance; its smallest is {variance.min()}.")
+    scale = np.sqrt(variance)
+    check_magnitude(scale, name)
+    unit = np.where(scale > 0.0, scale, 1.0)
+    correlation = values / unit[:, :, np.newaxis] / unit[:, np.newaxis]
+    if np.abs(correlation - correlation.transpose(0, 2, 1)).max() > _ROUNDING:
+        raise ValueError(f"{name} must be symmetric.")
+    correlation = 0.5 * (correlation + correlation.transpose(0, 2, 1))
+    if (correlation[scale == 0.0] != 0.0).any():
+        raise ValueError(f"{name} must be positive semi-definite: a weight without variance has no covariance.")
+    diagonal = np.einsum("oii->oi", correlation)
+    diagonal[...] = 1.0
+    if (lowest := np.linalg.eigvalsh(correlation).min()) < -_ROUNDING * p:
+        raise ValueError(
+            f"{name} must be positive semi-definite; the lowest eigenvalue of its correlations is {lowest:.3g}."
+        )
+    return scale, correlation
 
 
 def _word(value: Any) -> str | None:
@@ -75,7 +148,7 @@ def _word(value: Any) -> str | None:
 
 def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.ndarray:
     array = as_floats(value, name)
-    # With one output its row may stand alone.
+    # With one output, or one row for all, it may stand alone.
     if array.shape not in ((), shape, (shape[1],) if shape[0] == 1 else ()):
         raise ValueError(
             f"{name} must be 'auto', a number or an array of the shape (n_outputs, n_features_out) = {shape}; got the "
@@ -84,51 +157,71 @@ def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.n
     return np.broadcast_to(array, shape)
 
 
-def wide_scale(feature_size: np.ndarray, target_std: np.ndarray, target_largest: np.ndarray) -> np.ndarray:
+def wide_scale(
+    feature_size: np.ndarray, target_std: np.ndarray, target_largest: np.ndarray, shared: bool = False
+) -> np.ndarray:
     """10 * std(y) / rms(h), the scale of weights of which nothing is known.
 
     Parameters
     ----------
-    feature_size : ndarray of shape (p,)
+    feature_size : ndarray of shape (p,) or (o, p)
         Root mean square of each feature.
     target_std, target_largest : ndarray of shape (o,)
         Standard deviation of each target, and its largest absolute value, which serves where it does not vary.
+    shared : bool, default=False
+        Whether outputs share their weights: the widest of each.
 
     Returns
     -------
-    scale : ndarray of shape (o, p)
+    scale : ndarray of shape (o, p), or (1, p) if they are shared
     """
     size = np.where(target_std > 0.0, target_std, target_largest)
-    return _WIDE * np.where(size > 0.0, size, 1.0)[:, np.newaxis] / np.where(feature_size > 0.0, feature_size, 1.0)
+    size = _WIDE * np.where(size > 0.0, size, 1.0)[:, np.newaxis]
+    if not shared:
+        return size / np.where(feature_size > 0.0, feature_size, 1.0)
+    feature_size = np.broadcast_to(feature_size, (len(size), np.shape(feature_size)[-1]))
+    known = feature_size > 0.0
+    wide = np.where(known, size / np.where(known, feature_size, 1.0), 0.0).max(axis=0, keepdims=True)
+    return np.where(wide > 0.0, wide, size.max())
 
 
-def _map_prior(feature_map: Any, first: Any, n_outputs: int, width: int) -> tuple[np.ndarray, np.ndarray]:
-    """Prior (n_outputs, width) of a map's features; NaN in the scale where it has no opinion."""
+def _map_prior(
+    feature_map: Any, first: Any, n_outputs: int, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Mean and scale (k, width) of a map's weights, and their correlation; NaN in the scale where it has no opinion."""
     if hasattr(feature_map, "coef_prior"):
-        return _own_prior(feature_map, (n_outputs, width))
-    mean, scale = np.zeros((n_outputs, width)), np.full((n_outputs, width), np.nan)
+        return _own_prior(feature_map, n_outputs, shape)
+    mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
     if isinstance(feature_map, Pipeline):
         steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]
         for step in steps[:-1]:
             first = step.transform(first)
-        return _map_prior(steps[-1], first, n_outputs, width) if steps else (mean, scale)
+        return _map_prior(steps[-1], first, n_outputs, shape) if steps else (mean, scale, correlation)
     for part, part_first, columns, weight in _parts_of(feature_map, first):
-        part_mean, part_scale = _map_prior(part, part_first, n_outputs, len(columns))
+        part_mean, part_scale, part_correlation = _map_prior(part, part_first, n_outputs, (shape[0], len(columns)))
         mean[:, columns] = part_mean / weight
         scale[:, columns] = part_scale / abs(weight)
-    return mean, scale
+        correlation[:, columns[:, np.newaxis], columns] = part_correlation
+    return mean, scale, correlation
 
 
-def _own_prior(feature_map: Any, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
+def _own_prior(
+    feature_map: Any, n_outputs: int, shape: tuple[int, int]
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a map's ``coef_prior`` says, checked."""
-    prior = feature_map.coef_prior(shape[0])
+    (k, p), prior = shape, feature_map.coef_prior(n_outputs)
+    allowed = [shape, (p,)] if k == 1 else [shape]
     shapes = [np.shape(part) for part in prior] if isinstance(prior, (tuple, list)) else type(prior).__name__
-    if shapes != [shape, shape]:
+    if len(shapes) != 2 or shapes[0] not in allowed or shapes[1] not in [*allowed, (p, p), (k, p, p)]:
         raise ValueError(
-            f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = {shape}; "
-            f"got {shapes}."
+            f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = {shape}, "
+            f"of which the second may be the covariance, {(k, p, p)}; got {shapes}."
         )
-    return np.asarray(prior[0], dtype=float), np.asarray(prior[1], dtype=float)
+    mean = np.asarray(prior[0], dtype=float).reshape(shape)
+    if shapes[1] not in allowed:
+        scale, correlation = _of_covariance(prior[1], f"The covariance of coef_prior of {feature_map!r}", shape)
+        return mean, scale, correlation
+    return mean, np.asarray(prior[1], dtype=float).reshape(shape), _independent(shape)
 
 
 def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarray, float]]:
@@ -141,7 +234,7 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
         for name, part in feature_map.transformer_list:
             if part == "drop":
                 continue
-            width = np.shape(first if part == "passthrough" else part.transform(first))[1]
+            width = np.shape(first if part == "passthrough" else part.transform(first))[-1]
             weight = _weight(feature_map, name)
             if weight != 0.0:
                 yield part, first, np.arange(start, start + width), weight

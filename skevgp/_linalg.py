@@ -104,7 +104,7 @@ def triangular_inverse(L: np.ndarray) -> np.ndarray:
     |X| |L| (Higham 2002, section 14.2). Its method for an upper one, on the transpose, bounds L X - I instead; X L - I
     is then larger by the condition of L, 1e6 where there is little noise.
     """
-    return lapack.dtrtri(L, lower=1)[0]
+    return lapack.dtrtri(L, lower=1)[0] if len(L) else L.copy()
 
 
 def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray) -> np.ndarray:

@@ -60,7 +60,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             n_outputs = 1 if y.ndim == 1 else y.shape[1]
             if n_outputs != self._n_outputs:
                 raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
-            source = self._source(given, X, y)
+            source = self._source(given, X, y, self._row_shapes)
             residuals = self._fitted.units.rows(source).residuals
             check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
             self._fitted = self._fitted.updated(source, self.forgetting_factor)
@@ -98,6 +98,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         self._check_gradient_of(theta, eval_gradient)
         if theta is None:
             return self.lower_bound_
+        if self._predictor.shared:
+            raise ValueError("lower_bound(theta) is of outputs with weights of their own: not with share_coef.")
         if self._training_data is None:
             raise ValueError(
                 "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
@@ -118,7 +120,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         self.inducing_points_: Any = np.array(points) if same else points
         if len(self._predictor.groups) == 1:
             self.inducing_points_ = points[0]
-        self.sharing_ = [group.copy() for group in fitted.outputs]
+        self.sharing_ = fitted.sharing
         self.lower_bound_, self.upper_bound_ = fitted.lower_bound, fitted.upper_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter

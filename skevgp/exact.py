@@ -135,6 +135,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         kernel_map: TransformerMixin | None = None,
         coef_mean: ArrayLike | Literal["auto"] = "auto",
         coef_scale: ArrayLike | Literal["auto"] = "auto",
+        coef_cov: ArrayLike | None = None,
+        share_coef: bool | Literal["auto"] = "auto",
         noise_variance: float | None = None,
         normalize_y: bool = False,
         max_iter: int = 1000,
@@ -148,6 +150,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.kernel_map = kernel_map
         self.coef_mean = coef_mean
         self.coef_scale = coef_scale
+        self.coef_cov = coef_cov
+        self.share_coef = share_coef
         self.noise_variance = noise_variance
         self.normalize_y = normalize_y
         self.max_iter = max_iter
@@ -203,7 +207,7 @@ class EGPRegressor(ExplicitGaussianProcess):
             )
             self._set_common_attributes()
             if problem.vague.any():
-                self.coef_prior_scale_[problem.vague[0] if self._single_output else problem.vague] = np.inf
+                self.coef_prior_scale_[problem.vague[0] if self.coef_prior_scale_.ndim == 1 else problem.vague] = np.inf
             self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
@@ -242,6 +246,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         self._check_gradient_of(theta, eval_gradient)
         if theta is None:
             return self.log_marginal_likelihood_value_
+        if self._predictor.shared:
+            raise ValueError("log_marginal_likelihood(theta) is of outputs with their own weights: not with share_coef.")
         with single_threaded_libraries():
             found = self._value_at(theta, eval_gradient, self._fitted.log_likelihood_at)
         if not clone_kernel:

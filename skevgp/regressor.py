@@ -21,7 +21,7 @@ from .fitting.inducing import Placement
 from .fitting.outputs import Request, Sharing, fit_outputs
 from .fitting.sharing import with_groups
 from .rows.threads import single_threaded_libraries
-from .solvers import LBFGS, Adam, resolved
+from .solvers import LBFGS, Adam, check_weights, resolved
 
 
 class EVGPRegressor(SparseGaussianProcess):
@@ -212,6 +212,8 @@ class EVGPRegressor(SparseGaussianProcess):
         posterior: Literal["full", "diagonal"] = "full",
         coef_mean: ArrayLike | Literal["auto"] = "auto",
         coef_scale: ArrayLike | Literal["auto"] = "auto",
+        coef_cov: ArrayLike | None = None,
+        share_coef: bool | Literal["auto"] = "auto",
         noise_variance: float | None = None,
         noise_cv: int | None = None,
         normalize_y: bool = False,
@@ -234,6 +236,8 @@ class EVGPRegressor(SparseGaussianProcess):
         self.posterior = posterior
         self.coef_mean = coef_mean
         self.coef_scale = coef_scale
+        self.coef_cov = coef_cov
+        self.share_coef = share_coef
         self.noise_variance = noise_variance
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
@@ -302,7 +306,9 @@ class EVGPRegressor(SparseGaussianProcess):
                 None if isinstance(self.tol, str) else self.tol,
                 self.noise_cv,
                 effective_n_jobs(self.n_jobs),
+                problem.per_output,
             )
+            check_weights(solver, self.posterior, problem.units.prior)
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)

@@ -14,6 +14,7 @@ from .fitting.advice import how_it_ended
 from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
+from .inference.prior import CoefficientPrior
 from .optimizers.adam import adam
 from .optimizers.curvature import curvature_units
 from .optimizers.lbfgs import DESCENT, Descent, Tolerance, lbfgs
@@ -343,3 +344,14 @@ def resolved(solver: Any, posterior: str) -> LBFGS | Adam:
         raise ValueError(f"solver must be one of {names}, {objects}; got {solver!r}.")
     solver.check(posterior)
     return solver
+
+
+def check_weights(solver: LBFGS | Adam, posterior: str, prior: CoefficientPrior) -> None:
+    """Refuse what moves or restricts q in coordinates that correlated or shared weights do not have."""
+    told = "share_coef=True" if prior.shared else "a covariance of the weights (coef_cov)"
+    if prior.root is None and not prior.shared:
+        return
+    if isinstance(solver, Adam):
+        raise ValueError(f"{told} needs solver=\"lbfgs\" or an LBFGS(...); got solver={solver!r}.")
+    if posterior == "diagonal":
+        raise ValueError(f'{told} needs posterior="full"; got posterior={posterior!r}.')

@@ -5,7 +5,8 @@ import numpy as np
 
 from skevgp.fitting.start import starting_table
 from skevgp.fitting.strategy import Rules
-from skevgp.inference.bounds import LOG_2PI, CoefficientPrior
+from skevgp.inference.bounds import LOG_2PI
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
@@ -88,7 +89,7 @@ class ArrayRows:
         return len(self.inputs)
 
     def blocks(self, kernel, size, **options):
-        source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock(kernel, lambda raw: raw)
+        source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock((kernel,), lambda raw: raw)
         return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size, **options)
 
 

@@ -34,7 +34,7 @@ class Opinionated(TransformerMixin, BaseEstimator):
 
 def resolve(feature_map, coef_mean="auto", coef_scale="auto", targets=TARGETS):
     fitted = feature_map.fit(X)
-    return resolve_coef_prior(coef_mean, coef_scale, fitted, X, wide(fitted.transform(X), targets))
+    return resolve_coef_prior(coef_mean, coef_scale, fitted, X, wide(fitted.transform(X), targets))[:2]
 
 
 def wide(features, targets=TARGETS):
@@ -74,7 +74,7 @@ def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
 
 
 def test_without_features_the_prior_is_empty():
-    mean, scale = resolve_coef_prior("auto", "auto", None, X, np.empty((2, 0)))
+    mean, scale, _ = resolve_coef_prior("auto", "auto", None, X, np.empty((2, 0)))
     assert mean.shape == scale.shape == (2, 0)
 
 
@@ -104,7 +104,7 @@ def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of
     scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
     parts = make_column_transformer((OneHotEncoder(), ["kind"]), (scaled, names)).fit(frame)
     features = parts.transform(frame)
-    mean, scale = resolve_coef_prior("auto", "auto", parts, frame, wide(features))
+    mean, scale, _ = resolve_coef_prior("auto", "auto", parts, frame, wide(features))
     assert_array_equal(mean, np.hstack([np.zeros((2, 2)), IF_MEAN]))
     assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 
@@ -208,7 +208,7 @@ def test_a_scale_of_zero_is_allowed():
     ],
 )
 def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
-    with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.* = \(2, 3\); got "):
+    with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.* = \(2, 3\), .*; got "):
         resolve(Opinionated(mean, scale))
 
 
@@ -254,7 +254,7 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
 @pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
 def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
     union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
-    mean, scale = resolve_coef_prior("auto", "auto", union.fit(X), X, wide(X))
+    mean, scale, _ = resolve_coef_prior("auto", "auto", union.fit(X), X, wide(X))
     assert_allclose(mean, factor * IF_MEAN)
     assert_allclose(scale, abs(factor) * IF_SCALE)
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
-from ..inference.bounds import CoefficientPrior
+from ..inference.prior import CoefficientPrior
 from ..inference.exact import ExactModel
 from ..inference.posterior import Predictor
 from ..inference.statistics import Kernel
@@ -18,7 +18,7 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
-from .start import Units, checked_variance, column_centre, starting_table
+from .start import Units, centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
 
 # On so many rows it is seen whether a user's kernel works.
@@ -193,8 +193,8 @@ class ExactFit:
             That in log s² last.
         """
         own, model = slice(output, output + 1), self.model
-        rows = replace(model.rows, targets=model.rows.targets[:, own])
-        model = replace(model, prior=model.prior.outputs(own), vague=model.vague[own], rows=rows)
+        kernel = model.kernel if model.kernels is None else model.kernels[output]
+        model = ExactModel(kernel, model.prior.outputs(own), model.vague[own], model.rows.of(own))
         values = {
             "hyperparameters": hyperparameters,
             "signal": signal / self.units.target_unit[own] ** 2,
@@ -256,15 +256,15 @@ def fit_exact(
     """
     n, starts = len(rows), spec.starts
     everything = rows.some(np.arange(n))
-    _check_independent(everything.features, vague)
-    kernel = spec.covariance.centred(column_centre(rows.inputs))
+    _check_independent(everything.features, vague, units.prior.shared)
+    kernel, kernels = centred_kernels(spec.covariance, rows.inputs)
     first, variance = starts.hyperparameters.value, 1.0
     if first is not None:
         some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
-        variance = checked_variance(kernel, first, everything.inputs[some])
+        variance = checked_variance(kernel, first, everything.of(slice(0, 1)).inputs[some])
     table = starting_table(
         rows.inputs,
-        np.empty((1, 0, everything.inputs.shape[1])),
+        np.empty((1, 0, everything.inputs.shape[-1])),
         units.target_unit,
         starts,
         rows.scatter(),
@@ -272,7 +272,7 @@ def fit_exact(
         kernel.n_hyperparameters,
         variance,
     )
-    model = ExactModel(kernel, units.internal_prior(), vague, everything)
+    model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
@@ -285,11 +285,19 @@ def fit_exact(
 
 def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
     """From internal units to the user's, for each output's loss (o,) of all rows: each contrast has a unit."""
-    return (len(model.rows.inputs) - model.vague.sum(axis=1)) * np.log(units.target_unit)
+    n_vague = model.vague.sum(axis=1)
+    if model.prior.shared:
+        n_vague[1:] = 0
+    return (len(model.rows.inputs) - n_vague) * np.log(units.target_unit)
 
 
-def _check_independent(features: np.ndarray, vague: np.ndarray) -> None:
+def _check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> None:
     """Refuse features whose vague weights the rows cannot tell apart."""
+    if features.ndim == 3 and not shared:
+        for output, own in enumerate(vague):
+            _check_independent(features[:, output], own[np.newaxis], shared)
+        return
+    features = features.reshape(-1, features.shape[-1])
     size = np.sqrt(np.sum(features**2, axis=0))
     scaled = features / np.where(size > 0.0, size, 1.0)
     for mask in np.unique(vague, axis=0):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import chain
+from itertools import chain, pairwise, starmap
 from operator import index
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -23,7 +23,7 @@ from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask, grown
-from .start import Units, checked_variance, column_centre, starting_table
+from .start import Units, centred_kernels, checked_variance, starting_table
 from .strategy import search
 
 Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
@@ -53,6 +53,8 @@ class Request:
         Folds of consecutive rows by which the noise is calibrated.
     n_threads : int
         For independent models, or else for blocks of rows.
+    per_output : bool, default=False
+        Whether outputs have inputs or features of their own.
     found : bool, default=False
         Whether the groups were found and not given.
     """
@@ -68,6 +70,7 @@ class Request:
     tol: float | None
     noise_cv: int | None
     n_threads: int
+    per_output: bool = False
     found: bool = False
 
 
@@ -133,16 +136,31 @@ class FittedOutputs:
         total = 0
         for one in self.learned:
             n_outputs, p = one.model.prior.scale.shape
-            size = one.values["inducing_points"].shape[1] + p
-            q = 2 * size if one.model.family == "diagonal" else size + size * (size + 1) // 2
-            total += one.table.size + q * n_outputs
+            m, of_weights = one.values["inducing_points"].shape[1], p + p * (p + 1) // 2
+            of_values = m + m * (m + 1) // 2 + m * p
+            if one.model.family == "diagonal":
+                of_values, of_weights = 2 * m, 2 * p
+            total += one.table.size + n_outputs * of_values
+            total += of_weights * (1 if one.model.prior.shared else n_outputs)
         return total
+
+    @property
+    def sharing(self) -> list[list[int]]:
+        """Outputs by what they are fitted with: of a model, or of a group that is joined to others by weights alone."""
+        found = []
+        for outputs, one in zip(self.outputs, self.learned, strict=True):
+            separate = one.values["hyperparameters"].ndim == 2
+            found += [outputs[group] for group in one.model.groups] if separate else [outputs]
+        return sorted(found)
 
     def limits(self, name: str, output: int) -> np.ndarray:
         """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
         model, within = self._place_of(output)
-        limits = self.learned[model].table[name].value_limits()
-        return limits[[within]] * self.units.target_unit[output] ** 2 if name == "signal" else limits
+        table = self.learned[model].table
+        limits = table[name].value_limits()
+        if name == "signal":
+            return limits[[within]] * self.units.target_unit[output] ** 2
+        return limits.reshape(-1, table[name].start.shape[-1], 2)[self.learned[model].model.set_of(within, table[name])]
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
         """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
@@ -177,9 +195,11 @@ class FittedOutputs:
         """A model's values in other internal units, as far as they can serve another fit."""
         one, own, inputs = self.learned[model], self.outputs[model], rows.inputs
         values, points = one.values, one.values["inducing_points"]
-        lowest, highest = inputs.lowest, inputs.highest
-        if points.shape[2] != len(inputs.mean):
+        if inputs.mean.ndim == 2 and one.model.kernels is None:
+            inputs = inputs.at(own)
+        if points.shape[2] != inputs.mean.shape[-1] or inputs.mean.ndim == 2 and len(points) != len(inputs.mean):
             return {}
+        lowest, highest = (edge.reshape(-1, 1, points.shape[2]) for edge in (inputs.lowest, inputs.highest))
         if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
             return {}
         ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2
@@ -213,10 +233,10 @@ def fit_outputs(
     -------
     fitted : FittedOutputs
     """
+    models = _models(request)
     # One model has all threads for its blocks of rows; several have one each.
-    n_models = len(_models(request))
-    at_once = min(request.n_threads, n_models)
-    threads = BlockMap(request.n_threads if n_models == 1 else 1)
+    at_once = min(request.n_threads, len(models))
+    threads = BlockMap(request.n_threads if len(models) == 1 else 1)
     try:
         tasks = plan(request, rng, monitor, threads, previous)
         learned = side_by_side(_fit_one, tasks, at_once, monitor)
@@ -225,8 +245,7 @@ def fit_outputs(
     messages = sorted({one.message for one in learned if one.message})
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
-    outputs = [outputs for outputs, _ in _models(request)]
-    return FittedOutputs(request.units, outputs, request.found, tuple(learned), tuple(messages))
+    return FittedOutputs(request.units, [model.outputs for model in models], request.found, tuple(learned), tuple(messages))
 
 
 def plan(
@@ -238,43 +257,54 @@ def plan(
 ) -> list[SparseTask]:
     """The models to be fitted, each with its rows and where it starts; arguments as of `fit_outputs`."""
     units, placement, starts, solver = request.units, request.placement, request.spec.starts, request.solver
-    models = _models(request)
-    rows = units.rows(request.source, threads)
-    kernel = request.spec.covariance.centred(column_centre(rows.inputs))
+    models, rows = _models(request), units.rows(request.source, threads)
+    kernel, kernels = centred_kernels(request.spec.covariance, rows.inputs)
 
-    def table_of(outputs: list[int], points: np.ndarray, variance: float = 1.0) -> ParameterTable:
+    def table_of(outputs: list[int], points: np.ndarray, **options: Any) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        return starting_table(
-            rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
-        )
+        inputs = rows.outputs(outputs).inputs
+        return starting_table(inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, **options)
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
-    alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean)))).values_at_start()
-    inputs = rows.sample(placement.sample_size, rng).inputs
-    points = placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng)
+    sample, points = rows.sample(placement.sample_size, rng), []
+    for output in range(len(kernels or (kernel,))):
+        own = sample.of(slice(output, output + 1)).inputs
+        alone = table_of([output], np.empty((1, 0, own.shape[1]))).values_at_start()
+        points.append(placement.points(own, (kernels or (kernel,))[output], np.log(alone["hyperparameters"]), rng))
     first = starts.hyperparameters.value
-    variance = 1.0 if first is None else checked_variance(kernel, first, points)
+    variance = 1.0 if first is None else checked_variance(kernel, first, points[0])
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
     seed = rng.randint(np.iinfo(np.int32).max)
-    goes_on = previous is not None and previous.outputs == [outputs for outputs, _ in models]
+    goes_on = previous is not None and previous.outputs == [model.outputs for model in models]
     share, tasks = 1.0 / min(request.n_threads, len(models)), []
-    for i, (outputs, groups) in enumerate(models):
+    for i, model in enumerate(models):
+        outputs = model.outputs
+        own_kernels = tuple((kernels or (kernel,) * len(rows.residuals.mean))[o] for o in model.first_of_groups)
         warm: Values | None = None
         if goes_on and previous is not None:
-            warm = previous.values_in(units, rows, kernel, i)
+            warm = previous.values_in(units, rows, own_kernels[0], i)
             if isinstance(placement.method, np.ndarray):
                 warm.pop("inducing_points", None)
-        sets = _first_sets(points, len(groups), placement, warm, len(rows))
-        table = table_of(outputs, sets, variance)
+        sets = _first_sets([points[o % len(points)] for o in model.first_of_groups], placement, warm, len(rows))
+        table = table_of(outputs, sets, mean_variance=variance, n_kernels=len(sets) if model.separate else None)
         # Where they are all rows the bound is the likelihood: no other places are better.
-        stay = request.family == "full" and len(inputs) == len(rows) and all(are_all_rows(own, inputs) for own in sets)
+        stay = request.family == "full" and len(sample.targets) == len(rows)
+        stay = stay and all(
+            are_all_rows(own, sample.of([o]).inputs) for own, o in zip(sets, model.first_of_groups, strict=True)
+        )
         if stay:
             table = table.with_fixed("inducing_points")
         shift = len(rows) * units.log_unit(outputs)
         tasks.append(
             SparseTask(
                 SparseModel(
-                    kernel, units.internal_prior().outputs(outputs), request.family, groups, solver.rules.jitter, stay
+                    own_kernels[0],
+                    units.internal_prior().outputs(outputs),
+                    request.family,
+                    model.groups,
+                    solver.rules.jitter,
+                    stay,
+                    own_kernels if model.split else None,
                 ),
                 rows.outputs(outputs, share),
                 table,
@@ -292,22 +322,57 @@ def plan(
     return tasks
 
 
-def _first_sets(
-    points: np.ndarray, n_groups: int, placement: Placement, warm: Values | None, n_rows: int
-) -> np.ndarray:
+def _first_sets(points: list[np.ndarray], placement: Placement, warm: Values | None, n_rows: int) -> np.ndarray:
     """Inducing points (g, m, d) of each group; where their number is to be found, those of the fit before go on."""
     found, most = None if warm is None else warm.get("inducing_points"), placement.max_inducing
-    if found is None or most is None or len(found) != n_groups or found.shape[1] > min(most, n_rows):
-        return np.repeat(points[np.newaxis], n_groups, axis=0)
+    if found is None or most is None or len(found) != len(points) or found.shape[1] > min(most, n_rows):
+        m = min(map(len, points))
+        return np.array([own[:m] for own in points])
     return found
 
 
-def _models(request: Request) -> list[tuple[list[int], tuple[slice, ...]]]:
-    """The outputs of each independent model, and which of these each set of inducing points serves."""
-    outputs = partition_of(request.sharing, len(request.units.target_unit))
-    if isinstance(request.sharing, str) and request.sharing == "kernel":
-        return [(own, tuple(slice(o, o + 1) for o in range(len(own)))) for own in outputs]
-    return [(own, (slice(0, len(own)),)) for own in outputs]
+@dataclass(frozen=True)
+class _Model:
+    """What is fitted together.
+
+    Attributes
+    ----------
+    outputs : list of int
+    groups : tuple of slice
+        Which of these each set of inducing points serves.
+    split : bool
+        Whether rows are split by groups.
+    separate : bool
+        Whether each group has a kernel of its own.
+    """
+
+    outputs: list[int]
+    groups: tuple[slice, ...]
+    split: bool = False
+    separate: bool = False
+
+    @property
+    def first_of_groups(self) -> list[int]:
+        return [self.outputs[group.start] for group in self.groups]
+
+
+def _models(request: Request) -> list[_Model]:
+    """The independent models: one, if outputs share their weights."""
+    sharing, shared, per_output = request.sharing, request.units.prior.shared, request.per_output
+    partition = partition_of(sharing, len(request.units.target_unit))
+    everything = sorted(chain(*partition))
+    singles = tuple(slice(o, o + 1) for o in everything)
+    if isinstance(sharing, str) and sharing == "kernel":
+        return [_Model(everything, singles, split=shared or per_output)]
+    if per_output and max(map(len, partition)) > 1:
+        raise ValueError(
+            f"sharing={sharing!r} joins outputs by their inducing points, but kernel_map or feature_map returns a row "
+            "for each output: use 'none', or 'kernel' for outputs with the same kernel."
+        )
+    if not shared or len(partition) == 1:
+        return [_Model(own, (slice(0, len(own)),)) for own in partition]
+    ends = np.cumsum([0, *map(len, partition)]).tolist()
+    return [_Model(list(chain(*partition)), tuple(starmap(slice, pairwise(ends))), split=True, separate=True)]
 
 
 def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:

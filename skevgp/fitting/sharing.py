@@ -56,8 +56,10 @@ def with_groups(
     """
     if not (isinstance(request.sharing, str) and request.sharing == "auto"):
         return request
+    if request.per_output:
+        return replace(request, sharing="none")
     if previous is not None and previous.found and len(previous.units.target_unit) == len(request.units.target_unit):
-        return replace(request, sharing=previous.outputs, found=True)
+        return replace(request, sharing=previous.sharing, found=True)
     groups = found_groups(request, deepcopy(rng), monitor.silent())
     if monitor.stopped:
         raise KeyboardInterrupt
@@ -165,7 +167,9 @@ class _ShortFits:
         source = LocalSource.of(raw.inputs, raw.features, raw.targets)
         most = request.placement.max_inducing or request.placement.n_inducing
         placement = Placement("k-means", min(most, _POINTS))
-        request = replace(request, source=source, placement=placement, sharing="all", family="full")
+        # Each output has weights of its own here, if it shares them or not: what is asked is which kernel it wants.
+        units = replace(request.units, prior=replace(request.units.prior, shared=False))
+        request = replace(request, source=source, units=units, placement=placement, sharing="all", family="full")
         (task,) = plan(request, rng, monitor, BlockMap())
         together = _short_fit(task, task.table, _FIRST_ITERATIONS, monitor)
         points = together[0]["inducing_points"][0]

@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 
 from .._progress import Monitor
-from ..inference.bounds import BoundAtOptimum, features_alone_bound
+from ..inference.bounds import bounds_at_optimum, features_alone_bound
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
@@ -18,6 +18,7 @@ from ..inference.statistics import SufficientStatistics
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
+from ..rows.source import of_outputs
 from .advice import far_from_prior, learned_too_little
 from .calibration import calibrated_noise
 from .exact import ExactOptions, Unhindered
@@ -98,13 +99,14 @@ class SparseTask:
     @cached_property
     def blocks(self) -> Blocks:
         """All rows."""
-        return self.rows.blocks(self.model.kernel, self.n_inducing)
+        return self.model.blocks(self.rows, self.n_inducing)
 
     @cached_property
     def samples(self) -> tuple[int, ...]:
         """The sizes of the samples that the fit begins with."""
-        (o, p), d = self.model.prior.scale.shape, self.table["inducing_points"].start.shape[2]
-        return () if self.interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing + p, d + p + o)
+        (o, p), (g, _, d) = self.model.prior.scale.shape, self.table["inducing_points"].start.shape
+        width = d + p + o if self.model.kernels is None else g * (d + p) + o
+        return () if self.interpolates else self.solver.rules.samples(len(self.rows), self.n_inducing + p, width)
 
     @cached_property
     def _sample(self) -> Rows:
@@ -117,7 +119,7 @@ class SparseTask:
         """
         if n_rows is None:
             return self.blocks
-        return self._sample.part(0, n_rows, 1.0).blocks(self.model.kernel, self.n_inducing)
+        return self.model.blocks(self._sample.part(0, n_rows, 1.0), self.n_inducing)
 
     @property
     def interpolates(self) -> bool:
@@ -159,13 +161,19 @@ class SparseTask:
         return partial(self.solver.run, self)
 
     def _placed(self, values: Values, placement: Placement) -> Values:
-        """The same values with inducing points placed under their kernel, alike for all groups.
+        """The same values with inducing points placed under their kernel, alike for groups with the same.
 
         Where clusters coincide there are fewer: the table then keeps those that it has.
         """
-        inputs = self.rows.sample(placement.sample_size, self.rng).inputs
-        points = placement.points(inputs, self.model.kernel, np.log(values["hyperparameters"]), self.rng)
-        return values | {"inducing_points": np.repeat(points[np.newaxis], len(self.model.groups), axis=0)}
+        sample = self.rows.sample(placement.sample_size, self.rng)
+        sets = []
+        for index, group in enumerate(self.model.groups if self.model.kernels is not None else (slice(None),)):
+            kernel, hyperparameters = self.model.kernel_of(values, index)
+            inputs = of_outputs(sample.inputs, group)
+            sets.append(placement.points(inputs, kernel, np.log(hyperparameters), self.rng))
+        m = min(map(len, sets))
+        points = np.array([own[:m] for own in sets])
+        return values | {"inducing_points": np.repeat(points, len(self.model.groups) // len(points), axis=0)}
 
     def placed_under(self, values: Values) -> Values:
         """Values of a kernel, with as many inducing points as the task has, placed greedily; all rows if they stay."""
@@ -180,14 +188,15 @@ class SparseTask:
         if most is None or self.n_inducing >= most:
             return None
         wanted = min(int(np.ceil(_GROWTH * self.n_inducing)), most)
-        inputs = self.rows.sample(greedy_sample_size(wanted), self.rng).inputs
-        distinct, points = distinct_rows(inputs), values["inducing_points"]
-        everything = len(inputs) == len(self.rows) and len(distinct) <= wanted
-        if everything:
-            sets = [distinct] * len(points)
-        else:
-            hyperparameters = np.log(values["hyperparameters"])
-            sets = [with_more(own, wanted, inputs, self.model.kernel, hyperparameters) for own in points]
+        sample, sets, everything = self.rows.sample(greedy_sample_size(wanted), self.rng), [], True
+        for index, (group, points) in enumerate(zip(self.model.groups, values["inducing_points"], strict=True)):
+            inputs = of_outputs(sample.inputs, group)
+            distinct, (kernel, hyperparameters) = distinct_rows(inputs), self.model.kernel_of(values, index)
+            if len(inputs) == len(self.rows) and len(distinct) <= wanted:
+                sets.append(distinct)
+            else:
+                everything = False
+                sets.append(with_more(points, wanted, inputs, kernel, np.log(hyperparameters)))
         n_inducing = min(map(len, sets))
         if n_inducing <= self.n_inducing:
             return None
@@ -199,8 +208,8 @@ class SparseTask:
         return replace(self, table=table)
 
     def unhindered(self) -> Unhindered | None:
-        """The exact model of a sample of the rows; None if the kernel is fixed."""
-        if self.max_iter == 0 or not self.table["hyperparameters"].free.any():
+        """The exact model of a sample of the rows; None if the kernel is fixed, or groups have kernels of their own."""
+        if self.max_iter == 0 or not self.table["hyperparameters"].free.any() or self.model.kernels is not None:
             return None
         sample = self.rows.sample(_SAMPLE, self.rng)
         return Unhindered.of(
@@ -213,6 +222,19 @@ class SparseTask:
             self.rng,
             self.monitor.silent(),
         )
+
+
+    def learned_too_little(self, values: Values) -> str:
+        """What `advice` says of it, of each group with columns of its own; empty if all is well."""
+        if self.rows.inputs.mean.ndim == 1:
+            kernel, hyperparameters = self.model.kernel_of(values, 0)
+            return learned_too_little(kernel, values | {"hyperparameters": hyperparameters}, self.table, self.rows)
+        told = []
+        for index, group in enumerate(self.model.groups):
+            kernel, hyperparameters = self.model.kernel_of(values, index)
+            own = {"hyperparameters": hyperparameters, "noise": values["noise"][group]}
+            told.append(learned_too_little(kernel, own, self.table, self.rows.within(group)))
+        return max(told)
 
 
 def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
@@ -293,7 +315,7 @@ class Learned:
         advice = [fit.message, far_from_prior(task.model.prior, task.rows)]
         free_noise = task.table["noise"].free.any()
         if not task.monitor.stopped and task.max_iter > 0:
-            advice.append(learned_too_little(task.model.kernel, fit.values, task.table, task.rows))
+            advice.append(task.learned_too_little(fit.values))
         learned = cls(
             task.model,
             task.table,
@@ -335,8 +357,7 @@ class Learned:
         gradient : ndarray of shape (n_hyper + 1,)
             That in log s² last.
         """
-        own = slice(output, output + 1)
-        index = next(i for i, group in enumerate(self.model.groups) if group.start <= output < group.stop)
+        own, index = slice(output, output + 1), self.model.set_of(output, self.table["inducing_points"])
         points = self.values["inducing_points"][[index]]
         values = {
             "hyperparameters": hyperparameters,
@@ -344,9 +365,11 @@ class Learned:
             "noise": self.values["noise"][own],
             "inducing_points": points,
         }
-        model = replace(self.model, prior=self.model.prior.outputs(own), groups=(slice(0, 1),))
-        blocks = rows.blocks(model.kernel, points.shape[1])
-        bound, gradient = evaluate(model, values, blocks, partial(BoundAtOptimum, family=model.family))
+        kernel, _ = self.model.kernel_of(self.values, index)
+        prior = self.model.prior.outputs(own)
+        model = replace(self.model, kernel=kernel, prior=prior, groups=(slice(0, 1),), kernels=None)
+        blocks = model.blocks(rows, points.shape[1])
+        bound, gradient = evaluate(model, values, blocks, partial(bounds_at_optimum, family=model.family))
         return bound, np.append(gradient["hyperparameters"], gradient["signal"])
 
     def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
@@ -357,7 +380,7 @@ class Learned:
         n_inducing = self.values["inducing_points"].shape[1]
         # Whatever its points were of the rows before.
         model = replace(self.model, complete=False)
-        new = model.statistics(self.values, rows.blocks(model.kernel, n_inducing))
+        new = model.statistics(self.values, model.blocks(rows, n_inducing))
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
         return replace(self, model=model, statistics=statistics)._at_optimum()
 
@@ -366,7 +389,7 @@ class Learned:
         limits = self.table["noise"].value_limits()
         noise = calibrated_noise(self.model, self.values, self.statistics, rows, limits, n_folds)
         noise = np.where(self.table["noise"].free, noise, self.values["noise"])
-        blocks = rows.blocks(self.model.kernel, self.values["inducing_points"].shape[1])
+        blocks = self.model.blocks(rows, self.values["inducing_points"].shape[1])
         return replace(self, values=self.values | {"noise": noise})._at_optimum(blocks)
 
     def _at_optimum(self, blocks: Blocks | None = None) -> Learned:

@@ -10,13 +10,14 @@ from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 
 from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
-from ..inference.bounds import CoefficientPrior
+from ..inference.prior import CoefficientPrior
 from ..inference.posterior import Predictor
 from ..inference.statistics import Kernel
+from ..kernels.covariances import Covariance
 from ..kernels.parse import Start, Starts
 from ..optimizers.parameters import Parameter, ParameterTable
 from ..rows.internal import Rows
-from ..rows.source import Columns, Moments, RawRows, Source
+from ..rows.source import Columns, Moments, RawRows, Source, times_weights
 from ..rows.threads import BlockMap
 from .strategy import Rules
 
@@ -29,23 +30,27 @@ _NEIGHBOUR_SAMPLE = 2000
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (p, o) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH too, if asked for."""
+    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH (p, p) or (o, p, p) too, if asked for."""
 
     target_mean: np.ndarray
     coef: np.ndarray
     with_products: bool = False
 
     def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
-        left_over = raw.targets - self.target_mean - raw.features @ self.coef.T
         H = raw.features
-        sums = H.T @ left_over, np.einsum("no,no->o", left_over, left_over)
-        return (*sums, H.T @ H) if self.with_products else sums
+        left_over = raw.targets - self.target_mean - times_weights(H, self.coef)
+        HL = left_over.T @ H if H.ndim == 2 else np.einsum("no,nop->op", left_over, H)
+        sums = HL, np.einsum("no,no->o", left_over, left_over)
+        if not self.with_products:
+            return sums
+        by_output = H if H.ndim == 2 else H.transpose(1, 0, 2)
+        return (*sums, np.swapaxes(by_output, -1, -2) @ by_output)
 
 
 def features_alone(
-    source: Source, target_mean: np.ndarray, mean: np.ndarray, scale: np.ndarray
+    source: Source, target_mean: np.ndarray, prior: CoefficientPrior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable w of y = target_mean + H (mean + diag(scale) w) + ε, w ~ N(0, I), for each output.
+    """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
 
     The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
     the rounding of the normal equations.
@@ -55,10 +60,8 @@ def features_alone(
     source : Source
         n rows with p features and o targets.
     target_mean : ndarray of shape (o,)
-    mean : ndarray of shape (o, p)
-        Prior means.
-    scale : ndarray of shape (o, p)
-        Prior standard deviations; 0 keeps a coefficient at its mean.
+    prior : CoefficientPrior
+        Of the weights; a scale of 0 keeps one at its mean.
 
     Returns
     -------
@@ -66,24 +69,45 @@ def features_alone(
     left_over : ndarray of shape (o,)
         Root mean square of what they leave over.
     """
-    w = np.zeros(scale.shape)
-    HL, squares, HH = source.sum(_LeftOver(target_mean, mean, with_products=True))
-    moving = [o for o in range(len(scale)) if squares[o] > 0.0 and scale[o].any()]
-    share = 1e-12
-    for _ in range(2 if moving else 0):
+    (o, p), roots = prior.scale.shape, prior.roots()
+    w = np.zeros((o, p))
+    HL, squares, HH = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
+    products = np.swapaxes(roots, 1, 2) @ HH @ roots
+    everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
+    together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
+    # Where outputs share their weights, what each leaves over decides how much it counts.
+    shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
+    for share in shares if together else ():
         noise = share * squares / source.n_rows
-        share = 1.0
-        roots = {}
-        for o in moving:
-            precision = scale[o][:, np.newaxis] * HH * scale[o]
-            diagonal_of(precision)[...] += noise[o]
-            roots[o] = jittered_cholesky(precision) if noise[o] > 0.0 else None
+        steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
         for _ in range(3):
-            for o in moving:
-                if roots[o] is not None:
-                    w[o] += cho_solve((roots[o], True), scale[o] * HL[:, o] - noise[o] * w[o])
-            HL, squares = source.sum(_LeftOver(target_mean, mean + scale * w))
+            for step in steps:
+                step.take(w, np.einsum("oij,oi->oj", roots, HL))
+            HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
     return w, np.sqrt(squares / source.n_rows)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one."""
+
+    outputs: list[int]
+    least: float
+    counts: np.ndarray
+    root: np.ndarray
+
+    @classmethod
+    def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
+        noise = np.maximum(noise, 1e-16 * noise.max())
+        least = float(noise.min())
+        counts = least / noise
+        precision = np.einsum("o,oij->ij", counts, products[outputs])
+        diagonal_of(precision)[...] += least
+        return cls(outputs, least, counts, jittered_cholesky(precision))
+
+    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
+        first = self.outputs[0]
+        w[self.outputs] += cho_solve((self.root, True), self.counts @ from_data[self.outputs] - self.least * w[first])
 
 
 def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
@@ -128,17 +152,15 @@ class Units:
         source: Source,
         targets: Moments,
         target_mean: np.ndarray,
-        coef_mean: np.ndarray,
-        coef_scale: np.ndarray,
+        prior: CoefficientPrior,
     ) -> Units:
-        """The units of a training set, from its rows, its targets' moments, and the prior (o, p) of its weights."""
-        reference, left_over = features_alone(source, target_mean, coef_mean, coef_scale)
-        prior = CoefficientPrior(coef_mean, coef_scale, reference)
-        return cls(target_mean, unit_of(left_over, targets.largest), prior)
+        """The units of a training set, from its rows, its targets' moments, and the prior of its weights."""
+        reference, left_over = features_alone(source, target_mean, prior)
+        return cls(target_mean, unit_of(left_over, targets.largest), replace(prior, reference=reference))
 
     def to_internal(self, raw: RawRows) -> RawRows:
         """The same inputs and features, and what the reference leaves of the targets, in its own units."""
-        left_over = raw.targets - self.target_mean - raw.features @ self.prior.offset.T
+        left_over = raw.targets - self.target_mean - times_weights(raw.features, self.prior.offset)
         return replace(raw, targets=left_over / self.target_unit)
 
     def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
@@ -147,8 +169,7 @@ class Units:
 
     def internal_prior(self) -> CoefficientPrior:
         """The prior for residuals in units of ``target_unit``."""
-        unit = self.target_unit[:, np.newaxis]
-        return CoefficientPrior(self.prior.mean / unit, self.prior.scale / unit, self.prior.reference)
+        return self.prior.scaled(1.0 / self.target_unit)
 
     def log_unit(self, outputs: Columns) -> float:
         """What one row of some outputs adds to the loss on the way to the user's units."""
@@ -168,6 +189,15 @@ def column_scale(inputs: Moments) -> np.ndarray:
     """The standard deviation (d,) of each column; 1 where the column is constant but for rounding."""
     scale = np.sqrt(inputs.variance)
     return np.where(_constant(inputs) | (scale <= _SMALLEST_UNIT), 1.0, scale)
+
+
+def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, tuple[Covariance, ...] | None]:
+    """The kernel, told around which centre it is used; where outputs have inputs of their own, that of each too."""
+    centre = column_centre(inputs)
+    if centre.ndim == 1:
+        return covariance.centred(centre), None
+    kernels = tuple(covariance.centred(own) for own in centre)
+    return kernels[0], kernels
 
 
 def _constant(inputs: Moments) -> np.ndarray:
@@ -264,13 +294,14 @@ def starting_table(
     rules: Rules,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
+    n_kernels: int | None = None,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
     Parameters
     ----------
     inputs : Moments
-        Of the kernel's d columns.
+        Of the kernel's d columns, or of those of each group.
     inducing_points : ndarray of shape (g, m, d)
         One set per group of outputs.
     target_unit : ndarray of shape (o,)
@@ -285,6 +316,8 @@ def starting_table(
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
         Of k̃(x, x), with the hyperparameters where they start.
+    n_kernels : int, default=None
+        How many sets of hyperparameters there are, if each group of outputs has its own.
 
     Returns
     -------
@@ -292,17 +325,24 @@ def starting_table(
         With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
     """
     o, scale = np.ones(len(target_unit)), column_scale(inputs)
-    typical = scale if n_hyperparameters > 1 else np.sqrt(np.mean(scale**2, keepdims=True))
-    root_d = np.sqrt(len(scale))
+    # Outputs may have columns of their own, and groups of them kernels of their own.
+    own = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
+    typical = own if n_hyperparameters > 1 else np.sqrt(np.mean(own**2, axis=-1, keepdims=True))
+    root_d = np.sqrt(scale.shape[-1])
     lower, upper = rules.lengthscale_limits
-    first = starts.hyperparameters.value
+    default = rules.lengthscale * root_d * typical
+    first, centre = starts.hyperparameters.value, column_centre(inputs)
+    if first is not None:
+        default = first
+    if n_kernels is not None:
+        default = np.broadcast_to(default, (n_kernels, default.shape[-1]))
     signal = o / mean_variance
     return ParameterTable(
         [
             parameter_of(
                 starts.hyperparameters,
                 "hyperparameters",
-                rules.lengthscale * root_d * typical if first is None else first,
+                default,
                 lower * typical,
                 upper * root_d * typical,
                 1.0,
@@ -323,7 +363,12 @@ def starting_table(
                 rules.highest_noise * o,
                 target_unit**2,
             ),
-            Parameter("inducing_points", inducing_points, unit=scale, origin=column_centre(inputs)),
+            Parameter(
+                "inducing_points",
+                inducing_points,
+                unit=scale if scale.ndim == 1 else scale[:, np.newaxis],
+                origin=centre if centre.ndim == 1 else centre[:, np.newaxis],
+            ),
         ]
     )
 

@@ -1,16 +1,25 @@
 """The bounds as pure functions of the sufficient statistics.
 
-Per output, in whitened coordinates: f_m = s L v with K = s² L Lᵀ, and β = μ_β + c (w₀ + w) with Σ_β = diag(c²), so
-that v ~ N(0, I), w ~ N(-w₀, I) a priori. Here r = y - H (μ_β + c w₀): the reference w₀ is any fixed vector; put
-near the solution it keeps rᵀr, and with it the rounding errors of the sums, small. With P = [s Vᵀ, H diag(c)] the
+Per output, in whitened coordinates: f_m = s L v with K = s² L Lᵀ, and β = μ_β + C (w₀ + w) with Σ_β = C Cᵀ, so
+that v ~ N(0, I), w ~ N(-w₀, I) a priori. Here r = y - H (μ_β + C w₀): the reference w₀ is any fixed vector; put
+near the solution it keeps rᵀr, and with it the rounding errors of the sums, small. With P = [s Vᵀ, H C] the
 model is r = P ω + ε, ω = (v, w), and all that follows is Bayesian linear regression (Rasmussen & Williams 2006,
 sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
 
     B = I + σ⁻² PᵀP,   g = σ⁻² Pᵀr - (0, w₀),   posterior of ω: N(B⁻¹ g, B⁻¹).
+
+Outputs that share their weights have one w and a v each. B is then an arrowhead: with B_j = [D_j, E_j; E_jᵀ, F_j] the
+matrix of output j alone, its blocks are D_j on the diagonal, E_j in the columns of w, and I + Σ (F_j - I) in the corner.
+What is left of the corner, its Schur complement S = I + Σ (F_j - I - E_jᵀ D_j⁻¹ E_j), is the precision of w, so that
+
+    log|B| = Σ log|D_j| + log|S|,   precision of (v_j, w): [D_j, E_j; E_jᵀ, S + E_jᵀ D_j⁻¹ E_j],
+
+and of B⁻¹ all that predictions, the bound's gradient and the covariance between outputs need is in the inverses of these.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -18,38 +27,13 @@ from typing import Literal
 import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
-from ..rows.blocks import Blocks, LinearStatistics
-from ..rows.source import Columns
+from ..rows.blocks import Blocks, LinearSums
+from .prior import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
 
 LOG_2PI = float(np.log(2.0 * np.pi))
-
-
-@dataclass(frozen=True)
-class CoefficientPrior:
-    """β ~ N(mean, diag(scale²)) for each output, and the reference that residuals are taken from.
-
-    Attributes
-    ----------
-    mean, scale : ndarray of shape (o, p)
-    reference : ndarray of shape (o, p)
-        w₀: residuals are y - H (mean + scale * w₀).
-    """
-
-    mean: np.ndarray
-    scale: np.ndarray
-    reference: np.ndarray
-
-    @property
-    def offset(self) -> np.ndarray:
-        """The coefficients (o, p) that the residuals are taken from."""
-        return self.mean + self.scale * self.reference
-
-    def outputs(self, columns: Columns) -> CoefficientPrior:
-        """The prior of some of the outputs."""
-        return CoefficientPrior(self.mean[columns], self.scale[columns], self.reference[columns])
 
 
 @dataclass(frozen=True)
@@ -61,17 +45,20 @@ class WhitenedPosterior:
     B, root, root_inv : ndarray of shape (m + p, m + p)
         Precision, its lower Cholesky factor, and the inverse of that.
     mean : ndarray of shape (m + p,)
+    n_own : int
+        How many of the first coordinates are counted here: m if w is shared and counted with another output.
     """
 
     B: np.ndarray
     root: np.ndarray
     root_inv: np.ndarray
     mean: np.ndarray
+    n_own: int
 
     @property
     def log_det(self) -> float:
-        """log|B|."""
-        return 2.0 * float(np.log(diagonal_of(self.root)).sum())
+        """log|B|; where w is counted elsewhere, that of v given w."""
+        return 2.0 * float(np.log(diagonal_of(self.root)[: self.n_own]).sum())
 
 
 @dataclass(frozen=True)
@@ -104,20 +91,38 @@ class Group:
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """What makes Pᵀ of [V; Hᵀ] for each output, (o, m + p)."""
+        """What makes Pᵀ of [V; Hᵀ] for each output, (o, m + p), where the weights are independent a priori."""
         (o, p), m = self.prior.scale.shape, len(self.statistics.VV)
         scales = np.empty((o, m + p))
         scales[:, :m] = np.sqrt(self.signal)[:, np.newaxis]
         scales[:, m:] = self.prior.scale
         return scales
 
+    def weights_of(self, index: int, omega: np.ndarray) -> np.ndarray:
+        """T ω, (m + p) or (m + p, k), with P = [Vᵀ, H] T of an output: what [V; Hᵀ] is multiplied by."""
+        return self._times(index, omega, lambda root: root)
+
+    def pulled_back(self, index: int, sums: np.ndarray) -> np.ndarray:
+        """Tᵀ of sums over [V; Hᵀ], (m + p) or (m + p, k): those over Pᵀ."""
+        return self._times(index, sums, np.transpose)
+
+    def _times(self, index: int, given: np.ndarray, root_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+        found = (self.scales[index] * given.T).T
+        if self.prior.root is not None:
+            m = len(self.statistics.VV)
+            found[m:] = root_of(self.prior.root[index]) @ given[m:]
+        return found
+
 
 def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
     """PᵀP (m + p, m + p) and Pᵀr (m + p,) of a group's output."""
     statistics, scales = group.statistics, group.scales[index]
+    Pr = group.pulled_back(index, np.concatenate([statistics.VR[:, index], statistics.HR[:, index]]))
+    if group.prior.root is not None:
+        return group.pulled_back(index, group.pulled_back(index, statistics.joint).T), Pr
     PP = np.multiply.outer(scales, scales)
     PP *= statistics.joint
-    return PP, scales * np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
+    return PP, Pr
 
 
 def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
@@ -136,7 +141,48 @@ def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
     g[m:] -= group.prior.reference[index]
     root = jittered_cholesky(B)
     root_inv = triangular_inverse(root)
-    return WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g))
+    return WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B))
+
+
+def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]:
+    """The posterior of each output, by group; of outputs that share their weights, from the data of all of them."""
+    if not groups[0].prior.shared:
+        return [[optimal_posterior(group, o) for o in range(len(group.noise))] for group in groups]
+    p = groups[0].prior.scale.shape[1]
+    each, S, g_w = [], np.eye(p), -groups[0].prior.reference[0]
+    for group in groups:
+        m = len(group.statistics.VV)
+        for o, noise in enumerate(group.noise):
+            PP, g = projected(group, o)
+            PP /= noise
+            g /= noise
+            diagonal_of(PP)[:m] += 1.0
+            D_root = jittered_cholesky(PP[:m, :m])
+            D_root_inv = triangular_inverse(D_root)
+            A, z = D_root_inv @ PP[:m, m:], D_root_inv @ g[:m]
+            S += PP[m:, m:] - A.T @ A
+            g_w += g[m:] - A.T @ z
+            each.append((group, PP, D_root, D_root_inv, A, z))
+    S_root = jittered_cholesky(S)
+    S_root_inv = triangular_inverse(S_root)
+    w = S_root_inv.T @ (S_root_inv @ g_w)
+    found: dict[int, list[WhitenedPosterior]] = {id(group): [] for group in groups}
+    for index, (group, B, D_root, D_root_inv, A, z) in enumerate(each):
+        m = len(D_root)
+        B[m:, m:] = S + A.T @ A
+        root, root_inv = np.zeros(B.shape), np.zeros(B.shape)
+        root[:m, :m], root[m:, :m], root[m:, m:] = D_root, A.T, S_root
+        root_inv[:m, :m], root_inv[m:, m:] = D_root_inv, S_root_inv
+        root_inv[m:, :m] = -S_root_inv @ (A.T @ D_root_inv)
+        mean = np.concatenate([D_root_inv.T @ (z - A @ w), w])
+        found[id(group)].append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
+    return list(found.values())
+
+
+def bounds_at_optimum(groups: Sequence[Group], family: PosteriorFamily) -> list[BoundAtOptimum]:
+    """The bound of each group of a model's outputs, which perhaps share their weights."""
+    posteriors = optimal_posteriors(groups)
+    return [BoundAtOptimum(group, family, own) for group, own in zip(groups, posteriors, strict=True)]
 
 
 class BoundAtOptimum:
@@ -159,11 +205,12 @@ class BoundAtOptimum:
     ----------
     group : Group
     family : {"full", "diagonal"}
+    posteriors : list of WhitenedPosterior, default=None
+        One per output, of `optimal_posteriors`; None where no other group shares the weights.
 
     Attributes
     ----------
     posteriors : list of WhitenedPosterior
-        One per output.
     weights : ndarray of shape (m + p, o)
         e = r - [V; Hᵀ]ᵀ weights.
     gradient : StatisticsGradient
@@ -175,17 +222,19 @@ class BoundAtOptimum:
         If the sums are not finite.
     """
 
-    def __init__(self, group: Group, family: PosteriorFamily):
+    def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior] | None = None):
+        if posteriors is None:
+            (posteriors,) = optimal_posteriors([group])
         statistics, scales, noise = group.statistics, group.scales, group.noise
         joint, m = statistics.joint, len(statistics.VV)
-        self.group = group
-        self.posteriors = [optimal_posterior(group, o) for o in range(len(noise))]
-        mean = np.array([q.mean for q in self.posteriors])
-        self.weights = (scales * mean).T
+        self.group, self.posteriors = group, posteriors
+        mean = np.array([q.mean for q in posteriors])
+        self.weights = np.empty(mean.T.shape)
         joint_bar, L_bar = np.zeros(joint.shape), np.zeros((m, m))
         # Of each output: log|B| (and twice the gap), and derivatives of the bound in log s² and log 1/σ² by way of B.
         log_det, from_signal, from_noise = np.empty((3, len(noise)))
-        for o, q in enumerate(self.posteriors):
+        for o, q in enumerate(posteriors):
+            self.weights[:, o] = group.weights_of(o, q.mean)
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
@@ -193,7 +242,10 @@ class BoundAtOptimum:
                 log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
                 L_bar -= gap_L_bar
-            B_bar *= np.multiply.outer(scales[o] / noise[o], scales[o])
+            if group.prior.root is None:
+                B_bar *= np.multiply.outer(scales[o] / noise[o], scales[o])
+            else:
+                B_bar = group.weights_of(o, group.weights_of(o, B_bar).T) / noise[o]
             joint_bar += B_bar
             from_signal[o], from_noise[o] = np.vdot(B_bar[:m], joint[:m]), np.vdot(B_bar, joint)
         unexplained_bar = -0.5 * group.signal / noise
@@ -206,6 +258,8 @@ class BoundAtOptimum:
         )
         unexplained = unexplained_bar * statistics.unexplained
         mean[:, m:] += group.prior.reference
+        for own, q in zip(mean, posteriors, strict=True):
+            own[q.n_own :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # What does not depend on e, and its derivatives in log s² and log σ².
         self._value = unexplained - 0.5 * (statistics.n_rows * (LOG_2PI + np.log(noise)) + log_det + penalty)
@@ -232,7 +286,7 @@ class BoundAtOptimum:
         return self.value(residuals), {"signal": signal, "noise": noise}
 
 
-def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
+def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     """No less than the log marginal likelihood at these parameters, summed over outputs, whatever q is.
 
     With Q = UᵀK⁻¹U + HΣ_βHᵀ, r = y - Hμ_β and t = Σ(k(x, x) - q(x, x)), the trace of what the inducing points leave of
@@ -243,11 +297,13 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
-    j, and a row that comes often makes that so many times larger.
+    j, and a row that comes often makes that so many times larger. (Where outputs share their weights, y, σ² and t are
+    those of all outputs, one after the other.)
 
     Parameters
     ----------
-    group : Group
+    groups : sequence of Group
+        Of all outputs of a model.
     blocks : Blocks, default=None
         The rows, for errors summed row by row (see `BoundAtOptimum`); None takes them from the statistics.
 
@@ -256,31 +312,47 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
     bound : float
         In nats.
     """
-    statistics, left_over = group.statistics, group.statistics.unexplained
-    if group.complete:
-        left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
-    noise = group.noise + group.signal * left_over
+    wide, log_ratio = [], 0.0
+    for group in groups:
+        statistics, left_over = group.statistics, group.statistics.unexplained
+        if group.complete:
+            left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+        noise = group.noise + group.signal * left_over
+        wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
+        log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
     # The likelihood with this noise and without a trace term, but for its determinant.
-    wide = BoundAtOptimum(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)), "full")
-    left = wide.residuals() if blocks is None else errors(blocks, group.whitening, group.outputs, wide.weights)
-    log_dets = [q.log_det - optimal_posterior(group, o).log_det for o, q in enumerate(wide.posteriors)]
-    return wide.value(left) + 0.5 * float((statistics.n_rows * np.log(noise / group.noise) + log_dets).sum())
+    total, log_det = 0.0, log_ratio
+    for bound in bounds_at_optimum(wide, "full"):
+        group = bound.group
+        left = bound.residuals() if blocks is None else errors(blocks, group.whitening, group.outputs, bound.weights)
+        total += bound.value(left)
+        log_det += sum(q.log_det for q in bound.posteriors)
+    log_det -= sum(q.log_det for own in optimal_posteriors(groups) for q in own)
+    return total + 0.5 * log_det
 
 
-def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: CoefficientPrior) -> float:
+def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     """The bound without a Gaussian process, all that the features leave over being noise; summed over outputs."""
-    noise = np.maximum(sums.RR / sums.n_rows, 1e-20)  # of targets that they explain to the last digit
-    if prior.scale.shape[1] == 0:
-        return float(-0.5 * sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)).sum())
     o, p = prior.scale.shape
+    each = [sums.of(slice(index, index + 1)) for index in range(o)]
+    noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
+    if p == 0:
+        return float(-0.5 * sum(own.n_rows * (LOG_2PI + 1.0 + np.log(s2)).sum() for own, s2 in zip(each, noise)))
     empty = np.zeros((0, 0))
-    statistics = SufficientStatistics(
-        sums.n_rows, empty, np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0
-    )
-    bound = BoundAtOptimum(
-        Group(slice(0, o), Whitening(None, empty, empty), statistics, np.ones(o), noise, prior), "full"
-    )
-    return bound.value(bound.residuals())
+    groups = [
+        Group(
+            slice(index, index + 1),
+            Whitening(None, empty, empty),
+            SufficientStatistics(
+                own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0
+            ),
+            np.ones(1),
+            noise[index],
+            prior.outputs(slice(index, index + 1)),
+        )
+        for index, own in enumerate(each)
+    ]
+    return sum(bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full"))
 
 
 def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

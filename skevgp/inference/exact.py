@@ -1,22 +1,23 @@
 """The exact model with explicit features: likelihood, gradient and posterior (Rasmussen & Williams 2006, section 2.7).
 
-Per output, with ρ = σ²/s², L Lᵀ = K̃ + ρ I and the columns of c as prior scales, the whitened rows are z = L⁻¹ r / s
-and W = L⁻¹ H diag(c) / s; β = μ_β + c (w₀ + w) and r = y - H (μ_β + c w₀) as in `bounds`. Integrating β out leaves
+Per output, with ρ = σ²/s², L Lᵀ = K̃ + ρ I and Σ_β = C Cᵀ, the whitened rows are z = L⁻¹ r / s and
+W = L⁻¹ H C / s; β = μ_β + C (w₀ + w) and r = y - H (μ_β + C w₀) as in `bounds`. Integrating β out leaves
 
     -2 log p(y) = (n - k) log 2π + log |s² L Lᵀ| + log |B| + |z - W w|² + |D (w + w₀)|² - 2 Σ_vague log c,
     B = D + WᵀW,   w = B⁻¹ (Wᵀz - D w₀),   posterior of the weights: N(w, B⁻¹),
 
 where D = I, but 0 for the k weights whose prior is vague, Σ_β → ∞: for them c is a unit, and the likelihood that of
 n - k contrasts (eq. 2.45 there; the infinite log |Σ_β| left out). A QR factorisation of [W; D] gives B without squaring
-its condition.
+its condition. Outputs that share their weights are stacked: W and z are then those of all of them, one below the other.
 
 Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
-2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (c h(x) - s Wᵀ V)|², with
+2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|², with
 V = L⁻¹ k̃(X, x) and B = RᵀR.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +27,8 @@ from scipy.linalg import lapack
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..optimizers.parameters import Values
 from ..rows.source import RawRows
-from .bounds import LOG_2PI, CoefficientPrior
+from .bounds import LOG_2PI
+from .prior import CoefficientPrior
 from .posterior import Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
 
@@ -49,6 +51,14 @@ class OutputGivenKernel:
         Weights with Σ_β → ∞; their prior scale is a unit.
     """
 
+    # Of `join`.
+    R: np.ndarray
+    R_inv: np.ndarray
+    w: np.ndarray
+    left_over: np.ndarray
+    from_prior: np.ndarray
+    is_first: bool
+
     def __init__(
         self,
         K: np.ndarray,
@@ -64,39 +74,50 @@ class OutputGivenKernel:
         diagonal_of(shifted)[...] += self.ratio
         self.L = jittered_cholesky(shifted)
         self.L_inv = triangular_inverse(self.L)
-        s, scale, reference = np.sqrt(signal), prior.scale[0], prior.reference[0]
-        proper = ~vague
-        self.vague, self.scale = vague, scale
-        self.W = self.L_inv @ (H * (scale / s))
-        z = self.L_inv @ (r / s)
+        s = np.sqrt(signal)
+        self.vague, self.scale, self.reference = vague, prior.scale[0], prior.reference[0]
+        self.W = self.L_inv @ (H * (self.scale / s) if prior.root is None else H @ (prior.root[0] / s))
+        self.z = self.L_inv @ (r / s)
+
+    @staticmethod
+    def join(outputs: Sequence[OutputGivenKernel]) -> None:
+        """Find w from all of some outputs, which share it; what belongs to it is counted with the first of them."""
+        proper, reference = ~outputs[0].vague, outputs[0].reference
         # [W; D] w = [z; -D w₀] by least squares.
-        Q, self.R = np.linalg.qr(np.vstack([self.W, np.diag(proper.astype(float))]))
-        self.R_inv = lapack.dtrtri(self.R)[0] if len(self.R) else self.R
-        self.w = self.R_inv @ (Q.T @ np.concatenate([z, np.where(proper, -reference, 0.0)]))
-        self.left_over = z - self.W @ self.w
-        self.from_prior = proper * (self.w + reference)
+        Q, R = np.linalg.qr(np.vstack([*(own.W for own in outputs), np.diag(proper.astype(float))]))
+        R_inv = lapack.dtrtri(R)[0] if len(R) else R
+        w = R_inv @ (Q.T @ np.concatenate([*(own.z for own in outputs), np.where(proper, -reference, 0.0)]))
+        for own in outputs:
+            own.R, own.R_inv, own.w, own.is_first = R, R_inv, w, own is outputs[0]
+            own.left_over = own.z - own.W @ w
+            own.from_prior = proper * (w + reference)
 
     @property
     def log_likelihood(self) -> float:
         """Of the residuals, in nats."""
-        n_contrasts = len(self.L) - self.vague.sum()
+        n_contrasts = len(self.L)
         log_det = len(self.L) * np.log(self.signal) + 2.0 * np.log(np.diagonal(self.L)).sum()
-        log_det += 2.0 * (np.log(np.abs(np.diagonal(self.R))).sum() - np.log(self.scale[self.vague]).sum())
-        squares = self.left_over @ self.left_over + self.from_prior @ self.from_prior
+        squares = self.left_over @ self.left_over
+        if self.is_first:
+            n_contrasts -= self.vague.sum()
+            log_det += 2.0 * (np.log(np.abs(np.diagonal(self.R))).sum() - np.log(self.scale[self.vague]).sum())
+            squares += self.from_prior @ self.from_prior
         return float(-0.5 * (n_contrasts * LOG_2PI + log_det + squares))
 
     def gradient(self) -> tuple[np.ndarray, float, float]:
         """Of the log likelihood in K̃ (symmetric), log s² and log σ²: ½ (α αᵀ - P) pulled back to each.
 
-        (α = (s² L Lᵀ)⁻¹ (r - H c w); P is the inverse of y's covariance, or for vague weights its limit.)
+        (α = (s² L Lᵀ)⁻¹ (r - H C w); P is the inverse of y's covariance, of this output's rows, or for vague weights
+        its limit.)
         """
         n, s = len(self.L), np.sqrt(self.signal)
         alpha = self.L_inv.T @ self.left_over / s
-        from_weights = self.L_inv.T @ (self.W @ self.R_inv)
+        WR = self.W @ self.R_inv
+        from_weights = self.L_inv.T @ WR
         P = (symmetric_inverse(self.L_inv) - from_weights @ from_weights.T) / self.signal
         trace = float(np.trace(P))
         squares = float(self.left_over @ self.left_over)
-        explained = len(self.R) - float(np.sum(self.R_inv[~self.vague] ** 2))
+        explained = float(np.vdot(WR, WR))
         noise_bar = 0.5 * self.noise * (float(alpha @ alpha) - trace)
         P *= -1.0
         P += np.multiply.outer(alpha, alpha)
@@ -124,58 +145,72 @@ class ExactModel:
         Weights with an infinite prior scale; in ``prior`` theirs is a unit.
     rows : RawRows
         All of them, in internal units.
+    kernels : tuple of Kernel, optional
+        k̃ of each output, where outputs have inputs of their own.
     """
 
     kernel: Kernel
     prior: CoefficientPrior
     vague: np.ndarray
     rows: RawRows
+    kernels: tuple[Kernel, ...] | None = None
 
-    def outputs(self, values: Values) -> tuple[Any, list[OutputGivenKernel]]:
-        """The covariance of the rows, and each output given it."""
-        at = self.kernel.at(np.log(values["hyperparameters"]), self.rows.inputs)
-        K = at.matrix()
-        return at, [
-            OutputGivenKernel(
-                K,
-                self.rows.features,
-                self.rows.targets[:, o],
-                values["signal"][o],
-                values["noise"][o],
-                self.prior.outputs(slice(o, o + 1)),
-                self.vague[o],
-            )
-            for o in range(len(self.vague))
+    def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
+        """The covariance of the rows, of all outputs or of each, and each output given it."""
+        hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
+        each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
+        covariances = [
+            kernel.at(hyperparameters, own.inputs)
+            for kernel, own in zip(self.kernels or (self.kernel,), each, strict=False)
         ]
+        matrices = [at.matrix() for at in covariances]
+        outputs = [
+            OutputGivenKernel(
+                matrices[index % len(matrices)],
+                own.features,
+                own.targets[:, 0],
+                values["signal"][index],
+                values["noise"][index],
+                self.prior.outputs(slice(index, index + 1)),
+                self.vague[index],
+            )
+            for index, own in enumerate(each)
+        ]
+        for together in [outputs] if self.prior.shared else [[own] for own in outputs]:
+            OutputGivenKernel.join(together)
+        return covariances, outputs
 
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
         """Summed over outputs, and its gradient in the logarithms of the values."""
-        at, outputs = self.outputs(values)
+        covariances, outputs = self.outputs(values)
         total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
-        K_bar = np.zeros((len(self.rows.inputs),) * 2)
-        for o, output in enumerate(outputs):
+        K_bars = np.zeros((len(covariances), *outputs[0].L.shape))
+        for index, output in enumerate(outputs):
             total += output.log_likelihood
-            own, gradient["signal"][o], gradient["noise"][o] = output.gradient()
-            K_bar += own
-        gradient["hyperparameters"], _ = at.finish_pullback(at.start_pullback(), K_bar)
+            own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
+            K_bars[index % len(K_bars)] += own
+        for at, K_bar in zip(covariances, K_bars, strict=True):
+            gradient["hyperparameters"] += at.finish_pullback(at.start_pullback(), K_bar)[0]
         return total, gradient
 
     def predictor(self, values: Values) -> Predictor:
         """In internal units; the rows are its inducing points."""
-        at, outputs = self.outputs(values)
+        covariances, outputs = self.outputs(values)
         groups = []
-        for o, output in enumerate(outputs):
-            own, (mean, root) = slice(o, o + 1), output.posterior()
+        for index, output in enumerate(outputs):
+            own, (mean, root) = slice(index, index + 1), output.posterior()
             groups.append(
                 PredictorGroup.of(
                     own,
+                    self.kernel if self.kernels is None else self.kernels[index],
                     values["hyperparameters"],
-                    self.rows.inputs,
-                    Whitening(at, output.L, output.L_inv),
+                    self.rows.of(own).inputs,
+                    Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
                     values["signal"][own],
-                    self.prior.scale[own],
+                    self.prior.outputs(own),
                     [mean],
                     [root],
                 )
             )
-        return Predictor(self.kernel, tuple(groups), values["noise"], self.prior.offset, np.zeros(len(groups)))
+        offset = self.prior.offset
+        return Predictor(tuple(groups), values["noise"], offset, np.zeros(len(groups)), self.prior.shared)

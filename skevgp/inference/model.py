@@ -8,9 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._linalg import JITTER, Jitter
-from ..optimizers.parameters import Values
+from ..optimizers.parameters import Parameter, Values
 from ..rows.blocks import Blocks
-from .bounds import BoundAtOptimum, CoefficientPrior, Group, PosteriorFamily, diagonal_root, log_variances, upper_bound
+from ..rows.internal import Rows
+from .bounds import Group, PosteriorFamily, bounds_at_optimum, diagonal_root, log_variances, upper_bound
+from .prior import CoefficientPrior
 from .posterior import Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
@@ -24,7 +26,7 @@ class SparseModel:
     Attributes
     ----------
     kernel : Kernel
-        k̃, of unit signal variance, with hyperparameters common to all outputs.
+        k̃, of unit signal variance.
     prior : CoefficientPrior
         Of o outputs.
     family : {"full", "diagonal"}
@@ -35,6 +37,9 @@ class SparseModel:
     complete : bool, default=False
         Whether the inducing points are all rows: the bound is then the likelihood, and what is left of k(x, x) - |v|²
         is rounding.
+    kernels : tuple of Kernel, optional
+        If rows are split by groups, which then have inputs of their own or are joined by their weights: that of each
+        group. All have the same hyperparameters, or, where these are of shape (g, n_hyper), each its own.
     """
 
     kernel: Kernel
@@ -43,11 +48,30 @@ class SparseModel:
     groups: tuple[slice, ...]
     jitter: Jitter = JITTER
     complete: bool = False
+    kernels: tuple[Kernel, ...] | None = None
+
+    def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
+        """k̃ of a group, and its hyperparameters (n_hyper,)."""
+        hyperparameters = values["hyperparameters"]
+        own = hyperparameters if hyperparameters.ndim == 1 else hyperparameters[group]
+        return self.kernel if self.kernels is None else self.kernels[group], own
+
+    def set_of(self, output: int, parameter: Parameter) -> int:
+        """Which row of a parameter, of all groups or of each, belongs to an output."""
+        if parameter.start.ndim == 1:
+            return 0
+        return next(i for i, group in enumerate(self.groups) if group.start <= output < group.stop)
+
+    def blocks(self, rows: Rows, n_inducing: int) -> Blocks:
+        """The rows of its outputs as blocks."""
+        if self.kernels is None:
+            return rows.blocks(self.kernel, n_inducing)
+        return rows.blocks(self.kernels, n_inducing, self.groups)
 
     def whitenings(self, values: Values) -> Iterator[Whitening]:
         """Of each set of inducing points."""
-        for points in values["inducing_points"]:
-            yield Whitening.of(self.kernel, values["hyperparameters"], points, self.jitter)
+        for index, points in enumerate(values["inducing_points"]):
+            yield Whitening.of(*self.kernel_of(values, index), points, self.jitter)
 
     def groups_on(self, values: Values, blocks: Blocks) -> Iterator[Group]:
         """Each group with the statistics of some rows: a pass over them for each, when it is asked for."""
@@ -80,11 +104,10 @@ class SparseModel:
             What `statistics` returns for these values.
         """
         total, whitenings, mean, root = 0.0, [], [], []
-        for group in self.groups_of(values, statistics):
-            bound = BoundAtOptimum(group, self.family)
+        for bound in bounds_at_optimum(list(self.groups_of(values, statistics)), self.family):
             total += bound.value(bound.residuals())
-            whitenings.append(group.whitening)
-            L_inv = group.whitening.L_inv
+            whitenings.append(bound.group.whitening)
+            L_inv = bound.group.whitening.L_inv
             for q in bound.posteriors:
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
@@ -102,7 +125,7 @@ class SparseModel:
         blocks : Blocks, default=None
             All rows; without them digits cancel at high signal-to-noise ratios.
         """
-        return sum(upper_bound(group, blocks) for group in self.groups_of(values, statistics))
+        return upper_bound(list(self.groups_of(values, statistics)), blocks)
 
     def predictor(
         self,
@@ -121,22 +144,23 @@ class SparseModel:
         mean, root : sequence of ndarray
             One per output.
         """
+        sets = zip(self.groups, values["inducing_points"], whitenings, strict=True)
         return Predictor(
-            self.kernel,
             tuple(
                 PredictorGroup.of(
                     outputs,
-                    values["hyperparameters"],
+                    *self.kernel_of(values, index),
                     points,
                     whitening,
                     values["signal"][outputs],
-                    self.prior.scale[outputs],
+                    self.prior.outputs(outputs),
                     mean[outputs],
                     root[outputs],
                 )
-                for outputs, points, whitening in zip(self.groups, values["inducing_points"], whitenings, strict=True)
+                for index, (outputs, points, whitening) in enumerate(sets)
             ),
             values["noise"],
             self.prior.offset,
             np.zeros(len(values["noise"])),
+            self.prior.shared,
         )

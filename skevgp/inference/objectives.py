@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import Protocol
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
-from .bounds import LOG_2PI, BoundAtOptimum, Group
+from .bounds import LOG_2PI, BoundAtOptimum, Group, bounds_at_optimum
 from .families import DiagonalFamily, Family, FullFamily, NaturalFamily
 from .model import SparseModel
 from .posterior import Predictor
@@ -33,7 +33,10 @@ class Terms(Protocol):
 
 
 def evaluate(
-    model: SparseModel, values: Values, blocks: Blocks, terms_of: Callable[[Group], Terms]
+    model: SparseModel,
+    values: Values,
+    blocks: Blocks,
+    terms_of: Callable[[Sequence[Group]], Sequence[Terms]],
 ) -> tuple[float, Values]:
     """A scalar of the model and some rows, summed over outputs, and its gradient: two passes for each set of points.
 
@@ -43,7 +46,8 @@ def evaluate(
     values : dict
     blocks : Blocks
     terms_of : callable
-        What the scalar is, given a group's statistics.
+        What the scalar is, given groups with their statistics: one after the other or, if outputs share their weights,
+        all at once.
 
     Returns
     -------
@@ -57,17 +61,22 @@ def evaluate(
         If a matrix is not finite.
     """
     total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
-    for index, group in enumerate(model.groups_on(values, blocks)):
-        terms = terms_of(group)
-        (hyper_bar, Z_bar), residuals = pull_back(
-            blocks, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
-        )
-        value, own = terms.finish(residuals)
-        total += value
-        gradient["hyperparameters"] += hyper_bar
-        gradient["inducing_points"][index] += Z_bar
-        for name, bar in own.items():
-            gradient[name][group.outputs] = bar
+    groups = model.groups_on(values, blocks)
+    jointly: Iterable[Sequence[Group]] = [list(groups)] if model.prior.shared else ([group] for group in groups)
+    index = 0
+    for together in jointly:
+        for group, terms in zip(together, terms_of(together), strict=True):
+            (hyper_bar, Z_bar), residuals = pull_back(
+                blocks, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
+            )
+            value, own = terms.finish(residuals)
+            total += value
+            separate = gradient["hyperparameters"].ndim == 2
+            gradient["hyperparameters"][index if separate else slice(None)] += hyper_bar
+            gradient["inducing_points"][index] += Z_bar
+            for name, bar in own.items():
+                gradient[name][group.outputs] = bar
+            index += 1
     return total, gradient
 
 
@@ -83,7 +92,7 @@ class BoundObjective:
 
     def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
         self.model, self.table, self.blocks = model, table, blocks
-        self._terms_of = partial(BoundAtOptimum, family=model.family)
+        self._terms_of = partial(bounds_at_optimum, family=model.family)
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
         bound, gradient = evaluate(self.model, self.table.values(flat), self.blocks, self._terms_of)
@@ -132,7 +141,8 @@ class ElboObjective:
         else:
             self.family = FullFamily(optima) if model.family == "full" else DiagonalFamily(optima, factors)
         # A step of w should move the prediction as much as a step of v does.
-        reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH) / self.n_rows)
+        of_features = blocks.linear.of(slice(0, len(model.prior.scale)))
+        reach = model.prior.scale * np.sqrt(np.diagonal(of_features.HH) / self.n_rows)
         m = start["inducing_points"].shape[1]
         unit = np.hstack([np.ones((len(reach), m)), 1.0 / np.where(reach > 0.0, reach, 1.0)])
         self.table = ParameterTable([*table.parameters, *self.family.parameters(unit)])
@@ -151,7 +161,7 @@ class ElboObjective:
         values = self.table.values(x)
         # Rows that count N/n times: a noise variance of σ² n/N.
         counted = values | {"noise": values["noise"] * (blocks.linear.n_rows / self.n_rows)}
-        loss, gradient = evaluate(self.model, counted, blocks, lambda group: _ElboTerms(self, values, group))
+        loss, gradient = evaluate(self.model, counted, blocks, lambda groups: [_ElboTerms(self, values, group) for group in groups])
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..rows.source import Columns
+from ..rows.source import Columns, of_outputs, times_weights
+from .prior import CoefficientPrior
 from .statistics import Kernel, Whitening
 
 # Of the deviations of all outputs at once.
@@ -22,6 +23,8 @@ class PredictorGroup:
     ----------
     outputs : slice or list of int
         o of them.
+    kernel : Kernel
+        k̃.
     hyperparameters : ndarray of shape (n_hyper,)
         Of k̃.
     points : ndarray of shape (m, d)
@@ -32,10 +35,11 @@ class PredictorGroup:
     mean : ndarray of shape (o, m + p)
     root : ndarray of shape (o, k, m + p)
         The variance of g(x) is |root @ P|² and what the points leave of s² k̃(x, x); k is m + p, or less in the exact
-        model.
+        model. The last p entries of root @ P are what comes from the weights.
     """
 
     outputs: Columns
+    kernel: Kernel
     hyperparameters: np.ndarray
     points: np.ndarray
     whitening: Whitening
@@ -47,27 +51,24 @@ class PredictorGroup:
     def of(
         cls,
         outputs: Columns,
+        kernel: Kernel,
         hyperparameters: np.ndarray,
         points: np.ndarray,
         whitening: Whitening,
         signal: np.ndarray,
-        scale: np.ndarray,
+        prior: CoefficientPrior,
         mean: Sequence[np.ndarray],
         root: Sequence[np.ndarray],
     ) -> PredictorGroup:
-        """From q(ω) of each output, ω = (v, w) whitened as in `bounds`, with the prior's scales (o, p)."""
-        s = np.broadcast_to(np.sqrt(signal)[:, np.newaxis], (len(signal), len(points)))
-        # [s; c] turns [V; Hᵀ] into Pᵀ of each output.
-        scales = np.hstack([s, scale])
-        return cls(
-            outputs,
-            hyperparameters,
-            points,
-            whitening,
-            signal,
-            np.array(mean) * scales,
-            np.array(root) * scales[:, np.newaxis],
-        )
+        """From q(ω) of each output, ω = (v, w) whitened as in `bounds`, with these outputs' prior."""
+        m, s = len(points), np.sqrt(signal)[:, np.newaxis]
+        # T turns [V; Hᵀ] into Pᵀ of each output.
+        own_mean, own_root = np.array(mean), np.array(root)
+        own_mean[:, :m] *= s
+        own_mean[:, m:] = prior.times(own_mean[:, m:])
+        own_root[:, :, :m] *= s[:, np.newaxis]
+        own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
+        return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root)
 
     def scaled(self, factor: np.ndarray) -> PredictorGroup:
         """The same group for outputs in other units: y times ``factor`` (o,)."""
@@ -89,8 +90,6 @@ class Predictor:
 
     Attributes
     ----------
-    kernel : Kernel
-        k̃.
     groups : tuple of PredictorGroup
         Of all outputs, each in one of them.
     noise : ndarray of shape (o,)
@@ -99,13 +98,15 @@ class Predictor:
         What the groups' weights of features are added to.
     intercept : ndarray of shape (o,)
         What is added to the mean.
+    shared : bool, default=False
+        Whether outputs have the same weights, and so depend on each other.
     """
 
-    kernel: Kernel
     groups: tuple[PredictorGroup, ...]
     noise: np.ndarray
     offset: np.ndarray
     intercept: np.ndarray
+    shared: bool = False
 
     @classmethod
     def joined(
@@ -123,7 +124,7 @@ class Predictor:
             for group in part.groups:
                 own = np.array(columns)[group.outputs].tolist()
                 groups.append(replace(group.scaled(unit[own]), outputs=own))
-        return cls(parts[0].kernel, tuple(groups), noise, offset, intercept)
+        return cls(tuple(groups), noise, offset, intercept, parts[0].shared)
 
     @property
     def rows_at_once(self) -> int:
@@ -149,9 +150,9 @@ class Predictor:
 
         Parameters
         ----------
-        inputs : ndarray of shape (n, d)
+        inputs : ndarray of shape (n, d) or (n, o, d)
             The kernel's.
-        features : ndarray of shape (n, p)
+        features : ndarray of shape (n, p) or (n, o, p)
             h(x).
         return_variance : bool, default=False
 
@@ -160,9 +161,8 @@ class Predictor:
         mean : ndarray of shape (n, o)
         variance : ndarray of shape (n, o), or None
         """
-        prepared, means, variances = self.kernel.prepare(inputs), [], []
-        for group in self.groups:
-            P, unexplained = group.project(prepared, features)
+        means, variances = [], []
+        for group, (_, P, unexplained) in zip(self.groups, self._projected(inputs, features), strict=True):
             means.append(group.mean @ P)
             if return_variance:
                 o, k, size = group.root.shape
@@ -171,23 +171,52 @@ class Predictor:
                 squares = deviation.reshape(o, k, len(inputs)).sum(axis=1)
                 variances.append(np.outer(group.signal, unexplained) + squares)
         mean = self._in_order(means).T
-        mean += features @ self.offset.T
+        mean += times_weights(features, self.offset)
         mean += self.intercept
         return mean, self._in_order(variances).T if return_variance else None
 
     def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o)."""
+        """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o), of each output."""
         mean, _ = self.predict(inputs, features)
-        covariance, prepared = np.empty((len(mean), *mean.shape)), self.kernel.prepare(inputs)
-        for group in self.groups:
-            P, _ = group.project(prepared, features)
+        (n, o), covariance = mean.shape, np.empty((len(mean), *mean.shape))
+        for group, (own, P, _) in zip(self.groups, self._projected(inputs, features), strict=True):
             V = P[: len(group.points)]
-            unexplained = self.kernel.at(np.log(group.hyperparameters), inputs).matrix() - V.T @ V
-            outputs = np.arange(len(self.noise))[group.outputs]
-            for o, signal, root in zip(outputs, group.signal, group.root, strict=True):
+            unexplained = group.kernel.at(np.log(group.hyperparameters), own).matrix() - V.T @ V
+            for output, signal, root in zip(np.arange(o)[group.outputs], group.signal, group.root, strict=True):
                 deviation = root @ P
-                covariance[:, :, o] = signal * unexplained + deviation.T @ deviation
+                covariance[:, :, output] = signal * unexplained + deviation.T @ deviation
         return mean, covariance
+
+    def common(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """What outputs with the same weights have in common: M (k, n, o) with the covariance M_iᵀ M_j of two of them.
+
+        (Of B⁻¹ = R Rᵀ with R⁻¹ as in `bounds`, the rows of w; all else of an output is independent of the others.)
+        """
+        p, parts = self.offset.shape[1] if self.shared else 0, []
+        for group, (_, P, _) in zip(self.groups, self._projected(inputs, features), strict=True):
+            parts.append(group.root[:, group.root.shape[1] - p :] @ P)
+        return self._in_order(parts).transpose(1, 2, 0)
+
+    def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Covariances (n, n, o) of each output as one (n o, n o) of all, outputs of a row next to each other."""
+        n, _, o = covariance.shape
+        common = self.common(inputs, features)
+        between = np.einsum("kni,kmj->nimj", common, common, optimize=True)
+        for output in range(o):
+            between[:, output, :, output] = covariance[:, :, output]
+        return between.reshape(n * o, n * o)
+
+    def _projected(
+        self, inputs: np.ndarray, features: np.ndarray
+    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        """Each group's inputs, P = [V; Hᵀ], and k̃(x, x) - |v|² of each row."""
+        prepared, kernel = None, None
+        for group in self.groups:
+            own = of_outputs(inputs, group.outputs)
+            if prepared is None or inputs.ndim == 3 or group.kernel is not kernel:
+                kernel = group.kernel
+                prepared = kernel.prepare(own)
+            yield own, *group.project(prepared, of_outputs(features, group.outputs))
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""

@@ -23,7 +23,7 @@ from .._linalg import (
     triangular_inverse,
     triangular_product,
 )
-from ..rows.blocks import Block, Blocks
+from ..rows.blocks import AnyBlock, Block, Blocks
 
 _ROUNDING = 4.0 * np.finfo(float).eps
 # Relative to the diagonal: above rounding, and below any jitter.
@@ -199,8 +199,9 @@ class _FirstPass:
     whitening: Whitening
     outputs: slice
 
-    def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray, float]:
-        U, P = _projected(block, self.whitening, self.outputs)
+    def __call__(self, block: AnyBlock) -> tuple[np.ndarray, np.ndarray, float]:
+        block, outputs = block.of(self.outputs)
+        U, P = _projected(block, self.whitening, outputs)
         block.kept = (self.whitening, U, P) if block.may_keep else None
         V, linear = P[: len(U)], P[len(U) :]
         return V @ V.T, V @ linear.T, self.whitening.unexplained(block.prepared, V).sum()
@@ -229,9 +230,10 @@ class _Errors:
     outputs: slice
     weights: np.ndarray
 
-    def __call__(self, block: Block) -> tuple[np.ndarray, np.ndarray]:
-        U, P = _projected(block, self.whitening, self.outputs)
-        e = _put_errors(block, P, self.outputs, self.weights)
+    def __call__(self, block: AnyBlock) -> tuple[np.ndarray, np.ndarray]:
+        block, outputs = block.of(self.outputs)
+        U, P = _projected(block, self.whitening, outputs)
+        e = _put_errors(block, P, outputs, self.weights)
         return np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
 
 
@@ -248,13 +250,14 @@ class _SecondPass:
     unexplained_bar: float
     weights: np.ndarray
 
-    def __call__(self, block: Block) -> tuple[Any, np.ndarray, np.ndarray]:
+    def __call__(self, block: AnyBlock) -> tuple[Any, np.ndarray, np.ndarray]:
+        block, outputs = block.of(self.outputs)
         # It stays until the next first pass replaces it: all of it, let go, would be given back to the system.
         if block.kept is not None and block.kept[0] is self.whitening:
             _, U, P = block.kept
         else:
-            U, P = _projected(block, self.whitening, self.outputs)
-        e = _put_errors(block, P, self.outputs, self.weights)
+            U, P = _projected(block, self.whitening, outputs)
+        e = _put_errors(block, P, outputs, self.weights)
         U_bar = self.back @ P
         rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
         return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
@@ -275,7 +278,7 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
     -------
     statistics : SufficientStatistics
     """
-    linear = blocks.linear
+    linear = blocks.linear.of(outputs)
     VV, VL, unexplained = blocks.sum(_FirstPass(whitening, outputs))
     p = len(linear.HH)
     return SufficientStatistics(
@@ -284,8 +287,8 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
         VL[:, :p],
         VL[:, p:],
         linear.HH,
-        linear.HR[:, outputs],
-        linear.RR[outputs],
+        linear.HR,
+        linear.RR,
         float(unexplained),
     )
 

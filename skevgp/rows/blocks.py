@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, fields, is_dataclass
 from functools import cached_property
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 import numpy as np
 
@@ -66,6 +66,10 @@ class Block:
     def residuals(self) -> np.ndarray:
         return self.linear[:, self.n_features :]
 
+    def of(self, outputs: slice) -> tuple[Block, slice]:
+        """The block that some outputs are in, and where in it."""
+        return self, outputs
+
     def linear_of(self, outputs: slice) -> np.ndarray:
         """h(x), then r of some outputs, (n, p + their number); no copy if they are all."""
         residuals = self.residuals[:, outputs]
@@ -73,10 +77,84 @@ class Block:
             return self.linear
         return np.hstack([self.features, residuals])
 
+    @property
+    def nbytes(self) -> int:
+        """What it takes to keep it."""
+        return _nbytes((self.prepared, self.linear))
+
+    @property
+    def width(self) -> int:
+        """Columns of ``linear``."""
+        return self.linear.shape[1]
+
+    @property
+    def n_parts(self) -> int:
+        return 1
+
+    def sums(self) -> LinearSums:
+        """The sums that do not depend on any parameter."""
+        return LinearStatistics.of_block(self)
+
+    def keep(self) -> None:
+        """There is room for what a first pass leaves."""
+        self.may_keep = True
+
+
+@dataclass
+class SplitBlock:
+    """Consecutive rows of the data, once for each group of outputs: each has its inputs, features and residuals.
+
+    Attributes
+    ----------
+    parts : dict of int to Block
+        By the first output of a group; of this group's outputs.
+    """
+
+    parts: dict[int, Block]
+
+    def of(self, outputs: slice) -> tuple[Block, slice]:
+        return self.parts[outputs.start], slice(None)
+
+    @property
+    def nbytes(self) -> int:
+        return sum(part.nbytes for part in self.parts.values())
+
+    @property
+    def width(self) -> int:
+        return max(part.width for part in self.parts.values())
+
+    @property
+    def n_parts(self) -> int:
+        return len(self.parts)
+
+    def sums(self) -> LinearSums:
+        return SplitStatistics({first: LinearStatistics.of_block(part) for first, part in self.parts.items()})
+
+    def keep(self) -> None:
+        for part in self.parts.values():
+            part.keep()
+
+
+# One or the other, for all blocks of some rows.
+AnyBlock = Block | SplitBlock
+
+
+class LinearSums(Protocol):
+    """The sums over rows that do not depend on any parameter: computed once per data set."""
+
+    @property
+    def n_rows(self) -> int:
+        """N."""
+
+    def of(self, outputs: slice) -> LinearStatistics:
+        """Of some outputs, all in one group."""
+
+    def __add__(self, other: Self) -> Self: ...
+
 
 @dataclass(frozen=True)
 class LinearStatistics:
-    """The sums over rows that do not depend on any parameter: computed once per data set.
+    """The sums over rows that do not depend on any parameter, of outputs with the same features.
 
     Attributes
     ----------
@@ -95,37 +173,58 @@ class LinearStatistics:
     RR: np.ndarray
 
     @classmethod
-    def of(cls, block: Block) -> LinearStatistics:
+    def of_block(cls, block: Block) -> LinearStatistics:
         total, p = block.linear.T @ block.linear, block.n_features
         return cls(len(block.linear), total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy())
 
+    def of(self, outputs: slice) -> LinearStatistics:
+        return LinearStatistics(self.n_rows, self.HH, self.HR[:, outputs], self.RR[outputs])
+
     def __add__(self, other: LinearStatistics) -> LinearStatistics:
         return LinearStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
+
+
+@dataclass(frozen=True)
+class SplitStatistics:
+    """The same of groups of outputs, each with features of its own; by the first output of each."""
+
+    parts: dict[int, LinearStatistics]
+
+    @property
+    def n_rows(self) -> int:
+        return next(iter(self.parts.values())).n_rows
+
+    def of(self, outputs: slice) -> LinearStatistics:
+        first = max(first for first in self.parts if first <= outputs.start)
+        return self.parts[first].of(slice(outputs.start - first, outputs.stop - first))
+
+    def __add__(self, other: SplitStatistics) -> SplitStatistics:
+        return SplitStatistics({first: own + other.parts[first] for first, own in self.parts.items()})
 
 
 class Blocks(Protocol):
     """Rows that a function of a block can be summed over."""
 
     @property
-    def linear(self) -> LinearStatistics:
+    def linear(self) -> LinearSums:
         """The sums that do not depend on any parameter."""
 
-    def sum(self, function: Callable[[Block], Any]) -> Any:
+    def sum(self, function: Callable[[Any], Any]) -> Any:
         """The sum of function(block), by ``+`` (of tuples, entry by entry), in an order that never changes."""
 
 
 class Batch:
     """One block that stands for itself: a mini-batch."""
 
-    def __init__(self, block: Block):
+    def __init__(self, block: AnyBlock):
         self.block = block
-        block.may_keep = True
+        block.keep()
 
     @cached_property
-    def linear(self) -> LinearStatistics:
-        return LinearStatistics.of(self.block)
+    def linear(self) -> LinearSums:
+        return self.block.sums()
 
-    def sum(self, function: Callable[[Block], Any]) -> Any:
+    def sum(self, function: Callable[[Any], Any]) -> Any:
         return function(self.block)
 
 
@@ -148,7 +247,7 @@ class LocalBlocks:
 
     def __init__(
         self,
-        make: Callable[[slice], Block],
+        make: Callable[[slice], AnyBlock],
         n_rows: int,
         n_inducing: int,
         threads: BlockMap | None = None,
@@ -160,10 +259,12 @@ class LocalBlocks:
         self._make = make
         self._slices = [slice(first, min(first + size, n_rows)) for first in range(0, n_rows, size)]
         first = make(self._slices[0])
-        self._n_cached = int(share * CACHE_BYTES / max(_nbytes((first.prepared, first.linear)), 1))
+        self._n_cached = int(share * CACHE_BYTES / max(first.nbytes, 1))
         all_cached = self._n_cached >= len(self._slices)
-        kept_bytes = 8 * (2 * n_inducing + first.linear.shape[1]) * n_rows
-        self._may_keep = first.may_keep = keep and all_cached and kept_bytes <= share * KEEP_BYTES
+        kept_bytes = 8 * first.n_parts * (2 * n_inducing + first.width) * n_rows
+        self._may_keep = keep and all_cached and kept_bytes <= share * KEEP_BYTES
+        if self._may_keep:
+            first.keep()
         self._made = {0: first}
         per_group = -(-len(self._slices) // _MAX_GROUPS)
         blocks = range(len(self._slices))
@@ -173,20 +274,21 @@ class LocalBlocks:
     def __len__(self) -> int:
         return len(self._slices)
 
-    def __getitem__(self, index: int) -> Block:
+    def __getitem__(self, index: int) -> AnyBlock:
         block = self._made.get(index)
         if block is None:
             block = self._make(self._slices[index])
-            block.may_keep = self._may_keep
+            if self._may_keep:
+                block.keep()
             if index < self._n_cached:
                 self._made[index] = block
         return block
 
     @cached_property
-    def linear(self) -> LinearStatistics:
-        return self.sum(LinearStatistics.of)
+    def linear(self) -> LinearSums:
+        return self.sum(sums_of)
 
-    def sum(self, function: Callable[[Block], Any]) -> Any:
+    def sum(self, function: Callable[[Any], Any]) -> Any:
         def one(group: range) -> Any:
             total = function(self[group[0]])
             for index in group[1:]:
@@ -194,6 +296,11 @@ class LocalBlocks:
             return total
 
         return ordered_sum(self._threads(one, self._groups))
+
+
+def sums_of(block: AnyBlock) -> LinearSums:
+    """What `Blocks.linear` sums."""
+    return block.sums()
 
 
 def _nbytes(value: Any) -> int:

@@ -12,8 +12,8 @@ from sklearn.utils import check_array
 
 from .._optional import require
 from .._validation import as_floats, check_magnitude
-from .blocks import Block, Blocks, LinearStatistics, LocalBlocks
-from .mapped import MappedRows
+from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
+from .mapped import MappedRows, RowShapes
 from .maps import fit_map, fresh_map
 from .source import LocalSource, RawRows
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
@@ -92,13 +92,15 @@ class DaskSource:
         In the same chunks.
     feature_map, kernel_map : transformer or None
         Fitted.
+    shapes : (tuple, tuple), default=None
+        As of `MappedRows`.
     """
 
-    def __init__(self, X: Any, y: Any, feature_map: Any, kernel_map: Any):
+    def __init__(self, X: Any, y: Any, feature_map: Any, kernel_map: Any, shapes: RowShapes | None = None):
         dask = _dask()
         maps = dask.delayed((feature_map, kernel_map), traverse=False)
         chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
-        self._partitions: Sequence[Any] = _held([dask.delayed(_partition)(*chunk, maps) for chunk in chunks])
+        self._partitions: Sequence[Any] = _held([dask.delayed(_partition)(*chunk, maps, shapes) for chunk in chunks])
         self._ends: np.ndarray = np.cumsum(X.chunks[0])
         self.n_rows = len(X)
 
@@ -128,23 +130,23 @@ class DaskSource:
         part.n_rows = end - first
         return part
 
-    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+    def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return DaskBlocks(self._partitions, make, n_inducing)
 
 
 class DaskBlocks:
     """Blocks that Dask's workers make of their partitions and keep."""
 
-    def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], Block], n_inducing: int):
+    def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], AnyBlock], n_inducing: int):
         dask = _dask()
         shared = dask.delayed(make, traverse=False)
         self._partitions = _held([dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions])
 
     @cached_property
-    def linear(self) -> LinearStatistics:
-        return self.sum(LinearStatistics.of)
+    def linear(self) -> LinearSums:
+        return self.sum(sums_of)
 
-    def sum(self, function: Callable[[Block], Any]) -> Any:
+    def sum(self, function: Callable[[Any], Any]) -> Any:
         return _sum_over(self._partitions, function)
 
 
@@ -204,21 +206,21 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
 # --- what runs on the workers ------------------------------------------------------------------------------------
 
 
-def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any]) -> LocalSource:
+def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any], shapes: RowShapes | None) -> LocalSource:
     # Partitions are worked on at the same time, and transformers need not be safe for that.
     maps = deepcopy(maps)
     X = check_array(X, dtype=[np.float64, np.float32], input_name="X")
     y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
     check_magnitude(X, "X")
     check_magnitude(y, "y")
-    return LocalSource(MappedRows(X, X, y, *maps), len(X))
+    return LocalSource(MappedRows(X, X, y, *maps, shapes), len(X))
 
 
 def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
     return partition.part(first, end)
 
 
-def _blocks(partition: LocalSource, make: Callable[[RawRows], Block], n_inducing: int) -> Blocks:
+def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:
     return LocalBlocks(partition.through(make), partition.n_rows, n_inducing, keep=False)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from itertools import pairwise
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 import numpy as np
 from sklearn.utils.random import sample_without_replacement
 
-from .blocks import Batch, Block, Blocks
+from .blocks import AnyBlock, Batch, Block, Blocks, SplitBlock
 from .source import Columns, LocalSource, Moments, RawRows, Source
 from .threads import BlockMap
 
@@ -32,17 +32,37 @@ ToInternal = Callable[[RawRows], RawRows]
 
 @dataclass(frozen=True)
 class MakeBlock:
-    """Rows in the user's units -> `Block` of some outputs."""
+    """Rows in the user's units -> `Block` of some outputs, or `SplitBlock` of groups of them.
 
-    kernel: Preparer
+    Attributes
+    ----------
+    kernels : tuple of Preparer
+        One, or that of each group.
+    to_internal : callable
+    outputs : slice or list of int
+    groups : tuple of slice, optional
+        Of these outputs.
+    """
+
+    kernels: tuple[Preparer, ...]
     to_internal: ToInternal
     outputs: Columns = field(default_factory=lambda: slice(None))
+    groups: tuple[slice, ...] | None = None
 
-    def __call__(self, raw: RawRows) -> Block:
-        rows = self.to_internal(raw)
-        # A column's numbers side by side: products and errors take the columns, not the rows.
-        linear = np.asfortranarray(np.hstack([rows.features, rows.targets[:, self.outputs]]))
-        return Block(self.kernel.prepare(rows.inputs), linear, rows.features.shape[1])
+    def __call__(self, raw: RawRows) -> AnyBlock:
+        rows = self.to_internal(raw).of(self.outputs)
+        if self.groups is None:
+            return _block(rows, self.kernels[0].prepare(rows.inputs))
+        each = [rows.of(outputs) for outputs in self.groups]
+        prepared = [kernel.prepare(own.inputs) for kernel, own in zip(self.kernels, each, strict=True)]
+        return SplitBlock(
+            {group.start: _block(own, made) for group, own, made in zip(self.groups, each, prepared, strict=True)}
+        )
+
+
+def _block(rows: RawRows, prepared: Any) -> Block:
+    # A column's numbers side by side: products and errors take the columns, not the rows.
+    return Block(prepared, np.asfortranarray(np.hstack([rows.features, rows.targets])), rows.features.shape[1])
 
 
 @dataclass(frozen=True)
@@ -89,8 +109,8 @@ class Rows:
 
     @property
     def inputs(self) -> Moments:
-        """Of the inputs' columns."""
-        return self._moments[0]
+        """Of the inputs' columns (d,), or (o, d) where outputs have inputs of their own."""
+        return self._moments[0].at(self.columns)
 
     @property
     def residuals(self) -> Moments:
@@ -104,8 +124,7 @@ class Rows:
 
     def some(self, chosen: np.ndarray) -> RawRows:
         """Rows by index, in internal units."""
-        rows = self.to_internal(self.source.take(chosen))
-        return replace(rows, targets=rows.targets[:, self.columns])
+        return self.to_internal(self.source.take(chosen)).of(self.columns)
 
     def sample(self, size: int, rng: np.random.RandomState) -> RawRows:
         """All rows, or ``size`` of them drawn at random, in their order."""
@@ -114,15 +133,18 @@ class Rows:
             chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
         return self.some(chosen)
 
-    def blocks(self, kernel: Preparer, n_inducing: int) -> Blocks:
-        """The rows as blocks for a kernel with so many inducing points."""
-        make = MakeBlock(kernel, self.to_internal, self.columns)
+    def blocks(
+        self, kernel: Preparer | Sequence[Preparer], n_inducing: int, groups: tuple[slice, ...] | None = None
+    ) -> Blocks:
+        """The rows as blocks for a kernel with so many inducing points, perhaps split by groups with one each."""
+        kernels = tuple(kernel) if isinstance(kernel, Sequence) else (kernel,)
+        make = MakeBlock(kernels, self.to_internal, self.columns, groups)
         return self.source.blocks(make, n_inducing, self.threads, self.share)
 
     def batches(self, kernel: Preparer, size: int, rng: np.random.RandomState) -> Iterator[Batch]:
         """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""
         size = min(size, len(self))
-        make = MakeBlock(kernel, self.to_internal, self.columns)
+        make = MakeBlock((kernel,), self.to_internal, self.columns)
         # Parts of nearly equal length, none of them shorter than a batch.
         ends = np.linspace(0, len(self), max(len(self) // max(_SHUFFLED_ROWS, size), 1) + 1).astype(int)
         parts = list(pairwise(ends))
@@ -143,6 +165,11 @@ class Rows:
     def part(self, first: int, end: int, share: float) -> Rows:
         """Consecutive rows, with a share of the memory."""
         return replace(self, source=self.source.part(first, end), share=self.share * share)
+
+    def within(self, group: slice) -> Rows:
+        """The same rows with some of these outputs."""
+        columns = np.arange(len(self.residuals.mean))[self.columns][group].tolist()
+        return replace(self, columns=columns)
 
     def outputs(self, columns: Columns, share: float = 1.0) -> Rows:
         """The same rows with some of the outputs."""

@@ -7,11 +7,25 @@ from typing import Any
 
 import numpy as np
 
-from .maps import MAP_ROWS, apply_map, take_rows
+from .maps import MAP_ROWS, apply_map, shape_text, take_rows
 from .source import RawRows
 
 # What the maps make of all rows is kept if it fits in so many bytes; else they are applied anew at each pass.
 MAPPED_BYTES = 32 * 2**20
+
+
+# Of a row's kernel inputs, and of its features.
+RowShapes = tuple[tuple[int, ...], tuple[int, ...]]
+
+
+def check_shapes(mapped: tuple[np.ndarray, np.ndarray], shapes: RowShapes) -> None:
+    """Refuse inputs and features of rows that have other columns than those before."""
+    found = mapped[0].shape[1:], mapped[1].shape[1:]
+    if found != shapes:
+        raise ValueError(
+            "kernel_map and feature_map must return the same number of columns for all rows; they returned "
+            f"({', '.join(map(shape_text, shapes))}) and ({', '.join(map(shape_text, found))})."
+        )
 
 
 class MappedRows:
@@ -26,16 +40,26 @@ class MappedRows:
     y : ndarray of shape (n, o)
     feature_map, kernel_map : transformer or None
         Fitted.
+    shapes : (tuple, tuple), default=None
+        Of a row's inputs and features; None are those of the first row.
     """
 
-    def __init__(self, given: Any, X: Any, y: np.ndarray, feature_map: Any, kernel_map: Any):
+    def __init__(
+        self,
+        given: Any,
+        X: Any,
+        y: np.ndarray,
+        feature_map: Any,
+        kernel_map: Any,
+        shapes: RowShapes | None = None,
+    ):
         self.given, self.X, self.y = given, X, y
         self.feature_map, self.kernel_map = feature_map, kernel_map
         self._mapped: tuple[np.ndarray, np.ndarray] | None = None
         self._lock = Lock()
-        self._widths: tuple[int, int] | None = None
+        self._shapes = shapes
         first = self._through_maps(slice(0, MAP_ROWS))
-        made = (first[0].shape[1] if kernel_map is not None else 0) + first[1].shape[1]
+        made = (first[0][0].size if kernel_map is not None else 0) + first[1][0].size
         if made and 8 * made * len(X) <= MAPPED_BYTES:
             self._mapped = first if len(X) <= MAP_ROWS else self._through_maps(slice(0, len(X)))
 
@@ -53,13 +77,9 @@ class MappedRows:
         X = take_rows(self.X, rows)
         given = X if self.given is self.X else take_rows(self.given, rows)
         mapped = map_rows(given, X, self.feature_map, self.kernel_map)
-        widths = mapped[0].shape[1], mapped[1].shape[1]
-        if self._widths not in (None, widths):
-            raise ValueError(
-                "kernel_map and feature_map must return the same number of columns for all rows; they returned "
-                f"{self._widths} and {widths}."
-            )
-        self._widths = widths
+        if self._shapes is None:
+            self._shapes = mapped[0].shape[1:], mapped[1].shape[1:]
+        check_shapes(mapped, self._shapes)
         return mapped
 
     def __getstate__(self) -> dict[str, Any]:

@@ -70,12 +70,12 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
 
     Returns
     -------
-    values : ndarray of shape (n, width)
+    values : ndarray of shape (n, width) or, of a map with a row per output, (n, n_outputs, width)
 
     Raises
     ------
     ValueError
-        If it returns the wrong number of rows, not two dimensions or values that are not finite.
+        If it returns the wrong number of rows or of dimensions, or values that are not finite.
     """
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
@@ -84,10 +84,10 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
         values = _transform(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
-        if blocks and values.shape[1] != blocks[0].shape[1]:
+        if blocks and values.shape[1:] != blocks[0].shape[1:]:
             raise ValueError(
                 f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
-                f"{blocks[0].shape[1]} and {values.shape[1]}."
+                f"{shape_text(blocks[0].shape[1:])} and {shape_text(values.shape[1:])}."
             )
         blocks.append(values)
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
@@ -100,8 +100,18 @@ def _transform(fitted_map: Any, rows: Any) -> Any:
         if not any(isinstance(part, str) for part in maps):
             parts = [part.transform(rows) for part in maps]
             if all(type(part) is np.ndarray and part.shape[:1] == rows.shape[:1] for part in parts):
-                return np.hstack(parts)
+                return _side_by_side(parts)
     return fitted_map.transform(rows)
+
+
+def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:
+    """Columns of all parts; of parts with a row per output, and others with one for all, those of each output."""
+    n_outputs = {part.shape[1] for part in parts if part.ndim == 3}
+    if len(n_outputs) != 1:
+        return np.hstack(parts)
+    (o,) = n_outputs
+    each = [part if part.ndim == 3 else np.repeat(part[:, np.newaxis], o, axis=1) for part in parts]
+    return np.concatenate(each, axis=2)
 
 
 def _is_good(values: Any, n_rows: int) -> bool:
@@ -109,9 +119,9 @@ def _is_good(values: Any, n_rows: int) -> bool:
     return (
         type(values) is np.ndarray
         and values.dtype == np.float64
-        and values.ndim == 2
+        and values.ndim in (2, 3)
         and len(values) == n_rows
-        and values.shape[1] > 0
+        and values.size > 0
         and bool(np.abs(values).max() <= LARGEST)  # False if there is a NaN
     )
 
@@ -119,13 +129,18 @@ def _is_good(values: Any, n_rows: int) -> bool:
 def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
     """What a map returned as an array of floats, or an error that names the map."""
     values = as_floats(values.toarray() if issparse(values) else values, f"What {called} returns")
-    if values.ndim != 2 or len(values) != n_rows:
+    if values.ndim not in (2, 3) or len(values) != n_rows:
         raise ValueError(
             f"{called} must return one row per row of X; for {n_rows} rows it returned the shape {values.shape}."
         )
     if not np.isfinite(values).all():
         raise ValueError(f"{called} returned NaN or infinity.")
-    if values.shape[1] == 0:
+    if values.size == 0:
         raise ValueError(f"{called} returned no columns.")
     check_magnitude(values, f"What {called} returns")
     return values
+
+
+def shape_text(shape: tuple[int, ...]) -> str:
+    """What a row has, for errors: its columns, or outputs x columns."""
+    return " x ".join(map(str, shape))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, Self, TypeVar
 
 import numpy as np
 
-from .blocks import Block, Blocks, LocalBlocks
+from .blocks import AnyBlock, Blocks, LocalBlocks
 from .threads import BlockMap, ordered_sum
 
 Total = TypeVar("Total")
@@ -25,16 +25,34 @@ class RawRows:
 
     Attributes
     ----------
-    inputs : ndarray of shape (n, d)
-        The kernel's.
-    features : ndarray of shape (n, p)
-        h(x).
+    inputs : ndarray of shape (n, d) or (n, o, d)
+        The kernel's, of all outputs or of each.
+    features : ndarray of shape (n, p) or (n, o, p)
+        h(x), of all outputs or of each.
     targets : ndarray of shape (n, o)
     """
 
     inputs: np.ndarray
     features: np.ndarray
     targets: np.ndarray
+
+    def of(self, columns: Columns) -> RawRows:
+        """Some of the outputs; of a single one inputs and features have no axis of outputs."""
+        inputs, features = (of_outputs(values, columns) for values in (self.inputs, self.features))
+        return replace(self, inputs=inputs, features=features, targets=self.targets[:, columns])
+
+
+def of_outputs(values: np.ndarray, columns: Columns) -> np.ndarray:
+    """Rows (n, k), or what is there for some outputs of rows for each output (n, o, k)."""
+    if values.ndim == 2:
+        return values
+    values = values[:, columns]
+    return values[:, 0] if values.shape[1] == 1 else values
+
+
+def times_weights(features: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """h(x)ᵀ weights (n, o), of features (n, p) or (n, o, p) and the weights (o, p) of each output."""
+    return features @ weights.T if features.ndim == 2 else np.einsum("nop,op->no", features, weights)
 
 
 class Source(Protocol):
@@ -51,7 +69,7 @@ class Source(Protocol):
     def part(self, first: int, end: int) -> Source:
         """Consecutive rows, at least one."""
 
-    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+    def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
 
 
@@ -62,7 +80,7 @@ class Moments:
     Attributes
     ----------
     n : int
-    mean, squares, lowest, highest : ndarray of shape (columns,)
+    mean, squares, lowest, highest : ndarray of shape (columns,), or (o, columns) of columns for each output
         ``squares`` is the sum of squared deviations from the mean.
     """
 
@@ -89,6 +107,11 @@ class Moments:
             np.minimum(self.lowest, other.lowest),
             np.maximum(self.highest, other.highest),
         )
+
+    def at(self, columns: Columns) -> Self:
+        """Of some outputs, of columns (k,) or (o, k); of a single one without an axis of outputs."""
+        each = (self.mean, self.squares, self.lowest, self.highest)
+        return type(self)(self.n, *(of_outputs(values[np.newaxis], columns)[0] for values in each))
 
     @property
     def variance(self) -> np.ndarray:
@@ -138,10 +161,10 @@ class LocalSource:
     def part(self, first: int, end: int) -> LocalSource:
         return LocalSource(_Part(self.load, first, end), end - first)
 
-    def blocks(self, make: Callable[[RawRows], Block], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
+    def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return LocalBlocks(self.through(make), self.n_rows, n_inducing, threads, share)
 
-    def through(self, make: Callable[[RawRows], Block]) -> Callable[[slice], Block]:
+    def through(self, make: Callable[[RawRows], AnyBlock]) -> Callable[[slice], AnyBlock]:
         """Load, then make."""
         return _Through(self.load, make)
 
@@ -161,7 +184,7 @@ class _Part:
 @dataclass(frozen=True)
 class _Through:
     load: Callable[[slice | np.ndarray], RawRows]
-    make: Callable[[RawRows], Block]
+    make: Callable[[RawRows], AnyBlock]
 
-    def __call__(self, rows: slice) -> Block:
+    def __call__(self, rows: slice) -> AnyBlock:
         return self.make(self.load(rows))

@@ -5,6 +5,7 @@ import numpy as np
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import Request
 from skevgp.fitting.start import Units
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
 from skevgp.rows.source import LocalSource, Moments
 from skevgp.solvers import LBFGS
@@ -26,8 +27,9 @@ def source_of(X=X, H=H, Y=Y):
 def units_of(X=X, H=H, Y=Y, target_mean=0.0):
     """With both features, or with none if H has no columns."""
     o, p = Y.shape[1], H.shape[1]
-    prior = (own[np.arange(o) % 2, :p] for own in (COEF_MEAN, COEF_SCALE))
-    return Units.of(source_of(X, H, Y), Moments.of(Y), np.broadcast_to(target_mean, o), *prior)
+    mean, scale = (own[np.arange(o) % 2, :p] for own in (COEF_MEAN, COEF_SCALE))
+    prior = CoefficientPrior(mean, scale, np.zeros((o, p)))
+    return Units.of(source_of(X, H, Y), Moments.of(Y), np.broadcast_to(target_mean, o), prior)
 
 
 def data_of(Y, X=X):

@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import solve_triangular
 
 from skevgp.fitting.calibration import calibrated_noise, left_out_scores
-from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.internal import Rows

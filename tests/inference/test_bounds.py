@@ -8,7 +8,8 @@ from autograd import grad
 from skevgp._linalg import Jitter, NotPositiveDefiniteError
 from skevgp.fitting.start import starting_table
 from skevgp.fitting.strategy import Rules
-from skevgp.inference.bounds import BoundAtOptimum, CoefficientPrior, features_alone_bound, upper_bound
+from skevgp.inference.bounds import BoundAtOptimum, features_alone_bound, upper_bound
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.kernels.parse import Start, Starts
@@ -282,4 +283,4 @@ def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():
     first, second = (model.statistics(values, part.blocks(model.kernel, 20))[0] for part in parts)
     assert model.upper_bound(values, [first + second]) == pytest.approx(bounds_of(model, rows, values)[1], rel=1e-9)
     (group,) = model.groups_of(values, [first + second])
-    assert upper_bound(group) == model.upper_bound(values, [first + second])
+    assert upper_bound([group]) == model.upper_bound(values, [first + second])

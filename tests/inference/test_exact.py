@@ -5,7 +5,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 
-from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.exact import ExactModel
 from skevgp.kernels.constant import Constant
 from skevgp.kernels.covariances import Sum

@@ -6,7 +6,7 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from skevgp.inference.bounds import CoefficientPrior
+from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.inference.posterior import Predictor
 

@@ -31,11 +31,11 @@ def rows(targets=Y, **options):
 
 def test_a_block_is_of_prepared_inputs_features_and_some_residuals():
     raw = LocalSource.of(X, H, Y).take(np.arange(4))
-    block = MakeBlock(Identity(), halved, slice(1, 2))(raw)
+    block = MakeBlock((Identity(),), halved, slice(1, 2))(raw)
     np.testing.assert_array_equal(block.prepared, X[:4])
     np.testing.assert_array_equal(block.features, H[:4])
     np.testing.assert_array_equal(block.residuals, 0.5 * Y[:4, 1:])
-    np.testing.assert_array_equal(MakeBlock(Identity(), halved)(raw).residuals, 0.5 * Y[:4])
+    np.testing.assert_array_equal(MakeBlock((Identity(),), halved)(raw).residuals, 0.5 * Y[:4])
 
 
 def test_moments_are_of_inputs_and_residuals_in_internal_units():

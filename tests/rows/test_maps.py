@@ -164,8 +164,8 @@ def test_rows_are_counted_in_each_block():
         apply_map(returning(lambda X: np.resize(X, (4, 3))), X, "feature_map")
 
 
-@pytest.mark.parametrize("function", [lambda X: X[:, 0], lambda X: X[:, :, np.newaxis], lambda X: 1.0])
-def test_a_result_without_two_dimensions_is_an_error(function):
+@pytest.mark.parametrize("function", [lambda X: X[:, 0], lambda X: X[:, :, np.newaxis, np.newaxis], lambda X: 1.0])
+def test_a_result_of_other_dimensions_is_an_error(function):
     with pytest.raises(ValueError, match=r"kernel_map=.* must return one row per row of X"):
         apply_map(returning(function), X, "kernel_map")
 
