@@ -260,9 +260,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         weights = rng.standard_normal((len(common), n_samples)) if len(common) else np.empty((0, n_samples))
         samples = np.stack(
             [
-                rng.multivariate_normal(
-                    mean[:, o], cov[:, :, o] - own.T @ own, n_samples, check_valid="ignore"
-                ).T
+                rng.multivariate_normal(mean[:, o], cov[:, :, o] - own.T @ own, n_samples, check_valid="ignore").T
                 + own.T @ weights
                 for o, own in enumerate(np.moveaxis(common, 2, 0))
             ],

@@ -205,9 +205,7 @@ def _map_prior(
     return mean, scale, correlation
 
 
-def _own_prior(
-    feature_map: Any, n_outputs: int, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a map's ``coef_prior`` says, checked."""
     (k, p), prior = shape, feature_map.coef_prior(n_outputs)
     allowed = [shape, (p,)] if k == 1 else [shape]

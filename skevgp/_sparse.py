@@ -99,7 +99,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if theta is None:
             return self.lower_bound_
         if self._predictor.shared:
-            raise ValueError("lower_bound(theta) is of outputs with weights of their own: not with share_coef.")
+            raise ValueError("lower_bound(theta) needs outputs with weights of their own: no share_coef.")
         if self._training_data is None:
             raise ValueError(
                 "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "

@@ -41,16 +41,19 @@ class EGPRegressor(ExplicitGaussianProcess):
     ----------
     feature_map : transformer, default=None
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
-        it. None has no explicit features.
+        it. None has no explicit features. It may return a row for each output, (n, n_outputs, n_h).
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
         Covariance of f, as of `EVGPRegressor`; outputs share its shape, and have signal variances of their own.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
+        It may return a row for each output, (n, n_outputs, d).
     coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
         Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
         for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean; with the scale
         ``np.inf`` nothing is known of it (Rasmussen & Williams 2006, eq. 2.42 to 2.45): its estimate is that of
         generalised least squares.
+    coef_cov, share_coef
+        Prior covariance of the weights, and whether all outputs have the same, as of `EVGPRegressor`.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     normalize_y : bool, default=False
@@ -247,7 +250,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         if theta is None:
             return self.log_marginal_likelihood_value_
         if self._predictor.shared:
-            raise ValueError("log_marginal_likelihood(theta) is of outputs with their own weights: not with share_coef.")
+            raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: no share_coef.")
         with single_threaded_libraries():
             found = self._value_at(theta, eval_gradient, self._fitted.log_likelihood_at)
         if not clone_kernel:

@@ -40,6 +40,7 @@ class EVGPRegressor(SparseGaussianProcess):
     ----------
     feature_map : transformer, default=None
         x -> h(x), for example `InertiaForceGravity("pendulum")`, of X as given: do not scale its columns. None: none.
+        It may return a row for each output, (n, n_outputs, n_h), as the regressor matrix of a robot's torques.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
         Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
         a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
@@ -48,6 +49,7 @@ class EVGPRegressor(SparseGaussianProcess):
         None is an RBF with a length scale per column, all starts and bounds taken from the data.
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
+        It may return a row for each output, (n, n_outputs, d): the kernel of output j then sees row j.
     n_inducing : int or "auto", default=100
         Inducing points; fewer if there are fewer distinct rows. ``"auto"``, for L-BFGS, begins with 10 (or those of
         ``inducing_init``; in a warm start those of the last fit) and adds half as many again until that raises the
@@ -69,7 +71,8 @@ class EVGPRegressor(SparseGaussianProcess):
         (``"kernel"``, the paper's), or nothing. Groups, as ``[[0, 1], [2, 3]]``, share as ``"all"`` inside, and nothing
         with each other. ``"auto"`` finds them by short fits to up to 1,000 rows: on these it costs no output more than
         1 % of what its own Gaussian process gains, in nats, over features and noise; each group takes about the time of
-        ``"all"``. Signal variance, noise and weights are always per output.
+        ``"all"``. Signal variance and noise are always per output, and so are
+        weights but for ``share_coef``. Where a map returns a row for each output, ``"auto"`` is ``"none"``.
     posterior : {"full", "diagonal"}, default="full"
         q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
     coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
@@ -77,6 +80,17 @@ class EVGPRegressor(SparseGaussianProcess):
         for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean. If y is far
         from 0 compared with its scatter, an intercept among the features needs a wider scale than that, or
         ``normalize_y=True``.
+    coef_cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
+        Prior covariance of the weights, of all outputs or of each, in place of ``coef_scale``: a link's mass and its
+        first moment are correlated in any honest prior. ``coef_prior`` of a feature map may return one as its second
+        array, of shape (n_outputs, n_h, n_h) or (n_h, n_h); where that would be the shape of a scale too, it is one.
+    share_coef : bool or "auto", default="auto"
+        Whether all outputs have the same weights, as torques of a robot's joints have one set of inertial parameters:
+        then ``coef_mean``, ``coef_scale`` and what ``coef_prior`` returns have no axis of outputs, and outputs depend
+        on each other (``predict(X, return_cov="joint")``, `sample_y`). ``"auto"``: if the fitted ``feature_map`` has
+        an attribute ``share_coef`` that is true. Each output keeps its
+        own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
+        ``posterior="diagonal"`` it is an error, as are correlations.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=None
@@ -126,7 +140,7 @@ class EVGPRegressor(SparseGaussianProcess):
         columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
         of outputs then.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances. Only with a ``feature_map``.
+        Their posterior covariances. (Where outputs share their weights, nothing of them has an axis of outputs.) Only with a ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -308,7 +322,7 @@ class EVGPRegressor(SparseGaussianProcess):
                 effective_n_jobs(self.n_jobs),
                 problem.per_output,
             )
-            check_weights(solver, self.posterior, problem.units.prior)
+            check_weights(solver, self.posterior, problem.units.prior, self.sharing, problem.per_output)
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)

@@ -346,12 +346,19 @@ def resolved(solver: Any, posterior: str) -> LBFGS | Adam:
     return solver
 
 
-def check_weights(solver: LBFGS | Adam, posterior: str, prior: CoefficientPrior) -> None:
-    """Refuse what moves or restricts q in coordinates that correlated or shared weights do not have."""
+def check_weights(
+    solver: LBFGS | Adam, posterior: str, prior: CoefficientPrior, sharing: Any, per_output: bool
+) -> None:
+    """Refuse what moves or restricts q in coordinates that correlated or shared weights, or split rows, do not have."""
+    if isinstance(solver, Adam) and per_output and isinstance(sharing, str) and sharing == "kernel":
+        raise ValueError(
+            'sharing="kernel" of outputs with rows of their own needs solver="lbfgs" or an LBFGS(...); got '
+            f"solver={solver!r}."
+        )
     told = "share_coef=True" if prior.shared else "a covariance of the weights (coef_cov)"
     if prior.root is None and not prior.shared:
         return
     if isinstance(solver, Adam):
-        raise ValueError(f"{told} needs solver=\"lbfgs\" or an LBFGS(...); got solver={solver!r}.")
+        raise ValueError(f'{told} needs solver="lbfgs" or an LBFGS(...); got solver={solver!r}.')
     if posterior == "diagonal":
         raise ValueError(f'{told} needs posterior="full"; got posterior={posterior!r}.')

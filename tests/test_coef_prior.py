@@ -214,7 +214,7 @@ def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
 
 def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
     union = make_union(Opinionated(np.zeros((2, 2)), np.ones((2, 2))), FunctionTransformer())
-    with pytest.raises(ValueError, match=r"\(2, 3\); got \[\(2, 2\), \(2, 2\)\]"):
+    with pytest.raises(ValueError, match=r"\(2, 3\), .*; got \[\(2, 2\), \(2, 2\)\]"):
         resolve(union)
 
 

@@ -1,13 +1,24 @@
 """Rows for each output, weights that outputs share, and correlated weights: against a dense Gaussian process."""
 
+import pickle
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator, TransformerMixin
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.pipeline import make_union
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
+from skevgp.inference.exact import ExactModel
+from skevgp.inference.prior import CoefficientPrior
+from skevgp.kernels.stationary import SquaredExponential
+from skevgp.rows.source import RawRows
+from skevgp.solvers import LBFGS
+
+from .oracle import central_differences, relative_error
 
 N, O, P = 40, 3, 4  # noqa: E741
 
@@ -128,14 +139,25 @@ def test_shared_weights_are_those_of_a_dense_process(data, sharing, per_output):
     inputs, inputs_new = (kernel_map.transform(rows) for rows in (X, X_new))
     Z = inputs[:9] if per_output else np.repeat(inputs[:9, np.newaxis], O, axis=1)
     model = EVGPRegressor(
-        Rows(per_output=not joined), KERNEL, kernel_map=kernel_map, share_coef=True, coef_mean=mean, coef_cov=Sigma,
-        noise_variance=0.3, inducing_init=inputs[:9] if not per_output else "auto", n_inducing=9, sharing=sharing,
-        max_iter=0, random_state=0,
+        Rows(per_output=not joined),
+        KERNEL,
+        kernel_map=kernel_map,
+        share_coef=True,
+        coef_mean=mean,
+        coef_cov=Sigma,
+        noise_variance=0.3,
+        inducing_init=inputs[:9] if not per_output else "auto",
+        n_inducing=9,
+        sharing=sharing,
+        max_iter=0,
+        random_state=0,
     ).fit(X, Y)
     if per_output:
         Z = model.inducing_points_.transpose(1, 0, 2)
+
     def each(values):
         return values if values.ndim == 3 else np.repeat(values[:, np.newaxis], O, axis=1)
+
     dense = Dense(each(H), each(inputs), Y, mean, Sigma, np.full(O, 0.3), Z.transpose(1, 0, 2))
     assert model.coef_.shape == (P,)
     assert model.coef_cov_.shape == (P, P)
@@ -156,9 +178,271 @@ def test_the_exact_model_with_shared_weights_is_the_dense_process(data, per_outp
     if not per_output:
         inputs, inputs_new = (np.repeat(own[:, np.newaxis], O, axis=1) for own in (inputs, inputs_new))
     model = EGPRegressor(
-        Rows(), KERNEL, kernel_map=kernel_map, share_coef=True, coef_mean=mean, coef_cov=Sigma, noise_variance=0.3,
+        Rows(),
+        KERNEL,
+        kernel_map=kernel_map,
+        share_coef=True,
+        coef_mean=mean,
+        coef_cov=Sigma,
+        noise_variance=0.3,
         max_iter=0,
     ).fit(X, Y)
     dense = Dense(H, inputs, Y, mean, Sigma, np.full(O, 0.3))
     assert model.log_marginal_likelihood_value_ == pytest.approx(dense.bound(), rel=1e-9)
     check(model, dense, data, inputs_new, H_new)
+
+
+@pytest.mark.parametrize("sharing", ["none", "kernel", "all"])
+def test_the_gradient_is_that_of_finite_differences(data, sharing):
+    X, Y, Sigma, _, _ = data
+    found = []
+
+    class Checked(LBFGS):
+        def objective(self, task, table, n_rows=None):
+            loss = super().objective(task, table, n_rows)
+            x = table.start() + 0.1 * np.random.RandomState(1).randn(table.size)
+            found.append(relative_error(loss(x)[1], central_differences(lambda x: loss(x)[0], x)))
+            return loss
+
+    apart = sharing != "all"
+    kernel_map = FunctionTransformer(own_columns) if apart else FunctionTransformer(lambda X: X[:, :2])
+    model = EVGPRegressor(
+        Rows(per_output=apart),
+        kernel_map=kernel_map,
+        share_coef=True,
+        coef_cov=Sigma,
+        sharing=sharing,
+        n_inducing=6,
+        solver=Checked(),
+        max_iter=1,
+        random_state=0,
+    )
+    with pytest.warns(ConvergenceWarning, match="max_iter"):
+        model.fit(X, Y)
+    assert max(found) < 1e-5
+
+
+def test_the_exact_gradient_is_that_of_finite_differences(data):
+    X, Y, Sigma, mean, _ = data
+    rows = RawRows(own_columns(X), Rows().transform(X), Y / Y.std(axis=0))
+    roots = np.repeat(np.linalg.cholesky(Sigma)[np.newaxis], O, axis=0)
+    prior = CoefficientPrior(np.tile(mean, (O, 1)), np.ones((O, P)), np.tile(0.1 * mean, (O, 1)), roots, shared=True)
+    kernels = tuple(SquaredExponential(2) for _ in range(O))
+    model = ExactModel(kernels[0], prior, np.zeros((O, P), dtype=bool), rows, kernels)
+
+    def likelihood(theta):
+        values = {"hyperparameters": theta[:2], "signal": theta[2 : 2 + O], "noise": theta[2 + O :]}
+        return model.log_likelihood({name: np.exp(value) for name, value in values.items()})
+
+    theta = np.log(np.concatenate([[0.8, 1.3], [1.0, 2.0, 0.5], [0.1, 0.3, 0.2]]))
+    gradient = np.concatenate(list(likelihood(theta)[1].values()))
+    assert relative_error(gradient, central_differences(lambda x: likelihood(x)[0], theta)) < 1e-6
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_an_output_with_rows_of_its_own_is_fitted_as_if_alone(data, kind):
+    X, Y, _, _, X_new = data
+    options = {"inducing_init": own_columns(X)[:8, 0], "sharing": "none"} if kind is EVGPRegressor else {}
+    kernel = ConstantKernel(1.0, "fixed") * RBF([1.0, 1.0], "fixed")
+    together = kind(
+        Rows(), kernel, kernel_map=FunctionTransformer(own_columns), noise_variance=0.1, max_iter=0, **options
+    ).fit(X, Y)
+    mean, std = together.predict(X_new, return_std=True)
+    for o in range(O):
+        alone = kind(
+            FunctionTransformer(lambda X, o=o: Rows().transform(X)[:, o]),
+            kernel,
+            kernel_map=FunctionTransformer(lambda X, o=o: own_columns(X)[:, o]),
+            noise_variance=0.1,
+            max_iter=0,
+            **options,
+        ).fit(X, Y[:, o])
+        own_mean, own_std = alone.predict(X_new, return_std=True)
+        assert_allclose(together.coef_[o], alone.coef_, rtol=1e-8)
+        assert_allclose(mean[:, o], own_mean, rtol=1e-8)
+        assert_allclose(std[:, o], own_std, rtol=1e-8)
+
+
+def test_samples_have_the_joint_covariance(data):
+    X, Y, Sigma, _, X_new = data
+    model = EVGPRegressor(
+        Rows(),
+        KERNEL,
+        kernel_map=FunctionTransformer(own_columns),
+        share_coef=True,
+        coef_cov=Sigma,
+        noise_variance=0.3,
+        n_inducing=8,
+        max_iter=0,
+        random_state=0,
+    ).fit(X[:4], Y[:4])
+    mean, covariance = model.predict(X_new[:3], return_cov="joint")
+    samples = model.sample_y(X_new[:3], 20_000, random_state=0).reshape(3 * O, -1)
+    scale = np.sqrt(np.outer(np.diagonal(covariance), np.diagonal(covariance)))
+    assert_allclose(samples.mean(axis=1), mean.ravel(), atol=5.0 * np.sqrt(np.diagonal(covariance).max() / 20_000))
+    assert np.abs((np.cov(samples) - covariance) / scale).max() < 0.05
+    # Outputs do depend on each other.
+    across = covariance.reshape(3, O, 3, O)[:, 0, :, 1] / scale.reshape(3, O, 3, O)[:, 0, :, 1]
+    assert np.abs(across).max() > 0.1
+
+
+@pytest.mark.parametrize("sharing", ["none", "kernel"])
+def test_parts_of_the_rows_agree_with_all_of_them(data, sharing):
+    X, Y, Sigma, _, X_new = data
+
+    def model():
+        return EVGPRegressor(
+            Rows(),
+            KERNEL,
+            kernel_map=FunctionTransformer(own_columns),
+            share_coef=True,
+            coef_cov=Sigma,
+            noise_variance=0.3,
+            n_inducing=12,
+            max_iter=0,
+            sharing=sharing,
+            random_state=0,
+            coef_mean=0.0,
+        )
+
+    whole = model().fit(X[:12], Y[:12]).partial_fit(X[12:], Y[12:])
+    parts = model().fit(X[:12], Y[:12]).partial_fit(X[12:20], Y[12:20]).partial_fit(X[20:], Y[20:])
+    for found, expected in zip(
+        parts.predict(X_new, return_std=True), whole.predict(X_new, return_std=True), strict=True
+    ):
+        assert_allclose(found, expected, rtol=1e-9)
+    assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
+    assert_allclose(parts.coef_, whole.coef_, rtol=1e-9)
+
+
+def test_threads_and_pickles_change_nothing(data):
+    X, Y, _, _, X_new = data
+    options = {"kernel_map": FunctionTransformer(own_columns), "share_coef": True, "n_inducing": 8, "random_state": 0}
+    one = EVGPRegressor(Rows(), max_iter=20, tol=1e3, **options).fit(X, Y)
+    two = EVGPRegressor(Rows(), max_iter=20, tol=1e3, n_jobs=2, **options).fit(X, Y)
+    np.testing.assert_array_equal(one.predict(X_new), two.predict(X_new))
+    again = pickle.loads(pickle.dumps(one))
+    np.testing.assert_array_equal(
+        one.predict(X_new, return_cov="joint")[1], again.predict(X_new, return_cov="joint")[1]
+    )
+
+
+def test_dask_agrees(data):
+    da = pytest.importorskip("dask.array")
+    X, Y, Sigma, _, X_new = data
+    kernel_map = FunctionTransformer(own_columns)
+    model = EVGPRegressor(
+        Rows(),
+        KERNEL,
+        kernel_map=kernel_map,
+        share_coef=True,
+        coef_cov=Sigma,
+        noise_variance=0.3,
+        n_inducing=8,
+        inducing_init=own_columns(X)[:8, 0],
+        sharing="kernel",
+        max_iter=0,
+        coef_mean=0.0,
+    )
+    expected = model.fit(X, Y).predict(X_new, return_std=True)
+    found = model.fit(da.from_array(X, chunks=(15, O + 1)), da.from_array(Y, chunks=(15, O))).predict(
+        X_new, return_std=True
+    )
+    for own, other in zip(found, expected, strict=True):
+        assert_allclose(own, other, rtol=1e-8)
+
+
+def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
+    X, Y, Sigma, mean, X_new = data
+    options = {"kernel_map": FunctionTransformer(own_columns), "max_iter": 0, "noise_variance": 0.3}
+    told = EGPRegressor(Opinionated(prior=(mean, Sigma), share_coef=True), KERNEL, **options).fit(X, Y)
+    given = EGPRegressor(Rows(), KERNEL, share_coef=True, coef_mean=mean, coef_cov=Sigma, **options).fit(X, Y)
+    assert_allclose(told.predict(X_new), given.predict(X_new), rtol=1e-9)
+    assert_allclose(told.coef_prior_scale_, np.sqrt(np.diagonal(Sigma)))
+    union = make_union(Opinionated(prior=(mean, Sigma), share_coef=True), Rows(width=2, per_output=False))
+    with_more = EGPRegressor(union, KERNEL, share_coef=True, **options).fit(X, Y)
+    assert with_more.coef_.shape == (P + 2,)
+    assert_allclose(with_more.coef_prior_scale_[:P], np.sqrt(np.diagonal(Sigma)))
+
+
+def test_a_diagonal_covariance_is_a_scale(data):
+    X, Y, _, _, X_new = data
+    scale = np.array([0.5, 1.0, 2.0, 0.1])
+    options = {"n_inducing": 8, "max_iter": 0, "random_state": 0, "noise_variance": 0.3}
+    by_scale = EVGPRegressor(Rows(per_output=False), KERNEL_OF_ALL, coef_scale=np.tile(scale, (O, 1)), **options)
+    by_cov = EVGPRegressor(Rows(per_output=False), KERNEL_OF_ALL, coef_cov=np.diag(scale**2), **options)
+    np.testing.assert_array_equal(by_scale.fit(X, Y).predict(X_new), by_cov.fit(X, Y).predict(X_new))
+
+
+KERNEL_OF_ALL = ConstantKernel(1.0) * RBF(np.ones(O + 1))
+
+
+def test_a_weight_without_variance_keeps_its_mean(data):
+    X, Y, Sigma, mean, _ = data
+    Sigma = Sigma.copy()
+    Sigma[1], Sigma[:, 1] = 0.0, 0.0
+    model = EGPRegressor(Rows(), share_coef=True, coef_mean=mean, coef_cov=Sigma, max_iter=5, tol=1e3).fit(X, Y)
+    assert model.coef_[1] == mean[1]
+    assert model.coef_std_[1] == 0.0
+
+
+def _not_symmetric(Sigma):
+    return Sigma + np.triu(np.ones((P, P)), 1)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"coef_cov": np.eye(3)}, r"coef_cov must be of the shape .* = \(4, 4\)"),
+        ({"coef_cov": _not_symmetric(np.eye(P))}, "coef_cov must be symmetric"),
+        ({"coef_cov": np.eye(P) + 2.0 * (1 - np.eye(P))}, "coef_cov must be positive semi-definite"),
+        ({"coef_cov": -np.eye(P)}, "coef_cov must have no negative variance"),
+        ({"coef_cov": np.full((P, P), np.nan)}, "coef_cov must be finite"),
+        ({"coef_cov": np.eye(P), "coef_scale": 1.0}, "coef_cov and coef_scale=1.0 both say"),
+        ({"coef_cov": np.eye(P) + 0.1, "posterior": "diagonal"}, r'coef_cov\) needs posterior="full"'),
+        ({"coef_cov": np.eye(P) + 0.1, "solver": "adam"}, r'coef_cov\) needs solver="lbfgs"'),
+        ({"share_coef": True, "posterior": "diagonal"}, r'share_coef=True needs posterior="full"'),
+        ({"share_coef": True, "solver": "adam"}, r'share_coef=True needs solver="lbfgs"'),
+        ({"share_coef": True, "coef_mean": np.ones((O, P))}, "coef_mean must be 'auto', a number or an array"),
+        ({"share_coef": "yes"}, "share_coef"),
+        ({"sharing": "all"}, "sharing='all' joins outputs by their inducing points"),
+        ({"sharing": [[0, 1], [2]]}, "joins outputs by their inducing points"),
+        ({"sharing": "kernel", "solver": "adam"}, 'sharing="kernel" of outputs with rows of their own needs'),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(data, options, message):
+    X, Y, _, _, _ = data
+    with pytest.raises(ValueError, match=message):
+        EVGPRegressor(Rows(), kernel_map=FunctionTransformer(own_columns), max_iter=1, **options).fit(X, Y)
+
+
+@pytest.mark.parametrize("name", ["kernel_map", "feature_map"])
+def test_rows_for_other_outputs_than_those_of_y_are_refused(data, name):
+    X, Y, _, _, _ = data
+    with pytest.raises(ValueError, match=rf"{name}=.* returns a row for each of 3 outputs, but y has 2"):
+        EVGPRegressor(**{name: FunctionTransformer(own_columns)}).fit(X, Y[:, :2])
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
+    X, Y, _, _, X_new = data
+    model = kind(Rows(), max_iter=0).fit(X, Y)
+    model.feature_map_.width = 3
+    message = r"must return the same number of columns for all rows; they returned \(4, 3 x 4\) and \(4, 3 x 3\)"
+    with pytest.raises(ValueError, match=message):
+        model.predict(X_new)
+    if kind is EVGPRegressor:
+        with pytest.raises(ValueError, match=message):
+            model.partial_fit(X, Y)
+
+
+def test_the_joint_covariance_is_asked_for_by_name(data):
+    X, Y, _, _, X_new = data
+    model = EVGPRegressor(max_iter=0, n_inducing=5).fit(X, Y)
+    with pytest.raises(ValueError, match="return_cov must be False, True or 'joint'; got 'all'"):
+        model.predict(X_new, return_cov="all")
+    cov = model.predict(X_new, return_cov=True)[1]
+    joint = model.predict(X_new, return_cov="joint")[1].reshape(len(X_new), O, len(X_new), O)
+    for i in range(O):
+        for j in range(O):
+            np.testing.assert_array_equal(joint[:, i, :, j], cov[:, :, i] if i == j else 0.0)

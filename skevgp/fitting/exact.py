@@ -8,9 +8,9 @@ import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
-from ..inference.prior import CoefficientPrior
 from ..inference.exact import ExactModel
 from ..inference.posterior import Predictor
+from ..inference.prior import CoefficientPrior
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs
@@ -297,7 +297,7 @@ def _check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) ->
         for output, own in enumerate(vague):
             _check_independent(features[:, output], own[np.newaxis], shared)
         return
-    features = features.reshape(-1, features.shape[-1])
+    features = features.reshape(np.prod(features.shape[:-1]), features.shape[-1])
     size = np.sqrt(np.sum(features**2, axis=0))
     scaled = features / np.where(size > 0.0, size, 1.0)
     for mask in np.unique(vague, axis=0):

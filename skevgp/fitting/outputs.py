@@ -197,7 +197,7 @@ class FittedOutputs:
         values, points = one.values, one.values["inducing_points"]
         if inputs.mean.ndim == 2 and one.model.kernels is None:
             inputs = inputs.at(own)
-        if points.shape[2] != inputs.mean.shape[-1] or inputs.mean.ndim == 2 and len(points) != len(inputs.mean):
+        if points.shape[2] != inputs.mean.shape[-1] or (inputs.mean.ndim == 2 and len(points) != len(inputs.mean)):
             return {}
         lowest, highest = (edge.reshape(-1, 1, points.shape[2]) for edge in (inputs.lowest, inputs.highest))
         if (points < 2.0 * lowest - highest).any() or (points > 2.0 * highest - lowest).any():
@@ -245,7 +245,9 @@ def fit_outputs(
     messages = sorted({one.message for one in learned if one.message})
     if monitor.stopped:
         messages = [interrupted(max(len(one.loss_curve) for one in learned))]
-    return FittedOutputs(request.units, [model.outputs for model in models], request.found, tuple(learned), tuple(messages))
+    return FittedOutputs(
+        request.units, [model.outputs for model in models], request.found, tuple(learned), tuple(messages)
+    )
 
 
 def plan(

@@ -223,7 +223,6 @@ class SparseTask:
             self.monitor.silent(),
         )
 
-
     def learned_too_little(self, values: Values) -> str:
         """What `advice` says of it, of each group with columns of its own; empty if all is well."""
         if self.rows.inputs.mean.ndim == 1:

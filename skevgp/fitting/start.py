@@ -10,8 +10,8 @@ from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 
 from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
-from ..inference.prior import CoefficientPrior
 from ..inference.posterior import Predictor
+from ..inference.prior import CoefficientPrior
 from ..inference.statistics import Kernel
 from ..kernels.covariances import Covariance
 from ..kernels.parse import Start, Starts
@@ -47,9 +47,7 @@ class _LeftOver:
         return (*sums, np.swapaxes(by_output, -1, -2) @ by_output)
 
 
-def features_alone(
-    source: Source, target_mean: np.ndarray, prior: CoefficientPrior
-) -> tuple[np.ndarray, np.ndarray]:
+def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
     """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
 
     The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for

@@ -9,12 +9,13 @@ sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
     B = I + σ⁻² PᵀP,   g = σ⁻² Pᵀr - (0, w₀),   posterior of ω: N(B⁻¹ g, B⁻¹).
 
 Outputs that share their weights have one w and a v each. B is then an arrowhead: with B_j = [D_j, E_j; E_jᵀ, F_j] the
-matrix of output j alone, its blocks are D_j on the diagonal, E_j in the columns of w, and I + Σ (F_j - I) in the corner.
-What is left of the corner, its Schur complement S = I + Σ (F_j - I - E_jᵀ D_j⁻¹ E_j), is the precision of w, so that
+matrix of output j alone, its blocks are D_j on the diagonal, E_j in the columns of w, and I + Σ (F_j - I) in the
+corner. What is left of that, the Schur complement S = I + Σ (F_j - I - E_jᵀ D_j⁻¹ E_j), is the precision of w, so that
 
     log|B| = Σ log|D_j| + log|S|,   precision of (v_j, w): [D_j, E_j; E_jᵀ, S + E_jᵀ D_j⁻¹ E_j],
 
-and of B⁻¹ all that predictions, the bound's gradient and the covariance between outputs need is in the inverses of these.
+and all of B⁻¹ that predictions, the bound's gradient and the covariance between outputs need is in the inverses of
+these.
 """
 
 from __future__ import annotations
@@ -337,15 +338,14 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
     noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
     if p == 0:
-        return float(-0.5 * sum(own.n_rows * (LOG_2PI + 1.0 + np.log(s2)).sum() for own, s2 in zip(each, noise)))
+        each_bound = (own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) for own, s2 in zip(each, noise, strict=True))
+        return float(-0.5 * np.sum(list(each_bound)))
     empty = np.zeros((0, 0))
     groups = [
         Group(
             slice(index, index + 1),
             Whitening(None, empty, empty),
-            SufficientStatistics(
-                own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0
-            ),
+            SufficientStatistics(own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0),
             np.ones(1),
             noise[index],
             prior.outputs(slice(index, index + 1)),

@@ -28,8 +28,8 @@ from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangu
 from ..optimizers.parameters import Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI
-from .prior import CoefficientPrior
 from .posterior import Predictor, PredictorGroup
+from .prior import CoefficientPrior
 from .statistics import Kernel, Whitening
 
 

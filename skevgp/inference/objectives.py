@@ -161,7 +161,9 @@ class ElboObjective:
         values = self.table.values(x)
         # Rows that count N/n times: a noise variance of σ² n/N.
         counted = values | {"noise": values["noise"] * (blocks.linear.n_rows / self.n_rows)}
-        loss, gradient = evaluate(self.model, counted, blocks, lambda groups: [_ElboTerms(self, values, group) for group in groups])
+        loss, gradient = evaluate(
+            self.model, counted, blocks, lambda groups: [_ElboTerms(self, values, group) for group in groups]
+        )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 

@@ -178,11 +178,11 @@ class Predictor:
     def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o), of each output."""
         mean, _ = self.predict(inputs, features)
-        (n, o), covariance = mean.shape, np.empty((len(mean), *mean.shape))
+        outputs, covariance = np.arange(len(self.noise)), np.empty((len(mean), *mean.shape))
         for group, (own, P, _) in zip(self.groups, self._projected(inputs, features), strict=True):
             V = P[: len(group.points)]
             unexplained = group.kernel.at(np.log(group.hyperparameters), own).matrix() - V.T @ V
-            for output, signal, root in zip(np.arange(o)[group.outputs], group.signal, group.root, strict=True):
+            for output, signal, root in zip(outputs[group.outputs], group.signal, group.root, strict=True):
                 deviation = root @ P
                 covariance[:, :, output] = signal * unexplained + deviation.T @ deviation
         return mean, covariance

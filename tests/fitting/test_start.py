@@ -17,7 +17,9 @@ from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, N, X, Y, source_of, un
 
 def weights_alone(H, r, scale):
     source = LocalSource.of(np.zeros((len(H), 1)), H, r)
-    w, left_over = features_alone(source, np.zeros(len(scale)), CoefficientPrior(np.zeros_like(scale), scale, np.zeros_like(scale)))
+    w, left_over = features_alone(
+        source, np.zeros(len(scale)), CoefficientPrior(np.zeros_like(scale), scale, np.zeros_like(scale))
+    )
     np.testing.assert_allclose(left_over, np.sqrt(np.mean((r - H @ (scale * w).T) ** 2, axis=0)), atol=1e-14)
     return w
 

@@ -6,9 +6,9 @@ from dataclasses import FrozenInstanceError, replace
 import numpy as np
 import pytest
 
-from skevgp.inference.prior import CoefficientPrior
 from skevgp.inference.model import SparseModel
 from skevgp.inference.posterior import Predictor
+from skevgp.inference.prior import CoefficientPrior
 
 from ..oracle import problem, squared_exponential
 
