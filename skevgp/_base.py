@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Protocol
 
@@ -17,6 +18,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
+from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
@@ -61,7 +63,7 @@ class Problem:
         Width of the kernel's inputs.
     """
 
-    data: tuple[Any, Any, np.ndarray]
+    data: tuple[Any, Any, np.ndarray, Any]
     source: Source
     units: Units
     spec: KernelSpec
@@ -250,13 +252,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is the sum of ``of_kernel`` over outputs, and its gradient; see `value_at`."""
         return value_at(theta, eval_gradient, self._spec.order, self._predictor, of_kernel)
 
-    def _problem(self, X: Any, y: Any, allow_vague: bool = False) -> Problem:
-        """Look at X and y for a new fit: maps, kernel, prior and units."""
+    def _problem(
+        self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None, allow_vague: bool = False
+    ) -> Problem:
+        """Look at X, y and the rows' weights for a new fit: maps, kernel, prior and units."""
         given, X, y = self._validated(X, y, reset=True)
-        fit_to = fit_map_to_chunks if is_dask(X) else fit_map
+        chosen = chosen_rows(X, y, sample_weight, relative_variance)
+        fit_to = fit_map_to_chunks if is_dask(X) else partial(fit_map, chosen=chosen)
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
-        source = self._source(given, X, y)
+        source = self._source(given, X, y, chosen)
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
@@ -277,7 +282,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         units = Units.of(source, targets, target_mean, mean, np.where(vague, unit, scale))
         self._spec = spec
-        return Problem((given, X, y), source, units, spec, vague, len(inputs.mean))
+        return Problem((given, X, y, chosen), source, units, spec, vague, len(inputs.mean))
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
@@ -322,11 +327,13 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         given = array if given is X else take_rows(given, rows)
         return map_rows(given, array, self.feature_map_, self.kernel_map_)
 
-    def _source(self, given: Any, X: Any, y: np.ndarray) -> Source:
-        """The rows through the maps."""
+    def _source(self, given: Any, X: Any, y: np.ndarray, chosen: Any) -> Source:
+        """The rows that count, through the maps."""
+        maps = self.feature_map_, self.kernel_map_
         if is_dask(X):
-            return DaskSource(X, y, self.feature_map_, self.kernel_map_)
-        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), self.feature_map_, self.kernel_map_), len(X))
+            return DaskSource(X, y, *maps, chosen)
+        rows = MappedRows(given, X, y.reshape(len(y), -1), *maps, chosen)
+        return LocalSource(rows, chosen.n_rows, chosen.positions)
 
     def _set_common_attributes(self) -> None:
         """What is known of weights, if there are any, noise and kernel."""

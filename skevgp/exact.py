@@ -157,7 +157,14 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fit kernel and noise; the posterior is exact.
 
         Parameters
@@ -167,6 +174,8 @@ class EGPRegressor(ExplicitGaussianProcess):
             with a ``kernel_map`` it may hold what is no number, such as words that the maps encode.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        sample_weight, relative_variance : array-like of shape (n_samples,), default=None
+            As of `EVGPRegressor.fit`.
 
         Returns
         -------
@@ -189,7 +198,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
         with unchanged_if_it_fails(self), single_threaded_libraries(), monitor_of(self.verbose) as monitor:
-            problem = self._problem(X, y, allow_vague=True)
+            problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
             rows = problem.units.rows(problem.source)
             options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)
             self._fitted = fit_exact(

@@ -247,7 +247,14 @@ class EVGPRegressor(SparseGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fit kernel, noise, inducing points and posterior.
 
         Parameters
@@ -260,6 +267,12 @@ class EVGPRegressor(SparseGaussianProcess):
             Without a ``dask.distributed.Client`` chunks are read anew at each pass.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
+            What each row's log likelihood is multiplied by: 0 removes the row (before the maps are fitted, but to a
+            Dask array's chunks), 2 is the row twice. Maps whose ``fit`` has a ``sample_weight`` are given it.
+        relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
+            Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
+            With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
 
         Returns
         -------
@@ -286,7 +299,7 @@ class EVGPRegressor(SparseGaussianProcess):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         progress = monitor_of(self.verbose, solver.callback)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
-            problem = self._problem(X, y)
+            problem = self._problem(X, y, sample_weight, relative_variance)
             self._training_data = problem.data
             if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
                 raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")

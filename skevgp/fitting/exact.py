@@ -138,9 +138,11 @@ class Unhindered:
         """
         try:
             likelihood = sum(output.log_likelihood for output in self.model.outputs(values)[1])
+            likelihood += self.model.of_copies(values)
         except NotPositiveDefiniteError:
             return np.inf
-        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / self.model.rows.targets.size
+        nats = self.model.rows.total * self.model.rows.targets.shape[1]
+        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
 
 
 @dataclass(frozen=True)
@@ -271,6 +273,7 @@ def fit_exact(
         options.rules,
         kernel.n_hyperparameters,
         variance,
+        rows.mean_precision,
     )
     model = ExactModel(kernel, units.internal_prior(), vague, everything)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
@@ -285,7 +288,7 @@ def fit_exact(
 
 def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
     """From internal units to the user's, for each output's loss (o,) of all rows: each contrast has a unit."""
-    return (len(model.rows.inputs) - model.vague.sum(axis=1)) * np.log(units.target_unit)
+    return (model.rows.total - model.vague.sum(axis=1)) * np.log(units.target_unit)
 
 
 def _check_independent(features: np.ndarray, vague: np.ndarray) -> None:

@@ -165,9 +165,9 @@ class FittedOutputs:
             That in log s² last.
         """
         (model, within), own = self._place_of(output), [output]
-        internal = signal / self.units.target_unit[own] ** 2
+        internal, n_rows = signal / self.units.target_unit[own] ** 2, self.learned[model].statistics[0].n_rows
         bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, hyperparameters, internal)
-        return bound - len(rows) * self.units.log_unit(own), gradient
+        return bound - n_rows * self.units.log_unit(own), gradient
 
     def _place_of(self, output: int) -> tuple[int, int]:
         """Which model an output belongs to, and which of the model's it is."""
@@ -243,9 +243,9 @@ def plan(
     kernel = request.spec.covariance.centred(column_centre(rows.inputs))
 
     def table_of(outputs: list[int], points: np.ndarray, variance: float = 1.0) -> ParameterTable:
-        unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
+        unit, scatter, width = units.target_unit[outputs], rows.scatter()[outputs], kernel.n_hyperparameters
         return starting_table(
-            rows.inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, variance
+            rows.inputs, points, unit, starts, scatter, solver.rules, width, variance, rows.mean_precision
         )
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
@@ -270,7 +270,7 @@ def plan(
         stay = request.family == "full" and len(inputs) == len(rows) and all(are_all_rows(own, inputs) for own in sets)
         if stay:
             table = table.with_fixed("inducing_points")
-        shift = len(rows) * units.log_unit(outputs)
+        shift = rows.total * units.log_unit(outputs)
         tasks.append(
             SparseTask(
                 SparseModel(

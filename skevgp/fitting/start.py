@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -29,17 +30,26 @@ _NEIGHBOUR_SAMPLE = 2000
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (p, o) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH too, if asked for."""
+    """Rows -> Hᵀl (p, o) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH, Σ ω and Σ w too, if asked for.
+
+    Where rows have weights, each product has the factor ω.
+    """
 
     target_mean: np.ndarray
     coef: np.ndarray
     with_products: bool = False
 
-    def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
+    def __call__(self, raw: RawRows) -> tuple[Any, ...]:
         left_over = raw.targets - self.target_mean - raw.features @ self.coef.T
         H = raw.features
-        sums = H.T @ left_over, np.einsum("no,no->o", left_over, left_over)
-        return (*sums, H.T @ H) if self.with_products else sums
+        weighted, precision = left_over, raw.total
+        if raw.precision is not None:
+            weighted, precision = left_over * raw.precision[:, np.newaxis], float(raw.precision.sum())
+        sums = H.T @ weighted, np.einsum("no,no->o", weighted, left_over)
+        if not self.with_products:
+            return sums
+        HW = H.T if raw.precision is None else H.T * raw.precision
+        return (*sums, HW @ H, precision, raw.total)
 
 
 def features_alone(
@@ -64,14 +74,14 @@ def features_alone(
     -------
     w : ndarray of shape (o, p)
     left_over : ndarray of shape (o,)
-        Root mean square of what they leave over.
+        Root mean square of what they leave over, the noisier a row the less it counts.
     """
     w = np.zeros(scale.shape)
-    HL, squares, HH = source.sum(_LeftOver(target_mean, mean, with_products=True))
+    HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, mean, with_products=True))
     moving = [o for o in range(len(scale)) if squares[o] > 0.0 and scale[o].any()]
     share = 1e-12
     for _ in range(2 if moving else 0):
-        noise = share * squares / source.n_rows
+        noise = share * squares / n_rows
         share = 1.0
         roots = {}
         for o in moving:
@@ -83,7 +93,7 @@ def features_alone(
                 if roots[o] is not None:
                     w[o] += cho_solve((roots[o], True), scale[o] * HL[:, o] - noise[o] * w[o])
             HL, squares = source.sum(_LeftOver(target_mean, mean + scale * w))
-    return w, np.sqrt(squares / source.n_rows)
+    return w, np.sqrt(squares / total_precision)
 
 
 def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
@@ -251,7 +261,7 @@ def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawR
     inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
     queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
     _, nearest = cKDTree(inputs).query(inputs[queried], 2)
-    each, other = (RawRows(some.inputs[own], some.features[own], some.targets[own]) for own in nearest.T)
+    each, other = (some[own] for own in nearest.T)
     return each, other
 
 
@@ -264,6 +274,7 @@ def starting_table(
     rules: Rules,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
+    precision: float = 1.0,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -278,13 +289,15 @@ def starting_table(
     starts : Starts
         What the user says of them.
     scatter : ndarray of shape (o,)
-        Variance of the residuals, in squared target units: 1, but for targets far from 0.
+        Variance of the residuals, in squared target units: 1, but for targets far from 0 (`Rows.scatter`).
     rules : Rules
         Starts and limits where the user does not say.
     n_hyperparameters : int
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
         Of k̃(x, x), with the hyperparameters where they start.
+    precision : float, default=1.0
+        The mean of 1 / v over rows with noise variances σ² v.
 
     Returns
     -------
@@ -320,7 +333,7 @@ def starting_table(
                 "noise",
                 rules.first_noise * scatter,
                 np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
-                rules.highest_noise * o,
+                rules.highest_noise * precision * o,
                 target_unit**2,
             ),
             Parameter("inducing_points", inducing_points, unit=scale, origin=column_centre(inputs)),

@@ -152,6 +152,9 @@ class BoundAtOptimum:
 
         bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v|²)/σ²].
 
+    (Of rows with weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v, and the
+    constant Σ w log v stands beside N log 2πσ²: the rows of P and r are multiplied by √ω.)
+
     With e summed row by row (`statistics.pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives
     the same sums as differences of the statistics.
 
@@ -208,7 +211,8 @@ class BoundAtOptimum:
         mean[:, m:] += group.prior.reference
         penalty = np.einsum("ok,ok->o", mean, mean)
         # What does not depend on e, and its derivatives in log s² and log σ².
-        self._value = unexplained - 0.5 * (statistics.n_rows * (LOG_2PI + np.log(noise)) + log_det + penalty)
+        log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
+        self._value = unexplained - 0.5 * (log_noise + log_det + penalty)
         self._log_signal = from_signal + unexplained
         self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
 
@@ -243,7 +247,7 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
-    j, and a row that comes often makes that so many times larger.
+    j, and a row that comes or counts often makes that so many times larger.
 
     Parameters
     ----------
@@ -258,7 +262,7 @@ def upper_bound(group: Group, blocks: Blocks | None = None) -> float:
     """
     statistics, left_over = group.statistics, group.statistics.unexplained
     if group.complete:
-        left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+        left_over = group.whitening.jitter() * max(statistics.n_rows + statistics.surplus - len(statistics.VV) + 1, 1)
     noise = group.noise + group.signal * left_over
     # The likelihood with this noise and without a trace term, but for its determinant.
     wide = BoundAtOptimum(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)), "full")
@@ -271,11 +275,11 @@ def features_alone_bound(sums: LinearStatistics | SufficientStatistics, prior: C
     """The bound without a Gaussian process, all that the features leave over being noise; summed over outputs."""
     noise = np.maximum(sums.RR / sums.n_rows, 1e-20)  # of targets that they explain to the last digit
     if prior.scale.shape[1] == 0:
-        return float(-0.5 * sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)).sum())
+        return float(-0.5 * (sums.n_rows * (LOG_2PI + 1.0 + np.log(noise)) + sums.log_variance).sum())
     o, p = prior.scale.shape
     empty = np.zeros((0, 0))
     statistics = SufficientStatistics(
-        sums.n_rows, empty, np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0
+        sums.n_rows, empty, np.zeros((0, p)), np.zeros((0, o)), sums.HH, sums.HR, sums.RR, 0.0, sums.log_variance
     )
     bound = BoundAtOptimum(
         Group(slice(0, o), Whitening(None, empty, empty), statistics, np.ones(o), noise, prior), "full"

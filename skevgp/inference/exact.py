@@ -13,6 +13,11 @@ its condition.
 Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
 2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (c h(x) - s Wᵀ V)|², with
 V = L⁻¹ k̃(X, x) and B = RᵀR.
+
+A row with the noise variance σ² v has ρ v in place of ρ on its diagonal. One that counts w times is a row with the
+noise variance σ² v / w, but for what w copies of it have beside exp(-½ w e² / (σ² v)):
+
+    N(y | g, σ² v)^w = N(y | g, σ² v / w) (2πσ² v)^(-(w - 1)/2) w^(-1/2).
 """
 
 from __future__ import annotations
@@ -47,6 +52,8 @@ class OutputGivenKernel:
         Of this output.
     vague : ndarray of shape (p,)
         Weights with Σ_β → ∞; their prior scale is a unit.
+    relative : ndarray of shape (n,), optional
+        Noise variances v / w in units of σ²; None are ones.
     """
 
     def __init__(
@@ -58,15 +65,16 @@ class OutputGivenKernel:
         noise: float,
         prior: CoefficientPrior,
         vague: np.ndarray,
+        relative: np.ndarray | None = None,
     ):
         self.signal, self.noise, self.ratio = signal, noise, noise / signal
         shifted = K.copy()
-        diagonal_of(shifted)[...] += self.ratio
+        diagonal_of(shifted)[...] += self.ratio if relative is None else self.ratio * relative
         self.L = jittered_cholesky(shifted)
         self.L_inv = triangular_inverse(self.L)
         s, scale, reference = np.sqrt(signal), prior.scale[0], prior.reference[0]
         proper = ~vague
-        self.vague, self.scale = vague, scale
+        self.vague, self.scale, self.relative = vague, scale, relative
         self.W = self.L_inv @ (H * (scale / s))
         z = self.L_inv @ (r / s)
         # [W; D] w = [z; -D w₀] by least squares.
@@ -94,10 +102,10 @@ class OutputGivenKernel:
         alpha = self.L_inv.T @ self.left_over / s
         from_weights = self.L_inv.T @ (self.W @ self.R_inv)
         P = (symmetric_inverse(self.L_inv) - from_weights @ from_weights.T) / self.signal
-        trace = float(np.trace(P))
+        in_noise = alpha**2 - diagonal_of(P)
         squares = float(self.left_over @ self.left_over)
         explained = len(self.R) - float(np.sum(self.R_inv[~self.vague] ** 2))
-        noise_bar = 0.5 * self.noise * (float(alpha @ alpha) - trace)
+        noise_bar = 0.5 * self.noise * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
         P *= -1.0
         P += np.multiply.outer(alpha, alpha)
         P *= 0.5 * self.signal
@@ -135,6 +143,7 @@ class ExactModel:
         """The covariance of the rows, and each output given it."""
         at = self.kernel.at(np.log(values["hyperparameters"]), self.rows.inputs)
         K = at.matrix()
+        relative = None if self.rows.precision is None else 1.0 / self.rows.precision
         return at, [
             OutputGivenKernel(
                 K,
@@ -144,6 +153,7 @@ class ExactModel:
                 values["noise"][o],
                 self.prior.outputs(slice(o, o + 1)),
                 self.vague[o],
+                relative,
             )
             for o in range(len(self.vague))
         ]
@@ -151,14 +161,28 @@ class ExactModel:
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
         """Summed over outputs, and its gradient in the logarithms of the values."""
         at, outputs = self.outputs(values)
-        total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
+        total, gradient = self.of_copies(values), {name: np.zeros_like(value) for name, value in values.items()}
         K_bar = np.zeros((len(self.rows.inputs),) * 2)
         for o, output in enumerate(outputs):
             total += output.log_likelihood
             own, gradient["signal"][o], gradient["noise"][o] = output.gradient()
             K_bar += own
+        gradient["noise"] -= 0.5 * self.n_copies
         gradient["hyperparameters"], _ = at.finish_pullback(at.start_pullback(), K_bar)
         return total, gradient
+
+    @property
+    def n_copies(self) -> float:
+        """Σ (w - 1)."""
+        return self.rows.total - len(self.rows.inputs)
+
+    def of_copies(self, values: Values) -> float:
+        """What rows that count w times add to the log likelihood of rows with the noise variance σ² v / w."""
+        w, noise = self.rows.counts, values["noise"]
+        if w is None or self.rows.precision is None:
+            return 0.0
+        constant = float((w - 1.0) @ (LOG_2PI + np.log(w / self.rows.precision)) + np.log(w).sum())
+        return -0.5 * (len(noise) * constant + self.n_copies * float(np.log(noise).sum()))
 
     def predictor(self, values: Values) -> Predictor:
         """In internal units; the rows are its inducing points."""

@@ -46,6 +46,9 @@ class Block:
         best in Fortran's order.
     n_features : int
         p.
+    counts, roots : ndarray of shape (n,), optional
+        w, how often a row counts, and √ω, which ``linear`` has been multiplied by; ω = w / v, where the row's noise
+        variance is σ² v. None: 1.
     may_keep : bool
         Whether there is room for ``kept``.
     kept : (whitening, k(X_m, X), [V; Hᵀ; rᵀ]) or None
@@ -55,6 +58,8 @@ class Block:
     prepared: Any
     linear: np.ndarray
     n_features: int
+    counts: np.ndarray | None = None
+    roots: np.ndarray | None = None
     may_keep: bool = False
     kept: tuple[Any, np.ndarray, np.ndarray] | None = None
 
@@ -80,24 +85,39 @@ class LinearStatistics:
 
     Attributes
     ----------
-    n_rows : int
+    n_rows : float
+        Σ w: rows, each as often as it counts.
     HH : ndarray of shape (p, p)
-        HᵀH.
+        Hᵀ Ω H, with Ω = diag(ω) (see `Block`).
     HR : ndarray of shape (p, o)
-        Hᵀr.
+        Hᵀ Ω r.
     RR : ndarray of shape (o,)
-        rᵀr of each output.
+        rᵀ Ω r of each output.
+    length : int
+        Rows, however often they count.
+    log_variance : float
+        Σ w log v.
+    surplus : float
+        Σ max(ω, 1) - Σ w.
     """
 
-    n_rows: int
+    n_rows: float
     HH: np.ndarray
     HR: np.ndarray
     RR: np.ndarray
+    length: int = 0
+    log_variance: float = 0.0
+    surplus: float = 0.0
 
     @classmethod
     def of(cls, block: Block) -> LinearStatistics:
-        total, p = block.linear.T @ block.linear, block.n_features
-        return cls(len(block.linear), total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy())
+        total, p, n = block.linear.T @ block.linear, block.n_features, len(block.linear)
+        sums = total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy()
+        if block.counts is None or block.roots is None:
+            return cls(n, *sums, n)
+        n_rows = float(block.counts.sum())
+        log_variance = float(block.counts @ (np.log(block.counts) - 2.0 * np.log(block.roots)))
+        return cls(n_rows, *sums, n, log_variance, float(np.maximum(block.roots**2, 1.0).sum()) - n_rows)
 
     def __add__(self, other: LinearStatistics) -> LinearStatistics:
         return LinearStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
