@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -17,6 +18,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import resolve_coef_prior, wide_scale
+from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
@@ -64,7 +66,7 @@ class Problem:
         Whether outputs have inputs or features of their own.
     """
 
-    data: tuple[Any, Any, np.ndarray]
+    data: tuple[Any, Any, np.ndarray, Any]
     source: Source
     units: Units
     spec: KernelSpec
@@ -277,13 +279,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         """What is the sum of ``of_kernel`` over outputs, and its gradient; see `value_at`."""
         return value_at(theta, eval_gradient, self._spec.order, self._predictor, of_kernel)
 
-    def _problem(self, X: Any, y: Any, allow_vague: bool = False) -> Problem:
-        """Look at X and y for a new fit: maps, kernel, prior and units."""
+    def _problem(
+        self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None, allow_vague: bool = False
+    ) -> Problem:
+        """Look at X, y and the rows' weights for a new fit: maps, kernel, prior and units."""
         given, X, y = self._validated(X, y, reset=True)
-        fit_to = fit_map_to_chunks if is_dask(X) else fit_map
+        chosen = chosen_rows(X, y, sample_weight, relative_variance)
+        fit_to = fit_map_to_chunks if is_dask(X) else partial(fit_map, chosen=chosen)
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
-        source = self._source(given, X, y)
+        source = self._source(given, X, y, chosen)
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
@@ -307,7 +312,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         units = Units.of(source, targets, target_mean, prior)
         self._spec, self._row_shapes = spec, (inputs.mean.shape, features.mean.shape)
-        return Problem((given, X, y), source, units, spec, vague, n_columns, per_output)
+        return Problem((given, X, y, chosen), source, units, spec, vague, n_columns, per_output)
 
     def _prior(
         self, given: Any, features: Moments, targets: Moments, allow_vague: bool
@@ -381,12 +386,13 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, BaseEstimator):
         check_shapes((inputs, features), self._row_shapes)
         return inputs, features
 
-    def _source(self, given: Any, X: Any, y: np.ndarray, shapes: RowShapes | None = None) -> Source:
-        """The rows through the maps, which may have to be of certain shapes."""
+    def _source(self, given: Any, X: Any, y: np.ndarray, chosen: Any, shapes: RowShapes | None = None) -> Source:
+        """The rows that count, through the maps, which may have to be of certain shapes."""
         maps = self.feature_map_, self.kernel_map_
         if is_dask(X):
-            return DaskSource(X, y, *maps, shapes)
-        return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), *maps, shapes), len(X))
+            return DaskSource(X, y, *maps, chosen, shapes)
+        rows = MappedRows(given, X, y.reshape(len(y), -1), *maps, chosen, shapes)
+        return LocalSource(rows, chosen.n_rows, chosen.positions)
 
     def _set_common_attributes(self) -> None:
         """What is known of weights, if there are any, noise and kernel."""

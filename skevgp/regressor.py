@@ -140,7 +140,8 @@ class EVGPRegressor(SparseGaussianProcess):
         columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
         of outputs then.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances. (Where outputs share their weights, nothing of them has an axis of outputs.) Only with a ``feature_map``.
+        Their posterior covariances. Only with a ``feature_map``. (Where outputs share their weights, nothing of them
+        has an axis of outputs.)
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -265,7 +266,14 @@ class EVGPRegressor(SparseGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fit kernel, noise, inducing points and posterior.
 
         Parameters
@@ -278,6 +286,12 @@ class EVGPRegressor(SparseGaussianProcess):
             Without a ``dask.distributed.Client`` chunks are read anew at each pass.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
+            What each row's log likelihood is multiplied by: 0 removes the row (before the maps are fitted, but to a
+            Dask array's chunks), 2 is the row twice. Maps whose ``fit`` has a ``sample_weight`` are given it.
+        relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
+            Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
+            With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
 
         Returns
         -------
@@ -304,7 +318,7 @@ class EVGPRegressor(SparseGaussianProcess):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         progress = monitor_of(self.verbose, solver.callback)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
-            problem = self._problem(X, y)
+            problem = self._problem(X, y, sample_weight, relative_variance)
             self._training_data = problem.data
             if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
                 raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")

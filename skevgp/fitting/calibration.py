@@ -6,9 +6,10 @@ too small for new trajectories. Here blocks of consecutive rows are left out one
 2006, section 5.4.2: cross-validation, of which leaving out single rows is the finest), with kernel and inducing points
 as they are, and each output's noise variance is set so that
 
-    φ(σ²) = mean over all rows of r² / (latent variance + σ²) = 1,
+    φ(σ²) = mean over all rows of r² / (latent variance + σ² v) = 1,
 
-where the error r and the latent variance of a row are those of the optimal q without the row's block, for that σ².
+where the error r and the latent variance of a row are those of the optimal q without the row's block, for that σ²; v is
+its relative noise variance, and it counts as often in the mean as its weight says.
 (It may fall as well: what inducing points cannot represent is noise to the bound, while predictions count it twice.)
 
 Without a block the sufficient statistics are sums over the other blocks. (They are summed, not subtracted: what only
@@ -76,7 +77,7 @@ class _LeftOut:
 
 @dataclass(frozen=True)
 class _Scores:
-    """Block of a fold -> Σ r² / (latent variance + σ²) of each output and noise variance (o, g).
+    """Block of a fold -> Σ w r² / (latent variance + σ² v) of each output and noise variance (o, g).
 
     Attributes
     ----------
@@ -94,7 +95,11 @@ class _Scores:
     def __call__(self, block: Block) -> np.ndarray:
         whitening = self.group.whitening
         _, V = whitening.project(block.prepared)
-        unexplained = whitening.unexplained(block.prepared, V)
+        if block.roots is not None:
+            V *= block.roots
+        # Squares and variances of a row have the factor ω = w / v, as in the block's numbers.
+        unexplained = whitening.unexplained(block.prepared, V, block.roots)
+        w = 1.0 if block.counts is None else block.counts[:, np.newaxis]
         P = np.vstack([V, block.features.T])
         sums = np.empty(self.grid.shape)
         for o, (own, r) in enumerate(zip(self.left_out, block.residuals[:, self.group.outputs].T, strict=True)):
@@ -102,7 +107,7 @@ class _Scores:
             error = r[:, np.newaxis] - c.T @ own.mean
             coordinates = c if own.deviation is None else own.deviation @ P
             latent = (coordinates**2).T @ own.variances + self.group.signal[o] * unexplained[:, np.newaxis]
-            sums[o] = (error**2 / (latent + self.grid[o])).sum(axis=0)
+            sums[o] = (w * error**2 / (latent + w * self.grid[o])).sum(axis=0)
         return sums
 
 
@@ -139,8 +144,13 @@ def calibrated_noise(
     noise : ndarray of shape (o,)
     """
     edges = np.linspace(0, len(rows), n_folds + 1).astype(int)
-    m = values["inducing_points"].shape[1]
-    folds = [rows.part(*ends, 1.0 / n_folds).blocks(model.kernel, m) for ends in pairwise(edges)]
+    m, order = values["inducing_points"].shape[1], rows.as_given()
+    folds = [
+        (rows.part(*ends, 1.0 / n_folds) if order is None else rows.some_of(order[slice(*ends)], 1.0 / n_folds)).blocks(
+            model.kernel, m
+        )
+        for ends in pairwise(edges)
+    ]
     noise = np.empty(len(limits))
     for group in model.groups_of(values, statistics):
         bound, (low, high) = BoundAtOptimum(group, model.family), limits[group.outputs].T
@@ -149,9 +159,9 @@ def calibrated_noise(
         freedom = [n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
         left_over = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
         lowest = np.maximum(np.clip(left_over, low, high), _LOWEST)
-        highest = np.maximum(np.minimum(high, _HIGHEST), lowest)
+        highest = np.maximum(np.minimum(high, _HIGHEST * rows.mean_precision), lowest)
         grid = np.geomspace(lowest, highest, _GRID, axis=1)
-        phi = left_out_scores(group, model.family, folds, grid, rows.threads) / len(rows)
+        phi = left_out_scores(group, model.family, folds, grid, rows.threads) / n_rows
         noise[group.outputs] = [_first_root(*pair) for pair in zip(grid, phi, strict=True)]
     return noise
 
@@ -159,7 +169,7 @@ def calibrated_noise(
 def left_out_scores(
     group: Group, family: PosteriorFamily, folds: Sequence[Blocks], grid: np.ndarray, threads: BlockMap
 ) -> np.ndarray:
-    """Σ r² / (latent variance + σ²) over the rows of all folds, each predicted from the other folds.
+    """Σ w r² / (latent variance + σ² v) over the rows of all folds, each predicted from the other folds.
 
     Parameters
     ----------

@@ -160,7 +160,9 @@ class FittedOutputs:
         limits = table[name].value_limits()
         if name == "signal":
             return limits[[within]] * self.units.target_unit[output] ** 2
-        return limits.reshape(-1, table[name].start.shape[-1], 2)[self.learned[model].model.set_of(within, table[name])]
+        if table[name].start.ndim == 1:
+            return limits
+        return limits.reshape(*table[name].start.shape, 2)[self.learned[model].model.set_of(within, table[name])]
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
         """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
@@ -183,9 +185,9 @@ class FittedOutputs:
             That in log s² last.
         """
         (model, within), own = self._place_of(output), [output]
-        internal = signal / self.units.target_unit[own] ** 2
+        internal, n_rows = signal / self.units.target_unit[own] ** 2, self.learned[model].statistics[0].n_rows
         bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, hyperparameters, internal)
-        return bound - len(rows) * self.units.log_unit(own), gradient
+        return bound - n_rows * self.units.log_unit(own), gradient
 
     def _place_of(self, output: int) -> tuple[int, int]:
         """Which model an output belongs to, and which of the model's it is."""
@@ -264,8 +266,9 @@ def plan(
 
     def table_of(outputs: list[int], points: np.ndarray, **options: Any) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        inputs = rows.outputs(outputs).inputs
-        return starting_table(inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, **options)
+        inputs, width = rows.outputs(outputs).inputs, kernel.n_hyperparameters
+        options["precision"] = rows.mean_precision
+        return starting_table(inputs, points, unit, starts, scatter, solver.rules, width, **options)
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
     sample, points = rows.sample(placement.sample_size, rng), []
@@ -296,7 +299,7 @@ def plan(
         )
         if stay:
             table = table.with_fixed("inducing_points")
-        shift = len(rows) * units.log_unit(outputs)
+        shift = rows.total * units.log_unit(outputs)
         tasks.append(
             SparseTask(
                 SparseModel(

@@ -212,13 +212,14 @@ class SparseTask:
         if self.max_iter == 0 or not self.table["hyperparameters"].free.any() or self.model.kernels is not None:
             return None
         sample = self.rows.sample(_SAMPLE, self.rng)
+        nats = sample.total * sample.targets.shape[1]
         return Unhindered.of(
             self.model.kernel,
             self.model.prior,
             sample,
             self.table.without("inducing_points"),
             self.rows.scatter(),
-            ExactOptions(self.solver.rules, _ITERATIONS, max(self.tol or 0.0, _COARSE * sample.targets.size), 0),
+            ExactOptions(self.solver.rules, _ITERATIONS, max(self.tol or 0.0, _COARSE * nats), 0),
             self.rng,
             self.monitor.silent(),
         )
@@ -247,7 +248,7 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     a second opinion, the kernel of the exact model of a sample: while it makes the sample likelier than the fit's by
     `_MISSED`, growth does not end, and it is tried at each step.
     """
-    nats = len(task.rows) * len(task.rows.scatter())
+    nats = task.rows.total * len(task.rows.scatter())
     coarse = replace(
         task,
         max_iter=_ITERATIONS if task.max_iter > 0 else 0,

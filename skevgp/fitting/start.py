@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from scipy.linalg import cho_solve
@@ -30,21 +31,29 @@ _NEIGHBOUR_SAMPLE = 2000
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH (p, p) or (o, p, p) too, if asked for."""
+    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; if asked for, HᵀH, Σ ω and Σ w too.
+
+    Where rows have weights, each product has the factor ω. HᵀH is (p, p), or (o, p, p) of features for each output.
+    """
 
     target_mean: np.ndarray
     coef: np.ndarray
     with_products: bool = False
 
-    def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
+    def __call__(self, raw: RawRows) -> tuple[Any, ...]:
         H = raw.features
         left_over = raw.targets - self.target_mean - times_weights(H, self.coef)
-        HL = left_over.T @ H if H.ndim == 2 else np.einsum("no,nop->op", left_over, H)
-        sums = HL, np.einsum("no,no->o", left_over, left_over)
+        weighted, precision = left_over, raw.total
+        if raw.precision is not None:
+            weighted, precision = left_over * raw.precision[:, np.newaxis], float(raw.precision.sum())
+        HL = weighted.T @ H if H.ndim == 2 else np.einsum("no,nop->op", weighted, H)
+        sums = HL, np.einsum("no,no->o", weighted, left_over)
         if not self.with_products:
             return sums
         by_output = H if H.ndim == 2 else H.transpose(1, 0, 2)
-        return (*sums, np.swapaxes(by_output, -1, -2) @ by_output)
+        HW = np.swapaxes(by_output, -1, -2)
+        HW = HW if raw.precision is None else HW * raw.precision
+        return (*sums, HW @ by_output, precision, raw.total)
 
 
 def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
@@ -65,24 +74,24 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
     -------
     w : ndarray of shape (o, p)
     left_over : ndarray of shape (o,)
-        Root mean square of what they leave over.
+        Root mean square of what they leave over, the noisier a row the less it counts.
     """
     (o, p), roots = prior.scale.shape, prior.roots()
     w = np.zeros((o, p))
-    HL, squares, HH = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
+    HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
     products = np.swapaxes(roots, 1, 2) @ HH @ roots
     everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
     together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
     # Where outputs share their weights, what each leaves over decides how much it counts.
     shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
     for share in shares if together else ():
-        noise = share * squares / source.n_rows
+        noise = share * squares / n_rows
         steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
         for _ in range(3):
             for step in steps:
                 step.take(w, np.einsum("oij,oi->oj", roots, HL))
             HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
-    return w, np.sqrt(squares / source.n_rows)
+    return w, np.sqrt(squares / total_precision)
 
 
 @dataclass(frozen=True)
@@ -279,7 +288,7 @@ def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawR
     inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
     queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
     _, nearest = cKDTree(inputs).query(inputs[queried], 2)
-    each, other = (RawRows(some.inputs[own], some.features[own], some.targets[own]) for own in nearest.T)
+    each, other = (some[own] for own in nearest.T)
     return each, other
 
 
@@ -292,6 +301,7 @@ def starting_table(
     rules: Rules,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
+    precision: float = 1.0,
     n_kernels: int | None = None,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
@@ -307,13 +317,15 @@ def starting_table(
     starts : Starts
         What the user says of them.
     scatter : ndarray of shape (o,)
-        Variance of the residuals, in squared target units: 1, but for targets far from 0.
+        Variance of the residuals, in squared target units: 1, but for targets far from 0 (`Rows.scatter`).
     rules : Rules
         Starts and limits where the user does not say.
     n_hyperparameters : int
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
         Of k̃(x, x), with the hyperparameters where they start.
+    precision : float, default=1.0
+        The mean of 1 / v over rows with noise variances σ² v.
     n_kernels : int, default=None
         How many sets of hyperparameters there are, if each group of outputs has its own.
 
@@ -358,7 +370,7 @@ def starting_table(
                 "noise",
                 rules.first_noise * scatter,
                 np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
-                rules.highest_noise * o,
+                rules.highest_noise * precision * o,
                 target_unit**2,
             ),
             Parameter(

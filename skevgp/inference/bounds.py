@@ -199,6 +199,9 @@ class BoundAtOptimum:
 
         bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v|²)/σ²].
 
+    (Of rows with weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v, and the
+    constant Σ w log v stands beside N log 2πσ²: the rows of P and r are multiplied by √ω.)
+
     With e summed row by row (`statistics.pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives
     the same sums as differences of the statistics.
 
@@ -263,7 +266,8 @@ class BoundAtOptimum:
             own[q.n_own :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # What does not depend on e, and its derivatives in log s² and log σ².
-        self._value = unexplained - 0.5 * (statistics.n_rows * (LOG_2PI + np.log(noise)) + log_det + penalty)
+        log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
+        self._value = unexplained - 0.5 * (log_noise + log_det + penalty)
         self._log_signal = from_signal + unexplained
         self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
 
@@ -298,8 +302,8 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
-    j, and a row that comes often makes that so many times larger. (Where outputs share their weights, y, σ² and t are
-    those of all outputs, one after the other.)
+    j, and a row that comes or counts often makes that so many times larger. (Where outputs share their weights, y, σ²
+    and t are those of all outputs, one after the other.)
 
     Parameters
     ----------
@@ -317,7 +321,8 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     for group in groups:
         statistics, left_over = group.statistics, group.statistics.unexplained
         if group.complete:
-            left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+            n_left = statistics.n_rows + statistics.surplus - len(statistics.VV)
+            left_over = group.whitening.jitter() * max(n_left + 1, 1)
         noise = group.noise + group.signal * left_over
         wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
@@ -338,14 +343,18 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
     noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
     if p == 0:
-        each_bound = (own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) for own, s2 in zip(each, noise, strict=True))
-        return float(-0.5 * np.sum(list(each_bound)))
+        likelihoods = [
+            own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) + own.log_variance for own, s2 in zip(each, noise, strict=True)
+        ]
+        return float(-0.5 * np.sum(likelihoods))
     empty = np.zeros((0, 0))
     groups = [
         Group(
             slice(index, index + 1),
             Whitening(None, empty, empty),
-            SufficientStatistics(own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0),
+            SufficientStatistics(
+                own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0, own.log_variance
+            ),
             np.ones(1),
             noise[index],
             prior.outputs(slice(index, index + 1)),
