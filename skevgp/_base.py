@@ -33,8 +33,7 @@ from ._validation import (
     words_of,
 )
 from .fitting.start import Units
-from .inference.posterior import Predictor
-from .inference.prior import CoefficientPrior
+from .inference.posterior import CoefficientPrior, Predictor
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, as_rows, fit_map_to_chunks, is_dask, predict_chunks
 from .rows.mapped import MappedRows, RowShapes, check_shapes, map_rows

@@ -14,7 +14,7 @@ from .fitting.advice import how_it_ended
 from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
-from .inference.prior import CoefficientPrior
+from .inference.posterior import CoefficientPrior
 from .optimizers.adam import adam
 from .optimizers.curvature import curvature_units
 from .optimizers.lbfgs import DESCENT, Descent, Tolerance, lbfgs

@@ -9,8 +9,7 @@ import numpy as np
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from ..inference.exact import ExactModel
-from ..inference.posterior import Predictor
-from ..inference.prior import CoefficientPrior
+from ..inference.posterior import CoefficientPrior, Predictor
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs

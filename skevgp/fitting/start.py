@@ -11,8 +11,7 @@ from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 
 from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
-from ..inference.posterior import Predictor
-from ..inference.prior import CoefficientPrior
+from ..inference.posterior import CoefficientPrior, Predictor
 from ..inference.statistics import Kernel
 from ..kernels.covariances import Covariance
 from ..kernels.parse import Start, Starts

@@ -29,7 +29,7 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..rows.blocks import Blocks, LinearSums
-from .prior import CoefficientPrior
+from .posterior import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -388,15 +388,13 @@ def _diagonal_gap(
     In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
     """
     L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    B_vv = q.B[:m, :m]
-    precision = L_inv.T @ B_vv @ L_inv
+    precision = L_inv.T @ q.B[:m, :m] @ L_inv
     f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(q.B)[m:]
-    log_det_L = np.log(np.diagonal(L)).sum()
-    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + log_det_L
+    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
     B_bar = log_det_bar.copy()
     weighted = L_inv / f_diagonal
     B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
-    np.einsum("ii->i", B_bar[m:, m:])[...] += 0.5 / coef_diagonal
+    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
     L_bar = -np.tril((weighted @ precision).T)
     diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
     return float(gap), B_bar, L_bar

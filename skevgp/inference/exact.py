@@ -33,8 +33,7 @@ from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangu
 from ..optimizers.parameters import Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI
-from .posterior import Predictor, PredictorGroup
-from .prior import CoefficientPrior
+from .posterior import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
 
 

@@ -4,7 +4,7 @@ import pytest
 from skevgp.fitting.start import alike_neighbours, features_alone, parameter_of, starting_table, unit_of
 from skevgp.fitting.strategy import Rules
 from skevgp.inference.model import SparseModel
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.optimizers.parameters import ParameterTable
