@@ -21,7 +21,7 @@ from ._validation import (
     check_integer,
     is_plain,
 )
-from .fitting.start import Units
+from .fitting.units import Units
 from .inference.posterior import Predictor
 from .rows.dask import as_rows, is_dask, predict_chunks
 

@@ -23,7 +23,7 @@ from ._validation import (
     validate_frame,
     words_of,
 )
-from .fitting.start import Units
+from .fitting.units import Units
 from .inference.posterior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
 from .rows.dask import DaskSource, aligned, fit_map_to_chunks, is_dask

@@ -17,8 +17,9 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
-from .start import Units, centred_kernels, checked_variance, starting_table
+from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
+from .units import Units
 
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500

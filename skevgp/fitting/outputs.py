@@ -23,8 +23,9 @@ from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask, grown
-from .start import Units, centred_kernels, checked_variance, starting_table
+from .start import centred_kernels, checked_variance, starting_table
 from .strategy import search
+from .units import Units
 
 Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 

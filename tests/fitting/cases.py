@@ -4,7 +4,7 @@ import numpy as np
 
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import Request
-from skevgp.fitting.start import Units
+from skevgp.fitting.units import Units
 from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
 from skevgp.rows.source import LocalSource, Moments
