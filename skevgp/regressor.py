@@ -18,8 +18,9 @@ from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import unchanged_if_it_fails
 from .fitting.inducing import Placement
-from .fitting.outputs import Request, Sharing, fit_outputs
-from .fitting.sharing import with_groups
+from .outputs.fit import fit_outputs
+from .outputs.plan import Request, Sharing
+from .outputs.sharing import with_groups
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
 
