@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -16,12 +17,20 @@ from sklearn.utils import check_random_state
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
-from ._validation import unchanged_if_it_fails
+from ._validation import checked_groups, unchanged_if_it_fails
+from .exceptions import DependentRowsWarning
+from .fitting.calibration import CrossValidation
 from .fitting.inducing import Placement
 from .fitting.outputs import Request, Sharing, fit_outputs
 from .fitting.sharing import with_groups
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
+
+_DEPENDENT = (
+    "Rows near each other are alike: left out in blocks, they are predicted much worse than at random, and std is too "
+    "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
+    "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
+)
 
 
 class EVGPRegressor(SparseGaussianProcess):
@@ -93,14 +102,16 @@ class EVGPRegressor(SparseGaussianProcess):
         ``posterior="diagonal"`` it is an error, as are correlations.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
-    noise_cv : int, default=None
-        None: the noise variance is where the bound is highest. On rows of trajectories, each like the one before, that
-        is too low: the bound takes them for independent, and ``std`` is too small on new trajectories. A number of
-        folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
-        from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
-        are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
-        Put one trajectory after the other; where rows are independent, hardly anything changes. It takes two passes
-        over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
+    noise_cv : int, default=5
+        Folds, 2 or more, by which noise and signal variances of each output are set after the iterations: each fold is
+        predicted from the others with the same kernel shape and inducing points, and the two are where the log
+        predictive density of what was left out is highest (Rasmussen & Williams 2006, section 5.4.2), within their
+        bounds. Folds are whole ``groups`` of `fit`, else random. At its optimum the bound takes what inducing points
+        cannot represent for noise, and rows of a trajectory, each like the one before, for independent: ``std`` is too
+        large for rows like those of a table, and too small on new trajectories. It takes a few passes over the rows,
+        memory for as many matrices (m, m), and up to 2,000 rows are predicted; q is then at its optimum, after Adam
+        too. It is left out with None, with ``max_iter=0``, below 50 rows, when a fit is interrupted or out of time, and
+        for what the kernel fixes; `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
@@ -158,7 +169,7 @@ class EVGPRegressor(SparseGaussianProcess):
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
-        With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
+        With ``noise_cv`` the lower one is below that of the last iteration: noise and signal have moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
         sample of the rows: the sample's, times the number of rows over its size).
@@ -229,7 +240,7 @@ class EVGPRegressor(SparseGaussianProcess):
         coef_cov: ArrayLike | None = None,
         share_coef: bool | Literal["auto"] = "auto",
         noise_variance: float | None = None,
-        noise_cv: int | None = None,
+        noise_cv: int | None = 5,
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
@@ -265,7 +276,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None) -> Self:
         """Fit kernel, noise, inducing points and posterior.
 
         Parameters
@@ -278,6 +289,11 @@ class EVGPRegressor(SparseGaussianProcess):
             Without a ``dask.distributed.Client`` chunks are read anew at each pass.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        groups : array-like of shape (n_samples,), default=None
+            Which rows belong together, by any labels: for rows of trajectories their numbers, such as
+            ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
+            ones; of fewer than three groups, blocks of rows that follow each other inside a group. None: rows are
+            independent, and folds random.
 
         Returns
         -------
@@ -296,8 +312,11 @@ class EVGPRegressor(SparseGaussianProcess):
         -----
         ConvergenceWarning
             If the iterations were used up, rounding errors or Ctrl-C ended them (the best parameters so far are kept);
-            if the Gaussian process learned nothing, y is far from its prior mean, or a parameter of the given kernel
-            ended at a bound of it. It says what to change.
+            if the Gaussian process learned nothing, or nothing that holds for groups left out, y is far from its prior
+            mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
+        skevgp.exceptions.DependentRowsWarning
+            If rows near each other, in the order given, are so alike that the noise would be more than four times as
+            large if blocks of them were left out: ``groups`` should say which belong together.
         """
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
@@ -306,8 +325,7 @@ class EVGPRegressor(SparseGaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y)
             self._training_data = problem.data
-            if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
-                raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
+            of_rows = checked_groups(groups, problem.source.n_rows)
             request = Request(
                 problem.source,
                 problem.units,
@@ -318,7 +336,9 @@ class EVGPRegressor(SparseGaussianProcess):
                 solver,
                 solver.default_max_iter if self.max_iter is None else self.max_iter,
                 None if isinstance(self.tol, str) else self.tol,
-                self.noise_cv,
+                None
+                if self.noise_cv is None
+                else CrossValidation(self.noise_cv, of_rows, problem.spec.starts.signal.bounds is None),
                 effective_n_jobs(self.n_jobs),
                 problem.per_output,
             )
@@ -329,6 +349,8 @@ class EVGPRegressor(SparseGaussianProcess):
             self._fitted = fit_outputs(request, rng, monitor, previous)
             self._set_attributes()
         self._warn_of(self._fitted.messages)
+        if self._fitted.dependent:
+            warnings.warn(_DEPENDENT, DependentRowsWarning, stacklevel=3)
         return self
 
     def set_params(self, **params: Any) -> Self:

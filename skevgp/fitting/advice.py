@@ -54,6 +54,17 @@ def interrupted(n_iter: int) -> str:
     return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
 
 
+def signal_gone(gone: int, n_outputs: int) -> str:
+    """That of so many outputs fitted together nothing holds for groups that were left out."""
+    if not gone:
+        return ""
+    return (
+        f"What the Gaussian process learned of {gone} of {n_outputs} outputs fitted together does not hold for groups "
+        "that were left out: its signal variance went towards zero. Other columns (kernel_map) or features, more "
+        "groups, or fewer inducing points may tell what groups have in common."
+    )
+
+
 def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     """Whether y, or a weight, is so far from its prior mean that the fit suffers."""
     if (rows.scatter() < _FAR**-2).any():

@@ -1,124 +1,107 @@
-"""The noise variance under which rows that were left out are as far off as their predictions say.
+"""Signal and noise variance under which rows that were left out are predicted as well as possible, std included.
 
 The bound counts every row as new knowledge. Rows of a trajectory are alike, and what a sparse model cannot represent is
-alike in all of them: the noise that the bound likes best, and with it the standard deviation of predictions, is then
-too small for new trajectories. Here blocks of consecutive rows are left out one after the other (Rasmussen & Williams
-2006, section 5.4.2: cross-validation, of which leaving out single rows is the finest), with kernel and inducing points
-as they are, and each output's noise variance is set so that
+alike in all of them: the noise that the bound likes best, and with it the standard deviation of predictions, is then too
+small for new trajectories. And what inducing points cannot represent is noise to the bound, while predictions count it
+twice: of independent rows the noise is too large. So folds of rows are left out one after the other (Rasmussen &
+Williams 2006, section 5.4.2: cross-validation), with kernel and inducing points as they are, and each output's signal
+and noise variance are where their predictive density is highest,
 
-    φ(σ²) = mean over all rows of r² / (latent variance + σ²) = 1,
+    max over s², σ² of   mean over rows left out of log N(r | mean, variance)   -   a prior that weighs as much as one row,
 
-where the error r and the latent variance of a row are those of the optimal q without the row's block, for that σ².
-(It may fall as well: what inducing points cannot represent is noise to the bound, while predictions count it twice.)
-
-Without a block the sufficient statistics are sums over the other blocks. (They are summed, not subtracted: what only
-one block knows is then exactly unknown without it.) With B₀ = I + σ₀⁻² PᵀP = L Lᵀ of these (see `bounds`), and the
-eigenvalues λ and eigenvectors U of L⁻¹ L⁻ᵀ,
-
-    B(σ²) = I + σ⁻² PᵀP = L U diag(λ + (σ₀²/σ²) (1 - λ)) Uᵀ Lᵀ,
-
-so that one pass over the rows in the coordinates (L U)⁻¹ P gives φ on a whole grid of noise variances.
+log-normal around what the bound found: where the rows left out say nothing, all stays. (The squared errors left out are
+then on average as large as their variances.) What predicts rows that were left out is in `inference.left_out`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
-from itertools import accumulate, pairwise
-from operator import add
 
 import numpy as np
-from scipy.linalg import block_diag, eigh
 
-from ..inference.bounds import (
-    BoundAtOptimum,
-    Group,
-    PosteriorFamily,
-    log_variances,
-    optimal_posterior,
-    projected,
-)
+from ..inference.bounds import bounds_at_optimum
+from ..inference.left_out import LeftOut, Seen, Weights, prior_of, sums_of_others
 from ..inference.model import SparseModel
 from ..inference.statistics import SufficientStatistics, collect
-from ..optimizers.parameters import Values
-from ..rows.blocks import Block, Blocks
+from ..optimizers.parameters import ParameterTable, Values
+from ..rows.folds import FEWEST_ROWS, Fold, folds_in_order, folds_of_groups, random_folds
 from ..rows.internal import Rows
-from ..rows.threads import BlockMap
 
-# Noise variances at which φ is computed. Between them log φ is nearly linear in log σ²: the root is good to a per cent.
-_GRID = 64
-# The highest noise variance that is tried, and the lowest, in squared units of what the features leave over.
-_HIGHEST, _LOWEST = 1e2, 1e-20
-
-
-@dataclass(frozen=True)
-class _LeftOut:
-    """The optimal q(ω) of one output without a fold, for each of g noise variances; P = [V; Hᵀ] of a row.
-
-    Attributes
-    ----------
-    basis : ndarray of shape (m + p, m + p)
-        P -> coordinates c.
-    mean : ndarray of shape (m + p, g)
-        c -> mean of the latent function.
-    deviation : ndarray of shape (m + p, m + p), or None
-        P -> independent coordinates of the latent function's deviation; None if they are c.
-    variances : ndarray of shape (m + p, g)
-        Squares of these coordinates -> latent variance, but for what the inducing points do not explain.
-    """
-
-    basis: np.ndarray
-    mean: np.ndarray
-    deviation: np.ndarray | None
-    variances: np.ndarray
+# The noise is no lower than this share of the square of what the model leaves over of its own rows, and never this low.
+_LEFT_OVER, _LOWEST = 0.2, 1e-20
+# Ratios s²/σ² that are tried are powers of 2: these many doublings away first, then in steps of so many, and no further
+# than so many from where the bound is highest.
+_LOOK, _STEPS, _FARTHEST = (-6, 0, 6), (3.0, 1.0, 0.25), 36
+# The signal's limits in a fit are so many times wider here, if they are not the user's.
+_WIDER = 1e4
+# Noise variances that are tried for a ratio, as factors.
+_NOISES = 2.0 ** np.arange(-3.0, 3.25, 0.5)
+# Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds.
+_DEPENDENT = 4.0
+# Of so many rows that can be seen.
+_FEWEST_DEPENDENT = 200
+# The signal has gone if so little is left of what explained more than half of an output.
+_GONE, _EXPLAINED = 1e-3, 0.5
 
 
 @dataclass(frozen=True)
-class _Scores:
-    """Block of a fold -> Σ r² / (latent variance + σ²) of each output and noise variance (o, g).
+class CrossValidation:
+    """How rows are left out.
 
     Attributes
     ----------
-    group : Group
-    grid : ndarray of shape (o, g)
-        Noise variances.
-    left_out : list of _LeftOut
-        One per output.
+    n_folds : int
+    groups : ndarray of shape (n,), optional
+        Which rows are left out together; None: chance says.
+    wide : bool, default=True
+        Whether nobody set bounds for the signal: it may then leave those of the fit, which keep kernels from becoming
+        long waves of huge height. Here the kernel's shape stays.
     """
 
-    group: Group
-    grid: np.ndarray
-    left_out: list[_LeftOut]
+    n_folds: int
+    groups: np.ndarray | None = None
+    wide: bool = True
 
-    def __call__(self, block: Block) -> np.ndarray:
-        whitening = self.group.whitening
-        _, V = whitening.project(block.prepared)
-        unexplained = whitening.unexplained(block.prepared, V)
-        P = np.vstack([V, block.features.T])
-        sums = np.empty(self.grid.shape)
-        for o, (own, r) in enumerate(zip(self.left_out, block.residuals[:, self.group.outputs].T, strict=True)):
-            c = own.basis @ P
-            error = r[:, np.newaxis] - c.T @ own.mean
-            coordinates = c if own.deviation is None else own.deviation @ P
-            latent = (coordinates**2).T @ own.variances + self.group.signal[o] * unexplained[:, np.newaxis]
-            sums[o] = (error**2 / (latent + self.grid[o])).sum(axis=0)
-        return sums
+    def folds(self, n_rows: int, rng: np.random.RandomState) -> list[Fold]:
+        """Folds of all rows; none if these are too few."""
+        if n_rows < FEWEST_ROWS:
+            return []
+        if self.groups is None:
+            return random_folds(n_rows, self.n_folds, rng)
+        return folds_of_groups(self.groups, self.n_folds, rng)
 
 
-def calibrated_noise(
+@dataclass(frozen=True)
+class Calibrated:
+    """What came of it.
+
+    Attributes
+    ----------
+    signal, noise : ndarray of shape (o,)
+        s² and σ².
+    gone : int
+        Outputs of which nothing that was learned holds for groups that were left out.
+    dependent : bool
+        Whether rows near each other are alike.
+    """
+
+    signal: np.ndarray
+    noise: np.ndarray
+    gone: int = 0
+    dependent: bool = False
+
+
+def calibrated(
     model: SparseModel,
     values: Values,
     statistics: list[SufficientStatistics],
+    table: ParameterTable,
     rows: Rows,
-    limits: np.ndarray,
-    n_folds: int,
-) -> np.ndarray:
-    """The noise variance of each output at which φ first falls to 1, from the lowest that is allowed.
-
-    The lowest is what the model's own rows show, the square of what it leaves over per degree of freedom: blocks that
-    have nothing like them among the others are uncertain anyway, and say little of the noise. Where φ is 1 or less
-    there, it is the answer.
+    by: CrossValidation,
+    seed: int,
+) -> Calibrated | None:
+    """The signal and noise variances of each output that are free; None if there are too few rows.
 
     Parameters
     ----------
@@ -127,101 +110,240 @@ def calibrated_noise(
         As in `SparseModel.at_optimum`.
     statistics : list of SufficientStatistics
         Of all rows, for these values.
+    table : ParameterTable
+        What is free, within which limits.
     rows : Rows
-        At least ``n_folds``.
-    limits : ndarray of shape (o, 2)
-        Of the noise variances.
-    n_folds : int
-        Blocks of consecutive rows, of nearly equal length; 2 or more.
-
-    Returns
-    -------
-    noise : ndarray of shape (o,)
+    by : CrossValidation
+    seed : int
+        Draws folds.
     """
-    edges = np.linspace(0, len(rows), n_folds + 1).astype(int)
-    m = values["inducing_points"].shape[1]
-    folds = [rows.part(*ends, 1.0 / n_folds).blocks(model.kernel, m) for ends in pairwise(edges)]
-    noise = np.empty(len(limits))
-    for group in model.groups_of(values, statistics):
-        bound, (low, high) = BoundAtOptimum(group, model.family), limits[group.outputs].T
+    rng = np.random.RandomState(seed)
+    folds = by.folds(len(rows), rng)
+    if len(folds) < 2:
+        return None
+    limits, lowest = _Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
+    searches = _searches(model, values, folds, rows, limits, _LEFT_OVER * lowest)
+    found = np.array(list(rows.threads(_Search.best, searches)))
+    signal, noise = found.T
+    gone, dependent = 0, False
+    if by.groups is not None:
+        explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
+        gone = int((explained & (signal < _GONE * values["signal"])).sum())
+    elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
+        in_order = folds_in_order(np.arange(len(rows)), by.n_folds, rng)
+        alone = replace(limits, free_signal=False)
+        blocks = _searches(model, values, in_order, rows, alone, lowest)
+        chance = [search.with_limits(alone, lowest[search.output]) for search in searches]
+        each = (np.array([noise for _, noise in rows.threads(_Search.best, own)]) for own in (blocks, chance))
+        dependent = bool((next(each) > _DEPENDENT * next(each)).any())
+    return Calibrated(signal, noise, gone, dependent)
+
+
+@dataclass(frozen=True)
+class _Limits:
+    """Limits of signal and noise, each (o, 2), and which of the two are free."""
+
+    signal: np.ndarray
+    noise: np.ndarray
+    free_signal: bool
+    free_noise: bool
+
+    @classmethod
+    def of(cls, table: ParameterTable, wider: float) -> _Limits:
+        signal, noise = table["signal"], table["noise"]
+        return cls(
+            signal.value_limits() * [1.0 / wider, wider],
+            noise.value_limits(),
+            bool(signal.free.any()),
+            bool(noise.free.any()),
+        )
+
+
+def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:
+    """The square (o,) of what the model leaves over of its own rows, per degree of freedom."""
+    found = np.empty(len(values["noise"]))
+    for bound in bounds_at_optimum(list(model.groups_of(values, statistics)), model.family):
+        group = bound.group
         n_rows = group.statistics.n_rows
         # Rows less the trace of I - B⁻¹, the weights that they determine.
         freedom = [n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
-        left_over = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
-        lowest = np.maximum(np.clip(left_over, low, high), _LOWEST)
-        highest = np.maximum(np.minimum(high, _HIGHEST), lowest)
-        grid = np.geomspace(lowest, highest, _GRID, axis=1)
-        phi = left_out_scores(group, model.family, folds, grid, rows.threads) / len(rows)
-        noise[group.outputs] = [_first_root(*pair) for pair in zip(grid, phi, strict=True)]
-    return noise
+        found[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
+    return found
 
 
-def left_out_scores(
-    group: Group, family: PosteriorFamily, folds: Sequence[Blocks], grid: np.ndarray, threads: BlockMap
-) -> np.ndarray:
-    """Σ r² / (latent variance + σ²) over the rows of all folds, each predicted from the other folds.
+def _searches(
+    model: SparseModel, values: Values, folds: Sequence[Fold], rows: Rows, limits: _Limits, lowest: np.ndarray
+) -> list[_Search]:
+    """For each output, in order: a pass over the rows for each group."""
+    m, share = values["inducing_points"].shape[1], 1.0 / len(folds)
+    all_of = [model.blocks(rows.some_of(fold.rows, share), m) for fold in folds]
+    predicted = [model.blocks(rows.some_of(fold.predicted, share), m) for fold in folds]
+    each = []
+    for outputs, whitening in zip(model.groups, model.whitenings(values), strict=True):
+        of_others = sums_of_others([collect(fold, whitening, outputs) for fold in all_of])
+        seen = [fold.sum(Seen(whitening, outputs)) for fold in predicted]
+        groups = [model.group(values, outputs, whitening, others) for others in of_others]
+        each.append([LeftOut(group, model.family, own) for group, own in zip(groups, seen, strict=True)])
+    known: list[list[Weights | None]] = [[None] * len(folds)] * len(values["noise"])
+    if model.prior.shared:
+        known = _known_elsewhere(each)
+    searches = []
+    for group in each:
+        for index in range(len(group[0].group.noise)):
+            o = len(searches)
+            searches.append(_Search(o, index, group, known[o], values, limits, float(lowest[o])))
+    return searches
 
-    Parameters
+
+def _known_elsewhere(groups: Sequence[Sequence[LeftOut]]) -> list[list[Weights | None]]:
+    """Of each output: what its prior and the other outputs, as they were fitted, say of the weights without each fold."""
+    outputs = [(group, index) for group in groups for index in range(len(group[0].group.noise))]
+    told = [[fold.says(index) for fold in group] for group, index in outputs]
+    found: list[list[Weights | None]] = []
+    for o, (group, index) in enumerate(outputs):
+        own: list[Weights | None] = []
+        for k, fold in enumerate(group):
+            others = (each[k] for j, each in enumerate(told) if j != o)
+            own.append(sum(others, start=prior_of(fold.group, index)))
+        found.append(own)
+    return found
+
+
+@dataclass(frozen=True)
+class _Search:
+    """Where an output's log predictive density of rows left out is highest.
+
+    Attributes
     ----------
-    group : Group
-        Of o outputs.
-    family : {"full", "diagonal"}
-    folds : sequence of Blocks
-        Two or more.
-    grid : ndarray of shape (o, g)
-        Noise variances σ².
-    threads : BlockMap
-
-    Returns
-    -------
-    scores : ndarray of shape (o, g)
+    output, index : int
+        Of the model's outputs, and of its group's.
+    folds : list of LeftOut
+        Of its group.
+    known : list of Weights or None
+        What is known of the weights beside the output's own rows, without each fold.
+    values : dict
+        Where the bound is highest.
+    limits : _Limits
+    lowest : float
+        The noise is not lower.
     """
-    total, grids = np.zeros(grid.shape), list(enumerate(grid))
-    each = [collect(fold, group.whitening, group.outputs) for fold in folds]
-    for fold, others in zip(folds, _sums_of_others(each), strict=True):
-        known = replace(group, statistics=others)
-        left_out = list(threads(partial(_without_fold, known, family), grids))
-        total += fold.sum(_Scores(group, grid, left_out))
-    return total
+
+    output: int
+    index: int
+    folds: list[LeftOut]
+    known: list[Weights | None]
+    values: Values
+    limits: _Limits
+    lowest: float
+
+    def with_limits(self, limits: _Limits, lowest: float) -> _Search:
+        """The same search for less."""
+        return replace(self, limits=limits, lowest=float(lowest))
+
+    def best(self) -> tuple[float, float]:
+        """Signal and noise variance."""
+        signal, noise = self._along_ratios()
+        if not self.limits.free_signal or not np.isclose(signal, self._range("signal")).any():
+            return signal, noise
+        # Along a limit of the signal the noise alone is searched.
+        values = self.values | {"signal": np.full(len(self.values["signal"]), signal)}
+        return replace(self, values=values, limits=replace(self.limits, free_signal=False))._along_ratios()
+
+    def _along_ratios(self) -> tuple[float, float]:
+        s2, noise = (float(self.values[name][self.output]) for name in ("signal", "noise"))
+        if not self.limits.free_signal and not self.limits.free_noise:
+            return s2, noise
+        begin = float(np.round(np.log2(s2 / noise)))
+        tried: dict[float, tuple[float, float]] = {}
+
+        def loss(k: float) -> float:
+            if abs(k - begin) > _FARTHEST:
+                return np.inf
+            if k not in tried:
+                tried[k] = self._at_ratio(2.0**k)
+            return tried[k][0]
+
+        best = min((begin + step for step in _LOOK), key=loss)
+        for step in _STEPS:
+            while (k := min((best, best - step, best + step), key=loss)) != best:
+                best = k
+        if not np.isfinite(loss(best)):
+            return s2, noise
+        return self._between(best, [tried.get(best + side * step, (np.inf, np.nan)) for side in (-1, 0, 1)])
+
+    def _between(self, k: float, near: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        """Where a parabola through the losses at three powers, the last step apart around k, is lowest."""
+        (before, noise_before), (here, noise), (after, noise_after) = near
+        shift = 0.0
+        if np.isfinite(before + after):
+            shift = _vertex(before, here, after)
+            noise *= (noise_after / noise if shift > 0.0 else noise / noise_before) ** shift
+        if not self.limits.free_noise:
+            noise = float(self.values["noise"][self.output])
+        ratio = 2.0 ** (k + _STEPS[-1] * shift)
+        signal = ratio * noise
+        if not self.limits.free_signal:
+            signal = float(self.values["signal"][self.output])
+            noise = signal / ratio
+        return (
+            float(np.clip(signal, *self._range("signal"))),
+            float(np.clip(noise, *self._range("noise"))),
+        )
+
+    def _range(self, name: str) -> tuple[float, float]:
+        """From where to where it may move."""
+        if not getattr(self.limits, f"free_{name}"):
+            return (float(self.values[name][self.output]),) * 2
+        low, high = getattr(self.limits, name)[self.output]
+        if name == "noise":
+            low = max(low, min(self.lowest, high), _LOWEST)
+        return float(low), float(high)
+
+    def _at_ratio(self, ratio: float) -> tuple[float, float]:
+        """The lowest loss at a ratio s²/σ², and the noise variance there."""
+        (s_low, s_high), (low, high) = self._range("signal"), self._range("noise")
+        # A signal or a noise that is fixed is met to rounding.
+        low, high = max(low, s_low / ratio * (1.0 - 1e-9)), min(high, s_high / ratio * (1.0 + 1e-9))
+        if low > high:
+            return np.inf, np.nan
+        if high < low * 1.01:
+            noise = np.array([np.sqrt(low * high)])
+            return float(self._losses(ratio, noise)[0]), float(noise[0])
+        noise = np.clip(self.values["noise"][self.output], low, high)
+        # What makes squared errors as large as variances, were these in proportion to the noise.
+        for _ in range(2):
+            noise = np.clip(noise * self._excess(ratio, noise), low, high)
+        grid = np.clip(noise * _NOISES, low, high)
+        losses = self._losses(ratio, grid)
+        best = int(np.argmin(losses))
+        if not 0 < best < len(grid) - 1 or not grid[best - 1] < grid[best] < grid[best + 1]:
+            return float(losses[best]), float(grid[best])
+        shift = _vertex(*losses[best - 1 : best + 2])
+        noise = grid[best] * (_NOISES[1] / _NOISES[0]) ** shift
+        return float(losses[best] + 0.25 * shift * (losses[best + 1] - losses[best - 1])), float(noise)
+
+    def _excess(self, ratio: float, noise: float) -> float:
+        """Mean square of errors in units of their std."""
+        total, n = 0.0, 0
+        for fold, known in zip(self.folds, self.known, strict=True):
+            error, variance = fold.predicted(self.index, ratio, np.array([noise]), known)
+            total += float((error**2 / variance).sum())
+            n += len(variance)
+        return max(total / n, 1e-12)
+
+    def _losses(self, ratio: float, noise: np.ndarray) -> np.ndarray:
+        """What is to be low (g,), in nats per row, at noise variances (g,)."""
+        total, n = np.zeros(len(noise)), 0
+        for fold, known in zip(self.folds, self.known, strict=True):
+            error, variance = fold.predicted(self.index, ratio, noise, known)
+            total += 0.5 * (np.log(variance) + error**2 / variance).sum(axis=0)
+            n += len(variance)
+        s2, at_bound = (self.values[name][self.output] for name in ("signal", "noise"))
+        total += 0.5 * (np.log(ratio * noise / s2) ** 2 + np.log(noise / at_bound) ** 2)
+        return total / n
 
 
-def _sums_of_others(each: Sequence[SufficientStatistics]) -> Iterator[SufficientStatistics]:
-    """For each entry of two or more the sum of all others."""
-    before, after = list(accumulate(each[:-1])), list(accumulate(reversed(each[1:])))[::-1]
-    yield after[0]
-    yield from map(add, before, after[1:])
-    yield before[-1]
-
-
-def _without_fold(group: Group, family: PosteriorFamily, output: tuple[int, np.ndarray]) -> _LeftOut:
-    """What the statistics of the other folds say of an output, given with its grid (g,) of noise variances."""
-    o, grid = output
-    L_inv, m = group.whitening.L_inv, len(group.whitening.L)
-    scale, reference = group.prior.scale[o], group.prior.reference[o]
-    scales, ratio = np.append(np.full(m, np.sqrt(group.signal[o])), scale), group.noise[o] / grid
-    q = optimal_posterior(group, o)
-    _, Pr = projected(group, o)
-    eigenvalues, U = eigh(q.root_inv @ q.root_inv.T, overwrite_a=True, check_finite=False)
-    to_basis = U.T @ q.root_inv
-    precision = _between(np.clip(eigenvalues, 0.0, 1.0), np.ones(len(U)), ratio)
-    mean = (np.outer(to_basis @ Pr, 1.0 / grid) - (to_basis[:, m:] @ reference)[:, np.newaxis]) / precision
-    if family == "full":
-        return _LeftOut(to_basis * scales, mean, None, 1.0 / precision)
-    # In the coordinates (f_m, β), whose precisions are the diagonal of that of q.
-    at_prior, at_noise = (np.exp(-np.concatenate(log_variances(B, L_inv))) for B in (np.eye(len(U)), q.B))
-    deviation = block_diag(L_inv.T, np.eye(len(scale))) * scales
-    return _LeftOut(to_basis * scales, mean, deviation, 1.0 / _between(at_prior, at_noise, ratio))
-
-
-def _between(at_zero: np.ndarray, at_one: np.ndarray, ratio: np.ndarray) -> np.ndarray:
-    """Precisions (k, g), linear in the ratio (g,) of noise variances; no digits cancel for a ratio below 1."""
-    return at_zero[:, np.newaxis] + np.outer(at_one - at_zero, ratio)
-
-
-def _first_root(grid: np.ndarray, phi: np.ndarray) -> float:
-    """Where φ first falls to 1 along a rising grid, by interpolation of the logarithms; the last point if nowhere."""
-    low = np.flatnonzero(phi <= 1.0)
-    if len(low) == 0 or low[0] == 0:
-        return float(grid[-1] if len(low) == 0 else grid[0])
-    (first, last), (above, below) = np.log(grid[low[0] - 1 : low[0] + 1]), np.log(phi[low[0] - 1 : low[0] + 1])
-    return float(np.exp(first + (last - first) * above / (above - below)))
+def _vertex(before: float, here: float, after: float) -> float:
+    """Where a parabola through three points, one step apart, is lowest: in steps from the middle one, the lowest."""
+    curvature = before - 2.0 * here + after
+    return 0.0 if curvature <= 0.0 else float(np.clip(0.5 * (before - after) / curvature, -0.5, 0.5))

@@ -21,6 +21,7 @@ from ..rows.internal import Rows
 from ..rows.source import Source
 from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
+from .calibration import CrossValidation
 from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask, grown
 from .start import Units, centred_kernels, checked_variance, starting_table
@@ -49,8 +50,8 @@ class Request:
     max_iter : int
     tol : float or None
         In nats; None leaves it to the solver.
-    noise_cv : int or None
-        Folds of consecutive rows by which the noise is calibrated.
+    noise_cv : CrossValidation or None
+        By which signal and noise are calibrated.
     n_threads : int
         For independent models, or else for blocks of rows.
     per_output : bool, default=False
@@ -68,7 +69,7 @@ class Request:
     solver: Solver
     max_iter: int
     tol: float | None
-    noise_cv: int | None
+    noise_cv: CrossValidation | None
     n_threads: int
     per_output: bool = False
     found: bool = False
@@ -106,6 +107,11 @@ class FittedOutputs:
     def predictor(self) -> Predictor:
         """Of all outputs, in the user's units."""
         return self.units.predictor([one.predictor for one in self.learned], self.outputs)
+
+    @property
+    def dependent(self) -> bool:
+        """Whether rows near each other were found to be alike."""
+        return any(one.dependent for one in self.learned)
 
     @property
     def lower_bound(self) -> float:
@@ -159,7 +165,9 @@ class FittedOutputs:
         table = self.learned[model].table
         limits = table[name].value_limits()
         if name == "signal":
-            return limits[[within]] * self.units.target_unit[output] ** 2
+            # Calibrated, it may have left them.
+            (low, high), signal = limits[within], self.learned[model].values["signal"][within]
+            return np.array([[min(low, signal), max(high, signal)]]) * self.units.target_unit[output] ** 2
         return limits.reshape(-1, table[name].start.shape[-1], 2)[self.learned[model].model.set_of(within, table[name])]
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:

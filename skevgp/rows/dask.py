@@ -130,6 +130,15 @@ class DaskSource:
         part.n_rows = end - first
         return part
 
+    def some(self, rows: np.ndarray) -> DaskSource:
+        delayed, some = _dask().delayed, copy(self)
+        starts, owners = np.append(0, self._ends[:-1]), np.searchsorted(self._ends, rows, side="right")
+        own = [(owner, rows[owners == owner] - starts[owner]) for owner in np.unique(owners)]
+        some._partitions = [delayed(_some)(self._partitions[owner], chosen) for owner, chosen in own]
+        some._ends = np.cumsum([len(chosen) for _, chosen in own])
+        some.n_rows = len(rows)
+        return some
+
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return DaskBlocks(self._partitions, make, n_inducing)
 
@@ -218,6 +227,10 @@ def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any], shapes: RowS
 
 def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
     return partition.part(first, end)
+
+
+def _some(partition: LocalSource, rows: np.ndarray) -> LocalSource:
+    return partition.some(rows)
 
 
 def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:

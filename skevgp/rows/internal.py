@@ -166,6 +166,10 @@ class Rows:
         """Consecutive rows, with a share of the memory."""
         return replace(self, source=self.source.part(first, end), share=self.share * share)
 
+    def some_of(self, chosen: np.ndarray, share: float) -> Rows:
+        """Rows by index, in ascending order, with a share of the memory."""
+        return replace(self, source=self.source.some(chosen), share=self.share * share)
+
     def within(self, group: slice) -> Rows:
         """The same rows with some of these outputs."""
         columns = np.arange(len(self.residuals.mean))[self.columns][group].tolist()

@@ -69,6 +69,9 @@ class Source(Protocol):
     def part(self, first: int, end: int) -> Source:
         """Consecutive rows, at least one."""
 
+    def some(self, rows: np.ndarray) -> Source:
+        """Some rows, at least one, by index in ascending order."""
+
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
 
@@ -161,6 +164,9 @@ class LocalSource:
     def part(self, first: int, end: int) -> LocalSource:
         return LocalSource(_Part(self.load, first, end), end - first)
 
+    def some(self, rows: np.ndarray) -> LocalSource:
+        return LocalSource(_Some(self.load, rows), len(rows))
+
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return LocalBlocks(self.through(make), self.n_rows, n_inducing, threads, share)
 
@@ -179,6 +185,15 @@ class _Part:
         if isinstance(rows, slice):
             return self.load(slice(self.first + rows.start, min(self.first + rows.stop, self.end)))
         return self.load(self.first + rows)
+
+
+@dataclass(frozen=True)
+class _Some:
+    load: Callable[[slice | np.ndarray], RawRows]
+    rows: np.ndarray
+
+    def __call__(self, rows: slice | np.ndarray) -> RawRows:
+        return self.load(self.rows[rows])
 
 
 @dataclass(frozen=True)
