@@ -11,6 +11,7 @@ from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 
 from ._base import ExplicitGaussianProcess
+from ._row_weights import chosen_rows
 from ._sklearn import fit_context
 from ._validation import check_magnitude, unchanged_if_it_fails
 from .fitting.outputs import FittedOutputs
@@ -24,10 +25,17 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
     n_jobs: int | None
 
     _fitted: FittedOutputs
-    _training_data: tuple[Any, Any, np.ndarray] | None = None
+    _training_data: tuple[Any, Any, np.ndarray, Any] | None = None
 
     @fit_context(prefer_skip_nested_validation=False)
-    def partial_fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def partial_fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
 
         The first call is a `fit`. With ``forgetting_factor`` below 1 earlier rows count less. After Adam, q moves to
@@ -41,6 +49,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             noise.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             With as many outputs as in the first call.
+        sample_weight, relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
+            Of the new rows, as of `fit`.
 
         Returns
         -------
@@ -53,14 +63,15 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             As `fit`, and if y does not have the outputs of the first call.
         """
         if not hasattr(self, "_fitted"):
-            return self.fit(X, y)
+            return self.fit(X, y, sample_weight, relative_variance=relative_variance)
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
         with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
             n_outputs = 1 if y.ndim == 1 else y.shape[1]
             if n_outputs != self._n_outputs:
                 raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
-            source = self._source(given, X, y, self._row_shapes)
+            chosen = chosen_rows(X, y, sample_weight, relative_variance, ordered=False)
+            source = self._source(given, X, y, chosen, self._row_shapes)
             residuals = self._fitted.units.rows(source).residuals
             check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
             self._fitted = self._fitted.updated(source, self.forgetting_factor)

@@ -15,11 +15,13 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._progress import monitor_of
+from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .network.model import VariationalNetwork
 from .network.training import Scaling, train
+from .rows.chosen import Chosen, rows_of
 from .rows.threads import single_threaded_libraries
 
 # Without max_iter: so many epochs, or more if they make fewer steps than this.
@@ -173,7 +175,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=True)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(self, X: ArrayLike, y: ArrayLike, sample_weight: ArrayLike | None = None) -> Self:
         """Fit the distribution of the weights, the biases and the noise.
 
         Parameters
@@ -182,6 +184,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             The same of y.
+        sample_weight : array-like of shape (n_samples,), default=None
+            What each row's log likelihood is multiplied by: 0 removes the row, 2 is the row twice.
 
         Returns
         -------
@@ -199,7 +203,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
             If the loss still fell in the last epoch, or Ctrl-C ended the fit. It says what to change.
         """
         with unchanged_if_it_fails(self), single_threaded_libraries():
-            message = self._fit(X, y)
+            message = self._fit(X, y, sample_weight)
         if message:
             warnings.warn(message, ConvergenceWarning, stacklevel=3)
         return self
@@ -283,10 +287,10 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         samples = np.moveaxis(samples * self._scaling.y_scale + self._scaling.y_mean, 0, 2)
         return samples[:, 0] if samples.shape[1] == 1 else samples
 
-    def _fit(self, X: Any, y: Any) -> str:
+    def _fit(self, X: Any, y: Any, sample_weight: Any) -> str:
         """Fit, and say what the user should know of how it went."""
-        inputs, targets = self._intake(X, y)
-        scaling = Scaling.of(inputs, targets)
+        inputs, targets, counts = self._intake(X, y, sample_weight)
+        scaling = Scaling.of(inputs, targets, counts)
         network = self._network_of(inputs.shape[1], targets.shape[1])
         n_held_back = max(1, round(self.validation_fraction * len(inputs))) if self.early_stopping else 0
         n_kept = len(inputs) - n_held_back
@@ -314,6 +318,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
                 tol=self.tol,
                 patience=self.n_iter_no_change,
                 monitor=monitor.seen_as(shift=scaling.log_unit),
+                counts=counts,
             )
         self._network, self._scaling, self._theta = network, scaling, training.theta
         self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
@@ -322,14 +327,16 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         self._set_attributes()
         return training.how_it_ended(max_iter, self.tol, monitor.stopped)
 
-    def _intake(self, X: Any, y: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Inputs (n, d) and targets (n, o)."""
+    def _intake(self, X: Any, y: Any, sample_weight: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Inputs (n, d) and targets (n, o) of the rows that count, and how often they do."""
         X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
         targets = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
+        chosen: Chosen = chosen_rows(X, targets, sample_weight)
+        X, targets = rows_of(X, chosen.positions), rows_of(targets, chosen.positions)
         for values, name in ((X, "X"), (targets, "y")):
             check_magnitude(values, name)
             check_not_vanishing(np.abs(values).max(axis=0), name)
-        return X, targets
+        return X, targets, chosen.counts
 
     def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
         hidden = np.atleast_1d(np.asarray(self.hidden_layer_sizes))

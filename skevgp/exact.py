@@ -52,8 +52,10 @@ class EGPRegressor(ExplicitGaussianProcess):
         for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean; with the scale
         ``np.inf`` nothing is known of it (Rasmussen & Williams 2006, eq. 2.42 to 2.45): its estimate is that of
         generalised least squares.
-    coef_cov, share_coef
-        Prior covariance of the weights, and whether all outputs have the same, as of `EVGPRegressor`.
+    coef_cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
+        Prior covariance of the weights, as of `EVGPRegressor`.
+    share_coef : bool or "auto", default="auto"
+        Whether all outputs have the same weights, as of `EVGPRegressor`.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     normalize_y : bool, default=False
@@ -164,7 +166,14 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fit kernel and noise; the posterior is exact.
 
         Parameters
@@ -174,6 +183,8 @@ class EGPRegressor(ExplicitGaussianProcess):
             with a ``kernel_map`` it may hold what is no number, such as words that the maps encode.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        sample_weight, relative_variance : array-like of shape (n_samples,), default=None
+            As of `EVGPRegressor.fit`.
 
         Returns
         -------
@@ -196,7 +207,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
         with unchanged_if_it_fails(self), single_threaded_libraries(), monitor_of(self.verbose) as monitor:
-            problem = self._problem(X, y, allow_vague=True)
+            problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
             rows = problem.units.rows(problem.source)
             options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)
             self._fitted = fit_exact(

@@ -17,9 +17,9 @@ from sklearn.utils import check_random_state
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
-from ._validation import checked_groups, unchanged_if_it_fails
+from ._validation import unchanged_if_it_fails
+from .calibration.folds import CrossValidation
 from .exceptions import DependentRowsWarning
-from .fitting.calibration import CrossValidation
 from .fitting.inducing import Placement
 from .fitting.outputs import Request, Sharing, fit_outputs
 from .fitting.sharing import with_groups
@@ -151,7 +151,8 @@ class EVGPRegressor(SparseGaussianProcess):
         columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
         of outputs then.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances. (Where outputs share their weights, nothing of them has an axis of outputs.) Only with a ``feature_map``.
+        Their posterior covariances. Only with a ``feature_map``. (Where outputs share their weights, nothing of them
+        has an axis of outputs.)
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -276,7 +277,15 @@ class EVGPRegressor(SparseGaussianProcess):
         self.verbose = verbose
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None) -> Self:
+    def fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        groups: ArrayLike | None = None,
+        relative_variance: ArrayLike | None = None,
+    ) -> Self:
         """Fit kernel, noise, inducing points and posterior.
 
         Parameters
@@ -289,11 +298,17 @@ class EVGPRegressor(SparseGaussianProcess):
             Without a ``dask.distributed.Client`` chunks are read anew at each pass.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
             Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+        sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
+            What each row's log likelihood is multiplied by: 0 removes the row (before the maps are fitted, but to a
+            Dask array's chunks), 2 is the row twice. Maps whose ``fit`` has a ``sample_weight`` are given it.
         groups : array-like of shape (n_samples,), default=None
             Which rows belong together, by any labels: for rows of trajectories their numbers, such as
             ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
             ones; of fewer than three groups, blocks of rows that follow each other inside a group. None: rows are
             independent, and folds random.
+        relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
+            Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
+            With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
 
         Returns
         -------
@@ -323,9 +338,8 @@ class EVGPRegressor(SparseGaussianProcess):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         progress = monitor_of(self.verbose, solver.callback)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
-            problem = self._problem(X, y)
+            problem = self._problem(X, y, sample_weight, relative_variance, groups)
             self._training_data = problem.data
-            of_rows = checked_groups(groups, problem.source.n_rows)
             request = Request(
                 problem.source,
                 problem.units,
@@ -338,7 +352,7 @@ class EVGPRegressor(SparseGaussianProcess):
                 None if isinstance(self.tol, str) else self.tol,
                 None
                 if self.noise_cv is None
-                else CrossValidation(self.noise_cv, of_rows, problem.spec.starts.signal.bounds is None),
+                else CrossValidation(self.noise_cv, problem.groups, problem.spec.starts.signal.bounds is None),
                 effective_n_jobs(self.n_jobs),
                 problem.per_output,
             )

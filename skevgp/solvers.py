@@ -14,7 +14,7 @@ from .fitting.advice import how_it_ended
 from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit, Rules
 from .inference.objectives import BoundObjective, ElboObjective
-from .inference.prior import CoefficientPrior
+from .inference.posterior import CoefficientPrior
 from .optimizers.adam import adam
 from .optimizers.curvature import curvature_units
 from .optimizers.lbfgs import DESCENT, Descent, Tolerance, lbfgs
@@ -130,8 +130,8 @@ class LBFGS(BaseEstimator):
             Where it ended.
         """
         table = task.table.started_at(attempt.values)
-        spent, n_rows = len(attempt.loss_curve), len(task.rows)
-        rows = "all rows" if attempt.n_rows is None else f"{attempt.n_rows:,} of {n_rows:,} rows"
+        spent, n_rows = len(attempt.loss_curve), task.rows.total
+        rows = "all rows" if attempt.n_rows is None else f"{attempt.n_rows:,} of {len(task.rows):,} rows"
         if task.placement.max_inducing is not None:
             rows = f"{task.n_inducing} points, {rows}"
         is_last = attempt.is_last and attempt.until >= task.max_iter and self.n_restarts == 0
@@ -155,7 +155,7 @@ class LBFGS(BaseEstimator):
         )
 
     def _tolerance(self, task: SparseTask, attempt: Attempt) -> Tolerance:
-        n_rows = len(task.rows)
+        n_rows = task.rows.total
         if task.tol is not None and attempt.n_rows is None:
             return Tolerance(task.tol / n_rows)
         return Tolerance(_LEAST_TOL / n_rows, self.descent.enough, -task.alone / n_rows)
@@ -256,7 +256,7 @@ class Adam(BaseEstimator):
         fit : Fit
             Where it ended.
         """
-        n_rows, table = len(task.rows), task.table.started_at(attempt.values)
+        n_rows, table = task.rows.total, task.table.started_at(attempt.values)
         tol = _LEAST_TOL if task.tol is None else task.tol
         elbo = ElboObjective(task.model, table, task.blocks, _NATURAL_RATES if self.natural_gradient else None)
         start = elbo.table.start()

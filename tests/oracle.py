@@ -7,7 +7,7 @@ from skevgp.fitting.start import starting_table
 from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import LOG_2PI
 from skevgp.inference.model import SparseModel
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.blocks import LocalBlocks

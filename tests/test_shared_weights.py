@@ -13,7 +13,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.inference.exact import ExactModel
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import RawRows
 from skevgp.solvers import LBFGS

@@ -34,7 +34,7 @@ from skevgp.solvers import LBFGS, Adam
 from speed.scaling import N_INDUCING, make_files
 
 # Of Adam: how often it sees all rows.
-EPOCHS = {"adam 10": 10, "adam 40": 40}
+EPOCHS = {"adam 10": 10, "adam 40": 40, "adam 120": 120}
 FITS = ("default", *EPOCHS, "reference")
 N_TEST, BATCH_SIZE = 10_000, 2000
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..inference.prior import CoefficientPrior
+from ..inference.posterior import CoefficientPrior
 from ..inference.statistics import Kernel
 from ..optimizers.minimum import Minimum
 from ..optimizers.parameters import ParameterTable, Values

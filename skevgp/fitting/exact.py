@@ -9,8 +9,7 @@ import numpy as np
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from ..inference.exact import ExactModel
-from ..inference.posterior import Predictor
-from ..inference.prior import CoefficientPrior
+from ..inference.posterior import CoefficientPrior, Predictor
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs
@@ -18,8 +17,9 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
-from .start import Units, centred_kernels, checked_variance, starting_table
+from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
+from .units import Units
 
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
@@ -138,9 +138,11 @@ class Unhindered:
         """
         try:
             likelihood = sum(output.log_likelihood for output in self.model.outputs(values)[1])
+            likelihood += self.model.of_copies(values)
         except NotPositiveDefiniteError:
             return np.inf
-        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / self.model.rows.targets.size
+        nats = self.model.rows.total * self.model.rows.targets.shape[1]
+        return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
 
 
 @dataclass(frozen=True)
@@ -271,6 +273,7 @@ def fit_exact(
         options.rules,
         kernel.n_hyperparameters,
         variance,
+        rows.mean_precision,
     )
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
@@ -288,7 +291,7 @@ def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
     n_vague = model.vague.sum(axis=1)
     if model.prior.shared:
         n_vague[1:] = 0
-    return (len(model.rows.inputs) - n_vague) * np.log(units.target_unit)
+    return (model.rows.total - n_vague) * np.log(units.target_unit)
 
 
 def _check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> None:

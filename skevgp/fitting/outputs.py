@@ -11,6 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from .._progress import Monitor
+from ..calibration.folds import CrossValidation
 from ..inference.bounds import PosteriorFamily
 from ..inference.model import SparseModel
 from ..inference.posterior import Predictor
@@ -21,11 +22,11 @@ from ..rows.internal import Rows
 from ..rows.source import Source
 from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
-from .calibration import CrossValidation
 from .inducing import Placement, are_all_rows
 from .sparse import Learned, Solver, SparseTask, grown
-from .start import Units, centred_kernels, checked_variance, starting_table
+from .start import centred_kernels, checked_variance, starting_table
 from .strategy import search
+from .units import Units
 
 Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 
@@ -168,7 +169,9 @@ class FittedOutputs:
             # Calibrated, it may have left them.
             (low, high), signal = limits[within], self.learned[model].values["signal"][within]
             return np.array([[min(low, signal), max(high, signal)]]) * self.units.target_unit[output] ** 2
-        return limits.reshape(-1, table[name].start.shape[-1], 2)[self.learned[model].model.set_of(within, table[name])]
+        if table[name].start.ndim == 1:
+            return limits
+        return limits.reshape(*table[name].start.shape, 2)[self.learned[model].model.set_of(within, table[name])]
 
     def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
         """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
@@ -191,9 +194,9 @@ class FittedOutputs:
             That in log s² last.
         """
         (model, within), own = self._place_of(output), [output]
-        internal = signal / self.units.target_unit[own] ** 2
+        internal, n_rows = signal / self.units.target_unit[own] ** 2, self.learned[model].statistics[0].n_rows
         bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, hyperparameters, internal)
-        return bound - len(rows) * self.units.log_unit(own), gradient
+        return bound - n_rows * self.units.log_unit(own), gradient
 
     def _place_of(self, output: int) -> tuple[int, int]:
         """Which model an output belongs to, and which of the model's it is."""
@@ -272,8 +275,9 @@ def plan(
 
     def table_of(outputs: list[int], points: np.ndarray, **options: Any) -> ParameterTable:
         unit, scatter = units.target_unit[outputs], rows.scatter()[outputs]
-        inputs = rows.outputs(outputs).inputs
-        return starting_table(inputs, points, unit, starts, scatter, solver.rules, kernel.n_hyperparameters, **options)
+        inputs, width = rows.outputs(outputs).inputs, kernel.n_hyperparameters
+        options["precision"] = rows.mean_precision
+        return starting_table(inputs, points, unit, starts, scatter, solver.rules, width, **options)
 
     # The kernel starts alike in all models and without regard to the points, which may depend on it.
     sample, points = rows.sample(placement.sample_size, rng), []
@@ -304,7 +308,7 @@ def plan(
         )
         if stay:
             table = table.with_fixed("inducing_points")
-        shift = len(rows) * units.log_unit(outputs)
+        shift = rows.total * units.log_unit(outputs)
         tasks.append(
             SparseTask(
                 SparseModel(

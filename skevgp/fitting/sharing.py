@@ -164,7 +164,7 @@ class _ShortFits:
     def of(cls, request: Request, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
         """With the first fit."""
         raw = Rows(request.source, lambda rows: rows).sample(_SAMPLE, rng)
-        source = LocalSource.of(raw.inputs, raw.features, raw.targets)
+        source = LocalSource.holding(raw)
         most = request.placement.max_inducing or request.placement.n_inducing
         placement = Placement("k-means", min(most, _POINTS))
         # Each output has weights of its own here, if it shares them or not: what is asked is which kernel it wants.
@@ -209,7 +209,7 @@ class _ShortFits:
             loss, _ = BoundObjective(task.model, task.table, task.blocks)(task.table.started_at(values).start())
         except NotPositiveDefiniteError:
             loss = np.inf
-        return -self.n_rows * loss if np.isfinite(loss) else -np.finfo(float).max
+        return -task.rows.total * loss if np.isfinite(loss) else -np.finfo(float).max
 
     def shape(self, values: Values) -> np.ndarray:
         """k̃ at the points, as a vector of length 1: products are alignments (Cristianini et al. 2001)."""
@@ -228,7 +228,7 @@ class _ShortFits:
 
 def _short_fit(task: SparseTask, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
     """The values of each output where so many iterations lead."""
-    n_rows = len(task.rows)
+    n_rows = task.rows.total
     objective = BoundObjective(task.model, table, task.blocks)
     values = table.values(lbfgs(objective, table.start(), table.limits(), n_iter, _SHORT_TOL / n_rows, monitor).x)
     each = range(len(values["noise"]))

@@ -9,8 +9,9 @@ from typing import Protocol
 
 import numpy as np
 
-from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
+from ..calibration.calibrate import calibrated
+from ..calibration.folds import CrossValidation
 from ..inference.bounds import bounds_at_optimum, features_alone_bound
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
@@ -21,7 +22,6 @@ from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from ..rows.source import of_outputs
 from .advice import far_from_prior, learned_too_little, signal_gone
-from .calibration import Calibrated, CrossValidation, calibrated
 from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
@@ -213,13 +213,14 @@ class SparseTask:
         if self.max_iter == 0 or not self.table["hyperparameters"].free.any() or self.model.kernels is not None:
             return None
         sample = self.rows.sample(_SAMPLE, self.rng)
+        nats = sample.total * sample.targets.shape[1]
         return Unhindered.of(
             self.model.kernel,
             self.model.prior,
             sample,
             self.table.without("inducing_points"),
             self.rows.scatter(),
-            ExactOptions(self.solver.rules, _ITERATIONS, max(self.tol or 0.0, _COARSE * sample.targets.size), 0),
+            ExactOptions(self.solver.rules, _ITERATIONS, max(self.tol or 0.0, _COARSE * nats), 0),
             self.rng,
             self.monitor.silent(),
         )
@@ -236,19 +237,6 @@ class SparseTask:
             told.append(learned_too_little(kernel, own, self.table, self.rows.within(group)))
         return max(told)
 
-    def calibrated(self, values: Values, statistics: list[SufficientStatistics]) -> Calibrated | None:
-        """Signal and noise by rows that are left out; None if nobody asked, they are fixed, or it cannot be."""
-        free = any(self.table[name].free.any() for name in ("signal", "noise"))
-        if self.noise_cv is None or not free:
-            return None
-        with self.monitor.keeping_the_best():
-            try:
-                return calibrated(self.model, values, statistics, self.table, self.rows, self.noise_cv, self.seed)
-            except NotPositiveDefiniteError:
-                # Of fewer rows than all what the fit could do need not be possible.
-                return None
-        return None
-
 
 def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     """A fit whose number of inducing points has been found, and the task that it is of.
@@ -261,7 +249,7 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     a second opinion, the kernel of the exact model of a sample: while it makes the sample likelier than the fit's by
     `_MISSED`, growth does not end, and it is tried at each step.
     """
-    nats = len(task.rows) * len(task.rows.scatter())
+    nats = task.rows.total * len(task.rows.scatter())
     coarse = replace(
         task,
         max_iter=_ITERATIONS if task.max_iter > 0 else 0,
@@ -331,7 +319,9 @@ class Learned:
         advice, found = [fit.message, far_from_prior(model.prior, task.rows)], None
         if not task.monitor.stopped and task.max_iter > 0:
             advice.append(task.learned_too_little(values))
-            found = task.calibrated(values, statistics)
+            if task.noise_cv is not None:
+                with task.monitor.keeping_the_best():
+                    found = calibrated(model, values, statistics, task.table, task.rows, task.noise_cv, task.seed)
         if found is not None:
             values = values | {"signal": found.signal, "noise": found.noise}
             advice.append(signal_gone(found.gone, len(found.noise)))

@@ -1,181 +1,23 @@
-"""Where a fit starts: what the features alone explain, the internal units, first values and limits of parameters."""
+"""Where a fit starts: first values and limits of parameters, and what is seen of the rows before."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
-
 import numpy as np
-from scipy.linalg import cho_solve
 from scipy.spatial import cKDTree
 
-from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky
-from ..inference.posterior import Predictor
-from ..inference.prior import CoefficientPrior
+from .._linalg import NotPositiveDefiniteError, jittered_cholesky
 from ..inference.statistics import Kernel
 from ..kernels.covariances import Covariance
 from ..kernels.parse import Start, Starts
 from ..optimizers.parameters import Parameter, ParameterTable
 from ..rows.internal import Rows
-from ..rows.source import Columns, Moments, RawRows, Source, times_weights
-from ..rows.threads import BlockMap
+from ..rows.source import Moments, RawRows
 from .strategy import Rules
+from .units import SMALLEST_UNIT
 
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
 _LOWEST_NOISE = 1e-20
-# So that the lowest noise variance in the user's units is not rounded to 0.
-_SMALLEST_UNIT = 1e-140
 _NEIGHBOUR_SAMPLE = 2000
-
-
-@dataclass(frozen=True)
-class _LeftOver:
-    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; HᵀH (p, p) or (o, p, p) too, if asked for."""
-
-    target_mean: np.ndarray
-    coef: np.ndarray
-    with_products: bool = False
-
-    def __call__(self, raw: RawRows) -> tuple[np.ndarray, ...]:
-        H = raw.features
-        left_over = raw.targets - self.target_mean - times_weights(H, self.coef)
-        HL = left_over.T @ H if H.ndim == 2 else np.einsum("no,nop->op", left_over, H)
-        sums = HL, np.einsum("no,no->o", left_over, left_over)
-        if not self.with_products:
-            return sums
-        by_output = H if H.ndim == 2 else H.transpose(1, 0, 2)
-        return (*sums, np.swapaxes(by_output, -1, -2) @ by_output)
-
-
-def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
-
-    The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
-    the rounding of the normal equations.
-
-    Parameters
-    ----------
-    source : Source
-        n rows with p features and o targets.
-    target_mean : ndarray of shape (o,)
-    prior : CoefficientPrior
-        Of the weights; a scale of 0 keeps one at its mean.
-
-    Returns
-    -------
-    w : ndarray of shape (o, p)
-    left_over : ndarray of shape (o,)
-        Root mean square of what they leave over.
-    """
-    (o, p), roots = prior.scale.shape, prior.roots()
-    w = np.zeros((o, p))
-    HL, squares, HH = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
-    products = np.swapaxes(roots, 1, 2) @ HH @ roots
-    everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
-    together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
-    # Where outputs share their weights, what each leaves over decides how much it counts.
-    shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
-    for share in shares if together else ():
-        noise = share * squares / source.n_rows
-        steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
-        for _ in range(3):
-            for step in steps:
-                step.take(w, np.einsum("oij,oi->oj", roots, HL))
-            HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
-    return w, np.sqrt(squares / source.n_rows)
-
-
-@dataclass(frozen=True)
-class _Step:
-    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one."""
-
-    outputs: list[int]
-    least: float
-    counts: np.ndarray
-    root: np.ndarray
-
-    @classmethod
-    def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
-        noise = np.maximum(noise, 1e-16 * noise.max())
-        least = float(noise.min())
-        counts = least / noise
-        precision = np.einsum("o,oij->ij", counts, products[outputs])
-        diagonal_of(precision)[...] += least
-        return cls(outputs, least, counts, jittered_cholesky(precision))
-
-    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
-        first = self.outputs[0]
-        w[self.outputs] += cho_solve((self.root, True), self.counts @ from_data[self.outputs] - self.least * w[first])
-
-
-def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
-
-    Parameters
-    ----------
-    left_over : ndarray of shape (o,)
-        Root mean square.
-    largest : ndarray of shape (o,)
-        Of the target's absolute values.
-
-    Returns
-    -------
-    unit : ndarray of shape (o,)
-    """
-    unit = np.maximum(left_over, 1e-14 * largest)
-    return np.where(unit > 0.0, np.maximum(unit, _SMALLEST_UNIT), 1.0)
-
-
-@dataclass(frozen=True)
-class Units:
-    """What is subtracted from and divided out of the targets before inference.
-
-    Attributes
-    ----------
-    target_mean : ndarray of shape (o,)
-        Subtracted from y; part of the model (0 unless y is normalised).
-    target_unit : ndarray of shape (o,)
-        The size of what the features alone leave over.
-    prior : CoefficientPrior
-        In the user's units.
-    """
-
-    target_mean: np.ndarray
-    target_unit: np.ndarray
-    prior: CoefficientPrior
-
-    @classmethod
-    def of(
-        cls,
-        source: Source,
-        targets: Moments,
-        target_mean: np.ndarray,
-        prior: CoefficientPrior,
-    ) -> Units:
-        """The units of a training set, from its rows, its targets' moments, and the prior of its weights."""
-        reference, left_over = features_alone(source, target_mean, prior)
-        return cls(target_mean, unit_of(left_over, targets.largest), replace(prior, reference=reference))
-
-    def to_internal(self, raw: RawRows) -> RawRows:
-        """The same inputs and features, and what the reference leaves of the targets, in its own units."""
-        left_over = raw.targets - self.target_mean - times_weights(raw.features, self.prior.offset)
-        return replace(raw, targets=left_over / self.target_unit)
-
-    def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
-        """Rows in internal units."""
-        return Rows(source, self.to_internal, threads=BlockMap() if threads is None else threads)
-
-    def internal_prior(self) -> CoefficientPrior:
-        """The prior for residuals in units of ``target_unit``."""
-        return self.prior.scaled(1.0 / self.target_unit)
-
-    def log_unit(self, outputs: Columns) -> float:
-        """What one row of some outputs adds to the loss on the way to the user's units."""
-        return float(np.log(self.target_unit[outputs]).sum())
-
-    def predictor(self, parts: Sequence[Predictor], outputs: Sequence[list[int]]) -> Predictor:
-        """Predictors of some outputs each, in internal units -> one of all in the user's."""
-        return Predictor.joined(parts, outputs, self.target_unit, self.prior.offset, self.target_mean)
 
 
 def column_centre(inputs: Moments) -> np.ndarray:
@@ -186,7 +28,7 @@ def column_centre(inputs: Moments) -> np.ndarray:
 def column_scale(inputs: Moments) -> np.ndarray:
     """The standard deviation (d,) of each column; 1 where the column is constant but for rounding."""
     scale = np.sqrt(inputs.variance)
-    return np.where(_constant(inputs) | (scale <= _SMALLEST_UNIT), 1.0, scale)
+    return np.where(_constant(inputs) | (scale <= SMALLEST_UNIT), 1.0, scale)
 
 
 def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, tuple[Covariance, ...] | None]:
@@ -279,7 +121,7 @@ def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawR
     inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
     queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
     _, nearest = cKDTree(inputs).query(inputs[queried], 2)
-    each, other = (RawRows(some.inputs[own], some.features[own], some.targets[own]) for own in nearest.T)
+    each, other = (some[own] for own in nearest.T)
     return each, other
 
 
@@ -292,6 +134,7 @@ def starting_table(
     rules: Rules,
     n_hyperparameters: int,
     mean_variance: float = 1.0,
+    precision: float = 1.0,
     n_kernels: int | None = None,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
@@ -307,13 +150,15 @@ def starting_table(
     starts : Starts
         What the user says of them.
     scatter : ndarray of shape (o,)
-        Variance of the residuals, in squared target units: 1, but for targets far from 0.
+        Variance of the residuals, in squared target units: 1, but for targets far from 0 (`Rows.scatter`).
     rules : Rules
         Starts and limits where the user does not say.
     n_hyperparameters : int
         1 or d, unless the user says where they start.
     mean_variance : float, default=1.0
         Of k̃(x, x), with the hyperparameters where they start.
+    precision : float, default=1.0
+        The mean of 1 / v over rows with noise variances σ² v.
     n_kernels : int, default=None
         How many sets of hyperparameters there are, if each group of outputs has its own.
 
@@ -358,7 +203,7 @@ def starting_table(
                 "noise",
                 rules.first_noise * scatter,
                 np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
-                rules.highest_noise * o,
+                rules.highest_noise * precision * o,
                 target_unit**2,
             ),
             Parameter(

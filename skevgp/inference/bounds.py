@@ -29,7 +29,7 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..rows.blocks import Blocks, LinearSums
-from .prior import CoefficientPrior
+from .posterior import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -199,6 +199,9 @@ class BoundAtOptimum:
 
         bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v|²)/σ²].
 
+    (Of rows with weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v, and the
+    constant Σ w log v stands beside N log 2πσ²: the rows of P and r are multiplied by √ω.)
+
     With e summed row by row (`statistics.pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives
     the same sums as differences of the statistics.
 
@@ -263,7 +266,8 @@ class BoundAtOptimum:
             own[q.n_own :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # What does not depend on e, and its derivatives in log s² and log σ².
-        self._value = unexplained - 0.5 * (statistics.n_rows * (LOG_2PI + np.log(noise)) + log_det + penalty)
+        log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
+        self._value = unexplained - 0.5 * (log_noise + log_det + penalty)
         self._log_signal = from_signal + unexplained
         self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
 
@@ -298,8 +302,8 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
-    j, and a row that comes often makes that so many times larger. (Where outputs share their weights, y, σ² and t are
-    those of all outputs, one after the other.)
+    j, and a row that comes or counts often makes that so many times larger. (Where outputs share their weights, y, σ²
+    and t are those of all outputs, one after the other.)
 
     Parameters
     ----------
@@ -317,7 +321,8 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     for group in groups:
         statistics, left_over = group.statistics, group.statistics.unexplained
         if group.complete:
-            left_over = group.whitening.jitter() * max(statistics.n_rows - len(statistics.VV) + 1, 1)
+            n_left = statistics.n_rows + statistics.surplus - len(statistics.VV)
+            left_over = group.whitening.jitter() * max(n_left + 1, 1)
         noise = group.noise + group.signal * left_over
         wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
@@ -338,14 +343,18 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
     noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
     if p == 0:
-        each_bound = (own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) for own, s2 in zip(each, noise, strict=True))
-        return float(-0.5 * np.sum(list(each_bound)))
+        likelihoods = [
+            own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) + own.log_variance for own, s2 in zip(each, noise, strict=True)
+        ]
+        return float(-0.5 * np.sum(likelihoods))
     empty = np.zeros((0, 0))
     groups = [
         Group(
             slice(index, index + 1),
             Whitening(None, empty, empty),
-            SufficientStatistics(own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0),
+            SufficientStatistics(
+                own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0, own.log_variance
+            ),
             np.ones(1),
             noise[index],
             prior.outputs(slice(index, index + 1)),
@@ -379,15 +388,13 @@ def _diagonal_gap(
     In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
     """
     L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    B_vv = q.B[:m, :m]
-    precision = L_inv.T @ B_vv @ L_inv
+    precision = L_inv.T @ q.B[:m, :m] @ L_inv
     f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(q.B)[m:]
-    log_det_L = np.log(np.diagonal(L)).sum()
-    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + log_det_L
+    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
     B_bar = log_det_bar.copy()
     weighted = L_inv / f_diagonal
     B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
-    np.einsum("ii->i", B_bar[m:, m:])[...] += 0.5 / coef_diagonal
+    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
     L_bar = -np.tril((weighted @ precision).T)
     diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
     return float(gap), B_bar, L_bar

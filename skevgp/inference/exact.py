@@ -13,6 +13,11 @@ its condition. Outputs that share their weights are stacked: W and z are then th
 Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
 2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|², with
 V = L⁻¹ k̃(X, x) and B = RᵀR.
+
+A row with the noise variance σ² v has ρ v in place of ρ on its diagonal. One that counts w times is a row with the
+noise variance σ² v / w, but for what w copies of it have beside exp(-½ w e² / (σ² v)):
+
+    N(y | g, σ² v)^w = N(y | g, σ² v / w) (2πσ² v)^(-(w - 1)/2) w^(-1/2).
 """
 
 from __future__ import annotations
@@ -28,8 +33,7 @@ from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangu
 from ..optimizers.parameters import Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI
-from .posterior import Predictor, PredictorGroup
-from .prior import CoefficientPrior
+from .posterior import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
 
 
@@ -49,6 +53,8 @@ class OutputGivenKernel:
         Of this output.
     vague : ndarray of shape (p,)
         Weights with Σ_β → ∞; their prior scale is a unit.
+    relative : ndarray of shape (n,), optional
+        Noise variances v / w in units of σ²; None are ones.
     """
 
     # Of `join`.
@@ -68,14 +74,15 @@ class OutputGivenKernel:
         noise: float,
         prior: CoefficientPrior,
         vague: np.ndarray,
+        relative: np.ndarray | None = None,
     ):
         self.signal, self.noise, self.ratio = signal, noise, noise / signal
         shifted = K.copy()
-        diagonal_of(shifted)[...] += self.ratio
+        diagonal_of(shifted)[...] += self.ratio if relative is None else self.ratio * relative
         self.L = jittered_cholesky(shifted)
         self.L_inv = triangular_inverse(self.L)
         s = np.sqrt(signal)
-        self.vague, self.scale, self.reference = vague, prior.scale[0], prior.reference[0]
+        self.vague, self.scale, self.reference, self.relative = vague, prior.scale[0], prior.reference[0], relative
         self.W = self.L_inv @ (H * (self.scale / s) if prior.root is None else H @ (prior.root[0] / s))
         self.z = self.L_inv @ (r / s)
 
@@ -115,10 +122,10 @@ class OutputGivenKernel:
         WR = self.W @ self.R_inv
         from_weights = self.L_inv.T @ WR
         P = (symmetric_inverse(self.L_inv) - from_weights @ from_weights.T) / self.signal
-        trace = float(np.trace(P))
+        in_noise = alpha**2 - diagonal_of(P)
         squares = float(self.left_over @ self.left_over)
         explained = float(np.vdot(WR, WR))
-        noise_bar = 0.5 * self.noise * (float(alpha @ alpha) - trace)
+        noise_bar = 0.5 * self.noise * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
         P *= -1.0
         P += np.multiply.outer(alpha, alpha)
         P *= 0.5 * self.signal
@@ -159,6 +166,7 @@ class ExactModel:
         """The covariance of the rows, of all outputs or of each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
         each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
+        relative = None if self.rows.precision is None else 1.0 / self.rows.precision
         covariances = [
             kernel.at(hyperparameters, own.inputs)
             for kernel, own in zip(self.kernels or (self.kernel,), each, strict=False)
@@ -173,6 +181,7 @@ class ExactModel:
                 values["noise"][index],
                 self.prior.outputs(slice(index, index + 1)),
                 self.vague[index],
+                relative,
             )
             for index, own in enumerate(each)
         ]
@@ -183,15 +192,29 @@ class ExactModel:
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
         """Summed over outputs, and its gradient in the logarithms of the values."""
         covariances, outputs = self.outputs(values)
-        total, gradient = 0.0, {name: np.zeros_like(value) for name, value in values.items()}
+        total, gradient = self.of_copies(values), {name: np.zeros_like(value) for name, value in values.items()}
         K_bars = np.zeros((len(covariances), *outputs[0].L.shape))
         for index, output in enumerate(outputs):
             total += output.log_likelihood
             own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
             K_bars[index % len(K_bars)] += own
+        gradient["noise"] -= 0.5 * self.n_copies
         for at, K_bar in zip(covariances, K_bars, strict=True):
             gradient["hyperparameters"] += at.finish_pullback(at.start_pullback(), K_bar)[0]
         return total, gradient
+
+    @property
+    def n_copies(self) -> float:
+        """Σ (w - 1)."""
+        return self.rows.total - len(self.rows.inputs)
+
+    def of_copies(self, values: Values) -> float:
+        """What rows that count w times add to the log likelihood of rows with the noise variance σ² v / w."""
+        w, noise = self.rows.counts, values["noise"]
+        if w is None or self.rows.precision is None:
+            return 0.0
+        constant = float((w - 1.0) @ (LOG_2PI + np.log(w / self.rows.precision)) + np.log(w).sum())
+        return -0.5 * (len(noise) * constant + self.n_copies * float(np.log(noise).sum()))
 
     def predictor(self, values: Values) -> Predictor:
         """In internal units; the rows are its inducing points."""

@@ -12,8 +12,7 @@ from ..optimizers.parameters import Parameter, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from .bounds import Group, PosteriorFamily, bounds_at_optimum, diagonal_root, log_variances, upper_bound
-from .posterior import Predictor, PredictorGroup
-from .prior import CoefficientPrior
+from .posterior import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
 

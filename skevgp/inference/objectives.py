@@ -159,12 +159,13 @@ class ElboObjective:
     def evaluate(self, x: np.ndarray, blocks: Blocks) -> tuple[float, np.ndarray]:
         """The loss of some rows that stand for all, per row, and its gradient (size,); x is of the same size."""
         values = self.table.values(x)
-        # Rows that count N/n times: a noise variance of σ² n/N.
-        counted = values | {"noise": values["noise"] * (blocks.linear.n_rows / self.n_rows)}
+        # Rows that count N/n times (whatever their weights: all are drawn alike): a noise variance of σ² n/N.
+        counted = values | {"noise": values["noise"] * (blocks.linear.length / self.blocks.linear.length)}
         loss, gradient = evaluate(
             self.model, counted, blocks, lambda groups: [_ElboTerms(self, values, group) for group in groups]
         )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
+        loss += 0.5 * len(values["noise"]) * self.blocks.linear.log_variance
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 
     def solution(self, x: np.ndarray) -> tuple[float, Predictor]:

@@ -45,8 +45,11 @@ class KernelAt(Protocol):
     def start_pullback(self) -> Any:
         """An empty sum for `finish_pullback`."""
 
-    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: float) -> Any:
-        """What one block adds, by ``+``, to the sum for `finish_pullback`; may overwrite ``U_bar``."""
+    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: np.ndarray | float) -> Any:
+        """What one block adds, by ``+``, to the sum for `finish_pullback`; may overwrite ``U_bar``.
+
+        ``diagonal_bar`` is the gradient in each k(x, x), (n,), or one number for all.
+        """
 
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in the hyperparameters (n_hyper,) and the inducing points (m, d), of the rows and of `matrix`."""
@@ -102,9 +105,14 @@ class Whitening:
         U = self.covariance.cross(prepared)
         return U, triangular_product(self.L_inv, U, np.empty(U.shape) if out is None else out)
 
-    def unexplained(self, prepared: Any, V: np.ndarray) -> np.ndarray:
-        """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0."""
+    def unexplained(self, prepared: Any, V: np.ndarray, roots: np.ndarray | None = None) -> np.ndarray:
+        """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0.
+
+        If columns of V have been multiplied by ``roots`` (n,), that times their squares.
+        """
         variance = self.covariance.diagonal(prepared)
+        if roots is not None:
+            variance = variance * roots**2
         left = variance - np.einsum("mn,mn->n", V, V)
         # What is left of a row that is an inducing point is rounding.
         left -= _ROUNDING * variance
@@ -119,10 +127,12 @@ class Whitening:
 class SufficientStatistics:
     """Sums over rows; V = L⁻¹ k(X_m, X) is whitened for a kernel of unit signal variance.
 
+    Where rows have weights w and relative noise variances v, each product has the factor ω = w / v, row by row.
+
     Attributes
     ----------
     n_rows : float
-        N; less than there were, once earlier rows have been forgotten in part.
+        N, or Σ w; less than there were, once earlier rows have been forgotten in part.
     VV : ndarray of shape (m, m)
         V Vᵀ.
     VH : ndarray of shape (m, p)
@@ -137,6 +147,8 @@ class SufficientStatistics:
         rᵀr.
     unexplained : float
         The sum over rows of k(x, x) - |v|², each clipped at 0.
+    log_variance, surplus : float
+        As of `LinearStatistics`.
     """
 
     n_rows: float
@@ -147,6 +159,8 @@ class SufficientStatistics:
     HR: np.ndarray
     RR: np.ndarray
     unexplained: Any
+    log_variance: float = 0.0
+    surplus: float = 0.0
 
     @cached_property
     def joint(self) -> np.ndarray:
@@ -204,14 +218,16 @@ class _FirstPass:
         U, P = _projected(block, self.whitening, outputs)
         block.kept = (self.whitening, U, P) if block.may_keep else None
         V, linear = P[: len(U)], P[len(U) :]
-        return V @ V.T, V @ linear.T, self.whitening.unexplained(block.prepared, V).sum()
+        return V @ V.T, V @ linear.T, self.whitening.unexplained(block.prepared, V, block.roots).sum()
 
 
 def _projected(block: Block, whitening: Whitening, outputs: slice) -> tuple[np.ndarray, np.ndarray]:
-    """U (m, n), and [V; Hᵀ; rᵀ] of shape (m + p + o, n): one array, which one product multiplies."""
+    """U (m, n), and [V; Hᵀ; rᵀ] √Ω of shape (m + p + o, n): one array, which one product multiplies."""
     linear, m = block.linear_of(outputs), len(whitening.L)
     P = np.empty((m + linear.shape[1], len(linear)))
-    U, _ = whitening.project(block.prepared, out=P[:m])
+    U, V = whitening.project(block.prepared, out=P[:m])
+    if block.roots is not None:
+        V *= block.roots
     P[m:] = linear.T
     return U, P
 
@@ -241,7 +257,7 @@ class _Errors:
 class _SecondPass:
     """Block -> what it adds to the kernel's pull-back, eᵀe of each output and V e.
 
-    Ū = back [V; Hᵀ; eᵀ]: the m-sized products came first.
+    Ū = back [V; Hᵀ; eᵀ] Ω: the m-sized products came first.
     """
 
     whitening: Whitening
@@ -258,8 +274,11 @@ class _SecondPass:
         else:
             U, P = _projected(block, self.whitening, outputs)
         e = _put_errors(block, P, outputs, self.weights)
-        U_bar = self.back @ P
-        rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, self.unexplained_bar)
+        U_bar, weights = self.back @ P, 1.0 if block.roots is None else block.roots**2
+        if block.roots is not None:
+            U_bar *= block.roots
+        diagonal_bar = self.unexplained_bar * weights
+        rows_bar = self.whitening.covariance.cross_pullback(block.prepared, U, U_bar, diagonal_bar)
         return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
 
 
@@ -290,6 +309,8 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
         linear.HR,
         linear.RR,
         float(unexplained),
+        linear.log_variance,
+        linear.surplus,
     )
 
 

@@ -93,7 +93,13 @@ class VariationalNetwork:
         return theta
 
     def loss_and_gradient(
-        self, theta: np.ndarray, X: np.ndarray, Y: np.ndarray, draws: np.ndarray, n_rows: int
+        self,
+        theta: np.ndarray,
+        X: np.ndarray,
+        Y: np.ndarray,
+        draws: np.ndarray,
+        n_rows: float,
+        weights: np.ndarray | None = None,
     ) -> tuple[float, np.ndarray]:
         """Minus the evidence lower bound per row, in nats, as a mini-batch estimates it.
 
@@ -106,8 +112,10 @@ class VariationalNetwork:
         X, Y : ndarray of shape (b, d), (b, o)
         draws : ndarray of shape (b, n_hidden)
             Standard normal numbers.
-        n_rows : int
-            Of the whole training set.
+        n_rows : float
+            Of the whole training set, each as often as it counts.
+        weights : ndarray of shape (b,), default=None
+            How often each row counts, in units of their mean over the training set; None are ones.
         """
         n = self.n_weights
         gradient = np.empty_like(theta)
@@ -117,7 +125,7 @@ class VariationalNetwork:
         forward = self._forward(layers, variances, X, draws)
 
         error, precision = Y - forward.mean, np.exp(-log_noise)
-        misfit = (error**2 + forward.variance).mean(axis=0)
+        misfit = _mean(error**2 + forward.variance, weights)
         divergence = 0.5 * (theta[:n] ** 2 + flat_variances) * self._prior_precision
         divergence += self._prior_log_std - theta[n : 2 * n] - 0.5
         loss = _log_loss(misfit, log_noise) + float(divergence.sum()) / n_rows
@@ -125,6 +133,9 @@ class VariationalNetwork:
         noise_slope[:] = 0.5 - 0.5 * precision * misfit
         to_mean = error * (-precision / len(X))
         to_variance = np.broadcast_to(0.5 * precision / len(X), error.shape)
+        if weights is not None:
+            to_mean *= weights[:, np.newaxis]
+            to_variance = to_variance * weights[:, np.newaxis]
         for k in reversed(range(len(layers))):
             np.matmul(forward.inputs[k].T, to_mean, out=slopes[k].mean)
             np.matmul(forward.squares[k].T, to_variance, out=slopes[k].log_std)
@@ -138,11 +149,13 @@ class VariationalNetwork:
         gradient[n : 2 * n] += (flat_variances * self._prior_precision - 1.0) / n_rows
         return loss, gradient
 
-    def expected_log_likelihood(self, theta: np.ndarray, X: np.ndarray, Y: np.ndarray, draws: np.ndarray) -> float:
-        """Per row, in nats; one draw of the hidden pre-activations of each row."""
+    def expected_log_likelihood(
+        self, theta: np.ndarray, X: np.ndarray, Y: np.ndarray, draws: np.ndarray, weights: np.ndarray | None = None
+    ) -> float:
+        """Per row, in nats; one draw of the hidden pre-activations of each row. The mean of the ``weights`` is 1."""
         layers, log_noise = self.split(theta)
         forward = self._forward(layers, [np.exp(2.0 * layer.log_std) for layer in layers], X, draws)
-        return -_log_loss(((Y - forward.mean) ** 2 + forward.variance).mean(axis=0), log_noise)
+        return -_log_loss(_mean((Y - forward.mean) ** 2 + forward.variance, weights), log_noise)
 
     def draw(
         self, theta: np.ndarray, n_draws: int, rng: np.random.Generator, mirrored: bool = False
@@ -202,6 +215,11 @@ class _Pass:
 def _slices(sizes: Sequence[int]) -> list[slice]:
     """Of parts that follow each other."""
     return [slice(*ends) for ends in pairwise(accumulate(sizes, initial=0))]
+
+
+def _mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Over rows, with weights of mean 1."""
+    return values.mean(axis=0) if weights is None else weights @ values / len(values)
 
 
 def _log_loss(misfit: np.ndarray, log_noise: np.ndarray) -> float:

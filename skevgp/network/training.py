@@ -33,9 +33,9 @@ class Scaling:
     y_scale: np.ndarray
 
     @classmethod
-    def of(cls, X: np.ndarray, Y: np.ndarray) -> Scaling:
-        """The scaling of a training set."""
-        return cls(*_mean_and_scale(X), *_mean_and_scale(Y))
+    def of(cls, X: np.ndarray, Y: np.ndarray, counts: np.ndarray | None = None) -> Scaling:
+        """The scaling of a training set, whose rows count so often, or once."""
+        return cls(*_mean_and_scale(X, counts), *_mean_and_scale(Y, counts))
 
     @property
     def log_unit(self) -> float:
@@ -78,12 +78,17 @@ class Scaling:
         new[1][:] = log_noise - 2.0 * np.log(self.y_scale)
 
 
-def _mean_and_scale(values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean_and_scale(values: np.ndarray, counts: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """Of columns; what is constant becomes 0, in units of itself."""
     largest = np.abs(values).max(axis=0)
     constant = np.ptp(values, axis=0) <= _ROUNDING * largest
-    mean = np.where(constant, values[0], values.mean(axis=0))
-    scale = np.where(constant, largest, (values - mean).std(axis=0))
+    if counts is None:
+        mean = np.where(constant, values[0], values.mean(axis=0))
+        deviation = (values - mean).std(axis=0)
+    else:
+        mean = np.where(constant, values[0], counts @ values / counts.sum())
+        deviation = np.sqrt(counts @ (values - mean) ** 2 / counts.sum())
+    scale = np.where(constant, largest, deviation)
     return mean, np.where(scale > 0.0, scale, 1.0)
 
 
@@ -139,6 +144,7 @@ def train(
     tol: float,
     patience: int,
     monitor: Monitor | None = None,
+    counts: np.ndarray | None = None,
 ) -> Training:
     """Adam on mini-batches of freshly shuffled rows.
 
@@ -158,11 +164,15 @@ def train(
         As in `adam`.
     patience : int
         Epochs without a gain of ``tol`` on the rows held back after which training ends.
+    counts : ndarray of shape (n,), optional
+        How often each row counts; None are ones. Rows are drawn alike, however often they count.
     """
     held_back = np.zeros(len(X), dtype=np.bool_)
     held_back[rng.permutation(len(X))[:n_held_back]] = True
     others = X[held_back], Y[held_back]
     X, Y = X[~held_back], Y[~held_back]
+    weights, others_weights = _in_units_of_mean(counts, ~held_back), _in_units_of_mean(counts, held_back)
+    n_rows = float(len(X) if counts is None else counts[~held_back].sum())
     steps = -(-len(X) // batch_size)
     order = np.empty(0, dtype=int)
 
@@ -172,14 +182,15 @@ def train(
             order = rng.permutation(len(X))
         batch, order = order[:batch_size], order[batch_size:]
         draws = rng.standard_normal((len(batch), network.n_hidden))
-        return network.loss_and_gradient(theta, X[batch], Y[batch], draws, len(X))
+        own = None if weights is None else weights[batch]
+        return network.loss_and_gradient(theta, X[batch], Y[batch], draws, n_rows, own)
 
     watch = None
     if n_held_back > 0:
         # The same draws at each epoch: scores differ because parameters do.
         draws = rng.standard_normal((n_held_back, network.n_hidden))
         watch = _EarlyStopping(
-            lambda theta: network.expected_log_likelihood(theta, *others, draws), steps, tol, patience
+            lambda theta: network.expected_log_likelihood(theta, *others, draws, others_weights), steps, tol, patience
         )
     minimum = adam(objective, start, network.limits(), max_iter * steps, learning_rate, tol, monitor, stop=watch)
     losses = np.array(minimum.loss_curve)
@@ -190,6 +201,11 @@ def train(
         np.array([] if watch is None else watch.scores),
         minimum.n_iter == max_iter * steps and not is_flat(losses, tol),
     )
+
+
+def _in_units_of_mean(counts: np.ndarray | None, rows: np.ndarray) -> np.ndarray | None:
+    """The counts of some rows, if there are any, with a mean of 1."""
+    return None if counts is None or not rows.any() else counts[rows] / counts[rows].mean()
 
 
 class _EarlyStopping:

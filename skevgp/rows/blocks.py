@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import cached_property
 from typing import Any, Protocol, Self
 
@@ -46,6 +46,9 @@ class Block:
         best in Fortran's order.
     n_features : int
         p.
+    counts, roots : ndarray of shape (n,), optional
+        w, how often a row counts, and √ω, which ``linear`` has been multiplied by; ω = w / v, where the row's noise
+        variance is σ² v. None: 1.
     may_keep : bool
         Whether there is room for ``kept``.
     kept : (whitening, k(X_m, X), [V; Hᵀ; rᵀ]) or None
@@ -55,6 +58,8 @@ class Block:
     prepared: Any
     linear: np.ndarray
     n_features: int
+    counts: np.ndarray | None = None
+    roots: np.ndarray | None = None
     may_keep: bool = False
     kept: tuple[Any, np.ndarray, np.ndarray] | None = None
 
@@ -143,8 +148,16 @@ class LinearSums(Protocol):
     """The sums over rows that do not depend on any parameter: computed once per data set."""
 
     @property
-    def n_rows(self) -> int:
+    def n_rows(self) -> float:
         """N."""
+
+    @property
+    def length(self) -> int:
+        """How many rows there are, whatever they count."""
+
+    @property
+    def log_variance(self) -> float:
+        """Σ w log v."""
 
     def of(self, outputs: slice) -> LinearStatistics:
         """Of some outputs, all in one group."""
@@ -158,27 +171,42 @@ class LinearStatistics:
 
     Attributes
     ----------
-    n_rows : int
+    n_rows : float
+        Σ w: rows, each as often as it counts.
     HH : ndarray of shape (p, p)
-        HᵀH.
+        Hᵀ Ω H, with Ω = diag(ω) (see `Block`).
     HR : ndarray of shape (p, o)
-        Hᵀr.
+        Hᵀ Ω r.
     RR : ndarray of shape (o,)
-        rᵀr of each output.
+        rᵀ Ω r of each output.
+    length : int
+        Rows, however often they count.
+    log_variance : float
+        Σ w log v.
+    surplus : float
+        Σ max(ω, 1) - Σ w.
     """
 
-    n_rows: int
+    n_rows: float
     HH: np.ndarray
     HR: np.ndarray
     RR: np.ndarray
+    length: int = 0
+    log_variance: float = 0.0
+    surplus: float = 0.0
 
     @classmethod
     def of_block(cls, block: Block) -> LinearStatistics:
-        total, p = block.linear.T @ block.linear, block.n_features
-        return cls(len(block.linear), total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy())
+        total, p, n = block.linear.T @ block.linear, block.n_features, len(block.linear)
+        sums = total[:p, :p], total[:p, p:], np.diagonal(total)[p:].copy()
+        if block.counts is None or block.roots is None:
+            return cls(n, *sums, n)
+        n_rows = float(block.counts.sum())
+        log_variance = float(block.counts @ (np.log(block.counts) - 2.0 * np.log(block.roots)))
+        return cls(n_rows, *sums, n, log_variance, float(np.maximum(block.roots**2, 1.0).sum()) - n_rows)
 
     def of(self, outputs: slice) -> LinearStatistics:
-        return LinearStatistics(self.n_rows, self.HH, self.HR[:, outputs], self.RR[outputs])
+        return replace(self, HR=self.HR[:, outputs], RR=self.RR[outputs])
 
     def __add__(self, other: LinearStatistics) -> LinearStatistics:
         return LinearStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))
@@ -191,8 +219,20 @@ class SplitStatistics:
     parts: dict[int, LinearStatistics]
 
     @property
-    def n_rows(self) -> int:
-        return next(iter(self.parts.values())).n_rows
+    def n_rows(self) -> float:
+        return self._first.n_rows
+
+    @property
+    def length(self) -> int:
+        return self._first.length
+
+    @property
+    def log_variance(self) -> float:
+        return self._first.log_variance
+
+    @property
+    def _first(self) -> LinearStatistics:
+        return next(iter(self.parts.values()))
 
     def of(self, outputs: slice) -> LinearStatistics:
         first = max(first for first in self.parts if first <= outputs.start)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -13,6 +14,7 @@ from sklearn.utils import check_array
 from .._optional import require
 from .._validation import as_floats, check_magnitude
 from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
+from .chosen import Chosen
 from .mapped import MappedRows, RowShapes
 from .maps import fit_map, fresh_map
 from .source import LocalSource, RawRows
@@ -22,6 +24,9 @@ from .threads import BlockMap, ordered_sum, single_threaded_libraries
 _SUMMED_AT_ONCE = 8
 # A map without partial_fit is fitted to so many rows, evenly spread.
 _MAP_SAMPLE = 10_000
+
+# Takes the lowest and the highest of some numbers, and raises an error if they will not do.
+Range = Callable[[float, float], None]
 
 
 def is_dask(values: Any) -> bool:
@@ -82,6 +87,52 @@ def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
     return fitted.compute()
 
 
+@dataclass(frozen=True)
+class RowWeights:
+    """How often the rows of Dask arrays count, and how noisy they are.
+
+    Attributes
+    ----------
+    counts, variance : list of Delayed, optional
+        w and v of each chunk.
+    kept : ndarray of shape (n_chunks,), optional
+        Rows of each chunk that count at all; None: all.
+    """
+
+    counts: list[Any] | None = None
+    variance: list[Any] | None = None
+    kept: np.ndarray | None = None
+
+    @classmethod
+    def of(cls, X: Any, counts: Any, variance: Any, check_counts: Range, check_variance: Range) -> RowWeights:
+        """From arrays (n,), Dask arrays or None; checked by their lowest and highest entries."""
+        counts, variance = _chunks_like(X, counts, "sample_weight"), _chunks_like(X, variance, "relative_variance")
+        kept = None
+        for chunks, check in ((counts, check_counts), (variance, check_variance)):
+            if chunks is not None:
+                lowest, highest, positive = zip(*_dask().compute(*map(_dask().delayed(_range), chunks)), strict=True)
+                check(float(np.min(lowest)), float(np.max(highest)))
+                kept = np.array(positive) if chunks is counts else kept
+        return cls(counts, variance, kept)
+
+    def labels_of(self, labels: np.ndarray) -> np.ndarray:
+        """Of labels (n,) of all rows those of the rows that count."""
+        if self.counts is None:
+            return labels
+        return labels[np.concatenate(_dask().compute(*self.counts)) != 0.0]
+
+
+def _chunks_like(X: Any, values: Any, name: str) -> list[Any] | None:
+    """Numbers of the rows, in the chunks of X."""
+    if values is None:
+        return None
+    values = values if is_dask(values) else _dask_array().from_array(as_floats(values, name), chunks="auto")
+    values = as_rows(values, name, (1,))
+    if len(values) != len(X):
+        raise ValueError(f"{name} must have the shape (n_samples,) = ({len(X)},); got ({len(values)},).")
+    return list(values.rechunk({0: X.chunks[0]}).to_delayed().ravel())
+
+
 class DaskSource:
     """Rows that Dask's workers hold.
 
@@ -92,17 +143,35 @@ class DaskSource:
         In the same chunks.
     feature_map, kernel_map : transformer or None
         Fitted.
-    shapes : (tuple, tuple), default=None
+    weights : RowWeights, optional
+        Of the chunks; rows of weight 0 are left out.
+    shapes : (tuple, tuple), optional
         As of `MappedRows`.
     """
 
-    def __init__(self, X: Any, y: Any, feature_map: Any, kernel_map: Any, shapes: RowShapes | None = None):
-        dask = _dask()
+    positions: np.ndarray | None = None
+
+    def __init__(
+        self,
+        X: Any,
+        y: Any,
+        feature_map: Any,
+        kernel_map: Any,
+        weights: RowWeights | None = None,
+        shapes: RowShapes | None = None,
+    ):
+        dask, weights = _dask(), RowWeights() if weights is None else weights
         maps = dask.delayed((feature_map, kernel_map), traverse=False)
-        chunks = zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True)
-        self._partitions: Sequence[Any] = _held([dask.delayed(_partition)(*chunk, maps, shapes) for chunk in chunks])
-        self._ends: np.ndarray = np.cumsum(X.chunks[0])
-        self.n_rows = len(X)
+        lengths = np.array(X.chunks[0]) if weights.kept is None else weights.kept
+        none = [None] * len(lengths)
+        given = X.to_delayed().ravel(), y.to_delayed().ravel()
+        chunks = zip(*given, weights.counts or none, weights.variance or none, strict=True)
+        partition = dask.delayed(_partition)
+        self._partitions: Sequence[Any] = _held(
+            [partition(*chunk, maps, shapes) for chunk, n in zip(chunks, lengths, strict=True) if n > 0]
+        )
+        self._ends: np.ndarray = np.cumsum(lengths[lengths > 0])
+        self.n_rows = int(lengths.sum())
 
     def sum(self, function: Callable[[RawRows], Any]) -> Any:
         return _sum_over(self._partitions, function)
@@ -118,7 +187,7 @@ class DaskSource:
             parts.append(dask.delayed(_taken)(self._partitions[owner], own))
         found = dask.compute(*parts)
         back = np.argsort(order)
-        return RawRows(*(np.concatenate(columns)[back] for columns in zip(*found, strict=True)))
+        return RawRows(*_joined(found))[back]
 
     def part(self, first: int, end: int) -> DaskSource:
         delayed, part = _dask().delayed, copy(self)
@@ -215,14 +284,27 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
 # --- what runs on the workers ------------------------------------------------------------------------------------
 
 
-def _partition(X: np.ndarray, y: np.ndarray, maps: tuple[Any, Any], shapes: RowShapes | None) -> LocalSource:
+def _partition(
+    X: np.ndarray,
+    y: np.ndarray,
+    counts: np.ndarray | None,
+    variance: np.ndarray | None,
+    maps: tuple[Any, Any],
+    shapes: RowShapes | None,
+) -> LocalSource:
     # Partitions are worked on at the same time, and transformers need not be safe for that.
     maps = deepcopy(maps)
     X = check_array(X, dtype=[np.float64, np.float32], input_name="X")
     y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
     check_magnitude(X, "X")
     check_magnitude(y, "y")
-    return LocalSource(MappedRows(X, X, y, *maps, shapes), len(X))
+    chosen = Chosen.in_order(len(X), *(None if each is None else as_floats(each, "") for each in (counts, variance)))
+    return LocalSource(MappedRows(X, X, y, *maps, chosen, shapes), chosen.n_rows)
+
+
+def _range(values: np.ndarray) -> tuple[float, float, int]:
+    values = as_floats(values, "sample_weight or relative_variance")
+    return float(values.min()), float(values.max()), int(np.count_nonzero(values))
 
 
 def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
@@ -242,9 +324,15 @@ def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:
         return partition.sum(function)
 
 
-def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    raw = partition.take(rows)
-    return raw.inputs, raw.features, raw.targets
+def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[Any, ...]:
+    return partition.take(rows).parts
+
+
+def _joined(found: Sequence[tuple[Any, ...]]) -> list[Any]:
+    """Rows of several partitions, part by part; a partition whose rows all count once has no weights."""
+    weighted = any(parts[-1] is not None for parts in found)
+    ones = ((np.ones(len(parts[0])) if part is None and weighted else part for part in parts) for parts in found)
+    return [None if columns[0] is None else np.concatenate(columns) for columns in zip(*ones, strict=True)]
 
 
 def _partly_fitted(fitted: Any, X: np.ndarray, y: np.ndarray) -> Any:

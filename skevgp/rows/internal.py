@@ -62,7 +62,12 @@ class MakeBlock:
 
 def _block(rows: RawRows, prepared: Any) -> Block:
     # A column's numbers side by side: products and errors take the columns, not the rows.
-    return Block(prepared, np.asfortranarray(np.hstack([rows.features, rows.targets])), rows.features.shape[1])
+    linear = np.asfortranarray(np.hstack([rows.features, rows.targets]))
+    roots = None
+    if rows.precision is not None:
+        roots = np.sqrt(rows.precision)
+        linear *= roots[:, np.newaxis]
+    return Block(prepared, linear, rows.features.shape[1], rows.counts, roots)
 
 
 @dataclass(frozen=True)
@@ -73,7 +78,7 @@ class _InternalMoments:
 
     def __call__(self, raw: RawRows) -> tuple[Moments, Moments]:
         rows = self.to_internal(raw)
-        return Moments.of(rows.inputs), Moments.of(rows.targets)
+        return Moments.of(rows.inputs, rows.counts), Moments.of(rows.targets, rows.precision)
 
 
 @dataclass(frozen=True)
@@ -117,10 +122,20 @@ class Rows:
         """Of the residuals of all outputs."""
         return self._moments[1]
 
+    @property
+    def total(self) -> float:
+        """Σ w: rows, each as often as it counts."""
+        return self.inputs.n
+
+    @property
+    def mean_precision(self) -> float:
+        """The mean of 1 / v, Σ ω / Σ w: a noise variance σ² is one of σ² / this, on average."""
+        return self.residuals.n / self.inputs.n
+
     def scatter(self) -> np.ndarray:
-        """Variance (o,) of the residuals; 1 where they do not vary."""
+        """The noise variance σ² (o,) that would explain how residuals vary; the mean of 1 / v where they do not."""
         scatter = self.residuals.variance[self.columns]
-        return np.where(scatter > 0.0, scatter, 1.0)
+        return np.where(scatter > 0.0, scatter, 1.0) * self.mean_precision
 
     def some(self, chosen: np.ndarray) -> RawRows:
         """Rows by index, in internal units."""
@@ -159,16 +174,20 @@ class Rows:
         """``size`` of the rows, drawn at random and held in memory, in random order."""
         chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
         raw, order = self.source.take(chosen), rng.permutation(size)
-        source = LocalSource.of(raw.inputs[order], raw.features[order], raw.targets[order])
-        return replace(self, source=source)
+        return replace(self, source=LocalSource.holding(raw[order]))
+
+    def as_given(self) -> np.ndarray | None:
+        """The rows, by index, in the order in which the user gave them; None if that is theirs."""
+        positions = self.source.positions
+        return None if positions is None else np.argsort(positions)
+
+    def some_of(self, chosen: np.ndarray, share: float) -> Rows:
+        """Rows by index, in ascending order where the source is Dask's, with a share of the memory."""
+        return replace(self, source=self.source.some(chosen), share=self.share * share)
 
     def part(self, first: int, end: int, share: float) -> Rows:
         """Consecutive rows, with a share of the memory."""
         return replace(self, source=self.source.part(first, end), share=self.share * share)
-
-    def some_of(self, chosen: np.ndarray, share: float) -> Rows:
-        """Rows by index, in ascending order, with a share of the memory."""
-        return replace(self, source=self.source.some(chosen), share=self.share * share)
 
     def within(self, group: slice) -> Rows:
         """The same rows with some of these outputs."""

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from .chosen import Chosen
 from .maps import MAP_ROWS, apply_map, shape_text, take_rows
 from .source import RawRows
 
@@ -40,7 +41,9 @@ class MappedRows:
     y : ndarray of shape (n, o)
     feature_map, kernel_map : transformer or None
         Fitted.
-    shapes : (tuple, tuple), default=None
+    chosen : Chosen, optional
+        Which rows of these count; None are all.
+    shapes : (tuple, tuple), optional
         Of a row's inputs and features; None are those of the first row.
     """
 
@@ -51,17 +54,20 @@ class MappedRows:
         y: np.ndarray,
         feature_map: Any,
         kernel_map: Any,
+        chosen: Chosen | None = None,
         shapes: RowShapes | None = None,
     ):
         self.given, self.X, self.y = given, X, y
+        self.chosen = Chosen(len(X)) if chosen is None else chosen
         self.feature_map, self.kernel_map = feature_map, kernel_map
         self._mapped: tuple[np.ndarray, np.ndarray] | None = None
         self._lock = Lock()
         self._shapes = shapes
         first = self._through_maps(slice(0, MAP_ROWS))
         made = (first[0][0].size if kernel_map is not None else 0) + first[1][0].size
-        if made and 8 * made * len(X) <= MAPPED_BYTES:
-            self._mapped = first if len(X) <= MAP_ROWS else self._through_maps(slice(0, len(X)))
+        n_rows = self.chosen.n_rows
+        if made and 8 * made * n_rows <= MAPPED_BYTES:
+            self._mapped = first if n_rows <= MAP_ROWS else self._through_maps(slice(0, n_rows))
 
     def __call__(self, rows: slice | np.ndarray) -> RawRows:
         if self._mapped is not None:
@@ -70,10 +76,16 @@ class MappedRows:
             # Transformers need not be safe to call from several threads.
             with self._lock:
                 inputs, features = self._through_maps(rows)
-        return RawRows(inputs, features, np.asarray(self.y[rows], dtype=np.float64))
+        weights = (None if each is None else each[rows] for each in (self.chosen.counts, self.chosen.precision))
+        return RawRows(inputs, features, np.asarray(self.y[self._given(rows)], dtype=np.float64), *weights)
+
+    def _given(self, rows: slice | np.ndarray) -> slice | np.ndarray:
+        """Where rows are among those that were given."""
+        return rows if self.chosen.positions is None else self.chosen.positions[rows]
 
     def _through_maps(self, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""
+        rows = self._given(rows)
         X = take_rows(self.X, rows)
         given = X if self.given is self.X else take_rows(self.given, rows)
         mapped = map_rows(given, X, self.feature_map, self.kernel_map)

@@ -9,15 +9,17 @@ from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion
+from sklearn.utils.validation import has_fit_parameter
 
 from .._sklearn import safe_indexing
 from .._validation import LARGEST, as_floats, check_magnitude, is_frame
+from .chosen import Chosen, rows_of
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
 
 
-def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
+def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str, chosen: Chosen | None = None) -> Any:
     """A fitted clone of a transformer, or None.
 
     Parameters
@@ -28,13 +30,24 @@ def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str) -> Any:
     y : ndarray of shape (n,) or (n, o)
     name : str
         The argument's name, for errors.
+    chosen : Chosen, optional
+        The rows to fit it to; how often they count it is told if it takes a ``sample_weight``. None are all.
 
     Raises
     ------
     TypeError
         If it is not a transformer.
     """
-    return None if feature_map is None else fresh_map(feature_map, name).fit(X, y)
+    if feature_map is None:
+        return None
+    fitted = fresh_map(feature_map, name)
+    if chosen is None:
+        return fitted.fit(X, y)
+    if chosen.counts is not None and has_fit_parameter(fitted, "sample_weight"):
+        rows = chosen.positions
+        return fitted.fit(rows_of(X, rows), rows_of(y, rows), sample_weight=chosen.counts)
+    rows = chosen.positions if chosen.repeated is None else chosen.repeated
+    return fitted.fit(rows_of(X, rows), rows_of(y, rows))
 
 
 def fresh_map(feature_map: Any, name: str) -> Any:

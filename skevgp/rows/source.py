@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Protocol, Self, TypeVar
+from typing import Any, Protocol, Self, TypeVar
 
 import numpy as np
 
@@ -30,11 +30,30 @@ class RawRows:
     features : ndarray of shape (n, p) or (n, o, p)
         h(x), of all outputs or of each.
     targets : ndarray of shape (n, o)
+    counts, precision : ndarray of shape (n,), optional
+        w, how often a row counts, and ω = w / v, where its noise variance is σ² v. None: 1; both or neither.
     """
 
     inputs: np.ndarray
     features: np.ndarray
     targets: np.ndarray
+    counts: np.ndarray | None = None
+    precision: np.ndarray | None = None
+
+    def __getitem__(self, rows: slice | np.ndarray) -> RawRows:
+        """Some of them."""
+        some: list[Any] = [None if part is None else part[rows] for part in self.parts]
+        return RawRows(*some)
+
+    @property
+    def parts(self) -> tuple[Any, ...]:
+        """Their arrays, or None, in the order of the attributes."""
+        return self.inputs, self.features, self.targets, self.counts, self.precision
+
+    @property
+    def total(self) -> float:
+        """Σ w."""
+        return len(self.inputs) if self.counts is None else float(self.counts.sum())
 
     def of(self, columns: Columns) -> RawRows:
         """Some of the outputs; of a single one inputs and features have no axis of outputs."""
@@ -59,6 +78,8 @@ class Source(Protocol):
     """All rows of a data set: in memory, in a file, or on other machines. Their order never changes."""
 
     n_rows: int
+    # Of each row among the user's; None if they are in his order.
+    positions: np.ndarray | None
 
     def sum(self, function: Callable[[RawRows], Total]) -> Total:
         """The sum of function(piece) over pieces of the rows, by ``+``; ``function`` can be pickled."""
@@ -70,7 +91,7 @@ class Source(Protocol):
         """Consecutive rows, at least one."""
 
     def some(self, rows: np.ndarray) -> Source:
-        """Some rows, at least one, by index in ascending order."""
+        """Rows by index, at least one; in ascending order if they are Dask's, whose chunks stay in theirs."""
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
@@ -82,24 +103,30 @@ class Moments:
 
     Attributes
     ----------
-    n : int
+    n : float
+        The sum of the weights, if rows have some.
     mean, squares, lowest, highest : ndarray of shape (columns,), or (o, columns) of columns for each output
         ``squares`` is the sum of squared deviations from the mean.
     """
 
-    n: int
+    n: float
     mean: np.ndarray
     squares: np.ndarray
     lowest: np.ndarray
     highest: np.ndarray
 
     @classmethod
-    def of(cls, values: np.ndarray) -> Self:
-        """Of an array (n, columns) with at least one row."""
+    def of(cls, values: np.ndarray, weights: np.ndarray | None = None) -> Self:
+        """Of an array (n, columns) with at least one row, and its rows' weights (n,), above 0; None are ones."""
         lowest, highest = values.min(axis=0), values.max(axis=0)
+        n = len(values) if weights is None else float(weights.sum())
         # The mean of equal numbers may round.
-        mean = np.where(lowest == highest, lowest, values.mean(axis=0))
-        return cls(len(values), mean, np.sum((values - mean) ** 2, axis=0), lowest, highest)
+        average = values.mean(axis=0) if weights is None else np.tensordot(weights, values, 1) / n
+        mean = np.where(lowest == highest, lowest, average)
+        squares = (values - mean) ** 2
+        return cls(
+            n, mean, np.sum(squares, axis=0) if weights is None else np.tensordot(weights, squares, 1), lowest, highest
+        )
 
     def __add__(self, other: Self) -> Self:
         n, difference = self.n + other.n, other.mean - self.mean
@@ -132,8 +159,12 @@ class Moments:
 
 
 def moments_of_rows(raw: RawRows) -> tuple[Moments, Moments, Moments]:
-    """Of inputs, features and targets."""
-    return Moments.of(raw.inputs), Moments.of(raw.features), Moments.of(raw.targets)
+    """Of inputs, features and targets, whose weights are ω: the noisier a row, the less it says of them."""
+    return (
+        Moments.of(raw.inputs, raw.counts),
+        Moments.of(raw.features, raw.counts),
+        Moments.of(raw.targets, raw.precision),
+    )
 
 
 class LocalSource:
@@ -144,15 +175,21 @@ class LocalSource:
     load : callable
         A slice, or indices -> `RawRows`; may be called from several threads.
     n_rows : int
+    positions : ndarray of shape (n_rows,), optional
     """
 
-    def __init__(self, load: Callable[[slice | np.ndarray], RawRows], n_rows: int):
-        self.load, self.n_rows = load, n_rows
+    def __init__(self, load: Callable[[slice | np.ndarray], RawRows], n_rows: int, positions: np.ndarray | None = None):
+        self.load, self.n_rows, self.positions = load, n_rows, positions
 
     @classmethod
     def of(cls, inputs: np.ndarray, features: np.ndarray, targets: np.ndarray) -> Self:
         """Of arrays."""
-        return cls(lambda rows: RawRows(inputs[rows], features[rows], targets[rows]), len(inputs))
+        return cls.holding(RawRows(inputs, features, targets))
+
+    @classmethod
+    def holding(cls, rows: RawRows) -> Self:
+        """Of rows in memory."""
+        return cls(rows.__getitem__, len(rows.inputs))
 
     def sum(self, function: Callable[[RawRows], Total]) -> Total:
         pieces = (self.load(slice(first, first + PASS_ROWS)) for first in range(0, self.n_rows, PASS_ROWS))
@@ -165,6 +202,7 @@ class LocalSource:
         return LocalSource(_Part(self.load, first, end), end - first)
 
     def some(self, rows: np.ndarray) -> LocalSource:
+        """Rows by index, as a data set of their own."""
         return LocalSource(_Some(self.load, rows), len(rows))
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
@@ -190,10 +228,10 @@ class _Part:
 @dataclass(frozen=True)
 class _Some:
     load: Callable[[slice | np.ndarray], RawRows]
-    rows: np.ndarray
+    chosen: np.ndarray
 
     def __call__(self, rows: slice | np.ndarray) -> RawRows:
-        return self.load(self.rows[rows])
+        return self.load(self.chosen[rows])
 
 
 @dataclass(frozen=True)

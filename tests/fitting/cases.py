@@ -4,8 +4,8 @@ import numpy as np
 
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import Request
-from skevgp.fitting.start import Units
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.fitting.units import Units
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
 from skevgp.rows.source import LocalSource, Moments
 from skevgp.solvers import LBFGS

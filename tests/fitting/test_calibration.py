@@ -6,7 +6,7 @@ from scipy.linalg import solve_triangular
 
 from skevgp.fitting.calibration import calibrated_noise, left_out_scores
 from skevgp.inference.model import SparseModel
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.internal import Rows
 from skevgp.rows.source import LocalSource

@@ -11,7 +11,7 @@ from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import BoundAtOptimum, features_alone_bound, upper_bound
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.rows.source import Moments

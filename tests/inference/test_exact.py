@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skevgp.inference.exact import ExactModel
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.constant import Constant
 from skevgp.kernels.covariances import Sum
 from skevgp.kernels.dot_product import DotProduct

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from skevgp.inference.model import SparseModel
-from skevgp.inference.posterior import Predictor
-from skevgp.inference.prior import CoefficientPrior
+from skevgp.inference.posterior import CoefficientPrior, Predictor
 
 from ..oracle import problem, squared_exponential
 
@@ -199,3 +198,31 @@ def test_q_at_the_prior_predicts_the_prior():
         H = H_NEW * prior.scale[o]
         k = values["signal"][o] * squared_exponential(X_NEW, X_NEW, values["hyperparameters"])
         np.testing.assert_allclose(covariance[:, :, o], k + H @ H.T, atol=1e-10)
+
+
+ROOT = np.array([[[2.0, 0.0], [1.0, 0.5]], [[1.0, 0.2], [0.0, 3.0]]])
+PRIOR = CoefficientPrior(
+    np.array([[1.0, 2.0], [3.0, 4.0]]), np.sqrt(np.sum(ROOT**2, axis=2)), np.array([[0.1, 0.0], [0.0, 0.2]]), ROOT
+)
+
+
+def test_the_offset_is_where_the_reference_is():
+    for o in range(2):
+        np.testing.assert_allclose(PRIOR.offset[o], PRIOR.mean[o] + ROOT[o] @ PRIOR.reference[o])
+
+
+def test_independent_weights_have_a_diagonal_root():
+    prior = CoefficientPrior(PRIOR.mean, PRIOR.scale, PRIOR.reference)
+    np.testing.assert_array_equal(prior.roots()[1], np.diag(PRIOR.scale[1]))
+    np.testing.assert_allclose(prior.times(PRIOR.reference), PRIOR.scale * PRIOR.reference)
+
+
+def test_outputs_and_units_of_a_prior():
+    own = PRIOR.outputs([1])
+    np.testing.assert_array_equal(own.roots(), ROOT[[1]])
+    scaled = PRIOR.scaled(np.array([10.0, 0.1]))
+    np.testing.assert_allclose(scaled.offset, PRIOR.offset * [[10.0], [0.1]])
+    np.testing.assert_allclose(
+        scaled.roots() @ scaled.roots().transpose(0, 2, 1),
+        ROOT @ ROOT.transpose(0, 2, 1) * np.array([100.0, 0.01])[:, np.newaxis, np.newaxis],
+    )

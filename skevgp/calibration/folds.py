@@ -16,6 +16,34 @@ _FEWEST_GROUPS, _GAP = 3, 0.15
 
 
 @dataclass(frozen=True)
+class CrossValidation:
+    """How rows are left out.
+
+    Attributes
+    ----------
+    n_folds : int
+        No more than there are rows or groups.
+    groups : ndarray of shape (n,), optional
+        Which rows are left out together; None: chance says.
+    wide : bool, default=True
+        Whether nobody set bounds for the signal: it may then leave those of the fit, which keep kernels from becoming
+        long waves of huge height. Here the kernel's shape stays.
+    """
+
+    n_folds: int
+    groups: np.ndarray | None = None
+    wide: bool = True
+
+    def folds(self, n_rows: int, rng: np.random.RandomState) -> list[Fold]:
+        """Folds of all rows; none if these are too few."""
+        if n_rows < FEWEST_ROWS:
+            return []
+        if self.groups is None:
+            return random_folds(n_rows, self.n_folds, rng)
+        return folds_of_groups(self.groups, self.n_folds, rng)
+
+
+@dataclass(frozen=True)
 class Fold:
     """Rows that are left out together.
 
@@ -29,10 +57,6 @@ class Fold:
 
     rows: np.ndarray
     predicted: np.ndarray
-
-    @property
-    def size(self) -> int:
-        return len(self.rows)
 
 
 def random_folds(n_rows: int, n_folds: int, rng: np.random.RandomState) -> list[Fold]:
@@ -63,9 +87,7 @@ def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState
     return _thinned([np.flatnonzero(folds == fold) for fold in range(n_folds)], rng)
 
 
-def _thinned(
-    parts: list[np.ndarray], rng: np.random.RandomState, inner: list[np.ndarray] | None = None
-) -> list[Fold]:
+def _thinned(parts: list[np.ndarray], rng: np.random.RandomState, inner: list[np.ndarray] | None = None) -> list[Fold]:
     """Folds of these rows; of ``inner`` no more than `PREDICTED_ROWS` are predicted, an equal share of each."""
     inner = parts if inner is None else inner
     share = min(1.0, PREDICTED_ROWS / sum(map(len, inner)))

@@ -1,13 +1,13 @@
 """Rows that were left out, as the others predict them, for any signal and noise variance: no pass over rows for each.
 
-Of an output let ρ = s²/σ² be the ratio of the two. In the whitened coordinates of `bounds`, β = μ_β + C (w₀ + w), the
-precision of v given w is I + ρ V Vᵀ. With that at one ratio, I + ρ₀ V Vᵀ = L Lᵀ, and the eigenvalues λ and eigenvectors
-U of L⁻¹ L⁻ᵀ it is
+Of an output let ρ = s²/σ² be the ratio of the two. In the whitened coordinates of `inference.bounds`, with
+β = μ_β + C (w₀ + w), the precision of v given w is I + ρ V Vᵀ. With that at one ratio, I + ρ₀ V Vᵀ = L Lᵀ, and the
+eigenvalues λ and eigenvectors U of L⁻¹ L⁻ᵀ it is
 
     I + ρ V Vᵀ = L U D Uᵀ Lᵀ,   D = diag(λ + (ρ/ρ₀) (1 - λ)),
 
-so that in the coordinates z = Uᵀ L⁻¹ v(x) of a row it is diagonal for all ρ. With X = Uᵀ L⁻¹ V H and t = Uᵀ L⁻¹ V r what
-is left for w are p-sized matrices,
+so that in the coordinates z = Uᵀ L⁻¹ v(x) of a row it is diagonal for all ρ. With X = Uᵀ L⁻¹ V H and t = Uᵀ L⁻¹ V r
+what is left for w are p-sized matrices,
 
     precision of w: I + σ⁻² Cᵀ M C,   M = HᵀH - ρ Xᵀ D⁻¹ X,   its linear term: σ⁻² Cᵀ (Hᵀr - ρ Xᵀ D⁻¹ t) - w₀,
 
@@ -31,9 +31,9 @@ import numpy as np
 from scipy.linalg import eigh
 
 from .._linalg import diagonal_of, jittered_cholesky, triangular_inverse
+from ..inference.bounds import Group, PosteriorFamily
+from ..inference.statistics import SufficientStatistics, Whitening
 from ..rows.blocks import AnyBlock
-from .bounds import Group, PosteriorFamily
-from .statistics import SufficientStatistics, Whitening
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,21 @@ class SeenRows:
         k(x, x) - |v|².
     features : ndarray of shape (n, p)
     residuals : ndarray of shape (n, o)
+    noise : ndarray of shape (n,)
+        Of each row, relative to σ².
+    counts : ndarray of shape (n,)
+        How often it counts.
     """
 
     V: np.ndarray
     unexplained: np.ndarray
     features: np.ndarray
     residuals: np.ndarray
+    noise: np.ndarray
+    counts: np.ndarray
 
     def __add__(self, other: SeenRows) -> SeenRows:
-        each = (
-            np.concatenate([getattr(self, field.name), getattr(other, field.name)]) for field in fields(self)
-        )
+        each = (np.concatenate([getattr(self, field.name), getattr(other, field.name)]) for field in fields(self))
         return SeenRows(*each)
 
 
@@ -72,7 +76,13 @@ class Seen:
         block, outputs = block.of(self.outputs)
         _, V = self.whitening.project(block.prepared)
         unexplained = self.whitening.unexplained(block.prepared, V)
-        return SeenRows(V.T, unexplained, block.features, block.residuals[:, outputs])
+        features, residuals, counts = block.features, block.residuals[:, outputs], np.ones(len(unexplained))
+        if block.roots is None or block.counts is None:
+            return SeenRows(V.T, unexplained, features, residuals, counts, counts)
+        roots = block.roots[:, np.newaxis]
+        return SeenRows(
+            V.T, unexplained, features / roots, residuals / roots, block.counts / block.roots**2, block.counts
+        )
 
 
 @dataclass(frozen=True)
@@ -142,7 +152,7 @@ class LeftOut:
             self._at[ratio] = _AtRatio(
                 seen[:, p:],
                 rows.features - seen[:, :p],
-                1.0 + ratio * variance,
+                rows.noise + ratio * variance,
                 statistics.HH - told[:, :p],
                 statistics.HR - told[:, p:],
             )

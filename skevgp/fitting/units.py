@@ -1,0 +1,177 @@
+"""The internal units: what the features alone explain of y is taken out of it, and what they leave is of size one."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy.linalg import cho_solve
+
+from .._linalg import diagonal_of, jittered_cholesky
+from ..inference.posterior import CoefficientPrior, Predictor
+from ..rows.internal import Rows
+from ..rows.source import Columns, Moments, RawRows, Source, times_weights
+from ..rows.threads import BlockMap
+
+# So that the lowest noise variance in the user's units is not rounded to 0.
+SMALLEST_UNIT = 1e-140
+
+
+@dataclass(frozen=True)
+class _LeftOver:
+    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; if asked for, HᵀH, Σ ω and Σ w too.
+
+    Where rows have weights, each product has the factor ω. HᵀH is (p, p), or (o, p, p) of features for each output.
+    """
+
+    target_mean: np.ndarray
+    coef: np.ndarray
+    with_products: bool = False
+
+    def __call__(self, raw: RawRows) -> tuple[Any, ...]:
+        H = raw.features
+        left_over = raw.targets - self.target_mean - times_weights(H, self.coef)
+        weighted, precision = left_over, raw.total
+        if raw.precision is not None:
+            weighted, precision = left_over * raw.precision[:, np.newaxis], float(raw.precision.sum())
+        HL = weighted.T @ H if H.ndim == 2 else np.einsum("no,nop->op", weighted, H)
+        sums = HL, np.einsum("no,no->o", weighted, left_over)
+        if not self.with_products:
+            return sums
+        by_output = H if H.ndim == 2 else H.transpose(1, 0, 2)
+        HW = np.swapaxes(by_output, -1, -2)
+        HW = HW if raw.precision is None else HW * raw.precision
+        return (*sums, HW @ by_output, precision, raw.total)
+
+
+def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
+    """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
+
+    The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
+    the rounding of the normal equations.
+
+    Parameters
+    ----------
+    source : Source
+        n rows with p features and o targets.
+    target_mean : ndarray of shape (o,)
+    prior : CoefficientPrior
+        Of the weights; a scale of 0 keeps one at its mean.
+
+    Returns
+    -------
+    w : ndarray of shape (o, p)
+    left_over : ndarray of shape (o,)
+        Root mean square of what they leave over, the noisier a row the less it counts.
+    """
+    (o, p), roots = prior.scale.shape, prior.roots()
+    w = np.zeros((o, p))
+    HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
+    products = np.swapaxes(roots, 1, 2) @ HH @ roots
+    everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
+    together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
+    # Where outputs share their weights, what each leaves over decides how much it counts.
+    shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
+    for share in shares if together else ():
+        noise = share * squares / n_rows
+        steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
+        for _ in range(3):
+            for step in steps:
+                step.take(w, np.einsum("oij,oi->oj", roots, HL))
+            HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
+    return w, np.sqrt(squares / total_precision)
+
+
+@dataclass(frozen=True)
+class _Step:
+    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one."""
+
+    outputs: list[int]
+    least: float
+    counts: np.ndarray
+    root: np.ndarray
+
+    @classmethod
+    def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
+        noise = np.maximum(noise, 1e-16 * noise.max())
+        least = float(noise.min())
+        counts = least / noise
+        precision = np.einsum("o,oij->ij", counts, products[outputs])
+        diagonal_of(precision)[...] += least
+        return cls(outputs, least, counts, jittered_cholesky(precision))
+
+    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
+        first = self.outputs[0]
+        w[self.outputs] += cho_solve((self.root, True), self.counts @ from_data[self.outputs] - self.least * w[first])
+
+
+def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
+    """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
+
+    Parameters
+    ----------
+    left_over : ndarray of shape (o,)
+        Root mean square.
+    largest : ndarray of shape (o,)
+        Of the target's absolute values.
+
+    Returns
+    -------
+    unit : ndarray of shape (o,)
+    """
+    unit = np.maximum(left_over, 1e-14 * largest)
+    return np.where(unit > 0.0, np.maximum(unit, SMALLEST_UNIT), 1.0)
+
+
+@dataclass(frozen=True)
+class Units:
+    """What is subtracted from and divided out of the targets before inference.
+
+    Attributes
+    ----------
+    target_mean : ndarray of shape (o,)
+        Subtracted from y; part of the model (0 unless y is normalised).
+    target_unit : ndarray of shape (o,)
+        The size of what the features alone leave over.
+    prior : CoefficientPrior
+        In the user's units.
+    """
+
+    target_mean: np.ndarray
+    target_unit: np.ndarray
+    prior: CoefficientPrior
+
+    @classmethod
+    def of(
+        cls,
+        source: Source,
+        targets: Moments,
+        target_mean: np.ndarray,
+        prior: CoefficientPrior,
+    ) -> Units:
+        """The units of a training set, from its rows, its targets' moments, and the prior of its weights."""
+        reference, left_over = features_alone(source, target_mean, prior)
+        return cls(target_mean, unit_of(left_over, targets.largest), replace(prior, reference=reference))
+
+    def to_internal(self, raw: RawRows) -> RawRows:
+        """The same inputs and features, and what the reference leaves of the targets, in its own units."""
+        left_over = raw.targets - self.target_mean - times_weights(raw.features, self.prior.offset)
+        return replace(raw, targets=left_over / self.target_unit)
+
+    def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
+        """Rows in internal units."""
+        return Rows(source, self.to_internal, threads=BlockMap() if threads is None else threads)
+
+    def internal_prior(self) -> CoefficientPrior:
+        """The prior for residuals in units of ``target_unit``."""
+        return self.prior.scaled(1.0 / self.target_unit)
+
+    def log_unit(self, outputs: Columns) -> float:
+        """What one row of some outputs adds to the loss on the way to the user's units."""
+        return float(np.log(self.target_unit[outputs]).sum())
+
+    def predictor(self, parts: Sequence[Predictor], outputs: Sequence[list[int]]) -> Predictor:
+        """Predictors of some outputs each, in internal units -> one of all in the user's."""
+        return Predictor.joined(parts, outputs, self.target_unit, self.prior.offset, self.target_mean)

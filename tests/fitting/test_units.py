@@ -1,0 +1,55 @@
+import numpy as np
+
+from skevgp.fitting.units import features_alone, unit_of
+from skevgp.inference.posterior import CoefficientPrior
+from skevgp.rows.source import LocalSource
+
+
+def weights_alone(H, r, scale):
+    source = LocalSource.of(np.zeros((len(H), 1)), H, r)
+    w, left_over = features_alone(
+        source, np.zeros(len(scale)), CoefficientPrior(np.zeros_like(scale), scale, np.zeros_like(scale))
+    )
+    np.testing.assert_allclose(left_over, np.sqrt(np.mean((r - H @ (scale * w).T) ** 2, axis=0)), atol=1e-14)
+    return w
+
+
+def test_features_alone_are_least_squares_under_a_wide_prior():
+    rng = np.random.RandomState(0)
+    H, b = rng.randn(200, 3), np.array([[1.0, -2.0, 0.5], [0.0, 3.0, 1.0]])
+    r = H @ b.T + 1e-3 * rng.randn(200, 2)
+    w = weights_alone(H, r, np.full((2, 3), 100.0))
+    np.testing.assert_allclose(100.0 * w.T, np.linalg.lstsq(H, r, rcond=None)[0], atol=1e-8)
+
+
+def test_features_alone_are_ridge_regression_under_a_narrow_prior():
+    rng = np.random.RandomState(0)
+    H, scale = rng.randn(50, 2), np.array([[0.1, 0.2]])
+    r = H @ [[1.0], [1.0]] + rng.randn(50, 1)
+    w = weights_alone(H, r, scale)
+    P = H * scale
+    first = np.linalg.lstsq(P, r, rcond=None)[0]
+    noise = np.mean((r - P @ first) ** 2)
+    np.testing.assert_allclose(w[0], np.linalg.solve(P.T @ P + noise * np.eye(2), P.T @ r)[:, 0], rtol=1e-9)
+
+
+def test_a_scale_of_zero_keeps_a_weight():
+    H = np.random.RandomState(0).randn(20, 2)
+    w = weights_alone(H, H.sum(axis=1, keepdims=True), np.array([[1.0, 0.0]]))
+    assert w[0, 1] == 0.0
+    assert w[0, 0] != 0.0
+
+
+def test_duplicate_features_share_their_weight():
+    h = np.random.RandomState(0).randn(30, 1)
+    w = weights_alone(np.hstack([h, h]), 2.0 * h, np.ones((1, 2)))
+    np.testing.assert_allclose(w, [[1.0, 1.0]], rtol=1e-4)
+
+
+def test_units_survive_extreme_scales():
+    values = np.array([1e-120, 1e100, 0.0])
+    np.testing.assert_array_equal(unit_of(values, values), [1e-120, 1e100, 1.0])
+
+
+def test_the_unit_is_not_below_the_rounding_of_the_target():
+    assert unit_of(np.full(1, 1e-20), np.full(1, 1e5))[0] == pytest.approx(1e-9)

@@ -1,0 +1,326 @@
+"""``sample_weight`` and ``relative_variance`` of all estimators."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
+from sklearn.linear_model import Ridge
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.rows import chosen
+from skevgp.solvers import Adam
+
+# A few iterations are enough to compare.
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+RNG = np.random.RandomState(0)
+N = 80
+X = RNG.uniform(-2.0, 2.0, (N, 2))
+Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1]]) + 0.1 * RNG.randn(N, 2)
+X_NEW = RNG.uniform(-2.0, 2.0, (30, 2))
+WEIGHTS = RNG.randint(0, 4, N)
+AGAIN = RNG.permutation(np.repeat(np.arange(N), WEIGHTS))
+NOISE = np.exp(RNG.randn(N))
+
+
+def evgp(**parameters):
+    return EVGPRegressor(**{"n_inducing": 9, "max_iter": 25, "random_state": 0, **parameters})
+
+
+MODELS = {
+    "plain": evgp(),
+    "scaled": evgp(feature_map=PolynomialFeatures(1), kernel_map=StandardScaler(), normalize_y=True),
+    "pipeline": evgp(feature_map=make_pipeline(FunctionTransformer(np.tanh))),
+    "not stationary": evgp(kernel=RBF() + DotProduct(), sharing="kernel"),
+    "diagonal": evgp(posterior="diagonal", sharing="none"),
+    "all rows": evgp(n_inducing=200),
+    "auto": evgp(n_inducing="auto", max_inducing=25),
+    "adam": evgp(solver=Adam(batch_size=16), max_iter=60),
+    "natural": evgp(solver=Adam(batch_size=16, natural_gradient=True), max_iter=60),
+    "exact": EGPRegressor(PolynomialFeatures(1), max_iter=20),
+    "vague": EGPRegressor(PolynomialFeatures(1), coef_scale=np.inf, max_iter=20, normalize_y=True),
+    "network": BayesianMLPRegressor((8,), max_iter=5, random_state=0),
+    "early": BayesianMLPRegressor((8,), max_iter=5, early_stopping=True, random_state=0),
+    "residual": ResidualRegressor(evgp()),
+}
+of_all = pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
+
+
+def value_of(model):
+    """What the fit maximised, if it is known for all rows."""
+    for name in ("lower_bound_", "log_marginal_likelihood_value_"):
+        if hasattr(model, name):
+            return getattr(model, name)
+    return 0.0
+
+
+def assert_same(one, other, rtol=1e-7):
+    assert value_of(one) == pytest.approx(value_of(other), rel=rtol)
+    for found, expected in zip(one.predict(X_NEW, return_std=True), other.predict(X_NEW, return_std=True), strict=True):
+        np.testing.assert_allclose(found, expected, rtol=rtol, atol=rtol)
+
+
+@of_all
+def test_weights_of_0_and_2_are_rows_removed_and_repeated(model):
+    weighted = clone(model).fit(X, Y, sample_weight=WEIGHTS)
+    assert_same(weighted, clone(model).fit(X[AGAIN], Y[AGAIN]))
+    # They matter.
+    assert np.abs(weighted.predict(X_NEW) - clone(model).fit(X, Y).predict(X_NEW)).max() > 1e-4
+
+
+@of_all
+def test_the_order_of_the_rows_does_not_matter(model):
+    order = RNG.permutation(N)
+    assert_same(clone(model).fit(X[order], Y[order]), clone(model).fit(X, Y))
+
+
+@pytest.mark.parametrize("model", [MODELS["plain"], MODELS["exact"], MODELS["diagonal"], MODELS["adam"]], ids=repr)
+def test_with_known_noise_too(model):
+    weighted = clone(model).fit(X, Y, sample_weight=WEIGHTS, relative_variance=NOISE)
+    assert_same(weighted, clone(model).fit(X[AGAIN], Y[AGAIN], relative_variance=NOISE[AGAIN]))
+    plain = clone(model).fit(X, Y, sample_weight=WEIGHTS)
+    assert np.abs(weighted.predict(X_NEW) - plain.predict(X_NEW)).max() > 1e-4
+
+
+def test_the_unit_of_the_relative_variance_is_the_noises():
+    """10,000 times as large, it makes σ² 10,000 times smaller, and that is all."""
+    for model in (evgp(feature_map=PolynomialFeatures(1)), EGPRegressor()):
+        one = clone(model).fit(X, Y, relative_variance=NOISE)
+        other = clone(model).fit(X, Y, relative_variance=1e4 * NOISE)
+        np.testing.assert_allclose(one.predict(X_NEW), other.predict(X_NEW), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(one.noise_variance_, 1e4 * other.noise_variance_, rtol=1e-2)
+        assert value_of(one) == pytest.approx(value_of(other), abs=0.1)
+
+
+def test_known_noise_is_the_alpha_of_scikit_learn():
+    kernel = ConstantKernel(1.7) * RBF([0.8, 1.3])
+    exact = GaussianProcessRegressor(kernel, alpha=0.1 * NOISE, optimizer=None).fit(X, Y[:, 0])
+    expected = exact.predict(X_NEW, return_std=True)
+    for estimator in (EGPRegressor, EVGPRegressor):
+        own = estimator(kernel=kernel + WhiteKernel(1.0, "fixed"), max_iter=0)
+        if estimator is EVGPRegressor:
+            own.set_params(n_inducing=N)
+        own.fit(X, Y[:, 0], relative_variance=0.1 * NOISE)
+        np.testing.assert_allclose(own.predict(X_NEW, return_std=True, include_noise=False), expected, rtol=1e-6)
+        assert value_of(own) == pytest.approx(exact.log_marginal_likelihood(), rel=1e-8)
+
+
+def test_known_noise_is_worth_knowing():
+    """Half of the rows are far noisier: who knows it predicts better, and says how noisy the others are."""
+    rng = np.random.RandomState(1)
+    x = rng.uniform(-3.0, 3.0, (400, 1))
+    variance = np.where(rng.rand(400) < 0.5, 1.0, 400.0)
+    y = np.sin(2.0 * x[:, 0]) + 0.1 * np.sqrt(variance) * rng.randn(400)
+    grid = np.linspace(-3.0, 3.0, 50)[:, np.newaxis]
+    errors = []
+    for known in (None, variance):
+        model = evgp(n_inducing=20, max_iter=100).fit(x, y, relative_variance=known)
+        errors.append(np.sqrt(np.mean((model.predict(grid) - np.sin(2.0 * grid[:, 0])) ** 2)))
+    assert errors[1] < 0.5 * errors[0]
+    assert model.noise_variance_ == pytest.approx(0.01, rel=0.3)
+
+
+def test_lower_bound_sees_the_rows_and_weights_of_the_fit():
+    model = evgp(feature_map=PolynomialFeatures(1)).fit(X, Y[:, 0], WEIGHTS, relative_variance=NOISE)
+    value, gradient = model.lower_bound(model.kernel_.theta, eval_gradient=True)
+    assert value == pytest.approx(model.lower_bound_, rel=1e-8)
+    steps = 1e-5 * np.eye(len(gradient))
+    theta = model.kernel_.theta
+    differences = [(model.lower_bound(theta + e) - model.lower_bound(theta - e)) / 2e-5 for e in steps]
+    np.testing.assert_allclose(gradient, differences, rtol=1e-4, atol=1e-3)
+    exact = EGPRegressor(max_iter=20).fit(X, Y[:, 0], WEIGHTS, relative_variance=NOISE)
+    found = exact.log_marginal_likelihood(exact.kernel_.theta)
+    assert found == pytest.approx(exact.log_marginal_likelihood_value_, rel=1e-8)
+
+
+# --- large and foreign data ----------------------------------------------------------------------------------------
+
+
+def at_fixed_points(**parameters):
+    return evgp(inducing_init=X_NEW[:9], max_iter=0, **parameters)
+
+
+@pytest.mark.parametrize("parameters", [{}, {"posterior": "diagonal"}, {"kernel_map": StandardScaler()}], ids=str)
+def test_many_rows_are_weighed_where_they_stand(parameters, monkeypatch):
+    small = at_fixed_points(**parameters).fit(X, Y, WEIGHTS, relative_variance=NOISE)
+    monkeypatch.setattr(chosen, "ORDERED_ROWS", 10)
+    large = at_fixed_points(**parameters).fit(X, Y, WEIGHTS, relative_variance=NOISE)
+    assert_same(large, small)
+    assert large.upper_bound_ == pytest.approx(small.upper_bound_, rel=1e-8)
+
+
+def test_blocks_threads_and_pieces_do_not_matter():
+    """More rows than a block holds, seen once and in parts."""
+    rng = np.random.RandomState(2)
+    x = rng.uniform(-2.0, 2.0, (30_000, 2))
+    y = np.sin(2.0 * x[:, 0]) * x[:, 1] + 0.1 * rng.randn(30_000)
+    w, v = rng.uniform(0.0, 2.0, 30_000), np.exp(rng.randn(30_000))
+    w[::3] = 0.0
+    one, threaded = (evgp(max_iter=3, n_jobs=jobs).fit(x, y, w, relative_variance=v) for jobs in (1, 2))
+    np.testing.assert_array_equal(one.predict(X_NEW), threaded.predict(X_NEW))
+    kept = w > 0
+    assert_same(one, evgp(max_iter=3).fit(x[kept], y[kept], w[kept], relative_variance=v[kept]))
+
+
+def test_memory_maps(tmp_path, monkeypatch):
+    monkeypatch.setattr(chosen, "ORDERED_ROWS", 10)
+    path = tmp_path / "x.npy"
+    np.save(path, X)
+    mapped = np.load(path, mmap_mode="r")
+    assert_same(
+        evgp(max_iter=3).fit(mapped, Y, WEIGHTS, relative_variance=NOISE),
+        evgp(max_iter=3).fit(X, Y, WEIGHTS, relative_variance=NOISE),
+        1e-12,
+    )
+
+
+@pytest.mark.parametrize("posterior", ["full", "diagonal"])
+def test_partial_fit_with_weights_is_one_pass(posterior):
+    first, rest = slice(0, 30), slice(30, None)
+
+    def fitted_to(rows):
+        model = evgp(posterior=posterior, max_iter=5).fit(X[first], Y[first], NOISE[first])
+        for part in rows:
+            model.partial_fit(X[part], Y[part], WEIGHTS[part], relative_variance=NOISE[part])
+        return model
+
+    at_once, in_parts = fitted_to([rest]), fitted_to([slice(30, 50), slice(50, None)])
+    assert_same(at_once, in_parts)
+    repeated = evgp(posterior=posterior, max_iter=5).fit(X[first], Y[first], NOISE[first])
+    rows = np.repeat(np.arange(30, N), WEIGHTS[rest])
+    assert_same(at_once, repeated.partial_fit(X[rows], Y[rows], relative_variance=NOISE[rows]))
+    begun = evgp(posterior=posterior, max_iter=5).partial_fit(X[first], Y[first], NOISE[first])
+    assert_same(begun, evgp(posterior=posterior, max_iter=5).fit(X[first], Y[first], NOISE[first]))
+
+
+def test_partial_fit_from_the_prior_of_the_points_is_the_fit():
+    """With kernel, noise and points given, sums of parts are the sums of all."""
+    kernel = ConstantKernel(1.0, "fixed") * RBF(1.0, "fixed") + WhiteKernel(0.01, "fixed")
+    whole = at_fixed_points(kernel=kernel).fit(X, Y, NOISE, relative_variance=NOISE[::-1])
+    parts = at_fixed_points(kernel=kernel).fit(X[:30], Y[:30], NOISE[:30], relative_variance=NOISE[::-1][:30])
+    parts.partial_fit(X[30:], Y[30:], NOISE[30:], relative_variance=NOISE[::-1][30:])
+    assert_same(parts, whole)
+    assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("as_dask", [True, False])
+def test_dask(as_dask):
+    import dask.array as da
+
+    order = np.lexsort(X.T[::-1])
+    x, y, w, v = X[order], Y[order], WEIGHTS[order].astype(float), NOISE[order]
+    w[:25] = 0.0  # a whole chunk
+    weights = (w, v) if not as_dask else (da.from_array(w, chunks=30), da.from_array(v, chunks=40))
+    chunks = da.from_array(x, chunks=(25, 2)), da.from_array(y, chunks=(25, 2))
+    assert_same(evgp().fit(*chunks, weights[0], relative_variance=weights[1]), evgp().fit(x, y, w, relative_variance=v))
+    updated = at_fixed_points().fit(*chunks).partial_fit(*chunks, weights[0], relative_variance=weights[1])
+    assert_same(updated, at_fixed_points().fit(x, y).partial_fit(x, y, w, relative_variance=v))
+    for bad, message in ((-w, "sample_weight"), (0.0 * w, "zero"), (w[:5], "shape")):
+        with pytest.raises(ValueError, match=message):
+            evgp().fit(*chunks, bad)
+    with pytest.raises(ValueError, match="relative_variance must be positive"):
+        evgp().fit(*chunks, relative_variance=w)
+
+
+# --- maps -----------------------------------------------------------------------------------------------------------
+
+
+class Recorder(FunctionTransformer):
+    """Remembers what it was fitted to."""
+
+    def fit(self, X, y=None):
+        self.seen_ = np.asarray(X)
+        return super().fit(X, y)
+
+
+class Weighing(FunctionTransformer):
+    def fit(self, X, y=None, sample_weight=None):
+        self.weights_ = sample_weight
+        return super().fit(X, y)
+
+
+def test_maps_see_the_rows_that_count_and_how_often_if_they_ask():
+    model = evgp(feature_map=Recorder(), kernel_map=Weighing(), max_iter=0).fit(X, Y, WEIGHTS)
+    assert {tuple(row) for row in model.feature_map_.seen_} == {tuple(row) for row in X[WEIGHTS > 0]}
+    np.testing.assert_array_equal(np.sort(model.kernel_map_.weights_), np.sort(WEIGHTS[WEIGHTS > 0]))
+    repeated = evgp(feature_map=Recorder(), kernel_map=Weighing(), max_iter=0).fit(X[AGAIN], Y[AGAIN])
+    assert len(repeated.feature_map_.seen_) == len(AGAIN)
+    np.testing.assert_array_equal(repeated.kernel_map_.weights_, model.kernel_map_.weights_)
+    plain = evgp(feature_map=Recorder(), kernel_map=Weighing(), max_iter=0).fit(X, Y)
+    assert plain.kernel_map_.weights_ is None
+    assert len(plain.feature_map_.seen_) == N
+
+
+def test_data_frames_with_words():
+    frame = pd.DataFrame(X, columns=["a", "b"]).assign(word=np.where(X[:, 0] > 0, "up", "down"))
+    encode = FunctionTransformer(lambda rows: np.column_stack([rows["a"], rows["b"], rows["word"] == "up"]))
+    again = frame.iloc[AGAIN].reset_index(drop=True)
+    weighted = evgp(kernel_map=encode, max_iter=5).fit(frame, Y, pd.Series(WEIGHTS))
+    repeated = evgp(kernel_map=encode, max_iter=5).fit(again, Y[AGAIN])
+    np.testing.assert_allclose(weighted.predict(frame), repeated.predict(frame), rtol=1e-7)
+
+
+# --- bad input -------------------------------------------------------------------------------------------------------
+
+EACH = {"EVGP": evgp(max_iter=1), "EGP": EGPRegressor(max_iter=1), "network": BayesianMLPRegressor((3,), max_iter=1)}
+
+
+@pytest.mark.parametrize("model", EACH.values(), ids=EACH)
+@pytest.mark.parametrize(
+    ("weights", "message"),
+    [
+        (-np.ones(N), "sample_weight must be finite, not negative .* -1"),
+        (np.full(N, np.nan), "sample_weight must be finite"),
+        (np.full(N, np.inf), "sample_weight must be finite"),
+        (np.zeros(N), "sample_weight must be above 0 .* zero"),
+        (np.ones(N - 1), r"sample_weight must have the shape \(n_samples,\) = \(80,\); got \(79,\)"),
+        (np.ones((N, 1)), "sample_weight must have the shape"),
+        (2.0, "sample_weight must have the shape"),
+        (["a"] * N, "sample_weight must be real numbers"),
+    ],
+    ids=range(8),
+)
+def test_bad_weights(model, weights, message):
+    with pytest.raises(ValueError, match=message):
+        clone(model).fit(X, Y, sample_weight=weights)
+
+
+@pytest.mark.parametrize("model", [EACH["EVGP"], EACH["EGP"]], ids=["EVGP", "EGP"])
+@pytest.mark.parametrize(
+    ("variance", "message"),
+    [
+        (np.zeros(N), "relative_variance must be positive.*range from 0"),
+        (-np.ones(N), "relative_variance must be positive"),
+        (np.full(N, np.nan), "relative_variance must be positive"),
+        (np.ones((N, 2)), "relative_variance must have the shape"),
+    ],
+    ids=range(4),
+)
+def test_bad_variances(model, variance, message):
+    with pytest.raises(ValueError, match=message):
+        clone(model).fit(X, Y, relative_variance=variance)
+
+
+def test_bad_weights_leave_the_model_as_it_was():
+    model = evgp(max_iter=1).fit(X, Y)
+    before = model.predict(X_NEW)
+    for method in (model.fit, model.partial_fit):
+        with pytest.raises(ValueError, match="sample_weight"):
+            method(X, Y, np.zeros(N))
+    np.testing.assert_array_equal(model.predict(X_NEW), before)
+
+
+def test_a_residual_regressor_hands_weights_on():
+    weighted = ResidualRegressor(Ridge()).fit(X, Y, sample_weight=WEIGHTS)
+    np.testing.assert_allclose(weighted.predict(X), ResidualRegressor(Ridge()).fit(X[AGAIN], Y[AGAIN]).predict(X))
+
+
+def test_warnings_are_those_of_a_fit_without_weights():
+    with pytest.warns(ConvergenceWarning, match="max_iter=2"):
+        evgp(max_iter=2).fit(X, Y, NOISE)
