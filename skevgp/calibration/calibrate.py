@@ -5,12 +5,12 @@ alike in all of them: the noise that the bound likes best, and with it the stand
 small for new trajectories. And what inducing points cannot represent is noise to the bound, while predictions count it
 twice: of independent rows the noise is too large. So folds of rows are left out one after the other (Rasmussen &
 Williams 2006, section 5.4.2: cross-validation), with kernel and inducing points as they are, and each output's signal
-and noise variance are where their predictive density is highest,
+and noise variance are where this is highest:
 
-    max over s², σ² of   mean over rows left out of log N(r | mean, variance)   +   log prior / number of rows,
+    mean over rows left out of log N(r | mean, variance)  -  ½ log rms of (r - mean)  +  log prior / number of rows,
 
-with a prior that is log-normal around what the bound found: where the rows left out say nothing, all stays. (Their
-squared errors are then on average as large as their variances.) What predicts rows that were left out is in `left_out`.
+with a prior that is log-normal around what the bound found: where the rows left out say nothing, all stays. (Density
+alone would give the mean away where rows are uncertain anyway.) What predicts rows left out is in `left_out`.
 """
 
 from __future__ import annotations

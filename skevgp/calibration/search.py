@@ -15,6 +15,9 @@ _LOWEST = 1e-20
 # Ratios s²/σ² that are tried are powers of 2: these many doublings away first, then in steps of so many, and no further
 # than so many from where the bound is highest.
 _LOOK, _STEPS, _FARTHEST = (-6, 0, 6), (3.0, 1.0, 0.25), 36
+# What the logarithm of the root mean square error counts beside a log density. By density alone what is predicted of rows
+# that are uncertain anyway hardly matters.
+_SQUARES = 0.5
 # Noise variances that are tried for a ratio, as factors.
 _NOISES = 2.0 ** np.arange(-3.0, 3.25, 0.5)
 
@@ -163,14 +166,16 @@ class Search:
 
     def _losses(self, ratio: float, noise: np.ndarray) -> np.ndarray:
         """What is to be low (g,), in nats per row, at noise variances (g,)."""
-        total, n = np.zeros(len(noise)), 0.0
+        density, squares, n = np.zeros(len(noise)), np.zeros(1), 0.0
         for fold, known in zip(self.folds, self.known, strict=True):
             error, variance = fold.predicted(self.index, ratio, noise, known)
-            total += 0.5 * (fold.rows.counts @ (np.log(variance) + error**2 / variance))
-            n += fold.rows.counts.sum()
+            counts, error = fold.rows.counts, error**2
+            density += 0.5 * (counts @ (np.log(variance) + error / variance))
+            squares = squares + counts @ error
+            n += counts.sum()
         s2, at_bound = (self.values[name][self.output] for name in ("signal", "noise"))
-        total += 0.5 * (np.log(ratio * noise / s2) ** 2 + np.log(noise / at_bound) ** 2)
-        return total / n
+        density += 0.5 * (np.log(ratio * noise / s2) ** 2 + np.log(noise / at_bound) ** 2)
+        return density / n + 0.5 * _SQUARES * np.log(np.maximum(squares / n, _LOWEST))
 
 
 def _vertex(before: float, here: float, after: float) -> float:
