@@ -122,6 +122,11 @@ class EVGPRegressor(SparseGaussianProcess):
         The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
         Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
+    max_time : float, default=None
+        Seconds that `fit` may take, about: when they are over iterations end, of each independent model when its share
+        is, and the best so far is kept, with a ConvergenceWarning; then ``noise_cv`` is left out. Half of them is the
+        most for finding groups (``sharing="auto"``; if that is not enough, all outputs share). What comes before and
+        after the iterations, passes over the rows, is not cut short.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained over
@@ -153,6 +158,9 @@ class EVGPRegressor(SparseGaussianProcess):
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Their posterior covariances. Only with a ``feature_map``. (Where outputs share their weights, nothing of them
         has an axis of outputs.)
+    coef_names_ : ndarray of str of shape (n_h,)
+        What the feature map calls them, by its ``get_feature_names_out``; h0, h1, ... if it does not say. Only with a
+        ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -245,6 +253,7 @@ class EVGPRegressor(SparseGaussianProcess):
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
+        max_time: float | None = None,
         tol: float | Literal["auto"] = "auto",
         forgetting_factor: float = 1.0,
         warm_start: bool = False,
@@ -269,6 +278,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
+        self.max_time = max_time
         self.tol = tol
         self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
@@ -326,9 +336,9 @@ class EVGPRegressor(SparseGaussianProcess):
         Warns
         -----
         ConvergenceWarning
-            If the iterations were used up, rounding errors or Ctrl-C ended them (the best parameters so far are kept);
-            if the Gaussian process learned nothing, or nothing that holds for groups left out, y is far from its prior
-            mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
+            If iterations or time were used up, rounding errors or Ctrl-C ended them (the best parameters so far are
+            kept); if the Gaussian process learned nothing, or nothing that holds for groups left out, y is far from its
+            prior mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
         skevgp.exceptions.DependentRowsWarning
             If rows near each other, in the order given, are so alike that the noise would be more than four times as
             large if blocks of them were left out: ``groups`` should say which belong together.
@@ -336,7 +346,7 @@ class EVGPRegressor(SparseGaussianProcess):
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        progress = monitor_of(self.verbose, solver.callback)
+        progress = monitor_of(self.verbose, solver.callback, self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y, sample_weight, relative_variance, groups)
             self._training_data = problem.data

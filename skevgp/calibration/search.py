@@ -15,8 +15,8 @@ _LOWEST = 1e-20
 # Ratios s²/σ² that are tried are powers of 2: these many doublings away first, then in steps of so many, and no further
 # than so many from where the bound is highest.
 _LOOK, _STEPS, _FARTHEST = (-6, 0, 6), (3.0, 1.0, 0.25), 36
-# What the logarithm of the root mean square error counts beside a log density. By density alone what is predicted of rows
-# that are uncertain anyway hardly matters.
+# What the logarithm of the root mean square error counts beside a log density: to this the mean of rows that are
+# uncertain anyway hardly matters.
 _SQUARES = 0.5
 # Noise variances that are tried for a ratio, as factors.
 _NOISES = 2.0 ** np.arange(-3.0, 3.25, 0.5)
