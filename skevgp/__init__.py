@@ -6,7 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from . import datasets, features, kernels, metrics, plotting, solvers
+    from . import datasets, exceptions, features, kernels, metrics, plotting, solvers
     from .bnn import BayesianMLPRegressor
     from .exact import EGPRegressor
     from .regressor import EVGPRegressor
@@ -21,6 +21,7 @@ __all__ = [
     "ResidualRegressor",
     "__version__",
     "datasets",
+    "exceptions",
     "features",
     "kernels",
     "metrics",
@@ -28,7 +29,7 @@ __all__ = [
     "solvers",
 ]
 
-_SUBMODULES = ("datasets", "features", "kernels", "metrics", "plotting", "solvers")
+_SUBMODULES = ("datasets", "exceptions", "features", "kernels", "metrics", "plotting", "solvers")
 _HOME = {
     "BayesianMLPRegressor": "bnn",
     "EGPRegressor": "exact",

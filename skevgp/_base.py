@@ -13,6 +13,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
+from ._coef_prior import coef_names
 from ._intake import Intake
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
@@ -73,12 +74,13 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Intake):
         "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
         "normalize_y": ["boolean"],
         "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "max_time": [Interval(Real, 0, None, closed="neither"), None],
         "tol": [Interval(Real, 0, None, closed="left")],
         "random_state": ["random_state"],
         "verbose": ["verbose"],
     }
 
-    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_ = (_OfWeights() for _ in range(5))
+    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_, coef_names_ = (_OfWeights() for _ in range(6))
 
     _fitted: Fitted
 
@@ -234,6 +236,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Intake):
             first = 0 if prior.shared else first
             self.coef_, self.coef_cov_ = mean[first], covariance[first]
             self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+            columns = getattr(self, "feature_names_in_", None)
+            self.coef_names_ = coef_names(self.feature_map_, columns, self.coef_.shape[-1])
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
         self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
         kernels = [

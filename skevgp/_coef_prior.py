@@ -248,3 +248,22 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
 def _weight(union: Any, name: str) -> float:
     weight = (union.transformer_weights or {}).get(name)
     return 1.0 if weight is None else float(weight)
+
+
+def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int) -> np.ndarray:
+    """What a fitted feature map calls its features; "h0", "h1", ... if it does not say.
+
+    Parameters
+    ----------
+    feature_map : transformer
+    columns : ndarray of str, or None
+        Names of the columns of X.
+    n_features : int
+    """
+    try:
+        names = np.asarray([str(name) for name in feature_map.get_feature_names_out(columns)], dtype=object)
+    except (AttributeError, TypeError, ValueError):
+        names = np.empty(0, dtype=object)
+    if len(names) == n_features:
+        return names
+    return np.array([f"h{index}" for index in range(n_features)], dtype=object)

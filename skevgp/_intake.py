@@ -19,6 +19,7 @@ from ._validation import (
     FLOATS,
     check_magnitude,
     check_not_vanishing,
+    checked_groups,
     is_frame,
     validate_frame,
     words_of,
@@ -54,6 +55,8 @@ class Problem:
         Width of the kernel's inputs.
     per_output : bool
         Whether outputs have inputs or features of their own.
+    groups : ndarray of shape (n,), optional
+        The group of each row of the source.
     """
 
     data: tuple[Any, Any, np.ndarray, Any]
@@ -63,6 +66,7 @@ class Problem:
     vague: np.ndarray
     n_columns: int
     per_output: bool
+    groups: np.ndarray | None
 
 
 class Intake(BaseEstimator):
@@ -82,11 +86,18 @@ class Intake(BaseEstimator):
     _row_shapes: RowShapes
 
     def _problem(
-        self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None, allow_vague: bool = False
+        self,
+        X: Any,
+        y: Any,
+        sample_weight: Any = None,
+        relative_variance: Any = None,
+        groups: Any = None,
+        allow_vague: bool = False,
     ) -> Problem:
         """Look at X, y and the rows' weights for a new fit: maps, kernel, prior and units."""
         given, X, y = self._validated(X, y, reset=True)
-        chosen = chosen_rows(X, y, sample_weight, relative_variance)
+        groups = checked_groups(groups, len(y))
+        chosen = chosen_rows(X, y, sample_weight, relative_variance, groups)
         fit_to = fit_map_to_chunks if is_dask(X) else partial(fit_map, chosen=chosen)
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
@@ -114,7 +125,8 @@ class Intake(BaseEstimator):
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         units = Units.of(source, targets, target_mean, prior)
         self._spec, self._row_shapes = spec, (inputs.mean.shape, features.mean.shape)
-        return Problem((given, X, y, chosen), source, units, spec, vague, n_columns, per_output)
+        groups = None if groups is None else chosen.labels_of(groups)
+        return Problem((given, X, y, chosen), source, units, spec, vague, n_columns, per_output, groups)
 
     def _prior(
         self, given: Any, features: Moments, targets: Moments, allow_vague: bool

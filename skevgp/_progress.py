@@ -21,7 +21,7 @@ _FEW = 4
 
 
 class Monitor:
-    """The one object that a fit hands down: it shows progress, and ends the fit upon Ctrl-C.
+    """The one object that a fit hands down: it shows progress, and ends the fit upon Ctrl-C or when its time is over.
 
     An optimiser calls `iteration` once per iteration, and does its work inside `keeping_the_best`: Ctrl-C then ends the
     work and sets `stopped`, here and in all monitors made from this one by `seen_as`, in whatever thread they are.
@@ -32,11 +32,23 @@ class Monitor:
         report(iteration, loss, outputs), once per iteration.
     progress : Progress, default=None
         Told the same and more.
+    max_time : float, default=None
+        Seconds from now on; then it ends the fit as Ctrl-C does, but says so by `out_of_time`.
+    clock : callable
+        Seconds.
     """
 
-    def __init__(self, report: Report | None = None, progress: Progress | None = None):
-        self._report, self._progress = report, progress
-        self._stop = Event()
+    def __init__(
+        self,
+        report: Report | None = None,
+        progress: Progress | None = None,
+        max_time: float | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ):
+        self._report, self._progress, self.max_time, self._clock = report, progress, max_time, clock
+        self._end = None if max_time is None else clock() + max_time
+        # Of all parts; that of the own part is over; that of some part was.
+        self._stop, self._late, self._some_late = Event(), Event(), Event()
         self._n_before, self._factor, self._shift = 0, 1.0, 0.0
         self._about, self._is_last = tuple[str, ...](), True
         self._outputs: Sequence[int] = range(0)
@@ -74,6 +86,14 @@ class Monitor:
         part._is_last &= is_last
         return part
 
+    def with_time(self, share: float) -> Monitor:
+        """The same monitor for a part of the fit that has a share of the time that is left: only it ends with that."""
+        part = copy(self)
+        if self._end is not None:
+            now = self._clock()
+            part._end, part._late = now + share * (self._end - now), Event()
+        return part
+
     def silent(self) -> Monitor:
         """The same monitor for a part of the fit of which nobody is told; it ends like the others."""
         part = copy(self)
@@ -94,6 +114,9 @@ class Monitor:
         enough : float, default=None
             The optimiser ends before that when iterations gain less.
         """
+        if self._end is not None and self._clock() >= self._end:
+            self._late.set()
+            self._some_late.set()
         if self.stopped:
             raise KeyboardInterrupt
         number, loss = self._n_before + number, self._factor * loss + self._shift
@@ -109,8 +132,13 @@ class Monitor:
 
     @property
     def stopped(self) -> bool:
-        """Whether Ctrl-C has ended the fit."""
-        return self._stop.is_set()
+        """Whether Ctrl-C has ended the fit, or the time of this part is over."""
+        return self._stop.is_set() or self._late.is_set()
+
+    @property
+    def out_of_time(self) -> bool:
+        """Whether some part of the fit ended because its time was over."""
+        return self._some_late.is_set()
 
     def stop(self) -> None:
         """End all that is handed this monitor at its next iteration."""
@@ -122,7 +150,8 @@ class Monitor:
         try:
             yield
         except KeyboardInterrupt:
-            self.stop()
+            if not self._late.is_set():
+                self.stop()
 
 
 class _Way:
@@ -228,11 +257,12 @@ def _rounded(seconds: float) -> str:
 
 
 @contextmanager
-def monitor_of(verbose: int, callback: Report | None = None) -> Iterator[Monitor]:
+def monitor_of(verbose: int, callback: Report | None = None, max_time: float | None = None) -> Iterator[Monitor]:
     """The monitor of a fit that prints as ``verbose`` says, and calls callback(iteration, bound, outputs)."""
     progress = Progress(verbose) if verbose else None
     try:
-        yield Monitor(callback and (lambda number, loss, outputs: callback(number, -loss, outputs)), progress)
+        report = callback and (lambda number, loss, outputs: callback(number, -loss, outputs))
+        yield Monitor(report, progress, max_time)
     finally:
         if progress is not None:
             progress.close()

@@ -13,7 +13,14 @@ from .rows.dask import RowWeights, is_dask
 _SMALLEST_VARIANCE = 1.0 / LARGEST
 
 
-def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None, ordered: bool = True) -> Any:
+def chosen_rows(
+    X: Any,
+    y: Any,
+    sample_weight: Any = None,
+    relative_variance: Any = None,
+    groups: np.ndarray | None = None,
+    ordered: bool = True,
+) -> Any:
     """The rows that count.
 
     Parameters
@@ -22,6 +29,8 @@ def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: An
     y : ndarray or dask.array.Array of shape (n_samples,) or (n_samples, o)
     sample_weight, relative_variance : array-like of shape (n_samples,), optional
         As `EVGPRegressor.fit` takes them.
+    groups : ndarray of shape (n_samples,), optional
+        Of integers: only rows of the same group are joined.
     ordered : bool, default=True
         Whether few rows are put into an order of their own, and equal ones joined.
 
@@ -43,7 +52,7 @@ def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: An
         check_weights(float(counts.min()), float(counts.max()))
     if variance is not None:
         check_variances(float(variance.min()), float(variance.max()))
-    return Chosen.of(X, y, counts, variance) if ordered else Chosen.in_order(len(y), counts, variance)
+    return Chosen.of(X, y, counts, variance, groups) if ordered else Chosen.in_order(len(y), counts, variance)
 
 
 def check_weights(lowest: float, highest: float) -> None:

@@ -111,6 +111,21 @@ def as_floats(values: Any, name: str) -> np.ndarray:
         raise ValueError(f"{name} must be real numbers: {error}.") from error
 
 
+def checked_groups(groups: Any, n_samples: int) -> np.ndarray | None:
+    """Numbers 0, 1, ... (n_samples,) in place of the labels of groups; None for None."""
+    if groups is None:
+        return None
+    labels = np.asarray(groups.compute() if hasattr(groups, "__dask_graph__") else groups)
+    if labels.shape != (n_samples,):
+        raise ValueError(f"groups must have the shape (n_samples,) = ({n_samples},); got {labels.shape}.")
+    try:
+        numbers: np.ndarray = np.unique(labels, return_inverse=True)[1]
+    except TypeError:
+        # Words and numbers, say, have no order.
+        numbers = np.unique([repr(label) for label in labels.tolist()], return_inverse=True)[1]
+    return numbers
+
+
 @contextmanager
 def unchanged_if_it_fails(estimator: Any) -> Iterator[None]:
     """Give an estimator its attributes back if what is done to it fails."""

@@ -62,6 +62,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         Whether the prior mean is the training mean of y, in place of 0.
     max_iter : int, default=1000
         The most iterations of L-BFGS from each start. With 0 kernel and noise stay where they start.
+    max_time : float, default=None
+        Seconds that the iterations may take; when they are over, the best so far is kept, with a ConvergenceWarning.
     n_restarts : int, default=0
         Further fits with kernel and noise drawn log-uniformly around the first start, within their bounds; the
         likeliest is kept.
@@ -84,6 +86,9 @@ class EGPRegressor(ExplicitGaussianProcess):
         Their posterior standard deviations. Only with a ``feature_map``.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Their posterior covariances. Only with a ``feature_map``.
+    coef_names_ : ndarray of str of shape (n_h,)
+        What the feature map calls them, by its ``get_feature_names_out``; h0, h1, ... if it does not say. Only with a
+        ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -145,6 +150,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         noise_variance: float | None = None,
         normalize_y: bool = False,
         max_iter: int = 1000,
+        max_time: float | None = None,
         n_restarts: int = 0,
         tol: float = 0.01,
         random_state: int | np.random.RandomState | None = None,
@@ -160,6 +166,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.noise_variance = noise_variance
         self.normalize_y = normalize_y
         self.max_iter = max_iter
+        self.max_time = max_time
         self.n_restarts = n_restarts
         self.tol = tol
         self.random_state = random_state
@@ -200,13 +207,17 @@ class EGPRegressor(ExplicitGaussianProcess):
         Warns
         -----
         ConvergenceWarning
-            If the iterations were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far are
-            kept); if the Gaussian process learned nothing; if y is far from its prior mean; if a parameter of the given
-            kernel ended at one of its bounds. It says what to change.
+            If iterations or time were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far
+            are kept); if the Gaussian process learned nothing; if y is far from its prior mean; if a parameter of the
+            given kernel ended at one of its bounds. It says what to change.
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
-        with unchanged_if_it_fails(self), single_threaded_libraries(), monitor_of(self.verbose) as monitor:
+        with (
+            unchanged_if_it_fails(self),
+            single_threaded_libraries(),
+            monitor_of(self.verbose, max_time=self.max_time) as monitor,
+        ):
             problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
             rows = problem.units.rows(problem.source)
             options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)

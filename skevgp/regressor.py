@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -17,12 +18,20 @@ from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import unchanged_if_it_fails
+from .calibration.folds import CrossValidation
+from .exceptions import DependentRowsWarning
 from .fitting.inducing import Placement
 from .outputs.fit import fit_outputs
 from .outputs.plan import Request, Sharing
 from .outputs.sharing import with_groups
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
+
+_DEPENDENT = (
+    "Rows near each other are alike: left out in blocks, they are predicted much worse than at random, and std is too "
+    "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
+    "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
+)
 
 
 class EVGPRegressor(SparseGaussianProcess):
@@ -94,14 +103,16 @@ class EVGPRegressor(SparseGaussianProcess):
         ``posterior="diagonal"`` it is an error, as are correlations.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
-    noise_cv : int, default=None
-        None: the noise variance is where the bound is highest. On rows of trajectories, each like the one before, that
-        is too low: the bound takes them for independent, and ``std`` is too small on new trajectories. A number of
-        folds, 2 or more (10 is good): after the iterations each fold, of consecutive rows as in ``KFold``, is predicted
-        from the others with the same kernel and inducing points, and the noise variance is set so that squared errors
-        are on average as large as predicted variances (Rasmussen & Williams 2006, section 5.4.2), within its bounds.
-        Put one trajectory after the other; where rows are independent, hardly anything changes. It takes two passes
-        over the rows and memory for as many matrices (m, m); an interrupted fit leaves it out.
+    noise_cv : int, default=5
+        Folds, 2 or more, by which noise and signal variances of each output are set after the iterations: each fold is
+        predicted from the others with the same kernel shape and inducing points, and the two are where the log
+        predictive density of what was left out is highest (Rasmussen & Williams 2006, section 5.4.2), within their
+        bounds. Folds are whole ``groups`` of `fit`, else random. At its optimum the bound takes what inducing points
+        cannot represent for noise, and rows of a trajectory, each like the one before, for independent: ``std`` is too
+        large for rows like those of a table, and too small on new trajectories. It takes a few passes over the rows,
+        memory for as many matrices (m, m), and up to 2,000 rows are predicted; q is then at its optimum, after Adam
+        too. It is left out with None, with ``max_iter=0``, below 50 rows, when a fit is interrupted or out of time, and
+        for what the kernel fixes; `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
@@ -112,6 +123,11 @@ class EVGPRegressor(SparseGaussianProcess):
         The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
         Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
+    max_time : float, default=None
+        Seconds that `fit` may take, about: when they are over iterations end, of each independent model when its share
+        is, and the best so far is kept, with a ConvergenceWarning; then ``noise_cv`` is left out. Half of them is the
+        most for finding groups (``sharing="auto"``; if that is not enough, all outputs share). What comes before and
+        after the iterations, passes over the rows, is not cut short.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained over
@@ -143,6 +159,9 @@ class EVGPRegressor(SparseGaussianProcess):
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
         Their posterior covariances. Only with a ``feature_map``. (Where outputs share their weights, nothing of them
         has an axis of outputs.)
+    coef_names_ : ndarray of str of shape (n_h,)
+        What the feature map calls them, by its ``get_feature_names_out``; h0, h1, ... if it does not say. Only with a
+        ``feature_map``.
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
         The prior that was used. Only with a ``feature_map``.
     feature_map_, kernel_map_ : transformer or None
@@ -160,7 +179,7 @@ class EVGPRegressor(SparseGaussianProcess):
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
-        With ``noise_cv`` the lower one is below that of the last iteration: the noise has moved since.
+        With ``noise_cv`` the lower one is below that of the last iteration: noise and signal have moved since.
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
         sample of the rows: the sample's, times the number of rows over its size).
@@ -244,10 +263,11 @@ class EVGPRegressor(SparseGaussianProcess):
         coef_cov: ArrayLike | None = None,
         share_coef: bool | Literal["auto"] = "auto",
         noise_variance: float | None = None,
-        noise_cv: int | None = None,
+        noise_cv: int | None = 5,
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
+        max_time: float | None = None,
         tol: float | Literal["auto"] = "auto",
         forgetting_factor: float = 1.0,
         warm_start: bool = False,
@@ -272,6 +292,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
+        self.max_time = max_time
         self.tol = tol
         self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
@@ -286,6 +307,7 @@ class EVGPRegressor(SparseGaussianProcess):
         y: ArrayLike,
         sample_weight: ArrayLike | None = None,
         *,
+        groups: ArrayLike | None = None,
         relative_variance: ArrayLike | None = None,
     ) -> Self:
         """Fit kernel, noise, inducing points and posterior.
@@ -303,6 +325,11 @@ class EVGPRegressor(SparseGaussianProcess):
         sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
             What each row's log likelihood is multiplied by: 0 removes the row (before the maps are fitted, but to a
             Dask array's chunks), 2 is the row twice. Maps whose ``fit`` has a ``sample_weight`` are given it.
+        groups : array-like of shape (n_samples,), default=None
+            Which rows belong together, by any labels: for rows of trajectories their numbers, such as
+            ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
+            ones; of fewer than three groups, blocks of rows that follow each other inside a group. None: rows are
+            independent, and folds random.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
             Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
             With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
@@ -323,19 +350,20 @@ class EVGPRegressor(SparseGaussianProcess):
         Warns
         -----
         ConvergenceWarning
-            If the iterations were used up, rounding errors or Ctrl-C ended them (the best parameters so far are kept);
-            if the Gaussian process learned nothing, y is far from its prior mean, or a parameter of the given kernel
-            ended at a bound of it. It says what to change.
+            If iterations or time were used up, rounding errors or Ctrl-C ended them (the best parameters so far are
+            kept); if the Gaussian process learned nothing, or nothing that holds for groups left out, y is far from its
+            prior mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
+        skevgp.exceptions.DependentRowsWarning
+            If rows near each other, in the order given, are so alike that the noise would be more than four times as
+            large if blocks of them were left out: ``groups`` should say which belong together.
         """
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        progress = monitor_of(self.verbose, solver.callback)
+        progress = monitor_of(self.verbose, solver.callback, self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
-            problem = self._problem(X, y, sample_weight, relative_variance)
+            problem = self._problem(X, y, sample_weight, relative_variance, groups)
             self._training_data = problem.data
-            if (self.noise_cv or 0) > (n_rows := problem.source.n_rows):
-                raise ValueError(f"noise_cv={self.noise_cv} folds need a row each; got n_samples={n_rows}.")
             request = Request(
                 problem.source,
                 problem.units,
@@ -346,7 +374,9 @@ class EVGPRegressor(SparseGaussianProcess):
                 solver,
                 solver.default_max_iter if self.max_iter is None else self.max_iter,
                 None if isinstance(self.tol, str) else self.tol,
-                self.noise_cv,
+                None
+                if self.noise_cv is None
+                else CrossValidation(self.noise_cv, problem.groups, problem.spec.starts.signal.bounds is None),
                 effective_n_jobs(self.n_jobs),
                 problem.per_output,
             )
@@ -357,6 +387,8 @@ class EVGPRegressor(SparseGaussianProcess):
             self._fitted = fit_outputs(request, rng, monitor, previous)
             self._set_attributes()
         self._warn_of(self._fitted.messages)
+        if self._fitted.dependent:
+            warnings.warn(_DEPENDENT, DependentRowsWarning, stacklevel=3)
         return self
 
     def set_params(self, **params: Any) -> Self:

@@ -49,9 +49,21 @@ def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None
     )
 
 
-def interrupted(n_iter: int) -> str:
-    """That Ctrl-C ended the fit."""
-    return f"The fit was interrupted after {n_iter} iterations; the best parameters so far are kept."
+def interrupted(n_iter: int, max_time: float | None = None) -> str:
+    """That Ctrl-C ended the fit, or that so many seconds were over."""
+    how = "was interrupted" if max_time is None else f"ended since max_time={max_time:g} seconds were over,"
+    return f"The fit {how} after {n_iter} iterations; the best parameters so far are kept."
+
+
+def signal_gone(gone: int, n_outputs: int) -> str:
+    """That of so many outputs fitted together nothing holds for groups that were left out."""
+    if not gone:
+        return ""
+    return (
+        f"What the Gaussian process learned of {gone} of {n_outputs} outputs fitted together does not hold for groups "
+        "that were left out: its signal variance went towards zero. Other columns (kernel_map) or features, more "
+        "groups, or fewer inducing points may tell what groups have in common."
+    )
 
 
 def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:

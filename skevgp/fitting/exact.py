@@ -282,7 +282,9 @@ def fit_exact(
     advice = [best.message, far_from_prior(proper, rows)]
     if options.max_iter > 0:
         advice.append(learned_too_little(kernel, best.values, table, rows, sparse=False))
-    message = interrupted(best.n_iter) if monitor.stopped else " ".join(part for part in advice if part)
+    message = " ".join(part for part in advice if part)
+    if monitor.stopped:
+        message = interrupted(best.n_iter, monitor.max_time if monitor.out_of_time else None)
     return ExactFit(units, model, table, best, (message,) if message else ())
 
 

@@ -10,6 +10,8 @@ from typing import Protocol
 import numpy as np
 
 from .._progress import Monitor
+from ..calibration.calibrate import calibrated
+from ..calibration.folds import CrossValidation
 from ..inference.bounds import bounds_at_optimum, features_alone_bound
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
@@ -19,8 +21,7 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from ..rows.source import of_outputs
-from .advice import far_from_prior, learned_too_little
-from .calibration import calibrated_noise
+from .advice import far_from_prior, learned_too_little, signal_gone
 from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
@@ -66,8 +67,8 @@ class SparseTask:
     max_iter : int
     tol : float or None
         In nats; None leaves it to the solver.
-    noise_cv : int, optional
-        Folds of consecutive rows by which the noise is calibrated.
+    noise_cv : CrossValidation, optional
+        By which signal and noise are calibrated.
     seed : int
         Draws mini-batches, samples of the rows and restarts.
     monitor : Monitor
@@ -85,7 +86,7 @@ class SparseTask:
     solver: Solver
     max_iter: int
     tol: float | None
-    noise_cv: int | None
+    noise_cv: CrossValidation | None
     seed: int
     monitor: Monitor
     warm: Values | None = None
@@ -295,6 +296,8 @@ class Learned:
         Minus the bound per iteration.
     message : str
         What the user should know of how the fit ended; empty if all is well.
+    dependent : bool, default=False
+        Whether rows near each other were found to be alike.
     """
 
     model: SparseModel
@@ -306,32 +309,39 @@ class Learned:
     predictor: Predictor
     loss_curve: list[float]
     message: str
+    dependent: bool = False
 
     @classmethod
     def of(cls, task: SparseTask, fit: Fit) -> Learned:
-        """What is kept of a fit; its noise is calibrated if the task says so and Ctrl-C did not."""
-        statistics = task.model.statistics(fit.values, task.blocks)
-        bound, predictor = task.model.at_optimum(fit.values, statistics)
-        advice = [fit.message, far_from_prior(task.model.prior, task.rows)]
-        free_noise = task.table["noise"].free.any()
+        """What is kept of a fit; signal and noise are calibrated if the task says so and Ctrl-C did not."""
+        model, values = task.model, fit.values
+        statistics = model.statistics(values, task.blocks)
+        advice, found = [fit.message, far_from_prior(model.prior, task.rows)], None
         if not task.monitor.stopped and task.max_iter > 0:
-            advice.append(task.learned_too_little(fit.values))
-        learned = cls(
-            task.model,
-            task.table,
-            fit.values,
-            statistics,
+            advice.append(task.learned_too_little(values))
+            if task.noise_cv is not None:
+                with task.monitor.keeping_the_best():
+                    found = calibrated(model, values, statistics, task.table, task.rows, task.noise_cv, task.seed)
+        if found is not None:
+            values = values | {"signal": found.signal, "noise": found.noise}
+            advice.append(signal_gone(found.gone, len(found.noise)))
+        bound, predictor = model.at_optimum(values, statistics)
+        if found is None:
             # Summed row by row, which keeps its digits where the noise is low.
-            fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound,
-            task.model.upper_bound(fit.values, statistics, task.blocks),
-            predictor if fit.predictor is None else fit.predictor,
+            bound = fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound
+            predictor = predictor if fit.predictor is None else fit.predictor
+        return cls(
+            model,
+            task.table,
+            values,
+            statistics,
+            bound,
+            model.upper_bound(values, statistics, task.blocks),
+            predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
+            found is not None and found.dependent,
         )
-        if task.noise_cv is not None and free_noise and not task.monitor.stopped:
-            with task.monitor.keeping_the_best():
-                learned = learned.calibrated(task.rows, task.noise_cv)
-        return learned
 
     def bound_at(
         self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: np.ndarray
@@ -384,15 +394,7 @@ class Learned:
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
         return replace(self, model=model, statistics=statistics)._at_optimum()
 
-    def calibrated(self, rows: Rows, n_folds: int) -> Learned:
-        """The noise that is free from cross-validation, and q at its optimum for it."""
-        limits = self.table["noise"].value_limits()
-        noise = calibrated_noise(self.model, self.values, self.statistics, rows, limits, n_folds)
-        noise = np.where(self.table["noise"].free, noise, self.values["noise"])
-        blocks = self.model.blocks(rows, self.values["inducing_points"].shape[1])
-        return replace(self, values=self.values | {"noise": noise})._at_optimum(blocks)
-
-    def _at_optimum(self, blocks: Blocks | None = None) -> Learned:
+    def _at_optimum(self) -> Learned:
         bound, predictor = self.model.at_optimum(self.values, self.statistics)
-        upper_bound = self.model.upper_bound(self.values, self.statistics, blocks)
+        upper_bound = self.model.upper_bound(self.values, self.statistics)
         return replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)

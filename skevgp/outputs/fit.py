@@ -40,20 +40,24 @@ def fit_outputs(
     threads = BlockMap(request.n_threads if len(models) == 1 else 1)
     try:
         tasks = plan(request, rng, monitor, threads, previous)
-        learned = side_by_side(_fit_one, tasks, at_once, monitor)
+        # Of the time that is left each has a share when its turn comes.
+        turns = [(task, 1.0 / -(-(len(models) - i) // at_once)) for i, task in enumerate(tasks)]
+        learned = side_by_side(_fit_one, turns, at_once, monitor)
     finally:
         threads.close()
     messages = sorted({one.message for one in learned if one.message})
-    if monitor.stopped:
-        messages = [interrupted(max(len(one.loss_curve) for one in learned))]
+    if monitor.stopped or monitor.out_of_time:
+        n_iter, max_time = max(len(one.loss_curve) for one in learned), None if monitor.stopped else monitor.max_time
+        messages = [interrupted(n_iter, max_time)]
     return FittedOutputs(
         request.units, [model.outputs for model in models], request.found, tuple(learned), tuple(messages)
     )
 
 
-def _fit_one(task: SparseTask) -> Learned:
+def _fit_one(turn: tuple[SparseTask, float]) -> Learned:
+    task, share = turn
     # A copy, with which the blocks of rows are forgotten.
-    task = replace(task)
+    task = replace(task, monitor=task.monitor.with_time(share))
     if task.placement.max_inducing is None:
         return Learned.of(task, search(task))
     return Learned.of(*grown(task))

@@ -49,6 +49,11 @@ class FittedOutputs:
         return self.units.predictor([one.predictor for one in self.learned], self.outputs)
 
     @property
+    def dependent(self) -> bool:
+        """Whether rows near each other were found to be alike."""
+        return any(one.dependent for one in self.learned)
+
+    @property
     def lower_bound(self) -> float:
         """In nats, summed over outputs."""
         return sum(one.bound for one in self.learned) - self._shift
@@ -100,7 +105,9 @@ class FittedOutputs:
         table = self.learned[model].table
         limits = table[name].value_limits()
         if name == "signal":
-            return limits[[within]] * self.units.target_unit[output] ** 2
+            # Calibrated, it may have left them.
+            (low, high), signal = limits[within], self.learned[model].values["signal"][within]
+            return np.array([[min(low, signal), max(high, signal)]]) * self.units.target_unit[output] ** 2
         if table[name].start.ndim == 1:
             return limits
         return limits.reshape(*table[name].start.shape, 2)[self.learned[model].model.set_of(within, table[name])]

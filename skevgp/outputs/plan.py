@@ -11,6 +11,7 @@ from typing import Literal, TypeVar
 import numpy as np
 
 from .._progress import Monitor
+from ..calibration.folds import CrossValidation
 from ..fitting.inducing import Placement, are_all_rows
 from ..fitting.sparse import Solver, SparseTask
 from ..fitting.start import centred_kernels, checked_variance, starting_table
@@ -49,8 +50,8 @@ class Request:
     max_iter : int
     tol : float or None
         In nats; None leaves it to the solver.
-    noise_cv : int or None
-        Folds of consecutive rows by which the noise is calibrated.
+    noise_cv : CrossValidation or None
+        By which signal and noise are calibrated.
     n_threads : int
         For independent models, or else for blocks of rows.
     per_output : bool, default=False
@@ -68,7 +69,7 @@ class Request:
     solver: Solver
     max_iter: int
     tol: float | None
-    noise_cv: int | None
+    noise_cv: CrossValidation | None
     n_threads: int
     per_output: bool = False
     found: bool = False

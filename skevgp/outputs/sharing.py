@@ -24,6 +24,8 @@ from .plan import Request, plan
 
 # Of what its own Gaussian process gains an output over features and noise.
 _LARGEST_LOSS = 0.01
+# At the most, if the time is limited.
+_SHARE_OF_TIME = 0.5
 # In squared internal units: rounding.
 _CONSTANT = 1e-12
 # By which groups are found: at most so many rows and points; iterations of the first fit and of others; in nats.
@@ -61,9 +63,11 @@ def with_groups(
         return replace(request, sharing="none")
     if previous is not None and previous.found and len(previous.units.target_unit) == len(request.units.target_unit):
         return replace(request, sharing=previous.sharing, found=True)
-    groups = found_groups(request, deepcopy(rng), monitor.silent())
+    groups = found_groups(request, deepcopy(rng), part := monitor.silent().with_time(_SHARE_OF_TIME))
     if monitor.stopped:
         raise KeyboardInterrupt
+    if part.stopped:
+        return replace(request, sharing="all")
     return replace(request, sharing=groups, found=True)
 
 

@@ -88,12 +88,9 @@ class CoefficientDisplay:
         check_is_fitted(estimator)
         if not hasattr(estimator, "coef_"):
             raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
-        n_outputs, width = np.atleast_2d(estimator.coef_).shape
+        n_outputs = len(np.atleast_2d(estimator.coef_))
         check_output(output, n_outputs)
-        try:
-            names = [str(name) for name in estimator.feature_map_.get_feature_names_out()]
-        except AttributeError:  # A map, or a step of it, that does not name its features.
-            names = [f"h{index}" for index in range(width)]
+        names = list(estimator.coef_names_)
         parts = (
             np.atleast_2d(part)[output]
             for part in (

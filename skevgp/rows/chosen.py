@@ -61,6 +61,10 @@ class Chosen:
         found[alike < 0] = np.nan
         return found
 
+    def labels_of(self, labels: np.ndarray) -> np.ndarray:
+        """Of labels (n_samples,) of the user's rows those of these, (n,)."""
+        return labels if self.positions is None else labels[self.positions]
+
     @classmethod
     def in_order(cls, n_samples: int, counts: np.ndarray | None, variance: np.ndarray | None) -> Chosen:
         """All rows that count, in the user's order; arguments as of `of`."""

@@ -115,6 +115,12 @@ class RowWeights:
                 kept = np.array(positive) if chunks is counts else kept
         return cls(counts, variance, kept)
 
+    def labels_of(self, labels: np.ndarray) -> np.ndarray:
+        """Of labels (n,) of all rows those of the rows that count."""
+        if self.counts is None:
+            return labels
+        return labels[np.concatenate(_dask().compute(*self.counts)) != 0.0]
+
 
 def _chunks_like(X: Any, values: Any, name: str) -> list[Any] | None:
     """Numbers of the rows, in the chunks of X."""
@@ -183,9 +189,6 @@ class DaskSource:
         back = np.argsort(order)
         return RawRows(*_joined(found))[back]
 
-    def some(self, rows: np.ndarray) -> DaskSource:
-        raise NotImplementedError("chunks stay in their order")
-
     def part(self, first: int, end: int) -> DaskSource:
         delayed, part = _dask().delayed, copy(self)
         starts = np.append(0, self._ends[:-1])
@@ -195,6 +198,15 @@ class DaskSource:
         part._ends = np.cumsum([cuts[owner][1] - cuts[owner][0] for owner in owners])
         part.n_rows = end - first
         return part
+
+    def some(self, rows: np.ndarray) -> DaskSource:
+        delayed, some = _dask().delayed, copy(self)
+        starts, owners = np.append(0, self._ends[:-1]), np.searchsorted(self._ends, rows, side="right")
+        own = [(owner, rows[owners == owner] - starts[owner]) for owner in np.unique(owners)]
+        some._partitions = [delayed(_some)(self._partitions[owner], chosen) for owner, chosen in own]
+        some._ends = np.cumsum([len(chosen) for _, chosen in own])
+        some.n_rows = len(rows)
+        return some
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return DaskBlocks(self._partitions, make, n_inducing)
@@ -297,6 +309,10 @@ def _range(values: np.ndarray) -> tuple[float, float, int]:
 
 def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
     return partition.part(first, end)
+
+
+def _some(partition: LocalSource, rows: np.ndarray) -> LocalSource:
+    return partition.some(rows)
 
 
 def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:

@@ -182,7 +182,7 @@ class Rows:
         return None if positions is None else np.argsort(positions)
 
     def some_of(self, chosen: np.ndarray, share: float) -> Rows:
-        """Rows by index, with a share of the memory."""
+        """Rows by index, in ascending order where the source is Dask's, with a share of the memory."""
         return replace(self, source=self.source.some(chosen), share=self.share * share)
 
     def part(self, first: int, end: int, share: float) -> Rows:

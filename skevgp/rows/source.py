@@ -91,7 +91,7 @@ class Source(Protocol):
         """Consecutive rows, at least one."""
 
     def some(self, rows: np.ndarray) -> Source:
-        """Rows by index, at least one; only of a source with ``positions``."""
+        """Rows by index, at least one; in ascending order if they are Dask's, whose chunks stay in theirs."""
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""

@@ -1,0 +1,177 @@
+"""Signal and noise variance under which rows that were left out are predicted as well as possible, std included.
+
+The bound counts every row as new knowledge. Rows of a trajectory are alike, and what a sparse model cannot represent is
+alike in all of them: the noise that the bound likes best, and with it the standard deviation of predictions, is too
+small for new trajectories. And what inducing points cannot represent is noise to the bound, while predictions count it
+twice: of independent rows the noise is too large. So folds of rows are left out one after the other (Rasmussen &
+Williams 2006, section 5.4.2: cross-validation), with kernel and inducing points as they are, and each output's signal
+and noise variance are where this is highest:
+
+    mean over rows left out of log N(r | mean, variance)  -  ½ log rms of (r - mean)  +  log prior / number of rows,
+
+with a prior that is log-normal around what the bound found: where the rows left out say nothing, all stays. (Density
+alone would give the mean away where rows are uncertain anyway.) What predicts rows left out is in `left_out`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from .._linalg import NotPositiveDefiniteError
+from ..inference.bounds import bounds_at_optimum
+from ..inference.model import SparseModel
+from ..inference.statistics import SufficientStatistics, collect
+from ..optimizers.parameters import ParameterTable, Values
+from ..rows.internal import Rows
+from .folds import CrossValidation, Fold, folds_in_order
+from .left_out import LeftOut, Seen, Weights, prior_of, sums_of_others
+from .search import Limits, Search
+
+# The noise is no lower than this share of the square of what the model leaves over of its own rows.
+_LEFT_OVER = 0.2
+# The signal's limits in a fit are so many times wider here, if they are not the user's.
+_WIDER = 1e4
+# Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds.
+_DEPENDENT = 4.0
+# Of so many rows that can be seen.
+_FEWEST_DEPENDENT = 200
+# The signal has gone if so little is left of what explained more than half of an output.
+_GONE, _EXPLAINED = 1e-3, 0.5
+
+
+@dataclass(frozen=True)
+class Calibrated:
+    """What came of it.
+
+    Attributes
+    ----------
+    signal, noise : ndarray of shape (o,)
+        s² and σ².
+    gone : int
+        Outputs of which nothing that was learned holds for groups that were left out.
+    dependent : bool
+        Whether rows near each other are alike.
+    """
+
+    signal: np.ndarray
+    noise: np.ndarray
+    gone: int = 0
+    dependent: bool = False
+
+
+def calibrated(
+    model: SparseModel,
+    values: Values,
+    statistics: list[SufficientStatistics],
+    table: ParameterTable,
+    rows: Rows,
+    by: CrossValidation,
+    seed: int,
+) -> Calibrated | None:
+    """The signal and noise variances of each output; None if none is free, there are too few rows, or it fails.
+
+    Parameters
+    ----------
+    model : SparseModel
+    values : dict
+        As in `SparseModel.at_optimum`.
+    statistics : list of SufficientStatistics
+        Of all rows, for these values.
+    table : ParameterTable
+        What is free, within which limits.
+    rows : Rows
+    by : CrossValidation
+    seed : int
+        Draws folds.
+    """
+    rng = np.random.RandomState(seed)
+    folds = by.folds(len(rows), rng)
+    if len(folds) < 2 or not any(table[name].free.any() for name in ("signal", "noise")):
+        return None
+    try:
+        return _by_folds(model, values, statistics, table, rows, by, folds, rng)
+    except NotPositiveDefiniteError:
+        # All rows could be learned from; fewer need not be.
+        return None
+
+
+def _by_folds(
+    model: SparseModel,
+    values: Values,
+    statistics: list[SufficientStatistics],
+    table: ParameterTable,
+    rows: Rows,
+    by: CrossValidation,
+    folds: list[Fold],
+    rng: np.random.RandomState,
+) -> Calibrated:
+    limits, lowest = Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
+    searches = _searches(model, values, folds, rows, limits, _LEFT_OVER * lowest)
+    found = np.array(list(rows.threads(Search.best, searches)))
+    signal, noise = found.T
+    gone, dependent = 0, False
+    if by.groups is not None:
+        explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
+        gone = int((explained & (signal < _GONE * values["signal"])).sum())
+    elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
+        order = rows.as_given()
+        in_order = folds_in_order(np.arange(len(rows)) if order is None else order, by.n_folds, rng)
+        alone = replace(limits, free_signal=False)
+        blocks = _searches(model, values, in_order, rows, alone, lowest)
+        chance = [search.with_limits(alone, lowest[search.output]) for search in searches]
+        each = (np.array([noise for _, noise in rows.threads(Search.best, own)]) for own in (blocks, chance))
+        dependent = bool((next(each) > _DEPENDENT * next(each)).any())
+    return Calibrated(signal, noise, gone, dependent)
+
+
+def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:
+    """The square (o,) of what the model leaves over of its own rows, per degree of freedom."""
+    found = np.empty(len(values["noise"]))
+    for bound in bounds_at_optimum(list(model.groups_of(values, statistics)), model.family):
+        group = bound.group
+        n_rows = group.statistics.n_rows
+        # Rows less the trace of I - B⁻¹, the weights that they determine.
+        freedom = [n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
+        found[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
+    return found
+
+
+def _searches(
+    model: SparseModel, values: Values, folds: Sequence[Fold], rows: Rows, limits: Limits, lowest: np.ndarray
+) -> list[Search]:
+    """For each output, in order: a pass over the rows for each group."""
+    m, share = values["inducing_points"].shape[1], 1.0 / len(folds)
+    all_of = [model.blocks(rows.some_of(fold.rows, share), m) for fold in folds]
+    predicted = [model.blocks(rows.some_of(fold.predicted, share), m) for fold in folds]
+    each = []
+    for outputs, whitening in zip(model.groups, model.whitenings(values), strict=True):
+        of_others = sums_of_others([collect(fold, whitening, outputs) for fold in all_of])
+        seen = [fold.sum(Seen(whitening, outputs)) for fold in predicted]
+        groups = [model.group(values, outputs, whitening, others) for others in of_others]
+        each.append([LeftOut(group, model.family, own) for group, own in zip(groups, seen, strict=True)])
+    known: list[list[Weights | None]] = [[None] * len(folds)] * len(values["noise"])
+    if model.prior.shared:
+        known = _known_elsewhere(each)
+    searches: list[Search] = []
+    for group in each:
+        for index in range(len(group[0].group.noise)):
+            o = len(searches)
+            searches.append(Search(o, index, group, known[o], values, limits, float(lowest[o])))
+    return searches
+
+
+def _known_elsewhere(groups: Sequence[Sequence[LeftOut]]) -> list[list[Weights | None]]:
+    """Of each output: what its prior and the other outputs, as fitted, say of the weights without each fold."""
+    outputs = [(group, index) for group in groups for index in range(len(group[0].group.noise))]
+    told = [[fold.says(index) for fold in group] for group, index in outputs]
+    found: list[list[Weights | None]] = []
+    for o, (group, index) in enumerate(outputs):
+        own: list[Weights | None] = []
+        for k, fold in enumerate(group):
+            others = (each[k] for j, each in enumerate(told) if j != o)
+            own.append(sum(others, start=prior_of(fold.group, index)))
+        found.append(own)
+    return found

@@ -1,0 +1,99 @@
+"""Which rows are left out together, to be predicted from the others."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+# What few rows tell is told by random folds of no fewer rows than this, all together.
+FEWEST_ROWS = 50
+# A standard deviation needs no more than so many rows: of more, so many are drawn to be predicted.
+PREDICTED_ROWS = 2000
+# Fewer groups than this are no sample of groups: blocks of consecutive rows are left out, and of each block so much at
+# either end, which is like its neighbours, is not predicted.
+_FEWEST_GROUPS, _GAP = 3, 0.15
+
+
+@dataclass(frozen=True)
+class CrossValidation:
+    """How rows are left out.
+
+    Attributes
+    ----------
+    n_folds : int
+        No more than there are rows or groups.
+    groups : ndarray of shape (n,), optional
+        Which rows are left out together; None: chance says.
+    wide : bool, default=True
+        Whether nobody set bounds for the signal: it may then leave those of the fit, which keep kernels from becoming
+        long waves of huge height. Here the kernel's shape stays.
+    """
+
+    n_folds: int
+    groups: np.ndarray | None = None
+    wide: bool = True
+
+    def folds(self, n_rows: int, rng: np.random.RandomState) -> list[Fold]:
+        """Folds of all rows; none if these are too few."""
+        if n_rows < FEWEST_ROWS:
+            return []
+        if self.groups is None:
+            return random_folds(n_rows, self.n_folds, rng)
+        return folds_of_groups(self.groups, self.n_folds, rng)
+
+
+@dataclass(frozen=True)
+class Fold:
+    """Rows that are left out together.
+
+    Attributes
+    ----------
+    rows : ndarray
+        By index, in ascending order.
+    predicted : ndarray
+        Those of them that are predicted, at least one.
+    """
+
+    rows: np.ndarray
+    predicted: np.ndarray
+
+
+def random_folds(n_rows: int, n_folds: int, rng: np.random.RandomState) -> list[Fold]:
+    """Folds of nearly equal length; as many as there are rows if these are fewer."""
+    return _thinned(np.array_split(rng.permutation(n_rows), min(n_folds, n_rows)), rng)
+
+
+def folds_in_order(order: np.ndarray, n_folds: int, rng: np.random.RandomState, gap: bool = False) -> list[Fold]:
+    """Folds of rows that follow each other in an order; perhaps only what is inside of each is predicted."""
+    parts = [part for part in np.array_split(order, n_folds) if len(part)]
+    ends = [int(_GAP * len(part)) if gap else 0 for part in parts]
+    return _thinned(parts, rng, [part[end : len(part) - end] for part, end in zip(parts, ends, strict=True)])
+
+
+def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState) -> list[Fold]:
+    """Folds of whole groups, of nearly equal numbers of rows; ``groups`` (n,) says to which group each row belongs."""
+    names, own, sizes = np.unique(groups, return_inverse=True, return_counts=True)
+    if len(names) < _FEWEST_GROUPS:
+        return folds_in_order(np.argsort(own, kind="stable"), n_folds, rng, gap=True)
+    n_folds = min(n_folds, len(names))
+    # The largest first, each to the fold that has least; which of equal ones comes first is left to chance.
+    shuffled = rng.permutation(len(names))
+    fold_of, load = np.empty(len(names), dtype=int), np.zeros(n_folds)
+    for group in shuffled[np.argsort(-sizes[shuffled], kind="stable")]:
+        fold_of[group] = np.argmin(load)
+        load[fold_of[group]] += sizes[group]
+    folds = fold_of[own]
+    return _thinned([np.flatnonzero(folds == fold) for fold in range(n_folds)], rng)
+
+
+def _thinned(parts: list[np.ndarray], rng: np.random.RandomState, inner: list[np.ndarray] | None = None) -> list[Fold]:
+    """Folds of these rows; of ``inner`` no more than `PREDICTED_ROWS` are predicted, an equal share of each."""
+    inner = parts if inner is None else inner
+    share = min(1.0, PREDICTED_ROWS / sum(map(len, inner)))
+    folds = []
+    for rows, own in zip(parts, inner, strict=True):
+        if share < 1.0:
+            own = rng.permutation(own)[: max(round(share * len(own)), 1)]
+        folds.append(Fold(np.sort(rows), np.sort(own)))
+    return folds

@@ -1,0 +1,13 @@
+"""Warnings of skevgp's own."""
+
+from __future__ import annotations
+
+__all__ = ["DependentRowsWarning"]
+
+
+class DependentRowsWarning(UserWarning):
+    """Rows near each other are alike, and nobody said which belong together.
+
+    Given by `EVGPRegressor.fit` without ``groups``: its standard deviations are then those of rows like these, not of
+    new trajectories.
+    """

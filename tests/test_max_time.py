@@ -1,0 +1,117 @@
+"""max_time: a fit ends in time, with the best so far."""
+
+import numpy as np
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import EGPRegressor, EVGPRegressor
+from skevgp._progress import Monitor
+from skevgp.solvers import LBFGS
+
+rng = np.random.RandomState(0)
+X = rng.uniform(-2.0, 2.0, (120, 2))
+Y = np.column_stack([np.sin(2.0 * X[:, 0]), X[:, 1] ** 2, X[:, 0] * X[:, 1]]) + 0.05 * rng.randn(120, 3)
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self):
+        self.now = 0.0
+
+    def __call__(self):
+        return self.now
+
+
+def iterations(monitor, clock, most=100, seconds=1.0):
+    """How many iterations of so many seconds each a monitor lets happen."""
+    n = 0
+    with monitor.keeping_the_best():
+        for n in range(1, most + 1):
+            clock.now += seconds
+            monitor.iteration(n, 0.0)
+    return n
+
+
+def test_a_part_of_the_fit_ends_with_its_share_of_the_time_and_the_others_go_on():
+    clock = Clock()
+    monitor = Monitor(max_time=30.0, clock=clock)
+    first = monitor.with_time(1.0 / 3.0)
+    assert iterations(first.seen_as(n_before=1), clock) == 10
+    assert first.stopped
+    assert not monitor.stopped
+    assert monitor.out_of_time
+    # What the second leaves goes to the third.
+    second = monitor.with_time(0.5)
+    assert iterations(second, clock, most=4) == 4
+    assert not second.stopped
+    assert iterations(monitor.with_time(1.0), clock) == 16
+
+
+def test_ctrl_c_ends_all_parts_whatever_their_time():
+    monitor = Monitor(max_time=30.0, clock=Clock())
+    first, second = monitor.with_time(0.5), monitor.with_time(1.0)
+    with first.keeping_the_best():
+        raise KeyboardInterrupt
+    assert second.stopped
+    assert not monitor.out_of_time
+
+
+def test_without_a_limit_time_does_not_matter():
+    clock = Clock()
+    assert iterations(Monitor(clock=clock).with_time(0.5), clock, seconds=1e9) == 100
+
+
+@pytest.mark.parametrize("sharing", ["auto", "all", "none", [[0, 1], [2]]])
+@pytest.mark.parametrize("n_jobs", [1, 2])
+def test_when_it_is_over_the_best_so_far_is_kept(sharing, n_jobs):
+    model = EVGPRegressor(n_inducing=10, sharing=sharing, max_time=1e-9, n_jobs=n_jobs, random_state=0)
+    with pytest.warns(ConvergenceWarning, match=r"ended since max_time=1e-09 seconds were over, after 1 iterations"):
+        model.fit(X, Y)
+    assert model.n_iter_ == 1
+    assert np.isfinite(model.predict(X)).all()
+
+
+def test_it_ends_the_search_for_a_number_of_inducing_points_and_leaves_calibration_out():
+    settings = {"n_inducing": "auto", "random_state": 0}
+    with pytest.warns(ConvergenceWarning, match="max_time"):
+        model = EVGPRegressor(**settings, max_time=1e-9).fit(X, Y[:, 0])
+    assert len(model.inducing_points_) == 10
+    with pytest.warns(ConvergenceWarning, match="max_time"):
+        plain = EVGPRegressor(**settings, max_time=1e-9, noise_cv=None).fit(X, Y[:, 0])
+    assert plain.noise_variance_ == model.noise_variance_
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_time_enough_changes_nothing(solver):
+    settings = {"n_inducing": 10, "solver": solver, "max_iter": 5, "random_state": 0}
+    plain, timed = (EVGPRegressor(**settings, max_time=seconds) for seconds in (None, 1e6))
+    np.testing.assert_array_equal(plain.fit(X, Y).predict(X), timed.fit(X, Y).predict(X))
+
+
+def test_of_the_exact_model_too():
+    with pytest.warns(ConvergenceWarning, match="max_time=1e-09 seconds were over, after 1 iterations"):
+        model = EGPRegressor(max_time=1e-9).fit(X, Y)
+    assert model.n_iter_ == 1
+
+
+def test_adam_too():
+    with pytest.warns(ConvergenceWarning, match="max_time=1e-09"):
+        assert EVGPRegressor(solver="adam", n_inducing=10, max_time=1e-9, random_state=0).fit(X, Y).n_iter_ == 1
+
+
+def test_ctrl_c_is_told_as_such():
+    def interrupt(iteration, bound, outputs):
+        raise KeyboardInterrupt
+
+    model = EVGPRegressor(n_inducing=10, solver=LBFGS(callback=interrupt), max_time=1e6, sharing="all", random_state=0)
+    with pytest.warns(ConvergenceWarning, match="was interrupted after 1 iterations"):
+        model.fit(X, Y)
+
+
+@pytest.mark.parametrize("max_time", [0, -1.0, "10"])
+@pytest.mark.parametrize("estimator", [EVGPRegressor, EGPRegressor])
+def test_no_time_is_refused(estimator, max_time):
+    with pytest.raises(ValueError, match=f"The 'max_time' parameter of {estimator.__name__} must be"):
+        estimator(max_time=max_time).fit(X, Y)
