@@ -65,6 +65,11 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if not hasattr(self, "_fitted"):
             return self.fit(X, y, sample_weight, relative_variance=relative_variance)
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        if self._fitted.row_scales is not None:
+            raise ValueError(
+                'partial_fit needs noise="gaussian": with noise="student-t", how far the rows before are doubted '
+                "depends on the new ones. Call fit with all rows."
+            )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
             n_outputs = 1 if y.ndim == 1 else y.shape[1]

@@ -20,6 +20,8 @@ from ._validation import unchanged_if_it_fails
 from .fitting.inducing import Placement
 from .fitting.outputs import Request, Sharing, fit_outputs
 from .fitting.sharing import with_groups
+from .rows.chosen import Chosen
+from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, resolved
 
@@ -77,6 +79,13 @@ class EVGPRegressor(SparseGaussianProcess):
         for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean. If y is far
         from 0 compared with its scatter, an intercept among the features needs a wider scale than that, or
         ``normalize_y=True``.
+    noise : {"gaussian", "student-t"}, default="gaussian"
+        ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
+        Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
+        freedom, ten times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are fitted
+        together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std`` and
+        ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With L-BFGS
+        only, not for Dask arrays, and without `partial_fit` after the first.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=None
@@ -141,6 +150,9 @@ class EVGPRegressor(SparseGaussianProcess):
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
+    weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+        Only with ``noise="student-t"``: the expected τ of each row, by which its noise variance is divided: 1 for an
+        ordinary row, near 0 for one that is doubted; NaN for one of weight 0.
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
@@ -168,6 +180,8 @@ class EVGPRegressor(SparseGaussianProcess):
     - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
     - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
     - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
+    - M. E. Tipping, N. D. Lawrence (2005): Variational Inference for Student-t Models.
+    - P. Jylänki, J. Vanhatalo, A. Vehtari (2011): Robust Gaussian Process Regression with a Student-t Likelihood.
 
     Examples
     --------
@@ -190,6 +204,7 @@ class EVGPRegressor(SparseGaussianProcess):
         "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none", "auto"}), "array-like"],
         "posterior": [StrOptions({"full", "diagonal"})],
+        "noise": [StrOptions({"gaussian", "student-t"})],
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -212,6 +227,7 @@ class EVGPRegressor(SparseGaussianProcess):
         posterior: Literal["full", "diagonal"] = "full",
         coef_mean: ArrayLike | Literal["auto"] = "auto",
         coef_scale: ArrayLike | Literal["auto"] = "auto",
+        noise: Literal["gaussian", "student-t"] = "gaussian",
         noise_variance: float | None = None,
         noise_cv: int | None = None,
         normalize_y: bool = False,
@@ -234,6 +250,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.posterior = posterior
         self.coef_mean = coef_mean
         self.coef_scale = coef_scale
+        self.noise = noise
         self.noise_variance = noise_variance
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
@@ -297,6 +314,11 @@ class EVGPRegressor(SparseGaussianProcess):
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
+        if self.noise == "student-t" and (isinstance(solver, Adam) or is_dask(X)):
+            raise ValueError(
+                'noise="student-t" needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
+                f"solver={self.solver!r} and X of type {type(X).__name__}."
+            )
         progress = monitor_of(self.verbose, solver.callback)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y, sample_weight, relative_variance)
@@ -315,14 +337,26 @@ class EVGPRegressor(SparseGaussianProcess):
                 None if isinstance(self.tol, str) else self.tol,
                 self.noise_cv,
                 effective_n_jobs(self.n_jobs),
+                heavy_tails=self.noise == "student-t",
             )
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)
             self._fitted = fit_outputs(request, rng, monitor, previous)
             self._set_attributes()
+            self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         return self
+
+    def _set_weights(self, chosen: Chosen) -> None:
+        """How much each of the user's rows is doubted."""
+        scales = self._fitted.row_scales
+        if scales is None:
+            self.__dict__.pop("weights_", None)
+            return
+        model_of = [next(i for i, own in enumerate(self._fitted.outputs) if o in own) for o in range(self._n_outputs)]
+        weights = chosen.as_given(scales[:, model_of])
+        self.weights_ = weights[:, 0] if self._single_output else weights
 
     def set_params(self, **params: Any) -> Self:
         """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.

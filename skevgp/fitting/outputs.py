@@ -22,9 +22,10 @@ from ..rows.source import Source
 from ..rows.threads import BlockMap, side_by_side
 from .advice import interrupted
 from .inducing import Placement, are_all_rows
+from .noise.outliers import RowDoubts, fit_doubting
 from .sparse import Learned, Solver, SparseTask, grown
 from .start import Units, checked_variance, column_centre, starting_table
-from .strategy import search
+from .strategy import Fit, search
 
 Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 
@@ -55,6 +56,8 @@ class Request:
         For independent models, or else for blocks of rows.
     found : bool, default=False
         Whether the groups were found and not given.
+    heavy_tails : bool, default=False
+        Whether the noise has a Student-t's tails.
     """
 
     source: Source
@@ -69,6 +72,7 @@ class Request:
     noise_cv: int | None
     n_threads: int
     found: bool = False
+    heavy_tails: bool = False
 
 
 @dataclass(frozen=True)
@@ -93,6 +97,12 @@ class FittedOutputs:
     found: bool
     learned: tuple[Learned, ...]
     messages: tuple[str, ...]
+
+    @property
+    def row_scales(self) -> np.ndarray | None:
+        """E[τ] of each row and model, (n, n_models); None if the noise is Gaussian."""
+        each = [one.doubts.scales.mean for one in self.learned if isinstance(one.doubts, RowDoubts)]
+        return np.column_stack(each) if each else None
 
     def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
         """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
@@ -252,12 +262,11 @@ def plan(
     alone = table_of([0], np.empty((1, 0, len(rows.inputs.mean)))).values_at_start()
     inputs = rows.sample(placement.sample_size, rng).inputs
     points = placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng)
-    first = starts.hyperparameters.value
+    first, share = starts.hyperparameters.value, 1.0 / min(request.n_threads, len(models))
     variance = 1.0 if first is None else checked_variance(kernel, first, points)
     # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
     seed = rng.randint(np.iinfo(np.int32).max)
-    goes_on = previous is not None and previous.outputs == [outputs for outputs, _ in models]
-    share, tasks = 1.0 / min(request.n_threads, len(models)), []
+    goes_on, tasks = previous is not None and previous.outputs == [outputs for outputs, _ in models], []
     for i, (outputs, groups) in enumerate(models):
         warm: Values | None = None
         if goes_on and previous is not None:
@@ -287,6 +296,7 @@ def plan(
                 monitor.seen_as(shift=shift, outputs=_as_columns(outputs), about=_shown(outputs, len(models))),
                 None if warm is None else table.started_at(warm).values_at_start(),
                 warm is not None and sets is warm.get("inducing_points"),
+                request.heavy_tails,
             )
         )
     return tasks
@@ -342,6 +352,10 @@ def _shown(outputs: list[int], n_models: int) -> str:
 def _fit_one(task: SparseTask) -> Learned:
     # A copy, with which the blocks of rows are forgotten.
     task = replace(task)
-    if task.placement.max_inducing is None:
-        return Learned.of(task, search(task))
-    return Learned.of(*grown(task))
+    if task.heavy_tails:
+        return fit_doubting(task, _best)
+    return Learned.of(task, search(task)) if task.placement.max_inducing is None else Learned.of(*grown(task))
+
+
+def _best(task: SparseTask) -> tuple[SparseTask, Fit]:
+    return (task, search(task)) if task.placement.max_inducing is None else grown(task)

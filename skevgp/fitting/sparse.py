@@ -48,6 +48,16 @@ class Solver(Protocol):
         """The way from one start."""
 
 
+class Doubts(Protocol):
+    """How much each row is doubted (`noise.outliers`)."""
+
+    def weigh(self, rows: Rows) -> Rows:
+        """Rows as the rest of the model sees them."""
+
+    def told(self, learned: Learned) -> Learned:
+        """What is said of the noise is that of rows that are no outliers."""
+
+
 @dataclass(frozen=True)
 class SparseTask:
     """A sparse model to be fitted: what all attempts have in common.
@@ -75,6 +85,8 @@ class SparseTask:
         Where another fit ended.
     placed : bool
         Whether the table's inducing points are from that fit.
+    heavy_tails : bool
+        Whether the noise has a Student-t's tails.
     """
 
     model: SparseModel
@@ -89,6 +101,7 @@ class SparseTask:
     monitor: Monitor
     warm: Values | None = None
     placed: bool = False
+    heavy_tails: bool = False
 
     @cached_property
     def rng(self) -> np.random.RandomState:
@@ -274,6 +287,8 @@ class Learned:
         Minus the bound per iteration.
     message : str
         What the user should know of how the fit ended; empty if all is well.
+    doubts : Doubts, optional
+        Of the rows, if the noise has heavy tails.
     """
 
     model: SparseModel
@@ -285,9 +300,10 @@ class Learned:
     predictor: Predictor
     loss_curve: list[float]
     message: str
+    doubts: Doubts | None = None
 
     @classmethod
-    def of(cls, task: SparseTask, fit: Fit) -> Learned:
+    def of(cls, task: SparseTask, fit: Fit, doubts: Doubts | None = None) -> Learned:
         """What is kept of a fit; its noise is calibrated if the task says so and Ctrl-C did not."""
         statistics = task.model.statistics(fit.values, task.blocks)
         bound, predictor = task.model.at_optimum(fit.values, statistics)
@@ -307,6 +323,8 @@ class Learned:
             fit.loss_curve,
             " ".join(part for part in advice if part),
         )
+        if doubts is not None:
+            learned = doubts.told(replace(learned, doubts=doubts))
         if task.noise_cv is not None and free_noise and not task.monitor.stopped:
             with task.monitor.keeping_the_best():
                 learned = learned.calibrated(task.rows, task.noise_cv)
@@ -336,7 +354,7 @@ class Learned:
         gradient : ndarray of shape (n_hyper + 1,)
             That in log s² last.
         """
-        own = slice(output, output + 1)
+        own, rows = slice(output, output + 1), rows if self.doubts is None else self.doubts.weigh(rows)
         index = next(i for i, group in enumerate(self.model.groups) if group.start <= output < group.stop)
         points = self.values["inducing_points"][[index]]
         values = {
@@ -373,4 +391,5 @@ class Learned:
     def _at_optimum(self, blocks: Blocks | None = None) -> Learned:
         bound, predictor = self.model.at_optimum(self.values, self.statistics)
         upper_bound = self.model.upper_bound(self.values, self.statistics, blocks)
-        return replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)
+        learned = replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)
+        return learned if self.doubts is None else self.doubts.told(learned)
