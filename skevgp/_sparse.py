@@ -15,6 +15,7 @@ from ._row_weights import chosen_rows
 from ._sklearn import fit_context
 from ._validation import check_magnitude, unchanged_if_it_fails
 from .fitting.outputs import FittedOutputs
+from .rows.dask import is_dask
 from .rows.threads import BlockMap, single_threaded_libraries
 
 
@@ -65,10 +66,10 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if not hasattr(self, "_fitted"):
             return self.fit(X, y, sample_weight, relative_variance=relative_variance)
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
-        if self._fitted.row_scales is not None:
+        if self._fitted.row_scales is not None and (is_dask(X) or self.forgetting_factor < 1.0):
             raise ValueError(
-                'partial_fit needs noise="gaussian": with noise="student-t", how far the rows before are doubted '
-                "depends on the new ones. Call fit with all rows."
+                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (what '
+                f"changes would be taken for outliers); got forgetting_factor={self.forgetting_factor!r}."
             )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
@@ -82,6 +83,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             self._fitted = self._fitted.updated(source, self.forgetting_factor)
             self._training_data = None
             self._set_attributes()
+            self._set_weights(chosen)
         return self
 
     def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
@@ -125,6 +127,16 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
 
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
+
+    def _set_weights(self, chosen: Any) -> None:
+        """How much each of the user's rows is doubted."""
+        scales = self._fitted.row_scales
+        if scales is None:
+            self.__dict__.pop("weights_", None)
+            return
+        model_of = [next(i for i, own in enumerate(self._fitted.outputs) if o in own) for o in range(self._n_outputs)]
+        weights = chosen.as_given(scales[:, model_of])
+        self.weights_ = weights[:, 0] if self._single_output else weights
 
     def _set_attributes(self) -> None:
         self._set_common_attributes()

@@ -20,7 +20,6 @@ from ._validation import unchanged_if_it_fails
 from .fitting.inducing import Placement
 from .fitting.outputs import Request, Sharing, fit_outputs
 from .fitting.sharing import with_groups
-from .rows.chosen import Chosen
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, resolved
@@ -85,7 +84,7 @@ class EVGPRegressor(SparseGaussianProcess):
         freedom, ten times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are fitted
         together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std`` and
         ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With L-BFGS
-        only, not for Dask arrays, and without `partial_fit` after the first.
+        only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=None
@@ -152,7 +151,7 @@ class EVGPRegressor(SparseGaussianProcess):
         σ², in squared units of y.
     weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
         Only with ``noise="student-t"``: the expected τ of each row, by which its noise variance is divided: 1 for an
-        ordinary row, near 0 for one that is doubted; NaN for one of weight 0.
+        ordinary row, near 0 for one that is doubted; NaN for one of weight 0. After `partial_fit`, of the new rows.
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
@@ -347,16 +346,6 @@ class EVGPRegressor(SparseGaussianProcess):
             self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         return self
-
-    def _set_weights(self, chosen: Chosen) -> None:
-        """How much each of the user's rows is doubted."""
-        scales = self._fitted.row_scales
-        if scales is None:
-            self.__dict__.pop("weights_", None)
-            return
-        model_of = [next(i for i, own in enumerate(self._fitted.outputs) if o in own) for o in range(self._n_outputs)]
-        weights = chosen.as_given(scales[:, model_of])
-        self.weights_ = weights[:, 0] if self._single_output else weights
 
     def set_params(self, **params: Any) -> Self:
         """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.

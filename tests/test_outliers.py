@@ -128,11 +128,30 @@ def test_where_it_cannot_be_it_is_refused():
         evgp(solver=Adam()).fit(X, Y)
     with pytest.raises(ValueError, match="The 'noise' parameter .* must be a str among"):
         evgp(noise="laplace").fit(X, Y)
-    model = evgp(max_iter=5).partial_fit(X, Y)
+    model = evgp(max_iter=5, forgetting_factor=0.9).partial_fit(X, Y)
     before = model.predict(GRID)
-    with pytest.raises(ValueError, match='partial_fit needs noise="gaussian"'):
+    with pytest.raises(ValueError, match="partial_fit needs .* forgetting_factor=1 .* got forgetting_factor=0.9"):
         model.partial_fit(X, Y)
     np.testing.assert_array_equal(model.predict(GRID), before)
+
+
+def test_partial_fit_doubts_new_rows():
+    first, rest = slice(0, 150), slice(150, None)
+    model = evgp().fit(X[first], WRONG[first]).partial_fit(X[rest], WRONG[rest])
+    clean = evgp(noise="gaussian").fit(X[first], Y[first]).partial_fit(X[rest], Y[rest])
+    assert error(model) < 1.3 * error(clean)
+    assert model.weights_.shape == (150, 2)
+    assert (model.weights_[BAD[rest]] < 0.1).all()
+    assert np.mean(model.weights_[~BAD[rest]] > 0.9) > 0.99
+
+
+def test_what_is_new_to_the_model_is_no_outlier():
+    """Far from the first rows nothing is known: the function may be anything there."""
+    near = np.abs(X[:, 0]) < 1.5
+    model = evgp(inducing_init=np.linspace(-3.0, 3.0, 13)[:, np.newaxis]).fit(X[near], Y[near, 1])
+    model.partial_fit(X[~near], Y[~near, 1])
+    assert np.mean(model.weights_ > 0.9) > 0.95
+    assert error(model, 1) < 0.15
 
 
 def test_dask_arrays_are_refused():

@@ -57,6 +57,9 @@ class Doubts(Protocol):
     def told(self, learned: Learned) -> Learned:
         """What is said of the noise is that of rows that are no outliers."""
 
+    def updated(self, learned: Learned, rows: Rows) -> Learned:
+        """Fold new rows in, which are doubted as well."""
+
 
 @dataclass(frozen=True)
 class SparseTask:
@@ -373,6 +376,8 @@ class Learned:
 
         ``weight`` multiplies the log likelihood of the earlier rows.
         """
+        if self.doubts is not None:
+            return self.doubts.updated(self, rows)
         n_inducing = self.values["inducing_points"].shape[1]
         # Whatever its points were of the rows before.
         model = replace(self.model, complete=False)

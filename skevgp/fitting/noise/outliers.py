@@ -20,6 +20,8 @@ from .mixture import RowScales
 _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10
 # The median of the square of a standard normal number.
 _MEDIAN_SQUARE = 0.4549
+# If more rows than this share seem to be outliers, none of them is taken for one to begin with.
+_FEW = 0.3
 # The share of the iterations before doubts are looked at anew, and then so many from one look to the next.
 _BEFORE, _BETWEEN = 2.0 / 3.0, 50
 # Doubts and q take turns until no E[τ] moves by more than this, or so often.
@@ -59,6 +61,27 @@ class RowDoubts:
         predictor = replace(learned.predictor, noise=learned.values["noise"] * self.noise_factor)
         return replace(learned, upper_bound=np.inf, predictor=predictor)
 
+    def updated(self, learned: Learned, rows: Rows) -> Learned:
+        """Fold new rows in, which are doubted first for what is predicted of them, and then by turns with q.
+
+        What was doubted of the rows before stays.
+        """
+        noise, plain = learned.values["noise"], replace(learned, doubts=None)
+        look = look_at(rows, of_residuals(learned.predictor))
+        predicted = look.latent + np.multiply.outer(look.variance, noise)
+        doubts = replace(self, scales=RowScales(len(noise), (look.errors**2 / predicted).sum(axis=1)))
+        for _ in range(_TURNS):
+            new = plain.updated(doubts.weigh(rows))
+            before, look = doubts, look_at(rows, of_residuals(new.predictor))
+            doubts = replace(self, scales=RowScales(len(noise), look.distances(noise)))
+            if not doubts.differ_from(before):
+                break
+        return doubts.told(replace(plain.updated(doubts.weigh(rows)), doubts=doubts))
+
+    def differ_from(self, before: RowDoubts) -> bool:
+        """Whether some row is doubted more, or less, than before."""
+        return bool(np.abs(self.scales.mean - before.scales.mean).max() >= _SETTLED)
+
 
 def fit_doubting(task: SparseTask, run: Callable[[SparseTask], tuple[SparseTask, Fit]]) -> Learned:
     """Fit a model whose noise has heavy tails by coordinate ascent: no turn lowers the bound.
@@ -82,8 +105,7 @@ def fit_doubting(task: SparseTask, run: Callable[[SparseTask], tuple[SparseTask,
     with task.monitor.keeping_the_best():
         while not task.monitor.stopped:
             weighed, settled, now = settle(weighed, fit, rows, doubts)
-            moved = np.abs(now.scales.mean - doubts.scales.mean).max() >= _SETTLED
-            fit, doubts = settled, now
+            moved, fit, doubts = now.differ_from(doubts), settled, now
             if fit.n_iter >= task.max_iter or (fit.converged and not moved):
                 break
             until = min(fit.n_iter + _BETWEEN, task.max_iter)
@@ -100,8 +122,12 @@ def _first_doubts(task: SparseTask) -> RowDoubts:
     rows, size = task.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * task.n_inducing)
     some = rows.sampled(size, task.rng) if size < len(rows) else rows
     short = replace(task, rows=some, max_iter=min(_LOOK_ITERATIONS, task.max_iter), monitor=task.monitor.silent())
-    look = look_at(rows, _predictor(short, search(short).values))
-    return RowDoubts(RowScales(look.errors.shape[1], look.distances(look.typical)), np.ones(look.errors.shape[1]))
+    look = look_at(rows, predictor_at(short, search(short).values))
+    n_outputs = look.errors.shape[1]
+    scales = RowScales(n_outputs, look.distances(look.typical))
+    if np.mean(scales.outlier > 0.5) > _FEW:
+        scales = RowScales(n_outputs, np.zeros(len(rows)))
+    return RowDoubts(scales, np.ones(n_outputs))
 
 
 def settle(task: SparseTask, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[SparseTask, Fit, RowDoubts]:
@@ -124,11 +150,11 @@ def settle(task: SparseTask, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[S
     """
     noise = fit.values["noise"]
     for _ in range(_TURNS):
-        look = look_at(rows, _predictor(task, fit.values))
+        look = look_at(rows, predictor_at(task, fit.values))
         factor = np.where(task.table["noise"].free, look.clean_variance() / noise, 1.0)
         before, doubts = doubts, RowDoubts(RowScales(len(noise), look.distances(noise)), factor)
         task = replace(task, rows=doubts.weigh(rows))
-        if np.abs(doubts.scales.mean - before.scales.mean).max() < _SETTLED:
+        if not doubts.differ_from(before):
             break
     # Where nothing is optimised.
     return task, replace(fit, bound=task.minimise(Attempt(fit.values, 0)).bound), doubts
@@ -139,9 +165,13 @@ def _tolerance(task: SparseTask, fit: Fit) -> float:
     return max(0.01, DESCENT.enough * (fit.bound - task.alone)) if task.tol is None else task.tol
 
 
-def _predictor(task: SparseTask, values: Values) -> Predictor:
+def predictor_at(task: SparseTask, values: Values) -> Predictor:
     """With q at its optimum; of residuals."""
-    _, predictor = task.model.at_optimum(values, task.model.statistics(values, task.blocks))
+    return of_residuals(task.model.at_optimum(values, task.model.statistics(values, task.blocks))[1])
+
+
+def of_residuals(predictor: Predictor) -> Predictor:
+    """The same without the reference that residuals are taken from."""
     return replace(predictor, offset=np.zeros_like(predictor.offset))
 
 
@@ -170,8 +200,7 @@ class Look:
     @property
     def typical(self) -> np.ndarray:
         """A variance (o,) that no few rows can move: by the median."""
-        squares = self.errors**2 / self.variance[:, np.newaxis]
-        return np.maximum(np.median(squares, axis=0) / _MEDIAN_SQUARE, np.finfo(float).tiny)
+        return np.maximum(np.median(self.squares, axis=0) / _MEDIAN_SQUARE, np.finfo(float).tiny)
 
     def distances(self, noise: np.ndarray) -> np.ndarray:
         """The d (n,) of rows under noise variances (o,)."""

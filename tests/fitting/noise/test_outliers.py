@@ -66,7 +66,7 @@ def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
     scales, noise = doubts.scales, fit.values["noise"]
     (statistics,) = task.model.statistics(fit.values, task.blocks)
     assert statistics.log_variance == pytest.approx(scales.log_variance.sum())
-    look = look_at(rows, outliers._predictor(task, fit.values))
+    look = look_at(rows, outliers.predictor_at(task, fit.values))
     # Less the divergence of q(g): what depends on the rows.
     expected = scales.evidence.sum() - 0.5 * N * np.log(2.0 * np.pi * noise).sum()
     found = -0.5 * (scales.mean @ look.distances(noise) + N * np.log(2.0 * np.pi * noise).sum())
