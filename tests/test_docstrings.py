@@ -19,7 +19,7 @@ METHODS = list(
         method.__qualname__: method
         for owner in CLASSES
         for name, method in inspect.getmembers(owner, callable)
-        if not name.startswith("_") and method.__module__.startswith("skevgp")
+        if not name.startswith("_") and (getattr(method, "__module__", None) or "").startswith("skevgp")
     }.values()
 )
 IGNORED = {
