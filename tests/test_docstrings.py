@@ -19,7 +19,7 @@ METHODS = list(
         method.__qualname__: method
         for owner in CLASSES
         for name, method in inspect.getmembers(owner, callable)
-        if not name.startswith("_") and method.__module__.startswith("skevgp")
+        if not name.startswith("_") and (getattr(method, "__module__", None) or "").startswith("skevgp")
     }.values()
 )
 IGNORED = {
@@ -64,7 +64,7 @@ def test_what_a_class_method_returns_is_documented(method):
     assert all(value.desc for value in returned)
 
 
-@pytest.mark.parametrize("thing", CLASSES, ids=qualified_name)
+@pytest.mark.parametrize("thing", [own for own in CLASSES if not issubclass(own, Warning)], ids=qualified_name)
 def test_attributes_are_documented(thing):
     assert NumpyDocString(inspect.getdoc(thing))["Attributes"]
 
