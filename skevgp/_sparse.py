@@ -14,7 +14,7 @@ from ._base import ExplicitGaussianProcess
 from ._row_weights import chosen_rows
 from ._sklearn import fit_context
 from ._validation import check_magnitude, unchanged_if_it_fails
-from .fitting.outputs import FittedOutputs
+from .outputs.fitted import FittedOutputs
 from .rows.threads import BlockMap, single_threaded_libraries
 
 

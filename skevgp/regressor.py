@@ -21,8 +21,9 @@ from ._validation import unchanged_if_it_fails
 from .calibration.folds import CrossValidation
 from .exceptions import DependentRowsWarning
 from .fitting.inducing import Placement
-from .fitting.outputs import Request, Sharing, fit_outputs
-from .fitting.sharing import with_groups
+from .outputs.fit import fit_outputs
+from .outputs.plan import Request, Sharing
+from .outputs.sharing import with_groups
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
 
@@ -215,6 +216,19 @@ class EVGPRegressor(SparseGaussianProcess):
     >>> mean, std = model.predict(X, return_std=True)
     >>> round(model.score(X, y), 2)
     0.96
+
+    Gravity's torque in two joints is linear in the same two first moments, 20 and 5; each joint has a row of features:
+
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import FunctionTransformer
+    >>> def gravity(X):
+    ...     own, both = np.sin(X[:, 0]), np.sin(X[:, 0] + X[:, 1])
+    ...     return np.stack([np.column_stack([own, both]), np.column_stack([0.0 * own, both])], axis=1)
+    >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
+    >>> y = gravity(X) @ [20.0, 5.0] + np.cos(2.0 * X)
+    >>> model = EVGPRegressor(FunctionTransformer(gravity), share_coef=True, n_inducing=20, random_state=0).fit(X, y)
+    >>> model.coef_.round(1)
+    array([20.,  5.])
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {

@@ -228,8 +228,12 @@ def test_the_walk_of_fits_in_threads_is_no_longer():
 # --- tests mirror the house --------------------------------------------------------------------------------------
 
 # What has tests of its own elsewhere, or nothing to test.
-TESTED_WITH = {"optimizers/minimum.py": "optimizers/test_lbfgs.py"}
-FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "rows")
+TESTED_WITH = {
+    "optimizers/minimum.py": "optimizers/test_lbfgs.py",
+    "outputs/fit.py": "outputs/test_plan.py",
+    "outputs/fitted.py": "test_sharing.py",
+}
+FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "outputs", "rows")
 
 
 @pytest.mark.parametrize(

@@ -259,7 +259,7 @@ def fit_exact(
     n, starts = len(rows), spec.starts
     everything = rows.some(np.arange(n))
     _check_independent(everything.features, vague, units.prior.shared)
-    kernel, kernels = centred_kernels(spec.covariance, rows.inputs)
+    kernel, *others = kernels = centred_kernels(spec.covariance, rows.inputs)
     first, variance = starts.hyperparameters.value, 1.0
     if first is not None:
         some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
@@ -275,7 +275,7 @@ def fit_exact(
         variance,
         rows.mean_precision,
     )
-    model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels)
+    model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))

@@ -31,13 +31,9 @@ def column_scale(inputs: Moments) -> np.ndarray:
     return np.where(_constant(inputs) | (scale <= SMALLEST_UNIT), 1.0, scale)
 
 
-def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, tuple[Covariance, ...] | None]:
-    """The kernel, told around which centre it is used; where outputs have inputs of their own, that of each too."""
-    centre = column_centre(inputs)
-    if centre.ndim == 1:
-        return covariance.centred(centre), None
-    kernels = tuple(covariance.centred(own) for own in centre)
-    return kernels[0], kernels
+def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, ...]:
+    """The kernel, told around which centre it is used; where outputs have inputs of their own, that of each."""
+    return tuple(covariance.centred(own) for own in np.atleast_2d(column_centre(inputs)))
 
 
 def _constant(inputs: Moments) -> np.ndarray:

@@ -118,12 +118,12 @@ class Group:
 def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
     """PᵀP (m + p, m + p) and Pᵀr (m + p,) of a group's output."""
     statistics, scales = group.statistics, group.scales[index]
-    Pr = group.pulled_back(index, np.concatenate([statistics.VR[:, index], statistics.HR[:, index]]))
+    sums = np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
     if group.prior.root is not None:
-        return group.pulled_back(index, group.pulled_back(index, statistics.joint).T), Pr
+        return group.pulled_back(index, group.pulled_back(index, statistics.joint).T), group.pulled_back(index, sums)
     PP = np.multiply.outer(scales, scales)
     PP *= statistics.joint
-    return PP, Pr
+    return PP, scales * sums
 
 
 def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
@@ -233,12 +233,13 @@ class BoundAtOptimum:
         joint, m = statistics.joint, len(statistics.VV)
         self.group, self.posteriors = group, posteriors
         mean = np.array([q.mean for q in posteriors])
-        self.weights = np.empty(mean.T.shape)
+        self.weights = (scales * mean).T
+        if group.prior.root is not None:
+            self.weights[m:] = group.prior.times(mean[:, m:]).T
         joint_bar, L_bar = np.zeros(joint.shape), np.zeros((m, m))
         # Of each output: log|B| (and twice the gap), and derivatives of the bound in log s² and log 1/σ² by way of B.
         log_det, from_signal, from_noise = np.empty((3, len(noise)))
         for o, q in enumerate(posteriors):
-            self.weights[:, o] = group.weights_of(o, q.mean)
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
@@ -262,8 +263,9 @@ class BoundAtOptimum:
         )
         unexplained = unexplained_bar * statistics.unexplained
         mean[:, m:] += group.prior.reference
-        for own, q in zip(mean, posteriors, strict=True):
-            own[q.n_own :] = 0.0
+        if group.prior.shared:
+            for own, q in zip(mean, posteriors, strict=True):
+                own[q.n_own :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # What does not depend on e, and its derivatives in log s² and log σ².
         log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
@@ -342,11 +344,6 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     o, p = prior.scale.shape
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
     noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
-    if p == 0:
-        likelihoods = [
-            own.n_rows * (LOG_2PI + 1.0 + np.log(s2)) + own.log_variance for own, s2 in zip(each, noise, strict=True)
-        ]
-        return float(-0.5 * np.sum(likelihoods))
     empty = np.zeros((0, 0))
     groups = [
         Group(

@@ -206,7 +206,8 @@ class LinearStatistics:
         return cls(n_rows, *sums, n, log_variance, float(np.maximum(block.roots**2, 1.0).sum()) - n_rows)
 
     def of(self, outputs: slice) -> LinearStatistics:
-        return replace(self, HR=self.HR[:, outputs], RR=self.RR[outputs])
+        RR = self.RR[outputs]
+        return self if len(RR) == len(self.RR) else replace(self, HR=self.HR[:, outputs], RR=RR)
 
     def __add__(self, other: LinearStatistics) -> LinearStatistics:
         return LinearStatistics(*(getattr(self, field.name) + getattr(other, field.name) for field in fields(self)))

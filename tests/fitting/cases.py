@@ -3,10 +3,10 @@
 import numpy as np
 
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.outputs import Request
 from skevgp.fitting.units import Units
 from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
+from skevgp.outputs.plan import Request
 from skevgp.rows.source import LocalSource, Moments
 from skevgp.solvers import LBFGS
 

@@ -9,10 +9,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from skevgp._progress import Monitor
 from skevgp.calibration.folds import CrossValidation
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.outputs import plan
 from skevgp.fitting.sparse import Learned, SparseTask, grown
 from skevgp.fitting.strategy import Attempt, Fit, search
 from skevgp.inference.bounds import features_alone_bound
+from skevgp.outputs.plan import plan
 from skevgp.rows.threads import BlockMap
 from skevgp.solvers import LBFGS, Adam
 

@@ -1,4 +1,5 @@
 import numpy as np
+import pytest
 
 from skevgp.fitting.units import features_alone, unit_of
 from skevgp.inference.posterior import CoefficientPrior

@@ -11,15 +11,16 @@ import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
+from ..fitting.inducing import Placement
+from ..fitting.sparse import SparseTask
 from ..inference.objectives import BoundObjective
 from ..optimizers.lbfgs import lbfgs
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import LocalSource
 from ..rows.threads import BlockMap, side_by_side
-from .inducing import Placement
-from .outputs import FittedOutputs, Request, plan
-from .sparse import SparseTask
+from .fitted import FittedOutputs
+from .plan import Request, plan
 
 # Of what its own Gaussian process gains an output over features and noise.
 _LARGEST_LOSS = 0.01

@@ -9,11 +9,12 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 
 from skevgp._progress import Monitor
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
-from skevgp.fitting.outputs import fit_outputs, partition_of, plan
+from skevgp.outputs.fit import fit_outputs
+from skevgp.outputs.plan import partition_of, plan
 from skevgp.rows.threads import BlockMap
 from skevgp.solvers import LBFGS, Adam
 
-from .cases import NO_FEATURES, H, N, O, X, Y, data_of, request, source_of, units_of
+from ..fitting.cases import NO_FEATURES, H, N, O, X, Y, data_of, request, source_of, units_of
 
 SHARING = ("all", "kernel", "none")
 

@@ -4,14 +4,14 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
-from skevgp.fitting import sharing
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.outputs import fit_outputs
-from skevgp.fitting.sharing import found_groups, with_groups
 from skevgp.optimizers.lbfgs import lbfgs
+from skevgp.outputs import sharing
+from skevgp.outputs.fit import fit_outputs
+from skevgp.outputs.sharing import found_groups, with_groups
 from skevgp.rows.source import LocalSource
 
-from .cases import N, data_of, request
+from ..fitting.cases import N, data_of, request
 
 
 def fitted(monitor=None, previous=None, **changes):
