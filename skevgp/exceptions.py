@@ -10,4 +10,17 @@ class DependentRowsWarning(UserWarning):
 
     Given by `EVGPRegressor.fit` without ``groups``: its standard deviations are then those of rows like these, not of
     new trajectories.
+
+    See Also
+    --------
+    EVGPRegressor : Its ``fit`` takes ``groups``, by which ``noise_cv`` leaves out rows.
+
+    Examples
+    --------
+    Where rows are sorted but independent:
+
+    >>> import warnings
+    >>> from skevgp.exceptions import DependentRowsWarning
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", DependentRowsWarning)
     """

@@ -117,7 +117,7 @@ def test_it_learns(sharing, posterior):
 
 
 def test_the_bound_rises_and_ends_at_minus_the_loss():
-    m = model(inducing_init="k-means").fit(X, Y)
+    m = model(inducing_init="k-means", noise_cv=None).fit(X, Y)
     assert (np.diff(m.loss_curve_) <= 0).all()
     assert m.lower_bound_ == pytest.approx(-m.loss_curve_[-1], rel=1e-9)
 
@@ -196,7 +196,10 @@ def test_outputs_that_share_nothing_are_independent_models():
 
 
 def test_no_lower_bound_is_above_a_wider_familys():
-    bounds = {family: model(posterior=family, tol=1e-3).fit(X, Y).lower_bound_ for family in ("full", "diagonal")}
+    bounds = {
+        family: model(posterior=family, tol=1e-3, noise_cv=None).fit(X, Y).lower_bound_
+        for family in ("full", "diagonal")
+    }
     assert bounds["diagonal"] < bounds["full"]
 
 
@@ -446,7 +449,7 @@ def test_partial_fit_refuses_other_shapes():
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_warm_start_goes_on_where_the_last_fit_ended(sharing):
-    m = model(warm_start=True, sharing=sharing).fit(X, Y)
+    m = model(warm_start=True, sharing=sharing, noise_cv=None).fit(X, Y)
     first, n_first = m.lower_bound_, m.n_iter_
     m.fit(X, Y)
     assert m.lower_bound_ >= first - 0.1
@@ -477,7 +480,7 @@ def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch
 
 
 def test_verbose_prints_iteration_bound_and_time(capsys):
-    m = model(verbose=2).fit(X, Y)
+    m = model(verbose=2, noise_cv=None).fit(X, Y)
     lines = capsys.readouterr().out.splitlines()
     # Those of starts that were not kept too.
     assert len(lines) >= m.n_iter_
@@ -486,7 +489,7 @@ def test_verbose_prints_iteration_bound_and_time(capsys):
 
 
 def test_a_log_ends_with_the_line_of_the_last_iteration(capsys):
-    m = model(verbose=1).fit(X, Y)
+    m = model(verbose=1, noise_cv=None).fit(X, Y)
     line = capsys.readouterr().out.splitlines()[-1]
     assert line.startswith(f"all rows, iteration {m.n_iter_}, bound ")
     assert float(line.split(", ")[2].split()[1]) == pytest.approx(m.lower_bound_, abs=1e-2)
@@ -580,7 +583,7 @@ def test_warm_start_forgets_points_of_another_space():
 
 @pytest.mark.parametrize("learning_rate", [50.0, 1e6])
 def test_adam_that_diverges_says_so_and_ends_no_lower_than_it_started(learning_rate):
-    m = model(solver=Adam(learning_rate=learning_rate), max_iter=20, posterior="diagonal")
+    m = model(solver=Adam(learning_rate=learning_rate), max_iter=20, posterior="diagonal", noise_cv=None)
     with pytest.warns(ConvergenceWarning, match=r"Adam (diverged|ended with).* [Ll]ower learning_rate \(now"):
         m.fit(X, Y)
     start = model(max_iter=0, posterior="diagonal", solver="adam").fit(X, Y)

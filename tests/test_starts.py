@@ -20,7 +20,9 @@ Z = RNG.uniform(-2, 2, (7, 2))
 
 
 def model(**arguments):
-    return EVGPRegressor(**{"n_inducing": 8, "sharing": "all", "random_state": 0, "tol": 0.1, **arguments})
+    return EVGPRegressor(
+        **{"n_inducing": 8, "sharing": "all", "random_state": 0, "tol": 0.1, "noise_cv": None, **arguments}
+    )
 
 
 # --- n_restarts ------------------------------------------------------------------------------------------------

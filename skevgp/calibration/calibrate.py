@@ -38,8 +38,9 @@ _WIDER = 1e4
 _DEPENDENT = 4.0
 # Of so many rows that can be seen.
 _FEWEST_DEPENDENT = 200
-# The signal has gone if so little is left of what explained more than half of an output.
-_GONE, _EXPLAINED = 1e-3, 0.5
+# What explained more than so much of an output holds for no other group if it takes less than this from the mean square
+# error of what was left out.
+_EXPLAINED, _GAIN = 0.5, 0.05
 
 
 @dataclass(frozen=True)
@@ -115,7 +116,11 @@ def _by_folds(
     gone, dependent = 0, False
     if by.groups is not None:
         explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
-        gone = int((explained & (signal < _GONE * values["signal"])).sum())
+        gone = sum(
+            search.squares(*own) > (1.0 - _GAIN) * search.squares(0.0, level)
+            for search, own, level, is_explained in zip(searches, found, rows.scatter(), explained, strict=True)
+            if is_explained
+        )
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
         order = rows.as_given()
         in_order = folds_in_order(np.arange(len(rows)) if order is None else order, by.n_folds, rng)

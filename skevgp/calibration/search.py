@@ -82,6 +82,15 @@ class Search:
         values = self.values | {"signal": np.full(len(self.values["signal"]), signal)}
         return replace(self, values=values, limits=replace(self.limits, free_signal=False))._along_ratios()
 
+    def squares(self, signal: float, noise: float) -> float:
+        """Mean square error of what was left out; without a signal that of the features alone."""
+        total, n = 0.0, 0.0
+        for fold, known in zip(self.folds, self.known, strict=True):
+            error, _ = fold.predicted(self.index, signal / noise, np.array([noise]), known)
+            total += float((fold.rows.counts @ error**2)[0])
+            n += fold.rows.counts.sum()
+        return total / n
+
     def _along_ratios(self) -> tuple[float, float]:
         s2, noise = (float(self.values[name][self.output]) for name in ("signal", "noise"))
         if not self.limits.free_signal and not self.limits.free_noise:

@@ -61,8 +61,8 @@ def signal_gone(gone: int, n_outputs: int) -> str:
         return ""
     return (
         f"What the Gaussian process learned of {gone} of {n_outputs} outputs fitted together does not hold for groups "
-        "that were left out: its signal variance went towards zero. Other columns (kernel_map) or features, more "
-        "groups, or fewer inducing points may tell what groups have in common."
+        "that were left out: these are predicted no better than without it, and std says so. More groups, other "
+        "columns (kernel_map) or features may tell what groups have in common."
     )
 
 

@@ -7,6 +7,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp._progress import Monitor
+from skevgp.calibration.folds import CrossValidation
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.learned import Learned
 from skevgp.fitting.sparse import SparseTask, grown
@@ -217,22 +218,22 @@ def test_the_noise_is_calibrated_only_if_it_may(why):
     monitor, kernel = Monitor(), ConstantKernel() * RBF([1.0, 1.0])
     if why == "the noise is fixed":
         kernel += WhiteKernel(0.3, "fixed")
-    task = task_of(monitor, kernel=kernel, noise_cv=None if why == "nobody asked" else 5)
+    task = task_of(monitor, kernel=kernel, noise_cv=None if why == "nobody asked" else CrossValidation(5))
     fit = started(task)
     if why == "Ctrl-C":
         monitor.stop()
     np.testing.assert_array_equal(Learned.of(task, fit).values["noise"], fit.values["noise"])
 
 
-def test_a_calibrated_noise_is_that_of_the_folds_and_q_is_at_its_optimum_for_it():
-    task = task_of(noise_cv=5)
+def test_calibrated_are_signal_and_noise_and_q_is_at_its_optimum_for_them():
+    task = task_of(noise_cv=CrossValidation(5))
     fit = started(task)
     learned = Learned.of(task, fit)
     plain = Learned.of(replace(task, noise_cv=None), fit)
-    assert (learned.values["noise"] != fit.values["noise"]).all()
-    for name in ("hyperparameters", "signal", "inducing_points"):
+    for name in ("noise", "signal"):
+        assert (learned.values[name] != fit.values[name]).all()
+    for name in ("hyperparameters", "inducing_points"):
         np.testing.assert_array_equal(learned.values[name], fit.values[name])
-    np.testing.assert_array_equal(plain.calibrated(task.rows, 5).values["noise"], learned.values["noise"])
     bound, predictor = task.model.at_optimum(learned.values, learned.statistics)
     assert learned.bound == bound
     np.testing.assert_array_equal(learned.predictor.groups[0].mean, predictor.groups[0].mean)

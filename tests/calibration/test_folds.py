@@ -1,0 +1,84 @@
+import numpy as np
+import pytest
+
+from skevgp.calibration.folds import (
+    FEWEST_ROWS,
+    PREDICTED_ROWS,
+    CrossValidation,
+    folds_in_order,
+    folds_of_groups,
+    random_folds,
+)
+
+
+def rng():
+    return np.random.RandomState(0)
+
+
+def assert_parts(folds, n_rows):
+    """Each row is left out once, and all that is predicted is left out."""
+    np.testing.assert_array_equal(np.sort(np.concatenate([fold.rows for fold in folds])), np.arange(n_rows))
+    for fold in folds:
+        assert (np.diff(fold.rows) > 0).all()
+        assert (np.diff(fold.predicted) > 0).all()
+        assert np.isin(fold.predicted, fold.rows).all()
+        assert len(fold.predicted) > 0
+
+
+@pytest.mark.parametrize(("n_rows", "n_folds", "found"), [(103, 5, 5), (60, 60, 60), (7, 10, 7)])
+def test_random_folds_are_of_nearly_equal_length(n_rows, n_folds, found):
+    folds = random_folds(n_rows, n_folds, rng())
+    assert_parts(folds, n_rows)
+    sizes = [len(fold.rows) for fold in folds]
+    assert len(sizes) == found
+    assert max(sizes) - min(sizes) <= 1
+    assert all(len(fold.predicted) == len(fold.rows) for fold in folds)
+
+
+def test_random_folds_are_not_of_rows_that_follow_each_other():
+    for fold in random_folds(1000, 5, rng()):
+        assert 0.6 < (np.diff(fold.rows) > 1).mean() < 1.0
+
+
+def test_of_many_rows_some_are_predicted_from_all():
+    n_rows = 10 * PREDICTED_ROWS
+    folds = random_folds(n_rows, 4, rng())
+    assert_parts(folds, n_rows)
+    assert sum(len(fold.predicted) for fold in folds) == PREDICTED_ROWS
+
+
+def test_groups_stay_whole_and_folds_are_of_nearly_equal_length():
+    groups = np.repeat(np.arange(23), rng().randint(1, 40, 23))
+    groups = rng().permutation(groups)
+    folds = folds_of_groups(groups, 5, rng())
+    assert_parts(folds, len(groups))
+    assert sorted(np.concatenate([np.unique(groups[fold.rows]) for fold in folds]).tolist()) == list(range(23))
+    sizes = [len(fold.rows) for fold in folds]
+    assert max(sizes) <= 1.1 * min(sizes)
+
+
+def test_there_are_no_more_folds_than_groups():
+    assert len(folds_of_groups(np.repeat(["a", "b", "c"], 20), 10, rng())) == 3
+
+
+@pytest.mark.parametrize("names", [["only"], ["one", "other"]])
+def test_fewer_than_three_groups_are_left_out_in_blocks_of_which_the_inside_is_predicted(names):
+    groups = np.array(names * (200 // len(names)))
+    order = np.argsort(groups, kind="stable")
+    folds = folds_of_groups(groups, 4, rng())
+    assert_parts(folds, 200)
+    for fold, expected in zip(folds, np.split(order, 4), strict=True):
+        np.testing.assert_array_equal(fold.rows, np.sort(expected))
+        np.testing.assert_array_equal(fold.predicted, np.sort(expected[7:-7]))
+
+
+def test_folds_in_order_are_of_rows_that_follow_each_other_in_it():
+    order = np.arange(100)[::-1]
+    folds = folds_in_order(order, 3, rng())
+    assert_parts(folds, 100)
+    np.testing.assert_array_equal(folds[0].rows, np.arange(66, 100))
+
+
+def test_few_rows_are_left_alone():
+    assert CrossValidation(5).folds(FEWEST_ROWS - 1, rng()) == []
+    assert len(CrossValidation(5).folds(FEWEST_ROWS, rng())) == 5
