@@ -13,7 +13,14 @@ from .rows.dask import RowWeights, is_dask
 _SMALLEST_VARIANCE = 1.0 / LARGEST
 
 
-def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None, ordered: bool = True) -> Any:
+def chosen_rows(
+    X: Any,
+    y: Any,
+    sample_weight: Any = None,
+    relative_variance: Any = None,
+    ordered: bool = True,
+    labels: np.ndarray | None = None,
+) -> Any:
     """The rows that count.
 
     Parameters
@@ -24,6 +31,8 @@ def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: An
         As `EVGPRegressor.fit` takes them.
     ordered : bool, default=True
         Whether few rows are put into an order of their own, and equal ones joined.
+    labels : ndarray of shape (n_samples,), optional
+        Only rows with the same label are joined. Not of Dask arrays.
 
     Returns
     -------
@@ -43,7 +52,7 @@ def chosen_rows(X: Any, y: Any, sample_weight: Any = None, relative_variance: An
         check_weights(float(counts.min()), float(counts.max()))
     if variance is not None:
         check_variances(float(variance.min()), float(variance.max()))
-    return Chosen.of(X, y, counts, variance) if ordered else Chosen.in_order(len(y), counts, variance)
+    return Chosen.of(X, y, counts, variance, labels) if ordered else Chosen.in_order(len(y), counts, variance)
 
 
 def check_weights(lowest: float, highest: float) -> None:
