@@ -102,10 +102,10 @@ class EVGPRegressor(SparseGaussianProcess):
     noise : {"gaussian", "student-t"}, default="gaussian"
         ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
         Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
-        freedom, ten times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are fitted
-        together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std`` and
-        ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With L-BFGS
-        only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
+        freedom, thirty times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are
+        fitted together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std``
+        and ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With
+        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5

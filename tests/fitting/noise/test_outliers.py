@@ -20,7 +20,7 @@ BAD = np.array([3, 17, 40])
 def task_of(**changes):
     """With rows of which three are far off."""
     wrong = Y.copy()
-    wrong[BAD] += 3.0 * Y.std(axis=0)
+    wrong[BAD] += 6.0 * Y.std(axis=0)
     (task,) = plan(
         request(**data_of(wrong), **changes, heavy_tails=True), np.random.RandomState(0), Monitor(), BlockMap()
     )
