@@ -1,0 +1,247 @@
+"""Do standard deviations hold, without calibration (noise_cv=None) and with that by default?
+
+Of simulated systems, which are fitted with groups=train.groups, on new trajectories; of tables of independent rows,
+with nothing set, on rows that were not seen, shuffled and sorted by a column. Writes one row per fit to a CSV as soon
+as it is done (what is there already is not fitted again), and a page beside it.
+
+    python benchmarks/calibration.py                        # four systems, four tables, four seeds: half an hour
+    python benchmarks/calibration.py --folder ~/uci         # and the tables in there: <name>/data.csv.gz, whose last
+                                                            # column is the target, and <name>/test_mask.csv.gz
+    python benchmarks/calibration.py --quick                # a system and a table, small, one seed: a minute
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+import time
+import warnings
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parent))  # for what the scripts share
+
+import numpy as np
+from sklearn import datasets
+from threadpoolctl import threadpool_limits
+
+import harness
+from harness import Row
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
+from skevgp.exceptions import DependentRowsWarning
+from skevgp.features import AngleEncoder, InertiaForceGravity
+from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error
+
+# Inducing points and trajectories to learn from.
+SYSTEMS = {"pendulum": (10, 24), "cartpole": (60, 24), "acrobot": (100, 24), "iiwa14": (100, 40)}
+TEST_TRAJECTORIES = 40
+NOISES = ("0.0", "0.01")
+TABLES = {
+    "diabetes": lambda seed: datasets.load_diabetes(return_X_y=True),
+    "friedman1": lambda seed: datasets.make_friedman1(1500, noise=1.0, random_state=seed),
+    "friedman2": lambda seed: datasets.make_friedman2(1500, noise=30.0, random_state=seed),
+    "friedman3": lambda seed: datasets.make_friedman3(1500, noise=0.1, random_state=seed),
+}
+# Of larger tables so many rows are learned from.
+MOST_ROWS, ITERATIONS = 12_000, 100
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One fit.
+
+    Attributes
+    ----------
+    data : str
+        A system or a table.
+    variant : str
+        Of a system "", or "angles" with an AngleEncoder as kernel_map; of a table "shuffled", or "sorted by" a column.
+    noise : str
+        Of a system.
+    seed : int
+    noise_cv : str
+        "None" or a number of folds.
+    size : {"full", "quick"}
+    folder : Path or None
+        Of further tables.
+    """
+
+    data: str
+    variant: str
+    noise: str
+    seed: int
+    noise_cv: str
+    size: str
+    folder: Path | None = field(compare=False)
+
+
+Part = tuple[np.ndarray, np.ndarray]
+
+
+def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
+    """Trajectories to learn from, others, and the groups of the first; all with the same noise."""
+    n = 6 if cell.size == "quick" else SYSTEMS[cell.data][1]
+    everything = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
+    train = everything.groups < n
+    return (
+        (everything.data[train], everything.target[train]),
+        (everything.data[~train], everything.target[~train]),
+        everything.groups[train],
+    )
+
+
+def table(cell: Cell) -> tuple[Part, Part]:
+    """Rows to learn from, in the order that the cell says, and others; columns in units of their scatter."""
+    rng = np.random.RandomState(cell.seed)
+    if cell.data in TABLES:
+        rows = rng.permutation(np.column_stack(TABLES[cell.data](cell.seed)))
+        test = np.arange(len(rows)) >= 2 * len(rows) // 3
+    else:
+        assert cell.folder is not None
+        rows, masks = (
+            np.loadtxt(cell.folder / cell.data / name, delimiter=",") for name in ("data.csv.gz", "test_mask.csv.gz")
+        )
+        test = masks[:, cell.seed].astype(bool)
+    train, test = rng.permutation(rows[~test])[:MOST_ROWS], rows[test]
+    size = train.std(axis=0)
+    train, test = ((part - train.mean(axis=0)) / np.where(size > 0.0, size, 1.0) for part in (train, test))
+    if cell.variant != "shuffled":
+        train = train[np.argsort(train[:, int(cell.variant.split()[-1])], kind="stable")]
+    return (train[:, :-1], train[:, -1]), (test[:, :-1], test[:, -1])
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Fit one model, and look at it on the test rows; ``fit_seconds`` is processor time of one thread."""
+    max_iter = 10 if cell.size == "quick" else ITERATIONS
+    settings = {
+        "noise_cv": None if cell.noise_cv == "None" else int(cell.noise_cv),
+        "max_iter": max_iter,
+        "random_state": cell.seed,
+    }
+    groups = None
+    if cell.data in SYSTEMS:
+        train, (X, y), groups = system(cell)
+        kernel_map = AngleEncoder(cell.data) if cell.variant == "angles" else None
+        features, n_inducing = InertiaForceGravity(cell.data), SYSTEMS[cell.data][0]
+        model = EVGPRegressor(features, kernel_map=kernel_map, n_inducing=n_inducing, **settings)
+    else:
+        train, (X, y) = table(cell)
+        model = EVGPRegressor(n_inducing=256 if len(train[0]) > 10_000 else 100, **settings)
+    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        start = time.process_time()
+        model.fit(*train, groups=groups)
+        seconds = time.process_time() - start
+    mean, std = model.predict(X, return_std=True)
+    return {
+        **{name: getattr(cell, name) for name in ("data", "variant", "noise", "seed", "noise_cv", "size")},
+        "cr2": containing_ratios(y, mean, std)[1],
+        "nlpd": negative_log_predictive_density(y, mean, std) / np.size(y[0]),
+        "error_mean": prediction_error(y, mean),
+        "fit_seconds": seconds,
+        "n_rows": len(train[0]),
+        "n_iter": model.n_iter_,
+        "dependent": any(own.category is DependentRowsWarning for own in caught),
+        **harness.provenance(),
+    }
+
+
+def say(row: dict[str, Any]) -> str:
+    return f"CR-2 {row['cr2']:.3f}, NLPD {row['nlpd']:.3f}, {row['fit_seconds']:.1f} s"
+
+
+def lines(rows: Sequence[Row]) -> Iterator[list[str]]:
+    """Of a table: one for each setting, of the seeds that were fitted with and without."""
+    keys = dict.fromkeys((row["data"], row["variant"], row["noise"]) for row in rows)
+    for key in keys:
+        own = [row for row in rows if (row["data"], row["variant"], row["noise"]) == key]
+        by_seed = [
+            {row["seed"]: row for row in own if (row["noise_cv"] == "None") is without} for without in (True, False)
+        ]
+        seeds = sorted(by_seed[0].keys() & by_seed[1].keys())
+        if not seeds:
+            continue
+        plain, default = ([rows[seed] for seed in seeds] for rows in by_seed)
+        cr2, nlpd, error, seconds = (
+            [harness.column(part, name) for part in (plain, default)]
+            for name in ("cr2", "nlpd", "error_mean", "fit_seconds")
+        )
+        change = nlpd[1] - nlpd[0]
+        yield [
+            " ".join(part for part in (key[0], key[1], key[2] and f"noise {key[2]}") if part),
+            str(len(seeds)),
+            f"{cr2[0].mean():.3f} → {cr2[1].mean():.3f}",
+            f"{cr2[1].min():.3f} to {cr2[1].max():.3f}",
+            f"{nlpd[0].mean():.3f} → {nlpd[1].mean():.3f}",
+            f"{change.max():+.3f}",
+            f"{(error[1] / error[0]).mean():.3f}",
+            f"{seconds[1].sum() / seconds[0].sum():.2f}",
+            f"{sum(row['dependent'] == 'True' for row in default)}",
+        ]
+
+
+def paragraphs(rows: Sequence[Row]) -> list[str]:
+    """The page."""
+    header = ["", "seeds", "CR-2", "of seeds", "NLPD per output", "at worst", "Error, ratio", "time, ratio", "warned"]
+    parts = []
+    for title, of_systems in (("On new trajectories, by groups", True), ("Independent rows, by random folds", False)):
+        found = list(lines([row for row in rows if (row["data"] in SYSTEMS) is of_systems]))
+        if found:
+            parts += [f"## {title}", harness.table(header, found)]
+    if not parts:
+        return []
+    said = (
+        "Without noise_cv → by default, 100 iterations; means over seeds. CR-2 should be .954. At worst: how much "
+        "higher NLPD is than without, of all seeds. Warned: of how many seeds a fit said that rows near each other "
+        "are alike."
+    )
+    return ["# Standard deviations that hold", said, *parts, harness.provenance_text(rows)]
+
+
+def variants(data: str, folder: Path | None) -> list[str]:
+    """Of a table: shuffled, and sorted by up to three columns and the target."""
+    if data in TABLES:
+        width = np.shape(TABLES[data](0)[0])[1]
+    else:
+        assert folder is not None
+        width = np.loadtxt(folder / data / "data.csv.gz", delimiter=",", max_rows=1).size - 1
+    columns = dict.fromkeys([0, width // 2, width - 1, width])
+    return ["shuffled", *(f"sorted by {column}" for column in columns)]
+
+
+def main() -> None:
+    parser = harness.argument_parser(
+        __doc__,
+        quick="one system and one table, few trajectories and iterations, one seed",
+        seeds="seeds 0, 1, ...; default: 4, of a quick run 1",
+        systems=SYSTEMS,
+    )
+    parser.add_argument("--folder", type=Path, help="of further tables")
+    options = parser.parse_args()
+    output, size = harness.output_path(options, "calibration"), "quick" if options.quick else "full"
+    n_seeds = (1 if options.quick else 4) if options.seeds is None else options.seeds
+    further = sorted(path.parent.name for path in options.folder.glob("*/data.csv.gz")) if options.folder else []
+    tables = [*TABLES, *further]
+    systems = options.systems
+    if options.quick:
+        systems, tables = systems[:1], tables[:1]
+    of_systems = itertools.product(systems, ("", "angles"), NOISES)
+    settings = [
+        *of_systems,
+        *((name, variant, "") for name in tables for variant in variants(name, options.folder)),
+    ]
+    cells = [
+        Cell(data, variant, noise, seed, noise_cv, size, options.folder)
+        for seed in range(n_seeds)
+        for data, variant, noise in settings
+        for noise_cv in ("None", "5")
+    ]
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
+
+
+if __name__ == "__main__":
+    main()
