@@ -26,7 +26,7 @@ def test_it_runs_resumes_and_writes_its_page(run_script, tmp_path):
         ("spoiled", "student-t"),
     ]
     assert float(rows[4]["found"]) > 0.5
-    assert float(rows[4]["error_mean"]) < float(rows[3]["error_mean"])
+    assert float(rows[4]["nlpd"]) < float(rows[3]["nlpd"])
     page = output.with_suffix(".md").read_text()
     assert "| cartpole, clean rows, gaussian |" in page
     assert "1 of 1 cells are in" in run_script("outliers.py", "--quick", "--jobs", "1", "--output", output)
