@@ -38,6 +38,8 @@ from skevgp.features import InertiaForceGravity
 # Number of inducing points, and of seeds.
 DATASETS = {"elevators": (100, 4), "airfoil": (100, 10), "cartpole": (60, 4)}
 SHARE, SHIFT = 0.05, 20.0
+# Of a set of rows.
+KEPT = ("data", "target", "groups")
 # Rows, and noise.
 FITS = (
     ("clean", "gaussian"),
@@ -97,7 +99,7 @@ def spoiled(train: Bunch, sigma: np.ndarray, seed: int) -> tuple[Bunch, np.ndarr
     bad = rng.rand(len(train.data)) < SHARE
     target = train.target.copy()
     target[bad] += SHIFT * sigma * rng.choice([-1.0, 1.0], (bad.sum(), target.shape[1]))
-    return Bunch(data=train.data, target=target), bad
+    return Bunch(**{**train, "target": target}), bad
 
 
 def run(cell: Cell) -> list[dict[str, Any]]:
@@ -109,7 +111,7 @@ def run(cell: Cell) -> list[dict[str, Any]]:
         if condition != "clean":
             own, bad = spoiled(train, sigma, cell.seed)
         if condition == "left":
-            own, bad = Bunch(data=own.data[~bad], target=own.target[~bad]), bad[~bad]
+            own, bad = Bunch(**{name: own[name][~bad] for name in KEPT if name in own}), bad[~bad]
         model = model_of(cell, noise)
         mean, std, seconds, _ = timed(model, own, test)
         mean, std = mean.reshape(test.target.shape), std.reshape(test.target.shape)

@@ -73,7 +73,7 @@ def run(cell: Cell) -> list[dict[str, Any]]:
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         start = time.process_time()
-        regressor.fit(train.data, train.target)
+        regressor.fit(train.data, train.target, groups=train.groups)
         seconds = time.process_time() - start
         mean = regressor.predict(train.data)
     H = regressor.feature_map_.transform(train.data)
