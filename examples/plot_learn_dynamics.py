@@ -99,7 +99,7 @@ except ValueError as error:
 
 settings = {"solver": options.solver, "random_state": options.seed}
 if options.solver == "adam":
-    settings |= {"posterior": "diagonal", "sharing": "kernel"}
+    settings |= {"posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
 models = {
     "VGP": EVGPRegressor(n_inducing=m_vgp, **settings),
     "RES-VGP": EVGPRegressor(n_inducing=m_vgp, **settings),
@@ -116,7 +116,7 @@ print(" " * 9, *(f"{name:>8}" for name in columns), "  paper:", *(f"{name:>7}" f
 for name, model in models.items():
     base = (train.data[:, :n_states], test.data[:, :n_states]) if name == "RES-VGP" else (0.0, 0.0)
     start = time.perf_counter()
-    model.fit(train.data, train.target - base[0])
+    model.fit(train.data, train.target - base[0], groups=train.groups)
     seconds = time.perf_counter() - start
     mean, std = model.predict(test.data, return_std=True)
     mean = mean + base[1]

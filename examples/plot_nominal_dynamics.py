@@ -63,8 +63,8 @@ n_joints = train.target.shape[1] // 2
 # Two priors, and more and more data
 # ----------------------------------
 # ``tol=10``: L-BFGS stops when an iteration no longer gains 10 nats, of a bound of some hundred thousand. The default
-# takes several times as long for errors that are hardly smaller. ``noise_cv=5``: the rows of a move are alike, and are
-# not as many facts as they are rows. The noise is therefore set by what is predicted of moves that were left out.
+# takes several times as long for errors that are hardly smaller. ``groups``: the rows of a move are alike, and are not as
+# many facts as they are rows. Noise and signal are therefore set by what is predicted of moves that were left out.
 
 names = "IFG", "IF + nominal"
 features = InertiaForceGravity("iiwa14"), make_union(InertiaForce("iiwa14"), NominalDynamics(wrong))
@@ -78,9 +78,9 @@ print(f"{'moves':>5s} {'rows':>6s}  {'':13s}", *(f"{name:>8}" for name in column
 for size in sizes:
     rows = train.groups < size
     for name, feature_map in zip(names, features, strict=True):
-        model = EVGPRegressor(feature_map, tol=10.0, noise_cv=5, **settings)
+        model = EVGPRegressor(feature_map, tol=10.0, **settings)
         start = time.perf_counter()
-        model.fit(train.data[rows], train.target[rows])
+        model.fit(train.data[rows], train.target[rows], groups=train.groups[rows])
         seconds = time.perf_counter() - start
         mean, std = model.predict(test.data, return_std=True)
         errors = np.linalg.norm(test.target - mean, axis=1)

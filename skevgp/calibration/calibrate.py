@@ -38,9 +38,9 @@ _WIDER = 1e4
 _DEPENDENT = 4.0
 # Of so many rows that can be seen.
 _FEWEST_DEPENDENT = 200
-# What explained more than so much of an output holds for no other group if it takes less than this from the mean square
-# error of what was left out.
-_EXPLAINED, _GAIN = 0.5, 0.05
+# What explained more than so much of an output holds for no other group if it gains less than this, in nats per row
+# that was left out.
+_EXPLAINED, _GAIN = 0.5, 0.01
 
 
 @dataclass(frozen=True)
@@ -111,16 +111,17 @@ def _by_folds(
 ) -> Calibrated:
     limits, lowest = Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
     searches = _searches(model, values, folds, rows, limits, _LEFT_OVER * lowest)
-    found = np.array(list(rows.threads(Search.best, searches)))
-    signal, noise = found.T
+    found = list(rows.threads(Search.best, searches))
     gone, dependent = 0, False
     if by.groups is not None:
         explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
         gone = sum(
-            search.squares(*own) > (1.0 - _GAIN) * search.squares(0.0, level)
-            for search, own, level, is_explained in zip(searches, found, rows.scatter(), explained, strict=True)
+            own.loss(*best) > own.without_signal() - _GAIN
+            for own, best, is_explained in zip(searches, found, explained, strict=True)
             if is_explained
         )
+        groups = [by.groups[fold.predicted] for fold in folds]
+        found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
         order = rows.as_given()
         in_order = folds_in_order(np.arange(len(rows)) if order is None else order, by.n_folds, rng)
@@ -129,6 +130,7 @@ def _by_folds(
         chance = [search.with_limits(alone, lowest[search.output]) for search in searches]
         each = (np.array([noise for _, noise in rows.threads(Search.best, own)]) for own in (blocks, chance))
         dependent = bool((next(each) > _DEPENDENT * next(each)).any())
+    signal, noise = np.array(found).T
     return Calibrated(signal, noise, gone, dependent)
 
 

@@ -6,6 +6,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.stats import norm
+from scipy.stats import t as student_t
 
 from ..optimizers.parameters import ParameterTable, Values
 from .left_out import LeftOut, Weights
@@ -18,6 +20,9 @@ _LOOK, _STEPS, _FARTHEST = (-6, 0, 6), (3.0, 1.0, 0.25), 36
 # What the logarithm of the root mean square error counts beside a log density: to this the mean of rows that are
 # uncertain anyway hardly matters.
 _SQUARES = 0.5
+# Where groups are few, as many errors of a new one as should lie within 2 standard deviations; with no fewer degrees of
+# freedom than this.
+_INSIDE, _FEWEST_DEGREES = 0.97725, 3.0
 # Noise variances that are tried for a ratio, as factors.
 _NOISES = 2.0 ** np.arange(-3.0, 3.25, 0.5)
 
@@ -82,17 +87,42 @@ class Search:
         values = self.values | {"signal": np.full(len(self.values["signal"]), signal)}
         return replace(self, values=values, limits=replace(self.limits, free_signal=False))._along_ratios()
 
-    def squares(self, signal: float, noise: float) -> float:
-        """Mean square error of what was left out; without a signal that of the features alone."""
-        total, n = 0.0, 0.0
-        for fold, known in zip(self.folds, self.known, strict=True):
-            error, _ = fold.predicted(self.index, signal / noise, np.array([noise]), known)
-            total += float((fold.rows.counts @ error**2)[0])
-            n += fold.rows.counts.sum()
-        return total / n
+    def loss(self, signal: float, noise: float) -> float:
+        """Minus the mean log density of what was left out, but for a constant."""
+        density, _ = self._means(signal / noise, np.array([noise]))
+        return float(density[0])
+
+    def without_signal(self) -> float:
+        """The same of the features alone, with a noise as large as what they leave over."""
+        _, squares = self._means(0.0, self._at_bound("noise") * np.ones(1))
+        return self.loss(0.0, max(float(squares[0]), _LOWEST))
+
+    def in_doubt(self, signal: float, noise: float, groups: Sequence[np.ndarray]) -> float:
+        """By what variances should be larger since they are known from so many groups only, (n,) of each fold.
+
+        A group's root mean square of errors over std is one observation of the scale of std; of the mean of them, ν =
+        1 / (2 variance) degrees of freedom are left. Errors of a new group are then distributed as Student's t.
+        """
+        means: list[np.ndarray] = []
+        for fold, known, own in zip(self.folds, self.known, groups, strict=True):
+            error, variance = fold.predicted(self.index, signal / noise, np.array([noise]), known)
+            counts = np.bincount(own, fold.rows.counts)
+            sums = np.bincount(own, fold.rows.counts * (error**2 / variance)[:, 0])
+            means.append(sums[counts > 0.0] / counts[counts > 0.0])
+        scale = np.sqrt(np.concatenate(means))
+        variance = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)), _LOWEST) ** 2
+        degrees = max(len(scale) / (2.0 * max(variance, 1e-6)), _FEWEST_DEGREES)
+        return float((student_t.ppf(_INSIDE, degrees) / norm.ppf(_INSIDE)) ** 2)
+
+    def times(self, factor: float, signal: float, noise: float) -> tuple[float, float]:
+        """Variances times a factor, within their limits."""
+        signal, noise = (
+            float(np.clip(value * factor, *self._range(name))) for name, value in (("signal", signal), ("noise", noise))
+        )
+        return signal, noise
 
     def _along_ratios(self) -> tuple[float, float]:
-        s2, noise = (float(self.values[name][self.output]) for name in ("signal", "noise"))
+        s2, noise = (self._at_bound(name) for name in ("signal", "noise"))
         if not self.limits.free_signal and not self.limits.free_noise:
             return s2, noise
         begin = float(np.round(np.log2(s2 / noise)))
@@ -121,11 +151,11 @@ class Search:
             shift = _vertex(before, here, after)
             noise *= (noise_after / noise if shift > 0.0 else noise / noise_before) ** shift
         if not self.limits.free_noise:
-            noise = float(self.values["noise"][self.output])
+            noise = self._at_bound("noise")
         ratio = 2.0 ** (k + _STEPS[-1] * shift)
         signal = ratio * noise
         if not self.limits.free_signal:
-            signal = float(self.values["signal"][self.output])
+            signal = self._at_bound("signal")
             noise = signal / ratio
         return (
             float(np.clip(signal, *self._range("signal"))),
@@ -135,7 +165,7 @@ class Search:
     def _range(self, name: str) -> tuple[float, float]:
         """From where to where it may move."""
         if not getattr(self.limits, f"free_{name}"):
-            return (float(self.values[name][self.output]),) * 2
+            return (self._at_bound(name),) * 2
         low, high = getattr(self.limits, name)[self.output]
         if name == "noise":
             low = max(low, min(self.lowest, high), _LOWEST)
@@ -151,7 +181,7 @@ class Search:
         if high < low * 1.01:
             noise = np.array([np.sqrt(low * high)])
             return float(self._losses(ratio, noise)[0]), float(noise[0])
-        noise = np.clip(self.values["noise"][self.output], low, high)
+        noise = np.clip(self._at_bound("noise"), low, high)
         # What makes squared errors as large as variances, were these in proportion to the noise.
         for _ in range(2):
             noise = np.clip(noise * self._excess(ratio, noise), low, high)
@@ -175,6 +205,13 @@ class Search:
 
     def _losses(self, ratio: float, noise: np.ndarray) -> np.ndarray:
         """What is to be low (g,), in nats per row, at noise variances (g,)."""
+        density, squares = self._means(ratio, noise)
+        log_prior = np.log(ratio * noise / self._at_bound("signal")) ** 2 + np.log(noise / self._at_bound("noise")) ** 2
+        n = sum(fold.rows.counts.sum() for fold in self.folds)
+        return density + 0.5 * (log_prior / n + _SQUARES * np.log(np.maximum(squares, _LOWEST)))
+
+    def _means(self, ratio: float, noise: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Minus the mean log density but for a constant (g,), and the mean square error, of what was left out."""
         density, squares, n = np.zeros(len(noise)), np.zeros(1), 0.0
         for fold, known in zip(self.folds, self.known, strict=True):
             error, variance = fold.predicted(self.index, ratio, noise, known)
@@ -182,9 +219,10 @@ class Search:
             density += 0.5 * (counts @ (np.log(variance) + error / variance))
             squares = squares + counts @ error
             n += counts.sum()
-        s2, at_bound = (self.values[name][self.output] for name in ("signal", "noise"))
-        density += 0.5 * (np.log(ratio * noise / s2) ** 2 + np.log(noise / at_bound) ** 2)
-        return density / n + 0.5 * _SQUARES * np.log(np.maximum(squares / n, _LOWEST))
+        return density / n, squares / n
+
+    def _at_bound(self, name: str) -> float:
+        return float(self.values[name][self.output])
 
 
 def _vertex(before: float, here: float, after: float) -> float:
