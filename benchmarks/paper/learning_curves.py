@@ -79,7 +79,7 @@ def run(cell: Cell) -> dict[str, Any]:
     """Fit one model on the first trajectories of a run, and look at it on the test set."""
     whole, test = (data(cell.system, state, cell.size) for state in (cell.seed, TEST_STATE))
     rows = whole.groups < cell.n_trajectories
-    train = Bunch(data=whole.data[rows], target=whole.target[rows])
+    train = Bunch(data=whole.data[rows], target=whole.target[rows], groups=whole.groups[rows])
     fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
     return fitted_row(fit, train, test, n_trajectories=cell.n_trajectories, n_rows=len(train.data))
 

@@ -96,7 +96,7 @@ def build(cell: Cell) -> RegressorMixin:
     if cell.model == "EGP":
         return EGPRegressor(PolynomialFeatures(1), n_restarts=n_restarts, random_state=seed)
     features = PolynomialFeatures(1) if cell.model == "EVGP" else None
-    return EVGPRegressor(features, n_inducing=N_INDUCING, solver=LBFGS(n_restarts), random_state=seed)
+    return EVGPRegressor(features, n_inducing=N_INDUCING, noise_cv=None, solver=LBFGS(n_restarts), random_state=seed)
 
 
 def line_of(model: RegressorMixin) -> np.ndarray:
