@@ -1,26 +1,42 @@
-"""What is done with a fitted sparse model: new rows are folded in, and another kernel is tried."""
+"""The sparse model but for its arguments: what a fit asks for, new rows that are folded in, other kernels tried."""
 
 from __future__ import annotations
 
 from contextlib import closing
 from functools import partial
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 
 from ._base import ExplicitGaussianProcess
+from ._intake import Problem
 from ._row_weights import chosen_rows
 from ._sklearn import fit_context
 from ._validation import check_magnitude, unchanged_if_it_fails
+from .calibration.folds import CrossValidation
+from .fitting.inducing import Placement
 from .outputs.fitted import FittedOutputs
+from .outputs.plan import Request, Sharing
+from .rows.dask import is_dask
 from .rows.threads import BlockMap, single_threaded_libraries
+from .solvers import LBFGS, Adam, resolved
 
 
 class SparseGaussianProcess(ExplicitGaussianProcess):
     """A Gaussian process with explicit features and inducing points, however it is fitted."""
 
+    n_inducing: int | Literal["auto"]
+    max_inducing: int
+    inducing_init: Any
+    sharing: Sharing
+    posterior: Literal["full", "diagonal"]
+    noise: Literal["gaussian", "student-t"]
+    noise_cv: int | None
+    solver: Literal["lbfgs", "adam"] | LBFGS | Adam
+    max_iter: int | None
+    tol: float | Literal["auto"]
     forgetting_factor: float
     n_jobs: int | None
 
@@ -65,6 +81,11 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if not hasattr(self, "_fitted"):
             return self.fit(X, y, sample_weight, relative_variance=relative_variance)
         self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        if self._fitted.row_scales is not None and (is_dask(X) or self.forgetting_factor < 1.0):
+            raise ValueError(
+                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (what '
+                f"changes would be taken for outliers); got forgetting_factor={self.forgetting_factor!r}."
+            )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             given, X, y = self._validated(X, y)
             n_outputs = 1 if y.ndim == 1 else y.shape[1]
@@ -77,6 +98,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             self._fitted = self._fitted.updated(source, self.forgetting_factor)
             self._training_data = None
             self._set_attributes()
+            self._set_weights(chosen)
         return self
 
     def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
@@ -120,8 +142,35 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             rows = self._fitted.units.rows(self._source(*self._training_data), threads)
             return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
 
+    def set_params(self, **params: Any) -> Self:
+        """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.
+
+        Parameters
+        ----------
+        **params : dict
+            Parameters of the estimator, and of what it is made of.
+
+        Returns
+        -------
+        self : object
+            The estimator itself.
+        """
+        if isinstance(self.solver, str) and any(name.startswith("solver__") for name in params):
+            self.solver = resolved(self.solver, self.posterior)
+        return super().set_params(**params)
+
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
+
+    def _set_weights(self, chosen: Any) -> None:
+        """How much each of the user's rows is doubted."""
+        scales = self._fitted.row_scales
+        if scales is None:
+            self.__dict__.pop("weights_", None)
+            return
+        model_of = [next(i for i, own in enumerate(self._fitted.outputs) if o in own) for o in range(self._n_outputs)]
+        weights = chosen.as_given(scales[:, model_of])
+        self.weights_ = weights[:, 0] if self._single_output else weights
 
     def _set_attributes(self) -> None:
         self._set_common_attributes()
@@ -136,3 +185,23 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter
         self.n_parameters_ = fitted.n_parameters
+
+    def _request(self, problem: Problem, solver: LBFGS | Adam) -> Request:
+        """What the fits of all outputs are asked for."""
+        folds = self.noise_cv
+        free_signal = problem.spec.starts.signal.bounds is None
+        return Request(
+            problem.source,
+            problem.units,
+            problem.spec,
+            self.sharing,
+            self.posterior,
+            Placement.of(self.inducing_init, self.n_inducing, self.max_inducing, problem.n_columns),
+            solver,
+            solver.default_max_iter if self.max_iter is None else self.max_iter,
+            None if isinstance(self.tol, str) else self.tol,
+            None if folds is None else CrossValidation(folds, problem.groups, free_signal),
+            effective_n_jobs(self.n_jobs),
+            problem.per_output,
+            heavy_tails=self.noise == "student-t",
+        )

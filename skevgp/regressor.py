@@ -8,7 +8,6 @@ from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
-from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
@@ -18,13 +17,12 @@ from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import unchanged_if_it_fails
-from .calibration.folds import CrossValidation
 from .exceptions import DependentRowsWarning
 from .fitting.advice import DEPENDENT_ROWS
-from .fitting.inducing import Placement
 from .outputs.fit import fit_outputs
-from .outputs.plan import Request, Sharing
+from .outputs.plan import Sharing
 from .outputs.sharing import with_groups
+from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
 
@@ -96,6 +94,13 @@ class EVGPRegressor(SparseGaussianProcess):
         an attribute ``share_coef`` that is true. Each output keeps its
         own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
         ``posterior="diagonal"`` it is an error, as are correlations.
+    noise : {"gaussian", "student-t"}, default="gaussian"
+        ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
+        Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
+        freedom, thirty times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are
+        fitted together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std``
+        and ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With
+        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5
@@ -169,6 +174,9 @@ class EVGPRegressor(SparseGaussianProcess):
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
+    weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+        Only with ``noise="student-t"``: the expected τ of each row, by which its noise variance is divided: 1 for an
+        ordinary row, near 0 for one that is doubted; NaN for one of weight 0. After `partial_fit`, of the new rows.
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
@@ -196,6 +204,8 @@ class EVGPRegressor(SparseGaussianProcess):
     - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
     - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
     - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
+    - M. E. Tipping, N. D. Lawrence (2005): Variational Inference for Student-t Models.
+    - P. Jylänki, J. Vanhatalo, A. Vehtari (2011): Robust Gaussian Process Regression with a Student-t Likelihood.
 
     Examples
     --------
@@ -231,6 +241,7 @@ class EVGPRegressor(SparseGaussianProcess):
         "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none", "auto"}), "array-like"],
         "posterior": [StrOptions({"full", "diagonal"})],
+        "noise": [StrOptions({"gaussian", "student-t"})],
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
         "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -255,6 +266,7 @@ class EVGPRegressor(SparseGaussianProcess):
         coef_scale: ArrayLike | Literal["auto"] = "auto",
         coef_cov: ArrayLike | None = None,
         share_coef: bool | Literal["auto"] = "auto",
+        noise: Literal["gaussian", "student-t"] = "gaussian",
         noise_variance: float | None = None,
         noise_cv: int | None = 5,
         normalize_y: bool = False,
@@ -280,6 +292,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.coef_scale = coef_scale
         self.coef_cov = coef_cov
         self.share_coef = share_coef
+        self.noise = noise
         self.noise_variance = noise_variance
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
@@ -353,48 +366,24 @@ class EVGPRegressor(SparseGaussianProcess):
         solver = resolved(self.solver, self.posterior)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
+        if self.noise == "student-t" and (isinstance(solver, Adam) or is_dask(X)):
+            raise ValueError(
+                'noise="student-t" needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
+                f"solver={self.solver!r} and X of type {type(X).__name__}."
+            )
         progress = monitor_of(self.verbose, solver.callback, self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y, sample_weight, relative_variance, groups)
             self._training_data = problem.data
-            request = Request(
-                problem.source,
-                problem.units,
-                problem.spec,
-                self.sharing,
-                self.posterior,
-                Placement.of(self.inducing_init, self.n_inducing, self.max_inducing, problem.n_columns),
-                solver,
-                solver.default_max_iter if self.max_iter is None else self.max_iter,
-                None if isinstance(self.tol, str) else self.tol,
-                CrossValidation.of(self.noise_cv, problem.groups, problem.spec.starts.signal.bounds is None),
-                effective_n_jobs(self.n_jobs),
-                problem.per_output,
-            )
+            request = self._request(problem, solver)
             check_weights(solver, self.posterior, problem.units.prior, self.sharing, problem.per_output)
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)
             self._fitted = fit_outputs(request, rng, monitor, previous)
             self._set_attributes()
+            self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         if self._fitted.dependent:
             warnings.warn(DEPENDENT_ROWS, DependentRowsWarning, stacklevel=3)
         return self
-
-    def set_params(self, **params: Any) -> Self:
-        """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.
-
-        Parameters
-        ----------
-        **params : dict
-            Parameters of the estimator, and of what it is made of.
-
-        Returns
-        -------
-        self : object
-            The estimator itself.
-        """
-        if isinstance(self.solver, str) and any(name.startswith("solver__") for name in params):
-            self.solver = resolved(self.solver, self.posterior)
-        return super().set_params(**params)

@@ -71,11 +71,11 @@ class Dense:
     With inducing points Z (one set per output) the covariance of f is the sparse one, as of the bound.
     """
 
-    def __init__(self, H, inputs, Y, mean, Sigma, noise, Z=None, kernel=KERNEL):
+    def __init__(self, H, inputs, Y, mean, Sigma, noise, Z=None, kernel=KERNEL, relative=1.0):
         self.Z, self.kernel, self.Sigma, self.beta = Z, kernel, Sigma, mean
         self.H, self.inputs = H, inputs
         self.y = np.concatenate(list(Y.T))
-        self.noise = np.repeat(noise, len(Y))
+        self.noise = np.ravel(np.outer(noise, relative * np.ones(len(Y))))
         self.Q, self.K = self.of_f(inputs, inputs)
         self.flat = self.stacked(H)
         self.S = self.Q + self.flat @ Sigma @ self.flat.T + np.diag(self.noise)
@@ -446,3 +446,34 @@ def test_the_joint_covariance_is_asked_for_by_name(data):
     for i in range(O):
         for j in range(O):
             np.testing.assert_array_equal(joint[:, i, :, j], cov[:, :, i] if i == j else 0.0)
+
+
+def test_rows_with_known_noise_and_shared_weights_are_those_of_the_dense_process(data):
+    X, Y, Sigma, mean, X_new = data
+    relative = np.random.RandomState(1).uniform(0.2, 5.0, N)
+    kernel_map = FunctionTransformer(own_columns)
+    options = {"kernel_map": kernel_map, "share_coef": True, "coef_mean": mean, "coef_cov": Sigma, "max_iter": 0}
+    sparse = EVGPRegressor(Rows(), KERNEL, noise_variance=0.3, n_inducing=9, random_state=0, **options)
+    sparse.fit(X, Y, relative_variance=relative)
+    exact = EGPRegressor(Rows(), KERNEL, noise_variance=0.3, **options).fit(X, Y, relative_variance=relative)
+    for model, Z in ((sparse, sparse.inducing_points_), (exact, None)):
+        dense = Dense(
+            Rows().transform(X), own_columns(X), Y, mean, Sigma, np.full(O, 0.3), Z, KERNEL, relative=relative
+        )
+        bound = model.lower_bound_ if model is sparse else model.log_marginal_likelihood_value_
+        assert bound == pytest.approx(dense.bound(), rel=1e-9)
+        check(model, dense, data, own_columns(X_new), Rows().transform(X_new))
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_a_row_that_counts_twice_is_there_twice(data, kind):
+    X, Y, Sigma, _, X_new = data
+    weights = np.arange(N) % 3
+    options = {"kernel_map": FunctionTransformer(own_columns), "share_coef": True, "coef_cov": Sigma, "max_iter": 100}
+    models = [kind(Rows(), tol=1e3, **options) for _ in range(2)]
+    if kind is EVGPRegressor:
+        models = [model.set_params(n_inducing=9, random_state=0) for model in models]
+    models[0].fit(X, Y, sample_weight=weights)
+    models[1].fit(np.repeat(X, weights, axis=0), np.repeat(Y, weights, axis=0))
+    for found, expected in zip(*(model.predict(X_new, return_std=True) for model in models), strict=True):
+        assert_allclose(found, expected, rtol=1e-7)

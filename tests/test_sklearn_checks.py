@@ -16,6 +16,7 @@ SPARSE = [
     EVGPRegressor(noise_cv=3),
     EVGPRegressor(n_inducing="auto", max_inducing=20),
     EVGPRegressor(sharing="auto"),
+    EVGPRegressor(noise="student-t"),
 ]
 ESTIMATORS = [*SPARSE, EGPRegressor(), QUICK_NETWORK, *RESIDUALS, *MAPS]
 

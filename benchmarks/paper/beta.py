@@ -32,7 +32,7 @@ from threadpoolctl import threadpool_limits
 
 import harness
 from paper import beta_report
-from paper.models import QUICK_TRAJECTORIES, SYSTEMS, Fit, build, groups_of
+from paper.models import QUICK_TRAJECTORIES, SYSTEMS, Fit, build
 from skevgp.datasets import make_dynamics
 
 SETTINGS = ("paper", "skevgp")
@@ -73,7 +73,7 @@ def run(cell: Cell) -> list[dict[str, Any]]:
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         start = time.process_time()
-        regressor.fit(train.data, train.target, **groups_of(regressor, train))
+        regressor.fit(train.data, train.target, groups=train.groups)
         seconds = time.process_time() - start
         mean = regressor.predict(train.data)
     H = regressor.feature_map_.transform(train.data)

@@ -96,7 +96,8 @@ def build(cell: Cell) -> RegressorMixin:
     if cell.model == "EGP":
         return EGPRegressor(PolynomialFeatures(1), n_restarts=n_restarts, random_state=seed)
     features = PolynomialFeatures(1) if cell.model == "EVGP" else None
-    return EVGPRegressor(features, n_inducing=N_INDUCING, noise_cv=None, solver=LBFGS(n_restarts), random_state=seed)
+    settings = {"n_inducing": N_INDUCING, "noise_cv": None, "random_state": seed}
+    return EVGPRegressor(features, solver=LBFGS(n_restarts), **settings)
 
 
 def line_of(model: RegressorMixin) -> np.ndarray:

@@ -98,7 +98,8 @@ def run(cell: Cell) -> dict[str, Any]:
 
     n_jobs = 2 if engine.startswith("2") else 1
     solver = TimedLBFGS()
-    model = EVGPRegressor(n_inducing=N_INDUCING, solver=solver, max_iter=max_iter, n_jobs=n_jobs, random_state=0)
+    settings = {"max_iter": max_iter, "noise_cv": None, "n_jobs": n_jobs, "random_state": 0}
+    model = EVGPRegressor(n_inducing=N_INDUCING, solver=solver, **settings)
     with (
         warnings.catch_warnings(record=True) as caught,
         harness.peak_memory() as memory,

@@ -34,11 +34,6 @@ class CrossValidation:
     groups: np.ndarray | None = None
     wide: bool = True
 
-    @classmethod
-    def of(cls, n_folds: int | None, groups: np.ndarray | None, wide: bool) -> CrossValidation | None:
-        """None if nobody asked for it."""
-        return None if n_folds is None else cls(n_folds, groups, wide)
-
     def folds(self, n_rows: int, rng: np.random.RandomState) -> list[Fold]:
         """Folds of all rows; none if these are too few."""
         if n_rows < FEWEST_ROWS:

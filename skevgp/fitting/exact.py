@@ -281,7 +281,14 @@ def fit_exact(
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     advice = [best.message, far_from_prior(proper, rows)]
     if options.max_iter > 0:
-        advice.append(learned_too_little(kernel, best.values, table, rows, sparse=False))
+        each = [(rows, best.values["noise"])]
+        if others:
+            each = [(rows.within(slice(o, o + 1)), best.values["noise"][[o]]) for o in range(len(kernels))]
+        told = [
+            learned_too_little(own, best.values | {"noise": noise}, table, own_rows, sparse=False)
+            for own, (own_rows, noise) in zip(kernels, each, strict=True)
+        ]
+        advice.append(max(told))
     message = " ".join(part for part in advice if part)
     if monitor.stopped:
         message = interrupted(best.n_iter, monitor.max_time if monitor.out_of_time else None)

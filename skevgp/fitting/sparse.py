@@ -1,4 +1,4 @@
-"""A sparse model to be fitted, and what is kept of it when that is done."""
+"""A sparse model to be fitted."""
 
 from __future__ import annotations
 
@@ -10,18 +10,14 @@ from typing import Protocol
 import numpy as np
 
 from .._progress import Monitor
-from ..calibration.calibrate import calibrated
 from ..calibration.folds import CrossValidation
-from ..inference.bounds import bounds_at_optimum, features_alone_bound
+from ..inference.bounds import features_alone_bound
 from ..inference.model import SparseModel
-from ..inference.objectives import evaluate
-from ..inference.posterior import Predictor
-from ..inference.statistics import SufficientStatistics
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
 from ..rows.source import of_outputs
-from .advice import far_from_prior, learned_too_little, signal_gone
+from .advice import learned_too_little
 from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
@@ -77,6 +73,8 @@ class SparseTask:
         Where another fit ended.
     placed : bool
         Whether the table's inducing points are from that fit.
+    heavy_tails : bool
+        Whether the noise has a Student-t's tails.
     """
 
     model: SparseModel
@@ -91,6 +89,7 @@ class SparseTask:
     monitor: Monitor
     warm: Values | None = None
     placed: bool = False
+    heavy_tails: bool = False
 
     @cached_property
     def rng(self) -> np.random.RandomState:
@@ -273,128 +272,3 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
     if task.max_iter > 0 and not task.monitor.stopped:
         fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter)))
     return task, fit
-
-
-@dataclass(frozen=True)
-class Learned:
-    """A fitted sparse model.
-
-    Attributes
-    ----------
-    model : SparseModel
-    table : ParameterTable
-        Where it started, and its limits.
-    values : dict
-        Of the model's parameters, in internal units.
-    statistics : list of SufficientStatistics
-        At ``values``, one for each set of inducing points.
-    bound, upper_bound : float
-        On the log marginal likelihood, in nats, of the residuals in internal units.
-    predictor : Predictor
-        In internal units.
-    loss_curve : list of float
-        Minus the bound per iteration.
-    message : str
-        What the user should know of how the fit ended; empty if all is well.
-    dependent : bool, default=False
-        Whether rows near each other were found to be alike.
-    """
-
-    model: SparseModel
-    table: ParameterTable
-    values: Values
-    statistics: list[SufficientStatistics]
-    bound: float
-    upper_bound: float
-    predictor: Predictor
-    loss_curve: list[float]
-    message: str
-    dependent: bool = False
-
-    @classmethod
-    def of(cls, task: SparseTask, fit: Fit) -> Learned:
-        """What is kept of a fit; signal and noise are calibrated if the task says so and Ctrl-C did not."""
-        model, values = task.model, fit.values
-        statistics = model.statistics(values, task.blocks)
-        advice, found = [fit.message, far_from_prior(model.prior, task.rows)], None
-        if not task.monitor.stopped and task.max_iter > 0:
-            advice.append(task.learned_too_little(values))
-            if task.noise_cv is not None:
-                with task.monitor.keeping_the_best():
-                    found = calibrated(model, values, statistics, task.table, task.rows, task.noise_cv, task.seed)
-        if found is not None:
-            values = values | {"signal": found.signal, "noise": found.noise}
-            advice.append(signal_gone(found.gone, len(found.noise)))
-        bound, predictor = model.at_optimum(values, statistics)
-        if found is None:
-            # Summed row by row, which keeps its digits where the noise is low.
-            bound = fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound
-            predictor = predictor if fit.predictor is None else fit.predictor
-        return cls(
-            model,
-            task.table,
-            values,
-            statistics,
-            bound,
-            model.upper_bound(values, statistics, task.blocks),
-            predictor,
-            fit.loss_curve,
-            " ".join(part for part in advice if part),
-            found is not None and found.dependent,
-        )
-
-    def bound_at(
-        self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: np.ndarray
-    ) -> tuple[float, np.ndarray]:
-        """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
-
-        Noise and inducing points are the fitted ones, and q is at its optimum.
-
-        Parameters
-        ----------
-        rows : Rows
-            Those of the fit, of this output.
-        output : int
-            Of the model's outputs.
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        signal : ndarray of shape (1,)
-            s².
-
-        Returns
-        -------
-        bound : float
-        gradient : ndarray of shape (n_hyper + 1,)
-            That in log s² last.
-        """
-        own, index = slice(output, output + 1), self.model.set_of(output, self.table["inducing_points"])
-        points = self.values["inducing_points"][[index]]
-        values = {
-            "hyperparameters": hyperparameters,
-            "signal": signal,
-            "noise": self.values["noise"][own],
-            "inducing_points": points,
-        }
-        kernel, _ = self.model.kernel_of(self.values, index)
-        prior = self.model.prior.outputs(own)
-        model = replace(self.model, kernel=kernel, prior=prior, groups=(slice(0, 1),), kernels=None)
-        blocks = model.blocks(rows, points.shape[1])
-        bound, gradient = evaluate(model, values, blocks, partial(bounds_at_optimum, family=model.family))
-        return bound, np.append(gradient["hyperparameters"], gradient["signal"])
-
-    def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
-        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far.
-
-        ``weight`` multiplies the log likelihood of the earlier rows.
-        """
-        n_inducing = self.values["inducing_points"].shape[1]
-        # Whatever its points were of the rows before.
-        model = replace(self.model, complete=False)
-        new = model.statistics(self.values, model.blocks(rows, n_inducing))
-        statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        return replace(self, model=model, statistics=statistics)._at_optimum()
-
-    def _at_optimum(self) -> Learned:
-        bound, predictor = self.model.at_optimum(self.values, self.statistics)
-        upper_bound = self.model.upper_bound(self.values, self.statistics)
-        return replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)

@@ -8,8 +8,10 @@ import numpy as np
 
 from .._progress import Monitor
 from ..fitting.advice import interrupted
-from ..fitting.sparse import Learned, SparseTask, grown
-from ..fitting.strategy import search
+from ..fitting.learned import Learned
+from ..fitting.noise.outliers import fit_doubting
+from ..fitting.sparse import SparseTask, grown
+from ..fitting.strategy import Fit, search
 from ..rows.threads import BlockMap, side_by_side
 from .fitted import FittedOutputs
 from .plan import Request, models_of, plan
@@ -58,6 +60,10 @@ def _fit_one(turn: tuple[SparseTask, float]) -> Learned:
     task, share = turn
     # A copy, with which the blocks of rows are forgotten.
     task = replace(task, monitor=task.monitor.with_time(share))
-    if task.placement.max_inducing is None:
-        return Learned.of(task, search(task))
-    return Learned.of(*grown(task))
+    if task.heavy_tails:
+        return fit_doubting(task, _best)
+    return Learned.of(task, search(task)) if task.placement.max_inducing is None else Learned.of(*grown(task))
+
+
+def _best(task: SparseTask) -> tuple[SparseTask, Fit]:
+    return (task, search(task)) if task.placement.max_inducing is None else grown(task)

@@ -6,7 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..fitting.sparse import Learned
+from ..fitting.learned import Learned
+from ..fitting.noise.outliers import RowDoubts
 from ..fitting.units import Units
 from ..inference.posterior import Predictor
 from ..inference.statistics import Kernel
@@ -37,6 +38,12 @@ class FittedOutputs:
     found: bool
     learned: tuple[Learned, ...]
     messages: tuple[str, ...]
+
+    @property
+    def row_scales(self) -> np.ndarray | None:
+        """E[τ] of each row and model, (n, n_models); None if the noise is Gaussian."""
+        each = [one.doubts.scales.mean for one in self.learned if isinstance(one.doubts, RowDoubts)]
+        return np.column_stack(each) if each else None
 
     def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
         """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""

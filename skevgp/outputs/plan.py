@@ -58,6 +58,8 @@ class Request:
         Whether outputs have inputs or features of their own.
     found : bool, default=False
         Whether the groups were found and not given.
+    heavy_tails : bool, default=False
+        Whether the noise has a Student-t's tails.
     """
 
     source: Source
@@ -73,6 +75,7 @@ class Request:
     n_threads: int
     per_output: bool = False
     found: bool = False
+    heavy_tails: bool = False
 
 
 def plan(
@@ -128,6 +131,7 @@ def plan(
                 monitor.seen_as(shift=shift, outputs=_as_columns(outputs), about=_shown(outputs, len(models))),
                 None if warm is None else table.started_at(warm).values_at_start(),
                 warm is not None and sets is warm.get("inducing_points"),
+                request.heavy_tails,
             )
         )
     return tasks

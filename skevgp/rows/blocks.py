@@ -49,6 +49,8 @@ class Block:
     counts, roots : ndarray of shape (n,), optional
         w, how often a row counts, and √ω, which ``linear`` has been multiplied by; ω = w / v, where the row's noise
         variance is σ² v. None: 1.
+    log_variance : float
+        Σ w log v.
     may_keep : bool
         Whether there is room for ``kept``.
     kept : (whitening, k(X_m, X), [V; Hᵀ; rᵀ]) or None
@@ -60,6 +62,7 @@ class Block:
     n_features: int
     counts: np.ndarray | None = None
     roots: np.ndarray | None = None
+    log_variance: float = 0.0
     may_keep: bool = False
     kept: tuple[Any, np.ndarray, np.ndarray] | None = None
 
@@ -202,8 +205,7 @@ class LinearStatistics:
         if block.counts is None or block.roots is None:
             return cls(n, *sums, n)
         n_rows = float(block.counts.sum())
-        log_variance = float(block.counts @ (np.log(block.counts) - 2.0 * np.log(block.roots)))
-        return cls(n_rows, *sums, n, log_variance, float(np.maximum(block.roots**2, 1.0).sum()) - n_rows)
+        return cls(n_rows, *sums, n, block.log_variance, float(np.maximum(block.roots**2, 1.0).sum()) - n_rows)
 
     def of(self, outputs: slice) -> LinearStatistics:
         RR = self.RR[outputs]

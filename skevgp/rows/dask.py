@@ -330,9 +330,11 @@ def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[Any, ...]:
 
 def _joined(found: Sequence[tuple[Any, ...]]) -> list[Any]:
     """Rows of several partitions, part by part; a partition whose rows all count once has no weights."""
-    weighted = any(parts[-1] is not None for parts in found)
-    ones = ((np.ones(len(parts[0])) if part is None and weighted else part for part in parts) for parts in found)
-    return [None if columns[0] is None else np.concatenate(columns) for columns in zip(*ones, strict=True)]
+    if any(parts[3] is not None for parts in found):
+        found = [
+            (*parts[:3], *(np.ones(len(parts[0])) if part is None else part for part in parts[3:5])) for parts in found
+        ]
+    return [None if columns[0] is None else np.concatenate(columns) for columns in zip(*found, strict=True)]
 
 
 def _partly_fitted(fitted: Any, X: np.ndarray, y: np.ndarray) -> Any:

@@ -63,11 +63,13 @@ class MakeBlock:
 def _block(rows: RawRows, prepared: Any) -> Block:
     # A column's numbers side by side: products and errors take the columns, not the rows.
     linear = np.asfortranarray(np.hstack([rows.features, rows.targets]))
-    roots = None
-    if rows.precision is not None:
-        roots = np.sqrt(rows.precision)
-        linear *= roots[:, np.newaxis]
-    return Block(prepared, linear, rows.features.shape[1], rows.counts, roots)
+    block = Block(prepared, linear, rows.features.shape[1])
+    if rows.counts is not None and rows.precision is not None:
+        block.counts, block.roots = rows.counts, np.sqrt(rows.precision)
+        linear *= block.roots[:, np.newaxis]
+        log_v = np.log(rows.counts / rows.precision) if rows.log_variance is None else rows.log_variance
+        block.log_variance = float(rows.counts @ log_v)
+    return block
 
 
 @dataclass(frozen=True)

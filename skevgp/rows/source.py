@@ -32,6 +32,8 @@ class RawRows:
     targets : ndarray of shape (n, o)
     counts, precision : ndarray of shape (n,), optional
         w, how often a row counts, and ω = w / v, where its noise variance is σ² v. None: 1; both or neither.
+    log_variance : ndarray of shape (n,), optional
+        What the bound has for log v, where v is not known but for a q.
     """
 
     inputs: np.ndarray
@@ -39,6 +41,7 @@ class RawRows:
     targets: np.ndarray
     counts: np.ndarray | None = None
     precision: np.ndarray | None = None
+    log_variance: np.ndarray | None = None
 
     def __getitem__(self, rows: slice | np.ndarray) -> RawRows:
         """Some of them."""
@@ -48,7 +51,7 @@ class RawRows:
     @property
     def parts(self) -> tuple[Any, ...]:
         """Their arrays, or None, in the order of the attributes."""
-        return self.inputs, self.features, self.targets, self.counts, self.precision
+        return self.inputs, self.features, self.targets, self.counts, self.precision, self.log_variance
 
     @property
     def total(self) -> float:
@@ -205,6 +208,10 @@ class LocalSource:
         """Rows by index, as a data set of their own."""
         return LocalSource(_Some(self.load, rows), len(rows))
 
+    def weighed(self, factors: np.ndarray, log_variance: np.ndarray) -> LocalSource:
+        """The same rows with ω times ``factors`` (n_rows,), and with so much added to their log v."""
+        return LocalSource(_Weighed(self.load, factors, log_variance), self.n_rows, self.positions)
+
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return LocalBlocks(self.through(make), self.n_rows, n_inducing, threads, share)
 
@@ -232,6 +239,20 @@ class _Some:
 
     def __call__(self, rows: slice | np.ndarray) -> RawRows:
         return self.load(self.chosen[rows])
+
+
+@dataclass(frozen=True)
+class _Weighed:
+    load: Callable[[slice | np.ndarray], RawRows]
+    factors: np.ndarray
+    log_variance: np.ndarray
+
+    def __call__(self, rows: slice | np.ndarray) -> RawRows:
+        raw, factors, log_variance = self.load(rows), self.factors[rows], self.log_variance[rows]
+        if raw.counts is None or raw.precision is None:
+            return replace(raw, counts=np.ones(len(factors)), precision=factors, log_variance=log_variance)
+        log_v = np.log(raw.counts / raw.precision)
+        return replace(raw, precision=raw.precision * factors, log_variance=log_variance + log_v)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from skevgp._progress import Monitor
 from skevgp.calibration.folds import CrossValidation
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.sparse import Learned, SparseTask, grown
+from skevgp.fitting.learned import Learned
+from skevgp.fitting.sparse import SparseTask, grown
 from skevgp.fitting.strategy import Attempt, Fit, search
 from skevgp.inference.bounds import features_alone_bound
 from skevgp.outputs.plan import plan

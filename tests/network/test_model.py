@@ -183,3 +183,16 @@ def test_the_start_is_within_the_bounds():
         theta, (lower, upper) = network.start(np.random.default_rng(0)), network.limits()
         assert (lower < theta).all()
         assert (theta < upper).all()
+
+
+@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: str(network.sizes))
+def test_a_row_that_counts_twice_is_there_twice(network):
+    theta, X, Y, draws = case(network)
+    counts = np.array([1, 2, 1, 3, 1, 1, 2, 1])
+    again, weights = np.repeat(np.arange(8), counts), counts / counts.mean()
+    loss, gradient = network.loss_and_gradient(theta, X, Y, draws, N_ROWS, weights)
+    expected, expected_gradient = network.loss_and_gradient(theta, X[again], Y[again], draws[again], N_ROWS)
+    assert loss == pytest.approx(expected, rel=1e-12)
+    np.testing.assert_allclose(gradient, expected_gradient, rtol=1e-9, atol=1e-12)
+    found = network.expected_log_likelihood(theta, X, Y, draws, weights)
+    assert found == pytest.approx(network.expected_log_likelihood(theta, X[again], Y[again], draws[again]), rel=1e-12)

@@ -73,3 +73,30 @@ def test_rows_held_back_are_not_learned_from():
     assert len(a.losses) == len(a.scores) == 5
     assert a.minimum.n_iter == 5 * 3
     np.testing.assert_allclose(a.losses[0], np.mean(a.minimum.loss_curve[:3]))
+
+
+def test_all_rows_at_once_weighed_are_the_same_rows_repeated():
+    """Without hidden layers nothing is drawn."""
+    rng = np.random.RandomState(0)
+    X, counts = rng.randn(30, 2), rng.randint(1, 4, 30)
+    Y, again = X @ [[1.0], [-0.5]] + 0.1 * rng.randn(30, 1), np.repeat(np.arange(30), counts)
+    network, options = (
+        VariationalNetwork([2, 1], [0.7], 0.01),
+        {"n_held_back": 0, "max_iter": 50, "learning_rate": 0.05},
+    )
+    options |= {"tol": 0.0, "patience": 1}
+    weighed, repeated = (
+        train(network, np.zeros(network.n_parameters), *rows, np.random.default_rng(0), batch_size=n, **options, **more)
+        for rows, n, more in (((X, Y), 30, {"counts": counts.astype(float)}), ((X[again], Y[again]), len(again), {}))
+    )
+    np.testing.assert_allclose(weighed.theta, repeated.theta, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(weighed.losses, repeated.losses, rtol=1e-8)
+
+
+def test_the_scaling_of_rows_that_count_twice_is_that_of_repeated_ones():
+    rng = np.random.RandomState(0)
+    X, Y, counts = rng.randn(20, 3), rng.randn(20, 2), rng.randint(1, 4, 20)
+    again = np.repeat(np.arange(20), counts)
+    found, expected = Scaling.of(X, Y, counts.astype(float)), Scaling.of(X[again], Y[again])
+    for name in ("x_mean", "x_scale", "y_mean", "y_scale"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12)

@@ -27,7 +27,7 @@ def at_fixed(fixed: Fixed) -> Said:
 
 
 def fit(job: Job, watch: Watch) -> Fitted:
-    """With its defaults but for m, threads, noise_cv and, if the job says so, iterations and sharing.
+    """With its defaults but for m, threads and, if the job says so, iterations and sharing.
 
     What there was at an earlier time is what a fit gives that a callback ends then: the same way again, as fits are
     deterministic, and with a bound on all rows, which the callback's need not be.
@@ -64,7 +64,6 @@ def _fit_until(job: Job, watch: Watch, seconds: float) -> tuple[Any, str, int]:
         n_inducing=len(job.inducing_points),
         max_iter=job.max_iter or None,
         n_jobs=2,
-        noise_cv=None,  # as the others
         random_state=job.seed,
         solver=LBFGS(callback=count),
         **sharing,
