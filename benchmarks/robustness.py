@@ -29,6 +29,7 @@ import harness
 import internals
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
+from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.solvers import LBFGS
 
@@ -154,7 +155,7 @@ def dynamics(system: str, name: str, seed: int) -> Data:
         train.target - residual[0],
         test.data,
         test.target - residual[1],
-        {"feature_map": features, "n_inducing": n_inducing}
+        {"feature_map": features, "n_inducing": n_inducing, "noise_cv": None}
         | ({"max_iter": CARTPOLE_ITERATIONS} if system == "cartpole" else {}),
         f"{system}-{name}",
     )
@@ -176,7 +177,8 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")
-            warnings.simplefilter("ignore", ConvergenceWarning)
+            for category in (ConvergenceWarning, DependentRowsWarning):
+                warnings.simplefilter("ignore", category)
             model = EVGPRegressor(random_state=seed, **{**data.arguments, **arguments}).fit(data.X, data.Y)
             seconds = time.perf_counter() - start
             mean, std = model.predict(data.X_test, return_std=True)

@@ -87,8 +87,8 @@ models = {
 # Cross-validation over moves
 # ---------------------------
 # ``GroupKFold`` keeps the rows of a move together: neighbours in time would give the answer away. CR-2 is the share of
-# truths within two standard deviations; 0.954 would be right. ``fit`` is told the moves too (``params``), and sets noise
-# and signal by those that it leaves out itself.
+# truths within two standard deviations; 0.954 would be right. ``fit`` is told the moves too (``params``), and sets
+# noise and signal by those that it leaves out itself.
 
 splits = {"groups": moves.groups, "cv": GroupKFold(n_folds), "return_estimator": True, "return_indices": True}
 splits["params"] = {"groups": moves.groups}

@@ -63,8 +63,8 @@ n_joints = train.target.shape[1] // 2
 # Two priors, and more and more data
 # ----------------------------------
 # ``tol=10``: L-BFGS stops when an iteration no longer gains 10 nats, of a bound of some hundred thousand. The default
-# takes several times as long for errors that are hardly smaller. ``groups``: the rows of a move are alike, and are not as
-# many facts as they are rows. Noise and signal are therefore set by what is predicted of moves that were left out.
+# takes several times as long for errors that are hardly smaller. ``groups``: the rows of a move are alike, and are not
+# as many facts as they are rows. Noise and signal are therefore set by what is predicted of moves that were left out.
 
 names = "IFG", "IF + nominal"
 features = InertiaForceGravity("iiwa14"), make_union(InertiaForce("iiwa14"), NominalDynamics(wrong))

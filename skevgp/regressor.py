@@ -18,18 +18,13 @@ from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import unchanged_if_it_fails
 from .exceptions import DependentRowsWarning
+from .fitting.advice import DEPENDENT_ROWS
 from .outputs.fit import fit_outputs
 from .outputs.plan import Sharing
 from .outputs.sharing import with_groups
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
-
-_DEPENDENT = (
-    "Rows near each other are alike: left out in blocks, they are predicted much worse than at random, and std is too "
-    "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
-    "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
-)
 
 
 class EVGPRegressor(SparseGaussianProcess):
@@ -109,15 +104,14 @@ class EVGPRegressor(SparseGaussianProcess):
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5
-        Folds, 2 or more, by which noise and signal variances of each output are set after the iterations: each fold is
-        predicted from the others with the same kernel shape and inducing points, and the two are where the log
-        predictive density of what was left out is highest (Rasmussen & Williams 2006, section 5.4.2), within their
-        bounds. Folds are whole ``groups`` of `fit`, else random. At its optimum the bound takes what inducing points
-        cannot represent for noise, and rows of a trajectory, each like the one before, for independent: ``std`` is too
-        large for rows like those of a table, and too small on new trajectories. It takes a few passes over the rows,
-        memory for as many matrices (m, m), and up to 2,000 rows are predicted; q is then at its optimum, after Adam
-        too. It is left out with None, with ``max_iter=0``, below 50 rows, when a fit is interrupted or out of time, and
-        for what the kernel fixes; `partial_fit` keeps what the first call found.
+        Folds, 2 or more: whole ``groups`` of `fit`, else random. After the iterations each is predicted from the others
+        (Rasmussen & Williams 2006, section 5.4.2), with kernel shape and inducing points as they are, and signal and
+        noise variance of each output are where log density and, half as much, the logarithm of the rms error are best,
+        within their bounds. (The bound takes what inducing points cannot represent for noise: ``std`` of rows of a
+        table is then too large. And it takes rows of a trajectory for independent: on new ones ``std`` is too small.)
+        Up to 2,000 rows are predicted; it takes a few passes over all, and memory for twice as many matrices (m, m). q
+        is then at its optimum, after Adam too. It is left out with None, with ``max_iter=0``, of fewer than 50 rows,
+        and when a fit is interrupted or out of time; `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
@@ -129,10 +123,9 @@ class EVGPRegressor(SparseGaussianProcess):
         16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
         Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
     max_time : float, default=None
-        Seconds that `fit` may take, about: when they are over iterations end, of each independent model when its share
-        is, and the best so far is kept, with a ConvergenceWarning; then ``noise_cv`` is left out. Half of them is the
-        most for finding groups (``sharing="auto"``; if that is not enough, all outputs share). What comes before and
-        after the iterations, passes over the rows, is not cut short.
+        Seconds until iterations end, those of each independent model when its share is over: the best so far is kept,
+        with a ConvergenceWarning, and ``noise_cv`` left out. Half of them is the most for finding groups
+        (``sharing="auto"``; if it is not enough, all outputs share). The passes before and after are not cut short.
     tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
         than this, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained over
@@ -392,5 +385,5 @@ class EVGPRegressor(SparseGaussianProcess):
             self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         if self._fitted.dependent:
-            warnings.warn(_DEPENDENT, DependentRowsWarning, stacklevel=3)
+            warnings.warn(DEPENDENT_ROWS, DependentRowsWarning, stacklevel=3)
         return self

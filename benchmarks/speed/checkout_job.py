@@ -35,7 +35,9 @@ def fit(X: np.ndarray, Y: np.ndarray, *arguments: Any, **options: Any) -> tuple[
     start, cpu_start = time.perf_counter(), time.process_time()
     model.fit(X, Y)
     seconds, cpu_seconds = time.perf_counter() - start, time.process_time() - cpu_start
-    result = {"seconds": seconds, "cpu_seconds": cpu_seconds, "n_iter": model.n_iter_, "bound": model.lower_bound_}
+    # Before noise and signal were calibrated.
+    bound = -model.loss_curve_[-1] if model.n_iter_ else model.lower_bound_
+    result = {"seconds": seconds, "cpu_seconds": cpu_seconds, "n_iter": model.n_iter_, "bound": bound}
     return model, result
 
 

@@ -30,8 +30,9 @@ from .folds import CrossValidation, Fold, folds_in_order
 from .left_out import LeftOut, Seen, Weights, prior_of, sums_of_others
 from .search import Limits, Search
 
-# The noise is no lower than this share of the square of what the model leaves over of its own rows.
-_LEFT_OVER = 0.2
+# The noise is no lower than this share of the square of what the model leaves over of its own rows: inducing points are
+# where they are because of all rows, also of those that are left out.
+_LEFT_OVER = 0.4
 # The signal's limits in a fit are so many times wider here, if they are not the user's.
 _WIDER = 1e4
 # Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds.

@@ -110,8 +110,8 @@ class Search:
             sums = np.bincount(own, fold.rows.counts * (error**2 / variance)[:, 0])
             means.append(sums[counts > 0.0] / counts[counts > 0.0])
         scale = np.sqrt(np.concatenate(means))
-        variance = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)), _LOWEST) ** 2
-        degrees = max(len(scale) / (2.0 * max(variance, 1e-6)), _FEWEST_DEGREES)
+        spread = float(np.var(scale, ddof=1)) / max(float(np.mean(scale)) ** 2, _LOWEST)
+        degrees = max(len(scale) / max(2.0 * spread, 1e-6), _FEWEST_DEGREES)
         return float((student_t.ppf(_INSIDE, degrees) / norm.ppf(_INSIDE)) ** 2)
 
     def times(self, factor: float, signal: float, noise: float) -> tuple[float, float]:

@@ -19,6 +19,12 @@ _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 # y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
+DEPENDENT_ROWS = (
+    "Rows near each other are alike: left out in blocks, they are predicted much worse than at random, and std is too "
+    "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
+    "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
+)
+
 
 def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
     """Why L-BFGS ended before it converged; nothing if it did.

@@ -78,6 +78,17 @@ def test_folds_may_cut_chunks(rows):
     assert_same_model(actual, expected)
 
 
+@pytest.mark.parametrize("chunks", [None, 250])
+def test_folds_may_be_groups(chunks):
+    groups = np.repeat(np.arange(20), 30)
+    given = groups if chunks is None else da.from_array(groups, chunks=chunks)
+    weights = np.where(np.arange(600) % 5 == 0, 0.0, 1.0)
+    parameters = {"noise_cv": 20, "max_iter": 1, "feature_map": PolynomialFeatures(1)}
+    expected = model(**parameters).fit(X, Y, weights, groups=groups)
+    actual = model(**parameters).fit(*chunked(X, Y), weights, groups=given)
+    np.testing.assert_allclose(actual.noise_variance_, expected.noise_variance_, rtol=1e-6)
+
+
 def test_folds_on_two_workers_are_folds_of_arrays(cluster):
     parameters = {"noise_cv": 4, "max_iter": 1}
     assert_same_model(model(**parameters).fit(*chunked(X, Y)), model(**parameters).fit(X, Y))
