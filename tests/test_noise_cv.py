@@ -122,7 +122,7 @@ def test_q_is_at_its_optimum_for_the_new_noise_and_signal(solver, posterior):
 
 def test_what_the_user_fixes_stays():
     kernel = ConstantKernel() * RBF([1.0, 1.0]) + WhiteKernel(0.3, "fixed")
-    plain, noise_fixed = (fitted(kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))
+    plain, noise_fixed = (fitted(None, kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))
     np.testing.assert_allclose(noise_fixed.noise_variance_, 0.3)
     assert all(
         k.k1.constant_value != own.k1.constant_value for k, own in zip(plain.kernel_, noise_fixed.kernel_, strict=True)

@@ -111,16 +111,19 @@ def _by_folds(
     rng: np.random.RandomState,
 ) -> Calibrated:
     limits, lowest = Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
-    searches = _searches(model, values, folds, rows, limits, _LEFT_OVER * lowest)
+    # What few groups were left out says little of how far others may be from all: the signal does not fall.
+    first = limits if by.groups is None else limits.with_signal_above(values["signal"])
+    searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
     gone, dependent = 0, False
     if by.groups is not None:
         explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
-        gone = sum(
-            own.loss(*best) > own.without_signal() - _GAIN
-            for own, best, is_explained in zip(searches, found, explained, strict=True)
-            if is_explained
-        )
+        for own, is_explained in zip(searches, explained, strict=True):
+            little = own.without_signal() - _GAIN
+            if own.loss(*found[own.output]) > little:
+                # All of it does not hold for groups left out; perhaps some does.
+                found[own.output] = replace(own, limits=limits).best()
+                gone += int(is_explained and own.loss(*found[own.output]) > little)
         groups = [by.groups[fold.predicted] for fold in folds]
         found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:

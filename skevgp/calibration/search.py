@@ -46,6 +46,11 @@ class Limits:
             bool(noise.free.any()),
         )
 
+    def with_signal_above(self, least: np.ndarray) -> Limits:
+        """The same with a signal (o,) that does not fall below."""
+        low, high = self.signal.T
+        return replace(self, signal=np.column_stack([np.clip(least, low, high), high]))
+
 
 @dataclass(frozen=True)
 class Search:
