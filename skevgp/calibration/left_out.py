@@ -107,6 +107,31 @@ class _AtRatio:
     Mr: np.ndarray
 
 
+@dataclass(frozen=True)
+class _WeightsAtRatio:
+    """Of an output, in coordinates in which the precision of w is diagonal for all σ².
+
+    Attributes
+    ----------
+    ratio : float
+    beside : Weights
+        What is known of w beside the output's own data.
+    eigenvalues : ndarray of shape (p,)
+        As λ of the module's text, with the fitted noise as reference.
+    coordinates : ndarray of shape (n, p)
+        Of the rows.
+    told, known : ndarray of shape (p,)
+        The linear terms, of the output's own data in units of σ⁻², and of what is known beside.
+    """
+
+    ratio: float
+    beside: Weights
+    eigenvalues: np.ndarray
+    coordinates: np.ndarray
+    told: np.ndarray
+    known: np.ndarray
+
+
 class LeftOut:
     """One fold of rows and what the other folds say of it.
 
@@ -138,6 +163,8 @@ class LeftOut:
             self._squares, self._at_zero = (rows.V @ L_inv) ** 2, np.einsum("ji,ji->i", L_inv, L_inv)
             self._slope = np.einsum("ji,jk,ki->i", L_inv, statistics.VV, L_inv, optimize=True)
         self._roots, self._at = group.prior.roots(), dict[float, _AtRatio]()
+        self._priors = [prior_of(group, output) for output in range(len(group.noise))]
+        self._last: dict[int, _WeightsAtRatio] = {}
 
     def _at_ratio(self, ratio: float) -> _AtRatio:
         if ratio not in self._at:
@@ -176,21 +203,38 @@ class LeftOut:
         variance = np.multiply.outer(at.variance, noise)
         if len(C) == 0:
             return error, variance
-        known = prior_of(self.group, output) if known is None else known
-        reference = self.group.noise[output]
-        M, Mr = C.T @ at.M @ C, C.T @ at.Mr[:, output]
-        root_inv = triangular_inverse(jittered_cholesky(known.precision + M / reference))
-        eigenvalues, W = eigh(root_inv @ known.precision @ root_inv.T, overwrite_a=True, check_finite=False)
-        basis, eigenvalues = W.T @ root_inv, np.clip(eigenvalues, 0.0, 1.0)[:, np.newaxis]
-        precision = eigenvalues + (1.0 - eigenvalues) * (reference / noise)
-        weights = (np.outer(basis @ Mr, 1.0 / noise) + (basis @ known.linear)[:, np.newaxis]) / precision
-        coordinates = at.features @ (C @ basis.T)
-        error = error - coordinates @ weights
+        known = self._priors[output] if known is None else known
+        own = self._weights_at(output, ratio, known)
+        eigenvalues = own.eigenvalues[:, np.newaxis]
+        precision = eigenvalues + (1.0 - eigenvalues) * (self.group.noise[output] / noise)
+        weights = (np.outer(own.told, 1.0 / noise) + own.known[:, np.newaxis]) / precision
+        error = error - own.coordinates @ weights
         if self._is_diagonal:
-            coordinates = self.rows.features @ C
+            squares = (self.rows.features @ C) ** 2
             diagonal = np.einsum("ji,jk,ki->i", C, self.group.statistics.HH, C)
             precision = np.diagonal(known.precision)[:, np.newaxis] + np.outer(diagonal, 1.0 / noise)
-        return error, variance + coordinates**2 @ (1.0 / precision)
+        else:
+            squares = own.coordinates**2
+        return error, variance + squares @ (1.0 / precision)
+
+    def _weights_at(self, output: int, ratio: float, known: Weights) -> _WeightsAtRatio:
+        """Kept until another ratio is asked for."""
+        found = self._last.get(output)
+        if found is None or found.ratio != ratio or found.beside is not known:
+            at, C = self._at_ratio(ratio), self._roots[output]
+            M = C.T @ at.M @ C
+            root_inv = triangular_inverse(jittered_cholesky(known.precision + M / self.group.noise[output]))
+            eigenvalues, W = eigh(root_inv @ known.precision @ root_inv.T, overwrite_a=True, check_finite=False)
+            basis = W.T @ root_inv
+            found = self._last[output] = _WeightsAtRatio(
+                ratio,
+                known,
+                np.clip(eigenvalues, 0.0, 1.0),
+                at.features @ (C @ basis.T),
+                basis @ (C.T @ at.Mr[:, output]),
+                basis @ known.linear,
+            )
+        return found
 
 
 def prior_of(group: Group, output: int) -> Weights:
