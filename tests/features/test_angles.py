@@ -209,7 +209,12 @@ def test_a_regressor_whose_kernel_knows_angles_errs_less_and_not_more_after_a_fu
     errors = []
     for kernel_map in (None, AngleEncoder("pendulum")):
         model = EVGPRegressor(
-            InertiaForceGravity("pendulum"), kernel_map=kernel_map, n_inducing=10, max_iter=60, random_state=0
+            InertiaForceGravity("pendulum"),
+            kernel_map=kernel_map,
+            n_inducing=10,
+            max_iter=60,
+            noise_cv=None,
+            random_state=0,
         )
         model.fit(train.data, train.target)
         turned = model.predict(test.data + [2 * np.pi, 0.0, 0.0])

@@ -58,6 +58,7 @@ def cluster():
         yield cluster
 
 
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none", [[1], [0]], "auto"], ids=str)
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)])
 def test_fit_to_chunks_is_fit_to_arrays(sharing, feature_map):
@@ -69,6 +70,7 @@ def test_fit_to_chunks_on_two_workers_is_fit_to_arrays(cluster):
     assert_same_model(model(max_iter=5).fit(*chunked(X, Y)), model(max_iter=5).fit(X, Y))
 
 
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 @pytest.mark.parametrize("rows", [(150, 250, 200), (600,)])
 def test_folds_may_cut_chunks(rows):
     parameters = {"noise_cv": 4, "max_iter": 1, "feature_map": PolynomialFeatures(1)}

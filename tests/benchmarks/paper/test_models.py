@@ -7,7 +7,7 @@ import numpy as np
 from skevgp import BayesianMLPRegressor, EVGPRegressor
 from skevgp.features import AngleEncoder, InertiaForce
 
-PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel"}
+PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
 
 
 def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():

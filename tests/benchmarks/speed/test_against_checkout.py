@@ -24,7 +24,7 @@ def test_runs_take_turns_and_tell_what_a_fit_tells(run_script, tmp_path):
     mean, std = model.predict(test.data, return_std=True)
     expected = {
         "n_iter": 3,
-        "bound": model.lower_bound_,
+        "bound": -model.loss_curve_[-1],
         "error": prediction_error(test.target, mean),
         "nlpd": negative_log_predictive_density(test.target, mean, std),
     }
