@@ -44,7 +44,7 @@ def assert_same_model(actual, expected, rtol=1e-6):
     for part, whole in zip(
         actual.predict(X_NEW, return_std=True), expected.predict(X_NEW, return_std=True), strict=True
     ):
-        np.testing.assert_allclose(part, whole, rtol=rtol)
+        np.testing.assert_allclose(part, whole, rtol=rtol, atol=1e-8)
     np.testing.assert_allclose(actual.lower_bound_, expected.lower_bound_, rtol=rtol)
     np.testing.assert_allclose(actual.upper_bound_, expected.upper_bound_, rtol=rtol)
 
