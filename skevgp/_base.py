@@ -18,10 +18,7 @@ from ._intake import Intake
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
-from ._validation import (
-    check_integer,
-    is_plain,
-)
+from ._validation import check_integer, is_plain
 from .fitting.units import Units
 from .inference.posterior import Predictor
 from .rows.dask import as_rows, is_dask, predict_chunks
@@ -200,7 +197,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Intake):
             given, array, _ = self._validated(X)
             common = self._predictor.common(*self._inputs_and_features(given, array, slice(None)))
         # Of outputs that share their weights, what comes from these is one draw; all else is independent.
-        weights = rng.standard_normal((len(common), n_samples)) if len(common) else np.empty((0, n_samples))
+        weights = rng.standard_normal((len(common), n_samples))
         samples = np.stack(
             [
                 rng.multivariate_normal(mean[:, o], cov[:, :, o] - own.T @ own, n_samples, check_valid="ignore").T

@@ -135,6 +135,8 @@ class Intake(BaseEstimator):
         o, shared = len(targets.mean), self.share_coef
         if isinstance(shared, str):
             shared = bool(getattr(self.feature_map_, "share_coef", False))
+        elif shared and self.feature_map_ is None:
+            raise ValueError("share_coef=True needs a feature_map: without one there are no weights to share.")
         shared = shared and o > 1 and self.feature_map_ is not None
         wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest, shared)
         mean, scale, root = resolve_coef_prior(

@@ -91,9 +91,8 @@ class EVGPRegressor(SparseGaussianProcess):
         Whether all outputs have the same weights, as torques of a robot's joints have one set of inertial parameters:
         then ``coef_mean``, ``coef_scale`` and what ``coef_prior`` returns have no axis of outputs, and outputs depend
         on each other (``predict(X, return_cov="joint")``, `sample_y`). ``"auto"``: if the fitted ``feature_map`` has
-        an attribute ``share_coef`` that is true. Each output keeps its
-        own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
-        ``posterior="diagonal"`` it is an error, as are correlations.
+        an attribute ``share_coef`` that is true. Each output keeps its own f, noise and kernel (by ``sharing``), and
+        all are fitted together; with ``solver="adam"`` or ``posterior="diagonal"`` it is an error, as are correlations.
     noise : {"gaussian", "student-t"}, default="gaussian"
         ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
         Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
@@ -109,9 +108,10 @@ class EVGPRegressor(SparseGaussianProcess):
         noise variance of each output are where log density and, half as much, the logarithm of the rms error are best,
         within their bounds. (The bound takes what inducing points cannot represent for noise: ``std`` of rows of a
         table is then too large. And it takes rows of a trajectory for independent: on new ones ``std`` is too small.)
-        Up to 2,000 rows are predicted; it takes a few passes over all, and memory for twice as many matrices (m, m). q
-        is then at its optimum, after Adam too. It is left out with None, with ``max_iter=0``, of fewer than 50 rows,
-        and when a fit is interrupted or out of time; `partial_fit` keeps what the first call found.
+        Up to 2,000 rows are predicted, and random folds are of 50,000 rows at most; it takes a few passes over these,
+        and memory for twice as many matrices (m, m) as folds. q is then at its optimum, after Adam too. It is left out
+        with None, with ``max_iter=0``, of fewer than 50 rows, and when a fit is interrupted or out of time;
+        `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"

@@ -405,6 +405,7 @@ def _not_symmetric(Sigma):
         ({"share_coef": True, "solver": "adam"}, r'share_coef=True needs solver="lbfgs"'),
         ({"share_coef": True, "coef_mean": np.ones((O, P))}, "coef_mean must be 'auto', a number or an array"),
         ({"share_coef": "yes"}, "share_coef"),
+        ({"share_coef": True, "feature_map": None}, "share_coef=True needs a feature_map"),
         ({"sharing": "all"}, "sharing='all' joins outputs by their inducing points"),
         ({"sharing": [[0, 1], [2]]}, "joins outputs by their inducing points"),
         ({"sharing": "kernel", "solver": "adam"}, 'sharing="kernel" of outputs with rows of their own needs'),
@@ -413,7 +414,9 @@ def _not_symmetric(Sigma):
 def test_what_cannot_be_is_refused_by_name(data, options, message):
     X, Y, _, _, _ = data
     with pytest.raises(ValueError, match=message):
-        EVGPRegressor(Rows(), kernel_map=FunctionTransformer(own_columns), max_iter=1, **options).fit(X, Y)
+        EVGPRegressor(
+            **{"feature_map": Rows(), "kernel_map": FunctionTransformer(own_columns), "max_iter": 1, **options}
+        ).fit(X, Y)
 
 
 @pytest.mark.parametrize("name", ["kernel_map", "feature_map"])

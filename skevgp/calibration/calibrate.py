@@ -11,6 +11,10 @@ and noise variance are where this is highest:
 
 with a prior that is log-normal around what the bound found: where the rows left out say nothing, all stays. (Density
 alone would give the mean away where rows are uncertain anyway.) What predicts rows left out is in `left_out`.
+
+Groups, such as trajectories, are few: how far a new one may be from all is hardly known from a fold of them. So the
+signal, by which std grows away from the data, does not fall, unless nothing of what was learned holds for groups left
+out; and both variances are widened by Student's t, for as many degrees of freedom as the groups' own errors leave.
 """
 
 from __future__ import annotations
@@ -33,6 +37,8 @@ from .search import Limits, Search
 # The noise is no lower than this share of the square of what the model leaves over of its own rows: inducing points are
 # where they are because of all rows, also of those that are left out.
 _LEFT_OVER = 0.4
+# Random folds are of no more rows than this.
+_MOST_ROWS = 50_000
 # The signal's limits in a fit are so many times wider here, if they are not the user's.
 _WIDER = 1e4
 # Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds.
@@ -42,10 +48,6 @@ _FEWEST_DEPENDENT = 200
 # What explained more than so much of an output holds for no other group if it gains less than this, in nats per row
 # that was left out.
 _EXPLAINED, _GAIN = 0.5, 0.01
-
-
-# Random folds are of no more rows than this.
-_MOST_ROWS = 50_000
 
 
 @dataclass(frozen=True)
@@ -118,7 +120,6 @@ def _by_folds(
     rng: np.random.RandomState,
 ) -> Calibrated:
     limits, lowest = Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
-    # What few groups were left out says little of how far others may be from all: the signal does not fall.
     first = limits if by.groups is None else limits.with_signal_above(values["signal"])
     searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
@@ -129,7 +130,7 @@ def _by_folds(
             little = own.without_signal() - _GAIN
             if own.loss(*found[own.output]) > little:
                 # All of it does not hold for groups left out; perhaps some does.
-                found[own.output] = replace(own, limits=limits).best()
+                found[own.output] = own.with_limits(limits, own.lowest).best()
                 gone += int(is_explained and own.loss(*found[own.output]) > little)
         groups = [by.groups[fold.predicted] for fold in folds]
         found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]

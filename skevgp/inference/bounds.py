@@ -163,12 +163,12 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             A, z = D_root_inv @ PP[:m, m:], D_root_inv @ g[:m]
             S += PP[m:, m:] - A.T @ A
             g_w += g[m:] - A.T @ z
-            each.append((group, PP, D_root, D_root_inv, A, z))
+            each.append((PP, D_root, D_root_inv, A, z))
     S_root = jittered_cholesky(S)
     S_root_inv = triangular_inverse(S_root)
     w = S_root_inv.T @ (S_root_inv @ g_w)
-    found: dict[int, list[WhitenedPosterior]] = {id(group): [] for group in groups}
-    for index, (group, B, D_root, D_root_inv, A, z) in enumerate(each):
+    found = []
+    for index, (B, D_root, D_root_inv, A, z) in enumerate(each):
         m = len(D_root)
         B[m:, m:] = S + A.T @ A
         root, root_inv = np.zeros(B.shape), np.zeros(B.shape)
@@ -176,8 +176,9 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
         root_inv[:m, :m], root_inv[m:, m:] = D_root_inv, S_root_inv
         root_inv[m:, :m] = -S_root_inv @ (A.T @ D_root_inv)
         mean = np.concatenate([D_root_inv.T @ (z - A @ w), w])
-        found[id(group)].append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
-    return list(found.values())
+        found.append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
+    in_order = iter(found)
+    return [[next(in_order) for _ in group.noise] for group in groups]
 
 
 def bounds_at_optimum(groups: Sequence[Group], family: PosteriorFamily) -> list[BoundAtOptimum]:
