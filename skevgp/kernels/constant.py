@@ -42,6 +42,12 @@ class ConstantAt(CovarianceAt):
     def diagonal(self, prepared: np.ndarray) -> float:
         return self.constant
 
+    def slopes(self, prepared: np.ndarray) -> np.ndarray:
+        return np.zeros((self.shape[0], len(prepared), self.shape[1]))
+
+    def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        return np.zeros((len(prepared), self.shape[1], self.shape[1]))
+
     def start_pullback(self) -> np.ndarray:
         return np.zeros(1)
 

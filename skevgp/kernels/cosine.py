@@ -158,6 +158,13 @@ class WaveAt(CovarianceAt):
     def cross(self, prepared: np.ndarray) -> np.ndarray:
         return np.cos(self._differences(prepared))
 
+    def slopes(self, prepared: np.ndarray) -> np.ndarray:
+        return np.sin(self._differences(prepared))[:, :, np.newaxis] * self.frequencies
+
+    def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        d = len(self.frequencies)
+        return np.broadcast_to(np.outer(self.frequencies, self.frequencies), (prepared.shape[1], d, d))
+
     def start_pullback(self) -> np.ndarray:
         return np.zeros((len(self.points), len(self.frequencies) + 1))
 

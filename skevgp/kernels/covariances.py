@@ -93,6 +93,24 @@ class CovarianceAt(ABC):
         """An empty sum."""
 
     @abstractmethod
+    def slopes(self, prepared: Any) -> np.ndarray:
+        """∂k(z, x) / ∂x of each inducing point and row, (m, n, d)."""
+
+    def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
+        """∂k(x, x) / ∂x of each row, (n, d), or one number for all."""
+        return 0.0
+
+    @abstractmethod
+    def mixed_slopes(self, prepared: Any) -> np.ndarray:
+        """∂²k(x, x') / ∂x ∂x'ᵀ of each row at x' = x, (n, d, d): the covariance of the gradient of a function.
+
+        Raises
+        ------
+        ValueError
+            If functions of this covariance have none.
+        """
+
+    @abstractmethod
     def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
         """k(X_m, X), and the function that pulls gradients back through it."""
 
@@ -229,6 +247,15 @@ class SumAt(_CombinationAt):
     def diagonal(self, prepared: Any) -> PerRow:
         return reduce(add, (part.at.diagonal(part.own(prepared)) for part in self.parts))
 
+    def slopes(self, prepared: Any) -> np.ndarray:
+        return reduce(add, (part.at.slopes(part.own(prepared)) for part in self.parts))
+
+    def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
+        return reduce(add, (part.at.diagonal_slopes(part.own(prepared)) for part in self.parts))
+
+    def mixed_slopes(self, prepared: Any) -> np.ndarray:
+        return reduce(add, (part.at.mixed_slopes(part.own(prepared)) for part in self.parts))
+
     def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
         values, pulls = self._linearised(prepared)
 
@@ -254,6 +281,37 @@ class ProductAt(_CombinationAt):
 
     def diagonal(self, prepared: Any) -> PerRow:
         return reduce(mul, (part.at.diagonal(part.own(prepared)) for part in self.parts))
+
+    def slopes(self, prepared: Any) -> np.ndarray:
+        values = [part.at.cross(part.own(prepared))[:, :, np.newaxis] for part in self.parts]
+        return self._by_product_rule(values, [part.at.slopes(part.own(prepared)) for part in self.parts])
+
+    def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
+        values = [np.asarray(part.at.diagonal(part.own(prepared)))[..., np.newaxis] for part in self.parts]
+        return self._by_product_rule(values, [part.at.diagonal_slopes(part.own(prepared)) for part in self.parts])
+
+    def mixed_slopes(self, prepared: Any) -> np.ndarray:
+        first, *others = (self._at_the_row(part, prepared) for part in self.parts)
+        for other in others:
+            # With ∂k/∂x = ∂k/∂x' at x' = x, since k is symmetric.
+            (f, f_x, f_xx), (g, g_x, g_xx) = first, other
+            outer = f_x[:, :, np.newaxis] * g_x[:, np.newaxis]
+            mixed = f_xx * g[:, :, np.newaxis] + outer + outer.transpose(0, 2, 1) + f[:, :, np.newaxis] * g_xx
+            first = f * g, f * g_x + f_x * g, mixed
+        return first[2]
+
+    @staticmethod
+    def _at_the_row(part: _Part, prepared: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
+        own = part.own(prepared)
+        mixed = part.at.mixed_slopes(own)
+        n, d = mixed.shape[:2]
+        value = np.broadcast_to(part.at.diagonal(own), n)[:, np.newaxis]
+        return value, np.broadcast_to(0.5 * part.at.diagonal_slopes(own), (n, d)), mixed
+
+    @staticmethod
+    def _by_product_rule(values: Sequence[Any], slopes: Sequence[Any]) -> Any:
+        return reduce(add, (reduce(mul, (*values[:i], *values[i + 1 :]), own) for i, own in enumerate(slopes)))
 
     def linearised(self, prepared: Any) -> tuple[np.ndarray, Pull]:
         values, pulls = self._linearised(prepared)

@@ -43,6 +43,17 @@ class DotProductAt(CovarianceAt):
     def diagonal(self, prepared: np.ndarray) -> np.ndarray:
         return np.einsum("nd,nd->n", prepared, prepared) + self.bias
 
+    def slopes(self, prepared: np.ndarray) -> np.ndarray:
+        m, d = self.inducing_points.shape
+        return np.broadcast_to(self.inducing_points[:, np.newaxis], (m, len(prepared), d))
+
+    def diagonal_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        return 2.0 * prepared
+
+    def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        n, d = prepared.shape
+        return np.broadcast_to(np.eye(d), (n, d, d))
+
     def start_pullback(self) -> Sums:
         return Sums((0.0, np.zeros_like(self.inducing_points)))
 

@@ -6,6 +6,7 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from copy import deepcopy
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Self
 
 import autograd.numpy as anp
@@ -305,14 +306,29 @@ class Function(Covariance):
         ValueError
             If autograd cannot trace the function.
         """
+        return self._traced(lambda: make_vjp(function)(argument)[0](bar))
+
+    def _traced(self, differentiate: Callable[[], Any]) -> Any:
         try:
             with np.errstate(all="ignore"):
-                return make_vjp(function)(argument)[0](bar)
+                return differentiate()
         except (TypeError, ValueError, AttributeError, NotImplementedError, IndexError) as error:
             raise ValueError(
                 f"{name_of(self.function)} cannot be traced by autograd: write it with autograd.numpy in place of "
                 f"numpy. ({type(error).__name__}: {error})"
             ) from error
+
+    def along(self, function: Callable[[Any], Any], rows: Any, column: int) -> Any:
+        """The derivative of function(rows) in one column of all rows.
+
+        Raises
+        ------
+        ValueError
+            If autograd cannot trace the function, or knows no forward derivative of a part of it.
+        """
+        direction = np.zeros(np.shape(rows))
+        direction[:, column] = 1.0
+        return self._traced(lambda: make_jvp(function)(rows)(direction)[1])
 
     def _arguments(self, hyperparameters: Any) -> dict[str, Any]:
         return {name: anp.exp(hyperparameters[index]) for index, name in enumerate(self.names)}
@@ -338,6 +354,36 @@ class FunctionAt(CovarianceAt):
 
     def diagonal(self, prepared: np.ndarray) -> np.ndarray:
         return self._number(self.covariance.diagonal_values(self.hyperparameters, prepared))
+
+    def slopes(self, prepared: np.ndarray) -> np.ndarray:
+        covariance = self.covariance
+
+        def values(X: Any) -> Any:
+            return covariance.values(self.hyperparameters, self.inducing_points, X)
+
+        return np.stack([covariance.along(values, prepared, column) for column in range(prepared.shape[1])], axis=2)
+
+    def diagonal_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        covariance = self.covariance
+        return covariance.pulled_back(
+            lambda X: covariance.diagonal_values(self.hyperparameters, X) + 0.0 * X[:, 0],
+            prepared,
+            np.ones(len(prepared)),
+        )
+
+    def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        covariance, chunks = self.covariance, range(0, len(prepared), _CHUNK)
+
+        def of(rows: np.ndarray, column: int) -> np.ndarray:
+            def slope(X: Any) -> Any:
+                values = partial(covariance.values, self.hyperparameters, X)
+                return anp.diag(covariance.along(values, rows, column)) + 0.0 * X[:, 0]
+
+            return covariance.pulled_back(slope, rows, np.ones(len(rows)))
+
+        columns = range(prepared.shape[1])
+        each = [np.stack([of(prepared[i : i + _CHUNK], column) for column in columns], axis=2) for i in chunks]
+        return np.concatenate(each)
 
     def start_pullback(self) -> Sums:
         return Sums((np.zeros_like(self.hyperparameters), np.zeros_like(self.inducing_points)))

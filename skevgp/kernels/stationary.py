@@ -91,6 +91,19 @@ class StationaryAt(CovarianceAt):
     def cross(self, prepared: np.ndarray) -> np.ndarray:
         return self.profile.value(self._exponents(prepared)[0], self.parameters)
 
+    def slopes(self, prepared: np.ndarray) -> np.ndarray:
+        rows = prepared[: self.points.shape[1]].T
+        slopes, _ = self._derivatives(*self._exponents(prepared), self.cross(prepared))
+        precision = self.lengthscales**-2.0
+        return slopes[:, :, np.newaxis] * ((self.points * precision)[:, np.newaxis] - rows * precision)
+
+    def mixed_slopes(self, prepared: np.ndarray) -> np.ndarray:
+        if not self.profile.smooth:
+            raise ValueError("A function of a Matern kernel with nu up to 1 has no gradient.")
+        slope = self.profile.derivatives(np.zeros(1), np.ones(1), self.parameters)[0]
+        d = self.points.shape[1]
+        return np.broadcast_to(np.diag(slope * self.lengthscales**-2.0), (prepared.shape[1], d, d))
+
     def start_pullback(self) -> Any:
         return Sums((np.zeros_like(self._exponent), np.zeros(self.profile.n_parameters)))
 

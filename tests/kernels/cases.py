@@ -9,6 +9,8 @@ from skevgp.kernels.parse import BUILDERS, parse_kernel
 
 _rng = np.random.RandomState(0)
 X, Z = _rng.randn(40, 2), _rng.randn(7, 2)
+# Of central differences in rows.
+STEP_OF_ROWS = 1e-6
 
 
 def smooth(X, Z, lengthscale=1.0, weight=0.5):
