@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from . import datasets, exceptions, features, kernels, metrics, plotting, solvers
     from .bnn import BayesianMLPRegressor
     from .exact import EGPRegressor
+    from .prediction.rollout import rollout
     from .regressor import EVGPRegressor
     from .residual import ResidualRegressor
 
@@ -26,6 +27,7 @@ __all__ = [
     "kernels",
     "metrics",
     "plotting",
+    "rollout",
     "solvers",
 ]
 
@@ -35,6 +37,7 @@ _HOME = {
     "EGPRegressor": "exact",
     "EVGPRegressor": "regressor",
     "ResidualRegressor": "residual",
+    "rollout": "prediction.rollout",
 }
 
 

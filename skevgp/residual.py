@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
@@ -183,6 +184,72 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
         return samples + _columns(X, self.base_).reshape(*samples.shape[:-1], 1)
 
+    @available_if(_regressor_has("value_and_jacobian"))
+    def value_and_jacobian(self, X: ArrayLike, return_std: bool = False, **params: Any) -> Any:
+        """Predict y, and how that changes with the columns of X, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Numbers.
+        return_std : bool, default=False
+            Whether to return the standard deviation and its derivatives too.
+        **params : dict
+            For the regressor's ``value_and_jacobian``.
+
+        Returns
+        -------
+        mean, jacobian : ndarray
+            As of `EVGPRegressor.value_and_jacobian`: base columns add 1 to the derivatives in them.
+        std, std_jacobian : ndarray
+            If ``return_std``.
+        """
+        check_is_fitted(self)
+        X = self._validated(X)
+        mean, jacobian, *spread = self.regressor_.value_and_jacobian(X, return_std=return_std, **params)
+        return mean + _columns(X, self.base_).reshape(mean.shape), self._with_base(jacobian), *spread
+
+    @available_if(_regressor_has("jacobian"))
+    def jacobian(self, X: ArrayLike) -> np.ndarray:
+        """Differentiate the mean in the columns of X, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Numbers.
+
+        Returns
+        -------
+        jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
+            ∂mean/∂x: base columns add 1 to the derivatives in them.
+        """
+        check_is_fitted(self)
+        return self._with_base(self.regressor_.jacobian(self._validated(X)))
+
+    @available_if(_regressor_has("predict_gradient"))
+    def predict_gradient(self, X: ArrayLike, **params: Any) -> Any:
+        """Predict the gradient of the noise-free function, with its uncertainty, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Numbers.
+        **params : dict
+            For the regressor's ``predict_gradient``, such as ``return_std`` and ``return_cov``.
+
+        Returns
+        -------
+        gradient : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
+            Its mean: that of `jacobian`.
+        std or cov : ndarray
+            If the regressor was asked for them: as it returns them.
+        """
+        check_is_fitted(self)
+        predicted = self.regressor_.predict_gradient(self._validated(X), **params)
+        gradient, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
+        gradient = self._with_base(gradient)
+        return (gradient, *spread) if spread else gradient
+
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.
 
@@ -229,6 +296,17 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
+
+    @available_if(_regressor_has("_functions"))
+    def _functions(self) -> Any:
+        """The posterior as functions to be drawn and followed."""
+        return replace(self.regressor_._functions(), base=self.base_)
+
+    def _with_base(self, jacobian: np.ndarray) -> np.ndarray:
+        """A Jacobian of changes as one of what they lead to."""
+        found, outputs = jacobian.copy(), np.arange(len(self.base_))
+        found.reshape(len(found), len(self.base_), -1)[:, outputs, self.base_] += 1.0
+        return found
 
     def _validated(self, X: Any) -> Any:
         """X as the regressor shall see it: a data frame stays one, and the regressor looks at what it holds."""

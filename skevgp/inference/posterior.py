@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -136,6 +137,26 @@ class PredictorGroup:
         return P, self.whitening.unexplained(prepared, V)
 
 
+class Projected(NamedTuple):
+    """Rows as a group of outputs sees them.
+
+    Attributes
+    ----------
+    inputs : ndarray of shape (n, d)
+    prepared : object
+        What the kernel makes of them.
+    P : ndarray of shape (m + p, n)
+        [V; Hᵀ].
+    unexplained : ndarray of shape (n,)
+        k̃(x, x) - |v|².
+    """
+
+    inputs: np.ndarray
+    prepared: Any
+    P: np.ndarray
+    unexplained: np.ndarray
+
+
 @dataclass(frozen=True)
 class Predictor:
     """Mean, variance and covariance of the noise-free g(x), and the weights (the paper's eq. prediction, with C free).
@@ -187,7 +208,7 @@ class Predictor:
     @property
     def signal(self) -> np.ndarray:
         """s² of each output, (o,)."""
-        return self._in_order(group.signal for group in self.groups)
+        return self.in_order(group.signal for group in self.groups)
 
     @property
     def by_output(self) -> list[PredictorGroup]:
@@ -213,27 +234,33 @@ class Predictor:
         mean : ndarray of shape (n, o)
         variance : ndarray of shape (n, o), or None
         """
+        return self.moments(self.projected(inputs, features), features, return_variance)
+
+    def moments(
+        self, projected: Iterable[Projected], features: np.ndarray, return_variance: bool
+    ) -> tuple[np.ndarray, np.ndarray | None]:
+        """What `predict` returns, of rows as each group sees them."""
         means, variances = [], []
-        for group, (_, P, unexplained) in zip(self.groups, self._projected(inputs, features), strict=True):
-            means.append(group.mean @ P)
+        for group, own in zip(self.groups, projected, strict=True):
+            means.append(group.mean @ own.P)
             if return_variance:
                 o, k, size = group.root.shape
-                deviation = group.root.reshape(o * k, size) @ P
+                deviation = group.root.reshape(o * k, size) @ own.P
                 np.multiply(deviation, deviation, out=deviation)
-                squares = deviation.reshape(o, k, len(inputs)).sum(axis=1)
-                variances.append(np.outer(group.signal, unexplained) + squares)
-        mean = self._in_order(means).T
+                squares = deviation.reshape(o, k, len(features)).sum(axis=1)
+                variances.append(np.outer(group.signal, own.unexplained) + squares)
+        mean = self.in_order(means).T
         mean += times_weights(features, self.offset)
         mean += self.intercept
-        return mean, self._in_order(variances).T if return_variance else None
+        return mean, self.in_order(variances).T if return_variance else None
 
     def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o), of each output."""
         mean, _ = self.predict(inputs, features)
         outputs, covariance = np.arange(len(self.noise)), np.empty((len(mean), *mean.shape))
-        for group, (own, P, _) in zip(self.groups, self._projected(inputs, features), strict=True):
-            V = P[: len(group.points)]
-            unexplained = group.kernel.at(np.log(group.hyperparameters), own).matrix() - V.T @ V
+        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
+            P, V = own.P, own.P[: len(group.points)]
+            unexplained = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix() - V.T @ V
             for output, signal, root in zip(outputs[group.outputs], group.signal, group.root, strict=True):
                 deviation = root @ P
                 covariance[:, :, output] = signal * unexplained + deviation.T @ deviation
@@ -245,9 +272,9 @@ class Predictor:
         (Of B⁻¹ = R Rᵀ with R⁻¹ as in `bounds`, the rows of w; all else of an output is independent of the others.)
         """
         p, parts = self.offset.shape[1] if self.shared else 0, []
-        for group, (_, P, _) in zip(self.groups, self._projected(inputs, features), strict=True):
-            parts.append(group.root[:, group.root.shape[1] - p :] @ P)
-        return self._in_order(parts).transpose(1, 2, 0)
+        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
+            parts.append(group.root[:, group.root.shape[1] - p :] @ own.P)
+        return self.in_order(parts).transpose(1, 2, 0)
 
     def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Covariances (n, n, o) of each output as one (n o, n o) of all, outputs of a row next to each other."""
@@ -258,17 +285,15 @@ class Predictor:
             between[:, output, :, output] = covariance[:, :, output]
         return between.reshape(n * o, n * o)
 
-    def _projected(
-        self, inputs: np.ndarray, features: np.ndarray
-    ) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        """Each group's inputs, P = [V; Hᵀ], and k̃(x, x) - |v|² of each row."""
+    def projected(self, inputs: np.ndarray, features: np.ndarray) -> Iterator[Projected]:
+        """Rows as each group sees them."""
         prepared, kernel = None, None
         for group in self.groups:
             own = of_outputs(inputs, group.outputs)
             if prepared is None or inputs.ndim == 3 or group.kernel is not kernel:
                 kernel = group.kernel
                 prepared = kernel.prepare(own)
-            yield own, *group.project(prepared, of_outputs(features, group.outputs))
+            yield Projected(own, prepared, *group.project(prepared, of_outputs(features, group.outputs)))
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
@@ -281,7 +306,7 @@ class Predictor:
             covariance[group.outputs] = deviation.transpose(0, 2, 1) @ deviation
         return mean, covariance
 
-    def _in_order(self, parts: Iterable[np.ndarray]) -> np.ndarray:
+    def in_order(self, parts: Iterable[np.ndarray]) -> np.ndarray:
         """What each group has of its outputs, (o, ...) each, as one array of all outputs."""
         first, *others = parts
         if not others:

@@ -65,6 +65,9 @@ class Kernel(Protocol):
     def prepare(self, inputs: np.ndarray) -> Any:
         """What `KernelAt` needs of rows (n, d), computed once."""
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """k(x, x') of rows in pairs, (..., d) and (..., d): (...)."""
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> KernelAt:
         """The covariance with hyperparameters (n_hyper,) and inducing points (m, d) put in."""
 

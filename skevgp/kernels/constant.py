@@ -22,6 +22,9 @@ class Constant(Covariance):
         """The covariance of a ConstantKernel."""
         return cls()
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return np.full(np.broadcast_shapes(inputs.shape, others.shape)[:-1], np.exp(hyperparameters[0]))
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
         return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points.shape)
 

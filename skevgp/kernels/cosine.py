@@ -137,9 +137,15 @@ class Wave(Covariance):
     def centred(self, centre: np.ndarray) -> Wave:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return np.cos((inputs - others) @ self._frequencies(hyperparameters))
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> WaveAt:
-        frequencies = np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
-        return WaveAt(frequencies, self.rows.centred(inducing_points), self.isotropic)
+        return WaveAt(self._frequencies(hyperparameters), self.rows.centred(inducing_points), self.isotropic)
+
+    def _frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
+        """2π / ℓ of each column."""
+        return np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
 
 
 class WaveAt(CovarianceAt):

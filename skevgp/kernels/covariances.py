@@ -8,7 +8,7 @@ hand.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from operator import add, itemgetter, mul
@@ -149,6 +149,10 @@ class Covariance(ABC):
         return self
 
     @abstractmethod
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        """k(x, x') of rows x and x' in pairs, (..., d) and (..., d): (...), at log hyperparameters (n_hyper,)."""
+
+    @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
         """The covariance with log hyperparameters (n_hyper,) and inducing points (m, d) put in."""
 
@@ -179,12 +183,16 @@ class _Combination(Covariance):
     def centred(self, centre: np.ndarray) -> _Combination:
         return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
-    def _parts_at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> list[_Part]:
+    def _own(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
+        """Each part with its hyperparameters."""
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
-        own, given = np.split(hyperparameters, ends), self.preparations
+        return zip(self.parts, np.split(hyperparameters, ends), strict=True)
+
+    def _parts_at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> list[_Part]:
+        given = self.preparations
         return [
             _Part(part.at(values, inducing_points), _choice(part.preparations, given))
-            for part, values in zip(self.parts, own, strict=True)
+            for part, values in self._own(hyperparameters)
         ]
 
 
@@ -208,12 +216,18 @@ def _all_of_it(prepared: Any) -> Any:
 class Sum(_Combination):
     """Σ k̃ᵢ(x, x')."""
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return reduce(add, (part.paired(own, inputs, others) for part, own in self._own(hyperparameters)))
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SumAt:
         return SumAt(self._parts_at(hyperparameters, inducing_points))
 
 
 class Product(_Combination):
     """Π k̃ᵢ(x, x')."""
+
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return reduce(mul, (part.paired(own, inputs, others) for part, own in self._own(hyperparameters)))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ProductAt:
         return ProductAt(self._parts_at(hyperparameters, inducing_points))
@@ -302,7 +316,7 @@ class ProductAt(_CombinationAt):
 
     @staticmethod
     def _at_the_row(part: _Part, prepared: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
+        """Value k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
         own = part.own(prepared)
         mixed = part.at.mixed_slopes(own)
         n, d = mixed.shape[:2]

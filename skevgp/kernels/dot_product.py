@@ -22,6 +22,9 @@ class DotProduct(Covariance):
         """The covariance of a DotProduct."""
         return cls()
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        return np.einsum("...d,...d->...", inputs, others) + np.exp(2.0 * hyperparameters[0])
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> DotProductAt:
         return DotProductAt(float(np.exp(2.0 * hyperparameters[0])), inducing_points)
 

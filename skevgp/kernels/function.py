@@ -273,6 +273,15 @@ class Function(Covariance):
     def n_hyperparameters(self) -> int:
         return len(self.names)
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        shape = np.broadcast_shapes(inputs.shape, others.shape)
+        inputs, others = (np.broadcast_to(rows, shape).reshape(-1, shape[-1]) for rows in (inputs, others))
+        found = np.empty(len(inputs))
+        for first in range(0, len(inputs), _CHUNK):
+            own = slice(first, first + _CHUNK)
+            found[own] = np.diagonal(self.values(hyperparameters, inputs[own], others[own]))
+        return found.reshape(shape[:-1])
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> FunctionAt:
         return FunctionAt(self, hyperparameters, inducing_points)
 

@@ -66,6 +66,11 @@ class Stationary(Covariance):
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
+    def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
+        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
+        scaled = (inputs - others) * np.exp(-lengths)
+        return self.profile.value(-0.5 * np.einsum("...d,...d->...", scaled, scaled), own)
+
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
         return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
 

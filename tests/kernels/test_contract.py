@@ -50,6 +50,14 @@ def test_values_are_those_of_the_scikit_learn_kernel(name, centre):
 
 
 @pytest.mark.parametrize("name", KERNELS)
+def test_values_of_pairs_are_those_of_the_matrix(name):
+    covariance, hyperparameters = parsed(KERNELS[name], CENTRE)
+    expected = covariance.at(hyperparameters, Z).cross(covariance.prepare(X))
+    pairs = covariance.paired(hyperparameters, Z[:, np.newaxis], X)
+    np.testing.assert_allclose(pairs, expected, rtol=1e-11, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", KERNELS)
 def test_gradients_in_hyperparameters_are_those_of_the_scikit_learn_kernel(name):
     kernel = KERNELS[name]
     covariance, hyperparameters = parsed(kernel)

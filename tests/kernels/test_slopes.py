@@ -46,7 +46,9 @@ def test_mixed_slopes_agree_with_differences_of_slopes(name, centre):
     for row, own in zip(X[:10], actual, strict=False):
         # ∂k(z, x)/∂x at x = row, as a function of z.
         expected = differences(
-            lambda points, x=row: covariance.at(hyperparameters, points).slopes(covariance.prepare(x[np.newaxis]))[:, 0].T,
+            lambda points, x=row: (
+                covariance.at(hyperparameters, points).slopes(covariance.prepare(x[np.newaxis]))[:, 0].T
+            ),
             row[np.newaxis],
         )[:, 0]
         # Of a function that is differentiable just once, differences across z = x are as good as their step.

@@ -1,0 +1,194 @@
+"""Derivatives of predictions, against differences of `predict` and the Gaussian process of the gradient written out."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern, WhiteKernel
+from sklearn.pipeline import make_pipeline, make_union
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
+
+N_OUTPUTS, D = 3, 2
+QUICK = {"max_iter": 10, "tol": 1e6, "random_state": 0}
+
+
+@pytest.fixture(scope="module")
+def data():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (120, D))
+    Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
+    return X, Y + 0.05 * rng.randn(*Y.shape), rng.uniform(-2.0, 2.0, (9, D))
+
+
+def own_columns(X):
+    """Of each output other columns."""
+    return np.stack([X, X[:, ::-1], X * X], axis=1)
+
+
+def own_features(X):
+    return np.stack([X[:, :1], np.sin(X[:, :1]), X[:, 1:]], axis=1)
+
+
+KERNEL = ConstantKernel(2.0) * RBF([0.9, 1.2])
+MODELS = {
+    "plain": EVGPRegressor(n_inducing=20),
+    "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=15),
+    "diagonal": EVGPRegressor(PolynomialFeatures(1), KERNEL, posterior="diagonal", sharing="kernel", n_inducing=15),
+    "maps": EVGPRegressor(
+        make_union(PolynomialFeatures(2), StandardScaler()),
+        kernel_map=make_pipeline(StandardScaler(), PolynomialFeatures(2, include_bias=False)),
+        n_inducing=20,
+        normalize_y=True,
+    ),
+    "foreign maps": EVGPRegressor(
+        FunctionTransformer(np.sinh), kernel_map=FunctionTransformer(lambda X: np.exp(0.3 * X)), n_inducing=20
+    ),
+    "rows per output": EVGPRegressor(
+        FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), n_inducing=20
+    ),
+    "shared weights": EVGPRegressor(FunctionTransformer(own_features), share_coef=True, n_inducing=20),
+    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
+    "exact": EGPRegressor(PolynomialFeatures(1)),
+}
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def model(request, data):
+    X, Y, _ = data
+    return MODELS[request.param].set_params(**QUICK).fit(X, Y)
+
+
+def differences(function, X, step=1e-4):
+    """Of function(X), (n, ...), in each column of X: (n, ..., D)."""
+    steps = step * np.eye(X.shape[1])
+    return np.stack([(function(X + own) - function(X - own)) / (2.0 * step) for own in steps], axis=-1)
+
+
+def close(actual, expected, share):
+    assert actual.shape == expected.shape
+    assert np.abs(actual - expected).max() <= share * np.abs(expected).max()
+
+
+@pytest.mark.parametrize("include_noise", [True, False])
+def test_jacobians_agree_with_differences_of_predictions(model, data, include_noise):
+    X = data[2]
+    mean, jacobian, std, std_jacobian = model.value_and_jacobian(X, return_std=True, include_noise=include_noise)
+    expected = model.predict(X, return_std=True, include_noise=include_noise)
+    np.testing.assert_allclose(mean, expected[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(std, expected[1], rtol=1e-9)
+    assert jacobian.shape == std_jacobian.shape == (len(X), N_OUTPUTS, D)
+    close(jacobian, differences(model.predict, X), 1e-6)
+
+    def std_of(rows):
+        return model.predict(rows, return_std=True, include_noise=include_noise)[1]
+
+    close(std_jacobian, differences(std_of, X), 1e-5)
+    np.testing.assert_array_equal(model.jacobian(X), jacobian)
+    for one, other in zip(model.value_and_jacobian(X), (mean, jacobian), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_the_covariance_of_a_gradient_is_that_of_differences(model, data):
+    X, h = data[2], 1e-2
+    gradient, cov = model.predict_gradient(X, return_cov=True)
+    np.testing.assert_array_equal(gradient, model.jacobian(X))
+    assert cov.shape == (len(X), N_OUTPUTS, D, D)
+    _, std = model.predict_gradient(X, return_std=True)
+    np.testing.assert_allclose(std, np.sqrt(np.einsum("noii->noi", cov)), rtol=1e-12)
+    for row, own in zip(X[:3], cov, strict=False):
+        points = row + h * np.vstack([np.eye(D), -np.eye(D)])
+        between = model.predict(points, return_cov=True, include_noise=False)[1]
+        by = np.hstack([np.eye(D), -np.eye(D)]) / (2.0 * h)
+        close(own, np.einsum("ai,ijo,bj->oab", by, between, by), 5e-3)
+
+
+def test_the_gradient_of_the_exact_model_is_the_formula(data):
+    """Rasmussen & Williams 2006, section 9.4, with k + h Σ hᵀ as the kernel (section 2.7)."""
+    X, Y, X_new = data
+    scale, s2, noise, lengths = 1.5, 2.0, 0.01, np.array([0.9, 1.2])
+    kernel = ConstantKernel(s2, "fixed") * RBF(lengths, "fixed") + WhiteKernel(noise, "fixed")
+    model = EGPRegressor(PolynomialFeatures(1), kernel, coef_scale=scale).fit(X, Y[:, 0])
+    gradient, cov = model.predict_gradient(X_new, return_cov=True)
+    K = model.kernel_(X) + scale**2 * (1.0 + X @ X.T) + noise * np.eye(len(X))
+    for x, own_gradient, own_cov in zip(X_new, gradient, cov, strict=True):
+        slopes = (X - x) / lengths**2 * model.kernel_(X, x[np.newaxis]) + scale**2 * X
+        np.testing.assert_allclose(own_gradient, slopes.T @ np.linalg.solve(K, Y[:, 0]), rtol=1e-7, atol=1e-9)
+        prior = np.diag(s2 / lengths**2) + scale**2 * np.eye(D)
+        np.testing.assert_allclose(own_cov, prior - slopes.T @ np.linalg.solve(K, slopes), rtol=1e-6, atol=1e-9)
+
+
+def test_one_output_has_no_axis(data):
+    X, Y, X_new = data
+    for y in (Y[:, 0], Y[:, :1]):
+        model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, y)
+        mean, jacobian, std, std_jacobian = model.value_and_jacobian(X_new, return_std=True)
+        assert mean.shape == std.shape == (9,)
+        assert jacobian.shape == std_jacobian.shape == model.jacobian(X_new).shape == (9, D)
+        assert [part.shape for part in model.predict_gradient(X_new, return_std=True)] == [(9, D), (9, D)]
+        assert [part.shape for part in model.predict_gradient(X_new, return_cov=True)] == [(9, D), (9, D, D)]
+        assert model.predict_gradient(X_new).shape == (9, D)
+
+
+def test_many_rows_are_as_one_after_the_other(data, model):
+    X = np.random.RandomState(1).uniform(-2.0, 2.0, (3000, D))
+    some = np.array([0, 1500, 2999])
+    for many, few in zip(
+        model.value_and_jacobian(X, return_std=True), model.value_and_jacobian(X[some], return_std=True), strict=True
+    ):
+        np.testing.assert_allclose(many[some], few, rtol=1e-9, atol=1e-11)
+
+
+def test_data_frames(data):
+    X, Y, X_new = data
+    frame, new = (pd.DataFrame(rows, columns=["a", "b"]) for rows in (X, X_new))
+    model = EVGPRegressor(PolynomialFeatures(1), kernel_map=StandardScaler(), n_inducing=10, **QUICK)
+    found = model.fit(frame, Y).jacobian(new)
+    np.testing.assert_allclose(
+        found, differences(lambda rows: model.predict(pd.DataFrame(rows, columns=["a", "b"])), X_new), 1e-5, 1e-6
+    )
+    with pytest.raises(ValueError, match="feature names"):
+        model.jacobian(new[["b", "a"]])
+
+
+def test_what_a_residual_regressor_says_is_of_the_sum(data):
+    X, Y, X_new = data
+    model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0])
+    model.fit(X, Y)
+    mean, jacobian, std, _ = model.value_and_jacobian(X_new, return_std=True, include_noise=False)
+    expected = model.predict(X_new, return_std=True, include_noise=False)
+    np.testing.assert_allclose(mean, expected[0])
+    np.testing.assert_allclose(std, expected[1])
+    close(jacobian, differences(model.predict, X_new), 1e-6)
+    np.testing.assert_array_equal(model.jacobian(X_new), jacobian)
+    gradient, std = model.predict_gradient(X_new, return_std=True)
+    np.testing.assert_array_equal(gradient, jacobian)
+    np.testing.assert_array_equal(std, model.regressor_.predict_gradient(X_new, return_std=True)[1])
+    single = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=1).fit(X, Y[:, 0])
+    close(single.jacobian(X_new), differences(single.predict, X_new), 1e-6)
+    assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), "value_and_jacobian")
+
+
+def test_what_cannot_be_is_refused_by_name(data):
+    X, Y, X_new = data
+    with pytest.raises(NotFittedError, match="not fitted"):
+        EVGPRegressor().jacobian(X)
+    model = EVGPRegressor(kernel=Matern(nu=0.5), n_inducing=10, **QUICK).fit(X, Y)
+    assert np.isfinite(model.jacobian(X_new)).all()
+    with pytest.raises(ValueError, match="At most one of return_std and return_cov"):
+        model.predict_gradient(X_new, return_std=True, return_cov=True)
+    with pytest.raises(ValueError, match="nu up to 1 has no gradient"):
+        model.predict_gradient(X_new, return_std=True)
+    with pytest.raises(ValueError, match="2 features"):
+        model.jacobian(X_new[:, :1])
+    with pytest.raises(ValueError, match="NaN"):
+        model.jacobian(np.full((1, D), np.nan))
+
+
+def test_derivatives_are_not_for_dask_arrays(data):
+    da = pytest.importorskip("dask.array")
+    X, Y, _ = data
+    model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
+    with pytest.raises(ValueError, match="not for Dask arrays"):
+        model.jacobian(da.from_array(X))
