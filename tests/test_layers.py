@@ -234,7 +234,7 @@ TESTED_WITH = {
     "outputs/fit.py": "outputs/test_plan.py",
     "outputs/fitted.py": "test_sharing.py",
 }
-FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "outputs", "rows")
+FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "outputs", "prediction", "rows")
 
 
 @pytest.mark.parametrize(

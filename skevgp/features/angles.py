@@ -10,7 +10,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_array, check_is_fitted
 
 from ..robots.loading import Robot
-from .robot_map import RobotTransformer
+from .robot_map import RobotTransformer, same_for_all
 
 
 class AngleEncoder(RobotTransformer):
@@ -96,6 +96,8 @@ class AngleEncoder(RobotTransformer):
         self._source = np.repeat(np.arange(self.n_features_in_), copies)  # the column of X of each encoded one
         self._sines = np.searchsorted(self._source, self._angles)
         self._cosines = self._sines + 1
+        self._of_others = np.eye(self.n_features_in_)[self._source]  # the Jacobian but for the angles' entries
+        self._of_others[:, self._angles] = 0.0
 
     def _columns_of_angles(self) -> list[int]:
         names = {} if self.robot is None else {name: i for i, name in enumerate(self._layout.column_names)}
@@ -121,6 +123,12 @@ class AngleEncoder(RobotTransformer):
         encoded, angles = X.take(self._source, axis=1), X.take(self._angles, axis=1)
         encoded[:, self._sines], encoded[:, self._cosines] = np.sin(angles), np.cos(angles)
         return encoded
+
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        jacobian, angles = same_for_all(self._of_others, len(X)), X.take(self._angles, axis=1)
+        jacobian[:, self._sines, self._angles] = np.cos(angles)
+        jacobian[:, self._cosines, self._angles] = -np.sin(angles)
+        return jacobian
 
     def _names(self, columns: np.ndarray) -> list[str]:
         names = columns[self._source]

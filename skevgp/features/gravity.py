@@ -12,7 +12,7 @@ import numpy as np
 from .._sklearn import Interval, StrOptions
 from ..robots import GravityTerm, Layout, get_system, layout_of, load_robot
 from ..robots.loading import Robot, joint_axes
-from .robot_map import RobotMap, indices_of
+from .robot_map import RobotMap, indices_of, same_for_all
 
 # An axis is vertical up to this angle, rad: URDF files round π/2.
 _TILT = 1e-3
@@ -66,10 +66,27 @@ class SineGravity(GravityMap):
         assert self.robot is not None
         return get_system(self.robot).gravity
 
+    def _prepare(self, robot: Robot | None) -> None:
+        angles: list[tuple[int, ...]] = [(column,) for column in range(self.n_features_in_)]
+        if robot is not None:
+            angles = [term.angle for term in self._terms()]
+        self._first = np.array([columns[0] for columns in angles])
+        self._further = [(term, column) for term, columns in enumerate(angles) for column in columns[1:]]
+        self._summed = np.zeros((len(angles), self.n_features_in_))  # an angle of each term by the columns
+        for term, columns in enumerate(angles):
+            self._summed[term, list(columns)] = 1.0
+
+    def _angles(self, X: np.ndarray) -> np.ndarray:
+        angles = X.take(self._first, axis=1)
+        for term, column in self._further:
+            angles[:, term] += X[:, column]
+        return angles
+
     def _features(self, X: np.ndarray) -> np.ndarray:
-        if self.robot is None:
-            return np.sin(X)
-        return np.sin(np.column_stack([X[:, list(term.angle)].sum(axis=1) for term in self._terms()]))
+        return np.sin(self._angles(X))
+
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        return np.cos(self._angles(X))[:, :, np.newaxis] * self._summed
 
     def _names(self, columns: np.ndarray) -> list[str]:
         if self.robot is None:
@@ -229,6 +246,17 @@ class LinkGravity(GravityMap):
             return np.vstack([self._features(X[start : start + _BLOCK]) for start in range(0, len(X), _BLOCK)])
         return self._links.gravity(X[:, : self._layout.n_joints])[:, self._columns] * self._signs
 
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        if self.robot is None:
+            return same_for_all(np.eye(X.shape[1]), len(X))
+        n, columns = self._layout.n_joints, self._columns
+        jacobian = np.zeros((len(X), len(columns), X.shape[1]))
+        for start in range(0, len(X), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            by_q = self._links.gravity_jacobian(X[rows, :n])[:, columns]
+            jacobian[rows, :, :n] = by_q * self._signs[:, np.newaxis]
+        return jacobian
+
     def _names(self, columns: np.ndarray) -> list[str]:
         if self.robot is None:
             return list(columns)
@@ -259,14 +287,34 @@ class _Links:
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
         """Rᵢᵀg along u_x, u_y and u_z of each link i, (n, 3 * n_joints), of positions (n, n_joints)."""
+        weights: list[np.ndarray] = []  # of (n, 1, 3)
+        for parent, rotation in zip(self._parents, self._rotations(q), strict=True):
+            weights.append((weights[parent] if parent >= 0 else self._weight) @ rotation)
+        return np.concatenate(weights, axis=2)[:, 0]
+
+    def gravity_jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Derivatives of `gravity` by the positions, (n, 3 * n_joints, n_joints).
+
+        They are passed on as gravity itself is: a later link's are its parent's, rotated; and seen from a link that
+        turns about its u_z, (w_x, w_y, w_z) turns the other way, by (w_y, -w_x, 0).
+        """
+        n_joints = q.shape[1]
+        at_base = np.concatenate([self._weight, np.zeros((1, n_joints, 3))], axis=1)
+        passed: list[np.ndarray] = []  # of (n, 1 + n_joints, 3): gravity, then its derivative by each position
+        for joint, (parent, rotation) in enumerate(zip(self._parents, self._rotations(q), strict=True)):
+            here = (passed[parent] if parent >= 0 else at_base) @ rotation
+            if self._turns[joint]:
+                here[:, 1 + joint, 0], here[:, 1 + joint, 1] = here[:, 0, 1], -here[:, 0, 0]
+            passed.append(here)
+        return np.concatenate([here[:, 1:] for here in passed], axis=2).transpose(0, 2, 1)
+
+    def _rotations(self, q: np.ndarray) -> np.ndarray:
+        """Of each link in its parent, (n_joints, n, 3, 3)."""
         angles = q.T[:, :, np.newaxis, np.newaxis] * self._turns
         rotations = np.cos(angles) * self._cosine
         rotations += np.sin(angles) * self._sine
         rotations += self._fixed
-        weights: list[np.ndarray] = []  # of (n, 1, 3)
-        for parent, rotation in zip(self._parents, rotations, strict=True):
-            weights.append((weights[parent] if parent >= 0 else self._weight) @ rotation)
-        return np.concatenate(weights, axis=2)[:, 0]
+        return rotations
 
 
 def _right_handed(axis: np.ndarray) -> np.ndarray:

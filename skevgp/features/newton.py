@@ -15,7 +15,7 @@ from .._validation import as_floats
 from ..robots import Layout
 from ..robots.loading import Robot, named_system, read_once
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
-from .robot_map import RobotMap
+from .robot_map import RobotMap, same_for_all
 
 
 class _NewtonFeatures(RobotMap):
@@ -141,6 +141,9 @@ class InertiaForce(_NewtonFeatures):
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         return X.copy()
+
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        return same_for_all(np.eye(X.shape[1]), len(X))
 
     def _names(self, columns: np.ndarray) -> list[str]:
         return list(columns)
@@ -271,7 +274,14 @@ class InertiaForceGravity(_NewtonFeatures):
         return features.fit(np.zeros((1, n_columns)))
 
     def _features(self, X: np.ndarray) -> np.ndarray:
-        return np.hstack([X, self._gravity._features(X)])
+        return np.concatenate((X, self._gravity._features(X)), axis=1)
+
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        of_gravity, d = self._gravity._jacobian(X), X.shape[1]
+        jacobian = np.empty((len(X), d + of_gravity.shape[1], d))
+        jacobian[:, :d] = np.eye(d)
+        jacobian[:, d:] = of_gravity
+        return jacobian
 
     def _names(self, columns: np.ndarray) -> list[str]:
         return [*columns, *self._gravity._names(columns)]

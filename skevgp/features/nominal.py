@@ -11,7 +11,7 @@ import numpy as np
 from .._sklearn import Interval
 from ..robots import Layout, RigidBody, load_robot
 from ..robots.loading import Robot
-from .robot_map import RobotMap
+from .robot_map import RobotMap, same_for_all
 
 _NAMES = {
     "acceleration": "acc({})",
@@ -150,9 +150,29 @@ class NominalDynamics(RobotMap):
             "input": lambda: body.accelerations_by_force(q, body.joint_forces(u)),
         }
         features = np.hstack([columns[term]() for term in self._terms])
-        if not np.isfinite(features).all():
-            raise ValueError(self._why_not_finite(q[~np.isfinite(features).all(axis=1)][0]))
+        self._check_finite(features, q)
         return features
+
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        if self.robot is None:
+            return same_for_all(np.eye(X.shape[1]), len(X))
+        n = self._layout.n_joints
+        q, v, u = X[:, :n], X[:, n : 2 * n], X[:, 2 * n :]
+        body = self._body
+        blocks = {
+            "acceleration": lambda: body.accelerations_under_jacobian(q, v, u),
+            "gravity": lambda: body.gravity_jacobian(q),
+            "bias": lambda: body.forces_jacobian(q, v, np.zeros_like(v)),
+            "input": lambda: body.accelerations_by_force_jacobian(q, u),
+        }
+        jacobian = np.concatenate([blocks[term]() for term in self._terms], axis=1)
+        self._check_finite(jacobian, q)
+        return jacobian
+
+    def _check_finite(self, values: np.ndarray, q: np.ndarray) -> None:
+        if not np.isfinite(values).all():
+            bad = ~np.isfinite(values).reshape(len(q), -1).all(axis=1)
+            raise ValueError(self._why_not_finite(q[bad][0]))
 
     def _why_not_finite(self, q: np.ndarray) -> str:
         """An error's text, for one configuration."""

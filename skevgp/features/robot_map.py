@@ -29,7 +29,7 @@ def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str,
 class RobotTransformer(TransformerMixin, BaseEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
-    What a subclass says: `_features` and `_names` of them, and `_prepare` what it needs of the robot.
+    What a subclass says: `_features`, their `_jacobian` and `_names`, and `_prepare` what it needs of the robot.
     """
 
     robot: Robot | None
@@ -91,10 +91,27 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         H : ndarray of shape (n_samples, n_features_out)
             The features h(x) of each row.
         """
+        return self._features(self._checked(X))
+
+    def jacobian(self, X: ArrayLike) -> np.ndarray:
+        """Differentiate the features by the columns of X.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
+
+        Returns
+        -------
+        J : ndarray of shape (n_samples, n_features_out, n_features)
+            The analytic derivatives dh(x)/dx of each row.
+        """
+        return self._jacobian(self._checked(X))
+
+    def _checked(self, X: ArrayLike) -> np.ndarray:
         if not hasattr(self, "n_features_in_"):
             check_is_fitted(self)
-        rows: np.ndarray = X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[assignment]
-        return self._features(rows)
+        return X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[return-value]
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
         """Name the features.
@@ -121,9 +138,20 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         """h(x) of rows (n, n_features_in_); without a robot too."""
         raise NotImplementedError
 
+    def _jacobian(self, X: np.ndarray) -> np.ndarray:
+        """dh/dx of the same rows, (n, n_features_out, n_features_in_)."""
+        raise NotImplementedError
+
     def _names(self, columns: np.ndarray) -> list[str]:
         """Names of the features, given those of the columns of X."""
         raise NotImplementedError
+
+
+def same_for_all(jacobian: np.ndarray, n_rows: int) -> np.ndarray:
+    """A copy of one row's Jacobian (n_features_out, n_features_in_) for each of the rows."""
+    copies = np.empty((n_rows, *jacobian.shape))
+    copies[:] = jacobian
+    return copies
 
 
 def _has_robot(transformer: RobotMap) -> bool:

@@ -1,1 +1,1 @@
-"""What is asked of a fitted model beside its predictions: derivatives, and all this for control loops."""
+"""What is done with a fitted model beyond `predict`: derivatives, rollouts, predictions without validation."""

@@ -28,7 +28,7 @@ class RigidBody:
         self._driven = np.array(layout_of(model).driven)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_weightless")}
+        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_weightless", "_idle")}
 
     def joint_forces(self, u: np.ndarray) -> np.ndarray:
         """B u, the inputs on the driven joints and 0 on the others.
@@ -89,11 +89,7 @@ class RigidBody:
         a : ndarray of shape (n, n_joints)
             NaN or infinite where the mass matrix is singular.
         """
-        if not hasattr(self, "_weightless"):
-            model = self.model.copy()
-            model.gravity.linear = np.zeros(3)
-            self._weightless = RigidBody(model)
-        return self._weightless.accelerations(q, np.zeros_like(q), force)
+        return self._without_gravity.accelerations(q, np.zeros_like(q), force)
 
     def forces(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
         """τ = M(q)q̈ + C(q, q̇)q̇ + g(q), by the recursive Newton-Euler algorithm.
@@ -123,6 +119,78 @@ class RigidBody:
         still = np.zeros_like(q)
         return self.forces(q, still, still)
 
+    def accelerations_under_jacobian(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Derivatives of `accelerations_under`, by Pinocchio's analytic ones of the articulated-body algorithm.
+
+        Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018.
+
+        Parameters
+        ----------
+        q, v : ndarray of shape (n, n_joints)
+            Positions and velocities.
+        u : ndarray of shape (n, n_inputs)
+
+        Returns
+        -------
+        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
+            By [q, q̇, u]; NaN or infinite where the mass matrix is singular.
+        """
+        force = self.joint_forces(u) - self._damping * v
+        by_q, by_v, by_force = self._derivatives("computeABADerivatives", q, v, force)
+        # What damping takes away moves with the velocity too.
+        return np.concatenate([by_q, by_v - by_force * self._damping, by_force[:, :, self._driven]], axis=2)
+
+    def accelerations_by_force_jacobian(self, q: np.ndarray, u: np.ndarray) -> np.ndarray:
+        """Derivatives of `accelerations_by_force` of the joint forces B u: at rest and without gravity.
+
+        Parameters
+        ----------
+        q : ndarray of shape (n, n_joints)
+        u : ndarray of shape (n, n_inputs)
+
+        Returns
+        -------
+        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
+            By [q, q̇, u]; NaN or infinite where the mass matrix is singular.
+        """
+        body, force = self._without_gravity, self.joint_forces(u)
+        by_q, _, by_force = body._derivatives("computeABADerivatives", q, np.zeros_like(q), force)
+        return np.concatenate([by_q, np.zeros_like(by_q), by_force[:, :, self._driven]], axis=2)
+
+    def forces_jacobian(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Derivatives of `forces` by the positions and velocities, by those of the recursive Newton-Euler algorithm.
+
+        Parameters
+        ----------
+        q, v, a : ndarray of shape (n, n_joints)
+            Positions, velocities and accelerations.
+
+        Returns
+        -------
+        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
+            By [q, q̇, u], of which u does nothing.
+        """
+        by_q, by_v, _ = self._derivatives("computeRNEADerivatives", q, v, a)
+        return self._by_state(by_q, by_v)
+
+    def gravity_jacobian(self, q: np.ndarray) -> np.ndarray:
+        """Derivatives of `gravity`.
+
+        Parameters
+        ----------
+        q : ndarray of shape (n, n_joints)
+
+        Returns
+        -------
+        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
+            By [q, q̇, u], of which the first alone do something.
+        """
+        (by_q,) = self._derivatives("computeGeneralizedGravityDerivatives", q)
+        return self._by_state(by_q, np.zeros_like(by_q))
+
+    def _by_state(self, by_q: np.ndarray, by_v: np.ndarray) -> np.ndarray:
+        return np.concatenate([by_q, by_v, np.zeros((*by_q.shape[:2], len(self._driven)))], axis=2)
+
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
         """M(q) at one configuration, with reflected rotor inertias, by the composite-rigid-body algorithm.
 
@@ -137,6 +205,29 @@ class RigidBody:
         pin = require("pinocchio", "Rigid-body dynamics")
         upper = np.triu(pin.crba(self.model, self.model.createData(), q))
         return upper + np.triu(upper, 1).T
+
+    @property
+    def _without_gravity(self) -> RigidBody:
+        if not hasattr(self, "_weightless"):
+            model = self.model.copy()
+            model.gravity.linear = np.zeros(3)
+            self._weightless = RigidBody(model)
+        return self._weightless
+
+    def _derivatives(self, algorithm: str, *rows: np.ndarray) -> np.ndarray:
+        """The matrices that one of Pinocchio's algorithms returns for each row, (n_matrices, n, n_joints, n_joints)."""
+        derive = getattr(require("pinocchio", "Rigid-body dynamics"), algorithm)
+        n, n_joints = rows[0].shape
+        idle = vars(self).setdefault("_idle", [])  # one for each thread that was here at once: they take long to make
+        try:
+            data = idle.pop()
+        except IndexError:
+            data = self.model.createData()
+        found = np.empty((n, 1 if algorithm == "computeGeneralizedGravityDerivatives" else 3, n_joints, n_joints))
+        for matrices, *row in zip(found, *rows, strict=True):
+            matrices[:] = derive(self.model, data, *row)  # views of data, until its next use
+        idle.append(data)
+        return found.swapaxes(0, 1)
 
     def _over_rows(self, algorithm: str, *rows: np.ndarray) -> np.ndarray:
         pin = require("pinocchio", "Rigid-body dynamics")

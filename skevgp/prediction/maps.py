@@ -1,0 +1,210 @@
+"""Values and Jacobians of fitted feature maps and kernel maps, for plain arrays and without validation.
+
+A map is read once into a `DirectMap`; pipelines, unions and column transformers into one of their parts, to which the
+chain rule is applied. What is not known here is asked by its `transform`, and differentiated by central differences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from sklearn.compose import ColumnTransformer
+from sklearn.pipeline import FeatureUnion, Pipeline
+from sklearn.preprocessing import FunctionTransformer
+
+from .elementary import DirectMap, Foreign, Identity, elementary
+
+
+def map_jacobian(transformer: Any, X: np.ndarray, *, scale: np.ndarray | None = None) -> np.ndarray:
+    """Differentiate a fitted map by the columns of X.
+
+    Parameters
+    ----------
+    transformer : transformer or None
+        As `direct_map` takes it.
+    X : ndarray of shape (n, d)
+        Finite rows of float64, with the columns that it was fitted to.
+    scale : ndarray of shape (d,), optional
+        As in `direct_map`.
+
+    Returns
+    -------
+    jacobian : ndarray of shape (n, width, d) or, of a map with a row per output, (n, n_outputs, width, d)
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp.prediction.maps import map_jacobian
+    >>> X = np.array([[2.0]])
+    >>> map_jacobian(PolynomialFeatures(3).fit(X), X)
+    array([[[ 0.],
+            [ 1.],
+            [ 4.],
+            [12.]]])
+    """
+    return direct_map(transformer, scale=scale).jacobian(X)
+
+
+def direct(transformer: Any) -> Callable[[np.ndarray], np.ndarray]:
+    """What a fitted map's `transform` does with finite rows of float64, without checks: `DirectMap.value`."""
+    return direct_map(transformer).value
+
+
+def direct_jacobian(transformer: Any, *, scale: np.ndarray | None = None) -> Callable[[np.ndarray], np.ndarray]:
+    """The derivatives of the same: `DirectMap.jacobian`."""
+    return direct_map(transformer, scale=scale).jacobian
+
+
+def direct_map(transformer: Any, *, scale: np.ndarray | None = None) -> DirectMap:
+    """Read a fitted map.
+
+    Parameters
+    ----------
+    transformer : transformer or None
+        Exactly known are ours, scikit-learn's StandardScaler, MinMaxScaler, MaxAbsScaler, RobustScaler,
+        PolynomialFeatures, SplineTransformer, PCA and FunctionTransformer without a function, and Pipeline,
+        FeatureUnion and ColumnTransformer of any maps. Any other map is used by its `transform`, and by its
+        ``jacobian(X)`` if it has one, else by central differences: see `Foreign`. None and ``"passthrough"`` are the
+        identity. It is read now: fit it again, and it has to be read again.
+    scale : ndarray of shape (d,), optional
+        Of the columns of X, such as their standard deviations: what central differences take for a unit. By default
+        1, and also inside a pipeline after its first step.
+
+    Returns
+    -------
+    direct : DirectMap
+    """
+    kind = type(transformer)
+    if transformer is None or isinstance(transformer, str):
+        return Identity()
+    if kind is FunctionTransformer and transformer.func is None:
+        return Identity()
+    if kind is Pipeline:
+        return Chained(transformer, scale)
+    if kind is FeatureUnion:
+        return SideBySide(transformer, scale)
+    if kind is ColumnTransformer and not any(np.isscalar(columns) for _, _, columns in transformer.transformers_):
+        return OfColumns(transformer, scale)
+    return elementary(transformer, scale)
+
+
+class Chained(DirectMap):
+    """A pipeline."""
+
+    def __init__(self, pipeline: Pipeline, scale: np.ndarray | None):
+        steps = [step for _, step in pipeline.steps]
+        self._steps = [direct_map(steps[0], scale=scale), *map(direct_map, steps[1:])]
+        self._whole = Foreign(pipeline, scale)
+        self.linear = all(step.linear for step in self._steps)
+
+    def value(self, X: np.ndarray) -> np.ndarray:
+        for step in self._steps:
+            X = step.value(X)
+        return X
+
+    def jacobian(self, X: np.ndarray) -> np.ndarray:
+        return self._onward(X, None)
+
+    def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
+        return self._onward(X, inner)
+
+    def _onward(self, X: np.ndarray, inner: np.ndarray | None) -> np.ndarray:
+        jacobian, rows = inner, X
+        behind: list[DirectMap] = []  # steps through which the rows have yet to go: linear ones need them not
+        for step in self._steps:
+            if not step.linear:
+                for earlier in behind:
+                    rows = earlier.value(rows)
+                behind = []
+                if rows.ndim > 2:  # a row per output, and no rule for what is made of them
+                    return self._whole.jacobian(X) if inner is None else self._whole.chain(X, inner)
+            jacobian = step.jacobian(rows) if jacobian is None else step.chain(rows, jacobian)
+            behind.append(step)
+        assert jacobian is not None
+        return jacobian
+
+
+class SideBySide(DirectMap):
+    """A union: the columns of its parts, times their weights."""
+
+    def __init__(self, union: FeatureUnion, scale: np.ndarray | None):
+        weights = union.transformer_weights or {}
+        parts = [(name, part) for name, part in union.transformer_list if not _is_dropped(part)]
+        self._parts = [(direct_map(part, scale=scale), weights.get(name)) for name, part in parts]
+        self.linear = all(part.linear for part, _ in self._parts)
+
+    def value(self, X: np.ndarray) -> np.ndarray:
+        return _joined([_times(part.value(X), weight) for part, weight in self._parts], X, 1)
+
+    def jacobian(self, X: np.ndarray) -> np.ndarray:
+        return _joined([_times(part.jacobian(X), weight) for part, weight in self._parts], X, 2)
+
+    def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
+        return _joined([_times(part.chain(X, inner), weight) for part, weight in self._parts], inner, 2)
+
+
+class OfColumns(DirectMap):
+    """A column transformer: the columns of its parts, each of some columns of X."""
+
+    def __init__(self, transformer: ColumnTransformer, scale: np.ndarray | None):
+        weights = transformer.transformer_weights or {}
+        names = list(getattr(transformer, "feature_names_in_", []))
+        self._parts = []
+        for name, part, columns in transformer.transformers_:
+            chosen = _indices(columns, names, transformer.n_features_in_)
+            if len(chosen) and not _is_dropped(part):
+                own = direct_map(part, scale=None if scale is None else scale[chosen])
+                self._parts.append((own, chosen, weights.get(name)))
+        self.linear = all(part.linear for part, *_ in self._parts)
+
+    def value(self, X: np.ndarray) -> np.ndarray:
+        return _joined([_times(part.value(X.take(own, axis=1)), w) for part, own, w in self._parts], X, 1)
+
+    def jacobian(self, X: np.ndarray) -> np.ndarray:
+        each = np.eye(X.shape[1])
+        return self.chain(X, np.broadcast_to(each, (len(X), *each.shape)))
+
+    def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
+        parts = self._parts
+        return _joined([_times(p.chain(X.take(c, axis=1), inner.take(c, axis=1)), w) for p, c, w in parts], inner, 2)
+
+
+def _is_dropped(part: Any) -> bool:
+    return part is None or (isinstance(part, str) and part == "drop")
+
+
+def _indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
+    """Indices of the columns that a column transformer was given: by index or name, a slice, a list or a mask."""
+    if isinstance(columns, slice):
+        if isinstance(columns.start, str) or isinstance(columns.stop, str):  # names: the last is taken too
+            start = None if columns.start is None else names.index(columns.start)
+            stop = None if columns.stop is None else names.index(columns.stop) + 1
+            columns = slice(start, stop, columns.step)
+        return np.arange(n_columns)[columns]
+    if not len(columns):
+        return np.empty(0, dtype=int)
+    if isinstance(columns[0], str):
+        return np.array([names.index(name) for name in columns])
+    return np.arange(n_columns)[np.asarray(columns)]
+
+
+def _times(values: np.ndarray, weight: float | None) -> np.ndarray:
+    return values if weight is None else values * weight
+
+
+def _joined(parts: Sequence[np.ndarray], whole: np.ndarray, per_row: int) -> np.ndarray:
+    """Parts by their columns; those with one row for all outputs, if others have one for each, for each of them.
+
+    ``per_row`` is the number of dimensions of a row that is the same for all outputs: of values 1, of Jacobians 2.
+    """
+    if not parts:
+        return np.empty((len(whole), 0, *whole.shape[2:]))
+    n_outputs = next((part.shape[1] for part in parts if part.ndim == per_row + 2), None)
+    if n_outputs is not None:
+        parts = [
+            np.repeat(part[:, np.newaxis], n_outputs, axis=1) if part.ndim == per_row + 1 else part for part in parts
+        ]
+    return np.concatenate(parts, axis=-per_row)
