@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,12 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_is_fitted
 
 from ._intake import Intake
-from ._shapes import like_y
 from ._validation import is_plain
 from .inference.posterior import Predictor
-from .prediction.derivatives import MappedRows, gradient_covariance, mapped, moments_with_slopes
-from .prediction.maps import direct
+from .prediction.compiled import CompiledPredictor
+from .prediction.derivatives import gradient_covariance, mapped
+from .prediction.elementary import DirectMap
+from .prediction.maps import direct_map
 from .prediction.paths import Functions
 from .rows.dask import is_dask
 
@@ -78,14 +79,9 @@ class Differentiable(Intake):
         >>> jacobian.shape
         (1, 2, 3)
         """
-        parts = self._in_pieces(X, lambda rows: moments_with_slopes(self._predictor, rows, return_std))
-        mean, slopes = (np.concatenate(each) for each in zip(*(part[:2] for part in parts), strict=True))
-        if not return_std:
-            return like_y(mean), self._like_jacobian(slopes)
-        variance, variance_slopes = (np.concatenate(each) for each in zip(*(part[2:] for part in parts), strict=True))
-        std = np.sqrt(variance + (self._predictor.noise if include_noise else 0.0))
-        variance_slopes *= (0.5 / np.where(std > 0.0, std, np.inf))[:, :, np.newaxis]
-        return like_y(mean), self._like_jacobian(slopes), like_y(std), self._like_jacobian(variance_slopes)
+        fast = self.compile(include_noise)
+        parts = [fast.value_and_jacobian(rows, return_std) for rows in self._in_pieces(X)]
+        return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
     def jacobian(self, X: ArrayLike) -> np.ndarray:
         """Differentiate the mean in the columns of X.
@@ -139,31 +135,64 @@ class Differentiable(Intake):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        parts = self._in_pieces(X, self._gradient_with_covariance if return_std or return_cov else self._gradient)
-        gradient, *cov = (np.concatenate(each) for each in zip(*parts, strict=True))
-        gradient = self._like_jacobian(gradient)
-        if not cov:
+        fast, maps = self.compile(), self._direct_maps()
+        parts, covariances = [], []
+        for rows in self._in_pieces(X):
+            parts.append(fast.value_and_jacobian(rows)[1])
+            if return_std or return_cov:
+                covariances.append(gradient_covariance(self._predictor, mapped(rows, *maps)))
+        gradient = np.concatenate(parts)
+        if not covariances:
             return gradient
-        found = self._like_jacobian(cov[0])
-        return gradient, found if return_cov else np.sqrt(np.einsum("...ii->...i", found))
+        cov = np.concatenate(covariances)
+        cov = cov[:, 0] if cov.shape[1] == 1 else cov
+        return gradient, cov if return_cov else np.sqrt(np.einsum("...ii->...i", cov))
+
+    def compile(self, include_noise: bool = True) -> CompiledPredictor:
+        """Make a predictor for control loops: of few rows, several times as fast, without validation.
+
+        Parameters
+        ----------
+        include_noise : bool, default=True
+            Whether its standard deviations are of y, with the learned noise, or of the noise-free g(x).
+
+        Returns
+        -------
+        compiled : CompiledPredictor
+            With ``predict`` and ``value_and_jacobian`` of arrays (n_features,) or (n_samples, n_features); and
+            ``update(model)`` for the weights after a ``partial_fit``. Threads may share it, and it can be pickled.
+
+        Raises
+        ------
+        NotFittedError
+            Before `fit`.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import EVGPRegressor
+        >>> X = np.linspace(0.0, 6.0, 60)[:, np.newaxis]
+        >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, np.sin(X[:, 0]))
+        >>> mean, slope = model.compile().value_and_jacobian(np.array([0.0]))
+        >>> slope.round(2)
+        array([1.])
+        """
+        check_is_fitted(self)
+        return CompiledPredictor(self, include_noise)
 
     def _functions(self) -> Functions:
         """The posterior as functions to be drawn and followed."""
+        return Functions(self._predictor, *self._direct_maps())
 
-        def to_features(X: np.ndarray) -> np.ndarray:
-            return np.empty((len(X), 0)) if self.feature_map_ is None else features(X)
+    def _direct_maps(self) -> tuple[DirectMap | None, DirectMap | None]:
+        """Feature map and kernel map without validation."""
+        features, inputs = (
+            None if each is None else direct_map(each) for each in (self.feature_map_, self.kernel_map_)
+        )
+        return features, inputs
 
-        features = direct(self.feature_map_)
-        return Functions(self._predictor, direct(self.kernel_map_), to_features)
-
-    def _gradient(self, rows: MappedRows) -> tuple[np.ndarray, ...]:
-        return (moments_with_slopes(self._predictor, rows).mean_slopes,)
-
-    def _gradient_with_covariance(self, rows: MappedRows) -> tuple[np.ndarray, ...]:
-        return *self._gradient(rows), gradient_covariance(self._predictor, rows)
-
-    def _in_pieces(self, X: Any, function: Callable[[MappedRows], Any]) -> list[Any]:
-        """What a function has of some rows at once, through the maps with their Jacobians."""
+    def _in_pieces(self, X: Any) -> Iterator[np.ndarray]:
+        """Rows as floats, few enough at once that derivatives fit into memory."""
         check_is_fitted(self)
         if is_dask(X):
             raise ValueError("Derivatives need rows in memory: not for Dask arrays. Give them X.compute().")
@@ -171,9 +200,4 @@ class Differentiable(Intake):
         rows = np.asarray(rows, dtype=np.float64)
         stacked = sum(group.root.shape[0] * group.root.shape[2] for group in self._predictor.groups)
         size = int(np.clip(_NUMBERS // (stacked * rows.shape[1]), 1, 1024))
-        maps = self.feature_map_, self.kernel_map_
-        return [function(mapped(rows[first : first + size], *maps)) for first in range(0, len(rows), size)]
-
-    def _like_jacobian(self, slopes: np.ndarray) -> np.ndarray:
-        """Without the axis of outputs, the second, if there is one output."""
-        return slopes[:, 0] if slopes.shape[1] == 1 else slopes
+        return (rows[first : first + size] for first in range(0, len(rows), size))

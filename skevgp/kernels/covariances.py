@@ -61,8 +61,12 @@ class CentredSquares:
     centre: tuple[float, ...] = ()
 
     def __call__(self, inputs: np.ndarray) -> np.ndarray:
-        x = self.centred(inputs)
-        return np.ascontiguousarray(np.hstack([x, np.ones((len(x), 1)), x**2]).T)
+        n, d = inputs.shape
+        found = np.empty((2 * d + 1, n))
+        found[:d] = self.centred(inputs).T
+        found[d] = 1.0
+        np.square(found[:d], out=found[d + 1 :])
+        return found
 
     def centred(self, points: np.ndarray) -> np.ndarray:
         """The same points, seen from c."""

@@ -1,19 +1,14 @@
-"""Derivatives of predictions, and the posterior of the gradient of g(x) = h(x)ᵀβ + f(x).
-
-With P = [V; Hᵀ] a prediction has the mean W P and the variance s² (k̃(x, x) - |v|²) + |R P|² (`inference.posterior`).
-Their derivatives in the kernel's inputs and in the features are pulled back through the maps' own Jacobians to the
-columns of X. (With inputs of d columns, all of it is of the size of V times d.)
-"""
+"""Rows behind both maps with their Jacobians, and the posterior of the gradient of g(x) = h(x)ᵀβ + f(x)."""
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ..inference.posterior import Predictor, PredictorGroup
 from ..rows.source import of_outputs
-from .maps import direct, map_jacobian
+from .elementary import DirectMap
 
 
 class MappedRows(NamedTuple):
@@ -47,48 +42,15 @@ def _of_group(slopes: np.ndarray, group: PredictorGroup) -> np.ndarray:
     return of_outputs(slopes.reshape(n, o, k * columns), group.outputs).reshape(n, k, columns)
 
 
-def mapped(X: np.ndarray, feature_map: Any, kernel_map: Any) -> MappedRows:
-    """Rows X (n, D) through fitted maps, of which either may be None."""
+def mapped(X: np.ndarray, feature_map: DirectMap | None, kernel_map: DirectMap | None) -> MappedRows:
+    """Rows X (n, D) through the maps, of which either may be None."""
     n, columns = X.shape
     features, feature_slopes = np.empty((n, 0)), np.empty((n, 0, columns))
     if feature_map is not None:
-        features, feature_slopes = direct(feature_map)(X), map_jacobian(feature_map, X)
+        features, feature_slopes = feature_map.value(X), feature_map.jacobian(X)
     if kernel_map is None:
         return MappedRows(X, features, None, feature_slopes)
-    return MappedRows(direct(kernel_map)(X), features, map_jacobian(kernel_map, X), feature_slopes)
-
-
-class Moments(NamedTuple):
-    """Mean and variance (n, o) of the noise-free g(x), and their derivatives in X (n, o, D); None if not asked for."""
-
-    mean: np.ndarray
-    mean_slopes: np.ndarray
-    variance: Any
-    variance_slopes: Any
-
-
-def moments_with_slopes(predictor: Predictor, rows: MappedRows, return_variance: bool = False) -> Moments:
-    """What `Predictor.predict` returns, and its derivatives in X."""
-    projected = list(predictor.projected(rows.inputs, rows.features))
-    mean, variance = predictor.moments(projected, rows.features, return_variance)
-    of_mean, of_variance = [], []
-    for group, own in zip(predictor.groups, projected, strict=True):
-        m, covariance, (by_inputs, by_features) = len(group.points), group.whitening.covariance, rows.of(group)
-        slopes = covariance.slopes(own.prepared).transpose(1, 0, 2)  # (n, m, d)
-        weights = group.mean[:, m:] + predictor.offset[group.outputs]
-        found = (group.mean[:, :m] @ group.whitening.L_inv) @ slopes  # (n, o, d)
-        of_mean.append(_outputs_first(_chained(found, by_inputs) + weights @ by_features))
-        if return_variance:
-            P_bar = 2.0 * (group.root.transpose(0, 2, 1) @ (group.root @ own.P))  # (o, m + p, n)
-            P_bar[:, :m] -= 2.0 * group.signal[:, np.newaxis, np.newaxis] * own.P[:m]
-            found = (group.whitening.L_inv.T @ P_bar[:, :m]).transpose(2, 0, 1) @ slopes
-            at_row = np.broadcast_to(covariance.diagonal_slopes(own.prepared), own.inputs.shape)
-            found += group.signal[:, np.newaxis] * at_row[:, np.newaxis]
-            of_variance.append(
-                _outputs_first(_chained(found, by_inputs) + P_bar[:, m:].transpose(2, 0, 1) @ by_features)
-            )
-    mean_slopes = _rows_first(predictor.in_order(of_mean))
-    return Moments(mean, mean_slopes, variance, _rows_first(predictor.in_order(of_variance)) if of_variance else None)
+    return MappedRows(kernel_map.value(X), features, kernel_map.jacobian(X), feature_slopes)
 
 
 def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
@@ -102,7 +64,7 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
     parts = []
     for group, own in zip(predictor.groups, predictor.projected(rows.inputs, rows.features), strict=True):
         covariance, (by_inputs, by_features) = group.whitening.covariance, rows.of(group)
-        slopes = _chained(covariance.slopes(own.prepared).transpose(1, 0, 2), by_inputs)  # (n, m, D)
+        slopes = chained(covariance.slopes(own.prepared).transpose(1, 0, 2), by_inputs)  # (n, m, D)
         P = np.concatenate([group.whitening.L_inv @ slopes, by_features], axis=1)  # (n, m + p, D)
         V = P[:, : len(group.points)]
         left = covariance.mixed_slopes(own.prepared)
@@ -115,17 +77,9 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
         deviation = group.root[:, np.newaxis] @ P  # (o, n, k, D)
         signal = group.signal[:, np.newaxis, np.newaxis, np.newaxis]
         parts.append(signal * left + deviation.transpose(0, 1, 3, 2) @ deviation)
-    return _rows_first(predictor.in_order(parts))
+    return np.moveaxis(predictor.in_order(parts), 0, 1)
 
 
-def _chained(slopes: np.ndarray, by_inputs: np.ndarray | None) -> np.ndarray:
+def chained(slopes: np.ndarray, by_inputs: np.ndarray | None) -> np.ndarray:
     """From derivatives (n, k, d) in the kernel's inputs to those in X (n, k, D)."""
     return slopes if by_inputs is None else slopes @ by_inputs
-
-
-def _outputs_first(values: np.ndarray) -> np.ndarray:
-    return np.moveaxis(values, 1, 0)
-
-
-def _rows_first(values: np.ndarray) -> np.ndarray:
-    return np.moveaxis(values, 0, 1)

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..inference.posterior import Predictor, PredictorGroup, Projected
 from ..rows.source import times_weights
+from .elementary import DirectMap
 
 # In units of k̃(x, x): a row of which less is left is known from those before.
 _KNOWN = 1e-13
@@ -115,15 +116,14 @@ class Functions:
     Attributes
     ----------
     predictor : Predictor
-    to_inputs, to_features : callable
-        Rows X (n, D) -> the kernel's inputs and the features.
+    feature_map, kernel_map : DirectMap or None
     base : ndarray of shape (o,), optional
         The columns of X that are added to the outputs.
     """
 
     predictor: Predictor
-    to_inputs: Callable[[np.ndarray], np.ndarray]
-    to_features: Callable[[np.ndarray], np.ndarray]
+    feature_map: DirectMap | None
+    kernel_map: DirectMap | None
     base: np.ndarray | None = None
 
     @property
@@ -131,9 +131,14 @@ class Functions:
         """σ² of each output, (o,)."""
         return self.predictor.noise
 
+    def mapped(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's inputs and the features of rows (n, D)."""
+        features = np.empty((len(X), 0)) if self.feature_map is None else self.feature_map.value(X)
+        return X if self.kernel_map is None else self.kernel_map.value(X), features
+
     def between(self, X: np.ndarray) -> np.ndarray:
         """Covariances (n, o, o) of different outputs of a row, which are 0 but where outputs share their weights."""
-        common = self.predictor.common(self.to_inputs(X), self.to_features(X))
+        common = self.predictor.common(*self.mapped(X))
         return np.einsum("kni,knj->nij", common, common) * (1.0 - np.eye(len(self.noise)))
 
     def at_once(self, n_steps: int) -> int:
@@ -146,7 +151,7 @@ class Functions:
         paths = Paths(self.predictor, n, n_steps, rng)
 
         def step(X: np.ndarray) -> np.ndarray:
-            values = paths.step(self.to_inputs(X), self.to_features(X))
+            values = paths.step(*self.mapped(X))
             return values if self.base is None else values + X[:, self.base]
 
         return step
