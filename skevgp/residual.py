@@ -18,6 +18,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._sklearn import HasMethods, fit_context, safe_indexing
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
+from .prediction.compiled import CompiledPredictor
 
 
 def _regressor_has(method: str) -> Callable[[Any], bool]:
@@ -249,6 +250,23 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         gradient, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
         gradient = self._with_base(gradient)
         return (gradient, *spread) if spread else gradient
+
+    @available_if(_regressor_has("compile"))
+    def compile(self, include_noise: bool = True) -> CompiledPredictor:
+        """Make a predictor for control loops, if the regressor can.
+
+        Parameters
+        ----------
+        include_noise : bool, default=True
+            Whether its standard deviations are of y, with the learned noise, or of the noise-free function.
+
+        Returns
+        -------
+        compiled : CompiledPredictor
+            As of `EVGPRegressor.compile`, of the sum.
+        """
+        check_is_fitted(self)
+        return CompiledPredictor(self.regressor_, include_noise, self.base_)
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.

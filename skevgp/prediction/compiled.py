@@ -69,7 +69,7 @@ class CompiledPredictor:
         model : EVGPRegressor or EGPRegressor
             With the maps that this one was made with: of the same fit.
         """
-        predictor = model._predictor
+        predictor = model._predictor if self.base is None else getattr(model, "regressor_", model)._predictor
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
         groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
         self._state = (predictor, groups, noise)

@@ -4,60 +4,12 @@ import numpy as np
 import pandas as pd
 import pytest
 from sklearn.exceptions import NotFittedError
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern, WhiteKernel
-from sklearn.pipeline import make_pipeline, make_union
-from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 
-N_OUTPUTS, D = 3, 2
-QUICK = {"max_iter": 10, "tol": 1e6, "random_state": 0}
-
-
-@pytest.fixture(scope="module")
-def data():
-    rng = np.random.RandomState(0)
-    X = rng.uniform(-2.0, 2.0, (120, D))
-    Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
-    return X, Y + 0.05 * rng.randn(*Y.shape), rng.uniform(-2.0, 2.0, (9, D))
-
-
-def own_columns(X):
-    """Of each output other columns."""
-    return np.stack([X, X[:, ::-1], X * X], axis=1)
-
-
-def own_features(X):
-    return np.stack([X[:, :1], np.sin(X[:, :1]), X[:, 1:]], axis=1)
-
-
-KERNEL = ConstantKernel(2.0) * RBF([0.9, 1.2])
-MODELS = {
-    "plain": EVGPRegressor(n_inducing=20),
-    "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=15),
-    "diagonal": EVGPRegressor(PolynomialFeatures(1), KERNEL, posterior="diagonal", sharing="kernel", n_inducing=15),
-    "maps": EVGPRegressor(
-        make_union(PolynomialFeatures(2), StandardScaler()),
-        kernel_map=make_pipeline(StandardScaler(), PolynomialFeatures(2, include_bias=False)),
-        n_inducing=20,
-        normalize_y=True,
-    ),
-    "foreign maps": EVGPRegressor(
-        FunctionTransformer(np.sinh), kernel_map=FunctionTransformer(lambda X: np.exp(0.3 * X)), n_inducing=20
-    ),
-    "rows per output": EVGPRegressor(
-        FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), n_inducing=20
-    ),
-    "shared weights": EVGPRegressor(FunctionTransformer(own_features), share_coef=True, n_inducing=20),
-    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
-    "exact": EGPRegressor(PolynomialFeatures(1)),
-}
-
-
-@pytest.fixture(scope="module", params=MODELS)
-def model(request, data):
-    X, Y, _ = data
-    return MODELS[request.param].set_params(**QUICK).fit(X, Y)
+from .cases import N_OUTPUTS, QUICK, D
 
 
 def differences(function, X, step=1e-4):

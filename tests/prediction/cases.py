@@ -1,0 +1,45 @@
+"""Models whose predictions are differentiated, compiled and followed."""
+
+import numpy as np
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern
+from sklearn.pipeline import make_pipeline, make_union
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
+
+from skevgp import EGPRegressor, EVGPRegressor
+
+N_OUTPUTS, D = 3, 2
+QUICK = {"max_iter": 10, "tol": 1e6, "random_state": 0}
+
+
+def own_columns(X):
+    """Of each output other columns."""
+    return np.stack([X, X[:, ::-1], X * X], axis=1)
+
+
+def own_features(X):
+    return np.stack([X[:, :1], np.sin(X[:, :1]), X[:, 1:]], axis=1)
+
+
+def shrunk(X):
+    return np.exp(0.3 * X)
+
+
+KERNEL = ConstantKernel(2.0) * RBF([0.9, 1.2])
+MODELS = {
+    "plain": EVGPRegressor(n_inducing=20),
+    "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=15),
+    "diagonal": EVGPRegressor(PolynomialFeatures(1), KERNEL, posterior="diagonal", sharing="kernel", n_inducing=15),
+    "maps": EVGPRegressor(
+        make_union(PolynomialFeatures(2), StandardScaler()),
+        kernel_map=make_pipeline(StandardScaler(), PolynomialFeatures(2, include_bias=False)),
+        n_inducing=20,
+        normalize_y=True,
+    ),
+    "foreign maps": EVGPRegressor(FunctionTransformer(np.sinh), kernel_map=FunctionTransformer(shrunk), n_inducing=20),
+    "rows per output": EVGPRegressor(
+        FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), n_inducing=20
+    ),
+    "shared weights": EVGPRegressor(FunctionTransformer(own_features), share_coef=True, n_inducing=20),
+    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
+    "exact": EGPRegressor(PolynomialFeatures(1)),
+}

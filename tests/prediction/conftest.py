@@ -1,0 +1,21 @@
+"""Data and fitted models for the tests of what is done with a fitted model."""
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+
+from .cases import MODELS, QUICK, D
+
+
+@pytest.fixture(scope="module")
+def data():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (120, D))
+    Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
+    return X, Y + 0.05 * rng.randn(*Y.shape), rng.uniform(-2.0, 2.0, (9, D))
+
+
+@pytest.fixture(scope="module", params=MODELS)
+def model(request, data):
+    X, Y, _ = data
+    return clone(MODELS[request.param]).set_params(**QUICK).fit(X, Y)

@@ -1,0 +1,94 @@
+"""The predictor for control loops says what the estimator says."""
+
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pytest
+from sklearn.exceptions import NotFittedError
+from sklearn.preprocessing import PolynomialFeatures
+
+from skevgp import EVGPRegressor, ResidualRegressor
+
+from .cases import QUICK
+
+
+def same(found, expected):
+    assert len(found) == len(expected)
+    for one, other in zip(found, expected, strict=True):
+        assert one.shape == other.shape
+        assert np.abs(one - other).max() <= 1e-12 * max(np.abs(other).max(), 1.0)
+
+
+@pytest.mark.parametrize("include_noise", [True, False])
+def test_it_says_what_the_estimator_says(model, data, include_noise):
+    X, options = data[2], {"return_std": True, "include_noise": include_noise}
+    compiled = model.compile(include_noise)
+    mean, std = model.predict(X, **options)
+    found = compiled.predict(X, return_std=True)
+    same([found[0]], [mean])
+    # Where the variance is what two large numbers leave, rounding counts.
+    np.testing.assert_allclose(found[1], std, rtol=1e-9)
+    same([compiled.predict(X)], [mean])
+    same(compiled.value_and_jacobian(X), model.value_and_jacobian(X))
+    for one, other in zip(
+        compiled.value_and_jacobian(X, return_std=True), model.value_and_jacobian(X, **options), strict=True
+    ):
+        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
+
+
+def test_one_row_has_no_axis_of_rows(model, data):
+    X, compiled = data[2], model.compile()
+    expected = compiled.value_and_jacobian(X, return_std=True)
+    for i, row in enumerate(X):
+        same(compiled.value_and_jacobian(row, return_std=True), [part[i] for part in expected])
+        same(compiled.predict(row, return_std=True), [expected[0][i], expected[2][i]])
+
+
+def test_one_output_has_no_axis_of_outputs(data):
+    X, Y, X_new = data
+    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, **QUICK).fit(X, Y[:, 0])
+    compiled = model.compile()
+    same(compiled.value_and_jacobian(X_new, return_std=True), model.value_and_jacobian(X_new, return_std=True))
+    assert [part.shape for part in compiled.value_and_jacobian(X_new[0], return_std=True)] == [(), (2,), (), (2,)]
+    assert [part.shape for part in compiled.predict(X_new[0], return_std=True)] == [(), ()]
+
+
+def test_it_is_frozen_until_it_is_told_of_new_weights(data):
+    X, Y, X_new = data
+    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=15, **QUICK).fit(X[:100], Y[:100])
+    compiled, before = model.compile(), model.predict(X_new, return_std=True)
+    model.partial_fit(X[100:], Y[100:] + 1.0)
+    same(compiled.predict(X_new, return_std=True), before)
+    compiled.update(model)
+    after = model.predict(X_new, return_std=True)
+    same(compiled.predict(X_new, return_std=True), after)
+    assert np.abs(after[0] - before[0]).max() > 1e-3
+
+
+def test_threads_may_share_it_and_it_can_be_pickled(model, data):
+    rows = np.repeat(data[2], 30, axis=0)
+    compiled = pickle.loads(pickle.dumps(model.compile()))
+    expected = [compiled.value_and_jacobian(row, return_std=True) for row in data[2]]
+    with ThreadPoolExecutor(8) as threads:
+        found = list(threads.map(lambda row: compiled.value_and_jacobian(row, return_std=True), rows))
+    for i, each in enumerate(found):
+        for one, other in zip(each, expected[i // 30], strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_of_a_residual_regressor_it_is_of_the_sum(data):
+    X, Y, X_new = data
+    model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0]).fit(X, Y)
+    compiled = model.compile()
+    same(compiled.value_and_jacobian(X_new, return_std=True), model.value_and_jacobian(X_new, return_std=True))
+    same(compiled.predict(X_new, return_std=True), model.predict(X_new, return_std=True))
+    model.partial_fit(X, Y + 1.0)
+    compiled.update(model)
+    same(compiled.predict(X_new, return_std=True), model.predict(X_new, return_std=True))
+
+
+def test_before_a_fit_there_is_nothing_to_compile():
+    for model in (EVGPRegressor(), ResidualRegressor(EVGPRegressor())):
+        with pytest.raises(NotFittedError):
+            model.compile()
