@@ -272,7 +272,7 @@ class Own(DirectMap):
 
 def _is_own(transformer: Any) -> bool:
     """Whether a transformer has a value and a Jacobian beneath what validates them, as ours do."""
-    return _fits(transformer, "_jacobian", "_features", "transform", "jacobian")
+    return hasattr(transformer, "_features") and _fits(transformer, "_jacobian", "transform", "jacobian")
 
 
 def _fits(transformer: Any, name: str, *others: str) -> bool:
@@ -299,7 +299,9 @@ def elementary(transformer: Any, scale: np.ndarray | None = None) -> DirectMap:
     if _is_own(transformer):
         return Own(transformer)
     known = _KNOWN.get(type(transformer))
-    return Foreign(transformer, scale) if known is None else known(transformer)
+    if known is None or (known is Splines and transformer.extrapolation == "linear" and transformer.degree <= 1):
+        return Foreign(transformer, scale)  # such splines go on from another knot in the first column than in the rest
+    return known(transformer)
 
 
 _KNOWN: dict[type, Callable[[Any], DirectMap]] = {
