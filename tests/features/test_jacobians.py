@@ -19,7 +19,7 @@ PLANAR = ["pendulum", "cartpole", "acrobot"]
 LIFT = System(
     "lift",
     links=(
-        Link("z", "prismatic", (0.0, 0.0, 1.0), mass=2.0, damping=0.3),
+        Link("z", "prismatic", (0.0, 0.0, 1.0), mass=2.0, damping=0.3, rpy=(0.5, 0.2, 0.0)),
         Link("q", "revolute", (0.6, 0.0, 0.8), mass=1.0, com=(0.1, 0.2, 0.3), xyz=(1.0, 0.0, 0.0), rpy=(0.3, 0.2, 0.1)),
         Link("s", "prismatic", (0.48, -0.6, 0.64), mass=1.0, rpy=(0.3, -0.2, 0.1), effort=0.0),
     ),
