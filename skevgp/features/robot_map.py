@@ -105,6 +105,12 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         -------
         J : ndarray of shape (n_samples, n_features_out, n_features)
             The analytic derivatives dh(x)/dx of each row.
+
+        Notes
+        -----
+        Gravity as link i sees it, from which `LinkGravity` makes its features, turns with each joint j that turns and
+        bears the link, about the axis a_j: ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j). The derivatives of `NominalDynamics` are
+        Pinocchio's (Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018).
         """
         return self._jacobian(self._checked(X))
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib import import_module
 from importlib.util import find_spec
 from inspect import getattr_static
@@ -141,24 +141,31 @@ class Projection(DirectMap):
 
 
 class Monomials(DirectMap):
-    """What fitted PolynomialFeatures do: each monomial is one of a degree less times a column."""
+    """What fitted PolynomialFeatures do: each monomial is one of a degree less times its first column."""
 
     def __init__(self, polynomial: PolynomialFeatures):
         chosen = [tuple(powers) for powers in polynomial.powers_.tolist()]
         known = {(0,) * polynomial.n_features_in_} | set(chosen)
         for degree in range(max(map(sum, known)), 0, -1):
-            known |= {_without_first(powers)[0] for powers in known if sum(powers) == degree}
+            known |= {less for powers in known if sum(powers) == degree for _, less in _one_less(powers)}
         ordered = sorted(known, key=sum)
         position = {powers: index for index, powers in enumerate(ordered)}
-        self._chosen = np.array([position[powers] for powers in chosen], dtype=int)
         self._n_known = len(ordered)
+        self._chosen = np.array([position[powers] for powers in chosen], dtype=int)
         self._degrees = []  # of each: where its monomials are, those of a degree less, and the columns they lack
         for degree in range(1, sum(ordered[-1]) + 1):
             own = [powers for powers in ordered if sum(powers) == degree]
             first = position[own[0]]
-            less, columns = zip(*map(_without_first, own), strict=True)
+            columns, less = zip(*(next(_one_less(powers)) for powers in own), strict=True)
             parents = np.array([position[powers] for powers in less])
             self._degrees.append((slice(first, first + len(own)), parents, np.array(columns)))
+        # Derivatives that are not 0: where, and which known monomial times which power.
+        entries = [
+            (row * len(powers) + column, position[less], powers[column])
+            for row, powers in enumerate(chosen)
+            for column, less in _one_less(powers)
+        ]
+        self._entries, self._reduced, self._powers = np.array(entries, dtype=int).reshape(-1, 3).T
 
     def _all(self, X: np.ndarray) -> np.ndarray:
         values = np.ones((len(X), self._n_known))
@@ -170,18 +177,16 @@ class Monomials(DirectMap):
         return self._all(X).take(self._chosen, axis=1)
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
-        values, jacobian = self._all(X), np.zeros((len(X), self._n_known, X.shape[1]))
-        for own, parents, columns in self._degrees:
-            by_product = jacobian.take(parents, axis=1) * X.take(columns, axis=1)[:, :, np.newaxis]
-            by_product[:, np.arange(len(columns)), columns] += values.take(parents, axis=1)
-            jacobian[:, own] = by_product
-        return jacobian.take(self._chosen, axis=1)
+        jacobian = np.zeros((len(X), len(self._chosen) * X.shape[1]))
+        jacobian[:, self._entries] = self._all(X).take(self._reduced, axis=1) * self._powers
+        return jacobian.reshape(len(X), -1, X.shape[1])
 
 
-def _without_first(powers: tuple[int, ...]) -> tuple[tuple[int, ...], int]:
-    """The powers of a monomial without its first column, and which that is."""
-    column = next(column for column, power in enumerate(powers) if power)
-    return (*powers[:column], powers[column] - 1, *powers[column + 1 :]), column
+def _one_less(powers: tuple[int, ...]) -> Iterator[tuple[int, tuple[int, ...]]]:
+    """Each column of a monomial, and the powers of what is left without it once."""
+    for column, power in enumerate(powers):
+        if power:
+            yield column, (*powers[:column], power - 1, *powers[column + 1 :])
 
 
 class Foreign(DirectMap):
@@ -272,7 +277,7 @@ class Own(DirectMap):
 
 def _is_own(transformer: Any) -> bool:
     """Whether a transformer has a value and a Jacobian beneath what validates them, as ours do."""
-    return _fits(transformer, "_jacobian", "_features", "transform", "jacobian")
+    return hasattr(transformer, "_features") and _fits(transformer, "_jacobian", "transform", "jacobian")
 
 
 def _fits(transformer: Any, name: str, *others: str) -> bool:
@@ -299,7 +304,9 @@ def elementary(transformer: Any, scale: np.ndarray | None = None) -> DirectMap:
     if _is_own(transformer):
         return Own(transformer)
     known = _KNOWN.get(type(transformer))
-    return Foreign(transformer, scale) if known is None else known(transformer)
+    if known is None or (known is Splines and transformer.extrapolation == "linear" and transformer.degree <= 1):
+        return Foreign(transformer, scale)  # such splines go on from another knot in the first column than in the rest
+    return known(transformer)
 
 
 _KNOWN: dict[type, Callable[[Any], DirectMap]] = {

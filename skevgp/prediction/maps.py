@@ -6,6 +6,7 @@ chain rule is applied. What is not known here is asked by its `transform`, and d
 
 from __future__ import annotations
 
+from collections import UserList
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -137,13 +138,15 @@ class SideBySide(DirectMap):
         self.linear = all(part.linear for part, _ in self._parts)
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return _joined([_times(part.value(X), weight) for part, weight in self._parts], X, 1)
+        return _joined([_times(part.value(X), weight) for part, weight in self._parts], len(X))
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
-        return _joined([_times(part.jacobian(X), weight) for part, weight in self._parts], X, 2)
+        parts = [_times(part.jacobian(X), weight) for part, weight in self._parts]
+        return _joined(parts, len(X), X.shape[1])
 
     def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
-        return _joined([_times(part.chain(X, inner), weight) for part, weight in self._parts], inner, 2)
+        parts = [_times(part.chain(X, inner), weight) for part, weight in self._parts]
+        return _joined(parts, len(X), inner.shape[2])
 
 
 class OfColumns(DirectMap):
@@ -161,15 +164,19 @@ class OfColumns(DirectMap):
         self.linear = all(part.linear for part, *_ in self._parts)
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return _joined([_times(part.value(X.take(own, axis=1)), w) for part, own, w in self._parts], X, 1)
+        parts = [_times(part.value(X.take(own, axis=1)), weight) for part, own, weight in self._parts]
+        return _joined(parts, len(X))
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
         each = np.eye(X.shape[1])
         return self.chain(X, np.broadcast_to(each, (len(X), *each.shape)))
 
     def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
-        parts = self._parts
-        return _joined([_times(p.chain(X.take(c, axis=1), inner.take(c, axis=1)), w) for p, c, w in parts], inner, 2)
+        parts = []
+        for part, own, weight in self._parts:
+            rows = X if part.linear else X.take(own, axis=1)
+            parts.append(_times(part.chain(rows, inner.take(own, axis=1)), weight))
+        return _joined(parts, len(X), inner.shape[2])
 
 
 def _is_dropped(part: Any) -> bool:
@@ -184,27 +191,24 @@ def _indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
             stop = None if columns.stop is None else names.index(columns.stop) + 1
             columns = slice(start, stop, columns.step)
         return np.arange(n_columns)[columns]
-    if not len(columns):
+    if isinstance(columns, UserList):  # the rest, in scikit-learn 1.6: to look into it would warn
+        columns = columns.data
+    listed = np.asarray(columns).tolist()
+    if not listed:
         return np.empty(0, dtype=int)
-    if isinstance(columns[0], str):
-        return np.array([names.index(name) for name in columns])
-    return np.arange(n_columns)[np.asarray(columns)]
+    return np.arange(n_columns)[[names.index(name) for name in listed] if isinstance(listed[0], str) else listed]
 
 
 def _times(values: np.ndarray, weight: float | None) -> np.ndarray:
     return values if weight is None else values * weight
 
 
-def _joined(parts: Sequence[np.ndarray], whole: np.ndarray, per_row: int) -> np.ndarray:
-    """Parts by their columns; those with one row for all outputs, if others have one for each, for each of them.
-
-    ``per_row`` is the number of dimensions of a row that is the same for all outputs: of values 1, of Jacobians 2.
-    """
+def _joined(parts: Sequence[np.ndarray], n_rows: int, *more: int) -> np.ndarray:
+    """Parts (n_rows, width, *more) by their columns; with one for all outputs repeated, if others have one for each."""
     if not parts:
-        return np.empty((len(whole), 0, *whole.shape[2:]))
-    n_outputs = next((part.shape[1] for part in parts if part.ndim == per_row + 2), None)
+        return np.empty((n_rows, 0, *more))
+    for_all = 2 + len(more)
+    n_outputs = next((part.shape[1] for part in parts if part.ndim > for_all), None)
     if n_outputs is not None:
-        parts = [
-            np.repeat(part[:, np.newaxis], n_outputs, axis=1) if part.ndim == per_row + 1 else part for part in parts
-        ]
-    return np.concatenate(parts, axis=-per_row)
+        parts = [part if part.ndim > for_all else np.repeat(part[:, np.newaxis], n_outputs, axis=1) for part in parts]
+    return np.concatenate(parts, axis=-1 - len(more))

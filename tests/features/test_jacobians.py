@@ -1,0 +1,250 @@
+import pickle
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import pandas as pd
+import pinocchio
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.exceptions import NotFittedError
+
+from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from skevgp.robots import layout_of, load_robot
+from skevgp.robots.systems import Link, System
+
+G = 9.81
+TERMS = ("acceleration", "gravity", "bias", "input")
+PLANAR = ["pendulum", "cartpole", "acrobot"]
+# Turning about skew axes, sliding, and damped.
+LIFT = System(
+    "lift",
+    links=(
+        Link("z", "prismatic", (0.0, 0.0, 1.0), mass=2.0, damping=0.3, rpy=(0.5, 0.2, 0.0)),
+        Link("q", "revolute", (0.6, 0.0, 0.8), mass=1.0, com=(0.1, 0.2, 0.3), xyz=(1.0, 0.0, 0.0), rpy=(0.3, 0.2, 0.1)),
+        Link("s", "prismatic", (0.48, -0.6, 0.64), mass=1.0, rpy=(0.3, -0.2, 0.1), effort=0.0),
+    ),
+)
+ROBOTS_3D = ["iiwa14", "ur5", "panda", "double_pendulum_continuous", LIFT]
+MAPS = {
+    "inertia": InertiaForce,
+    "inertia and gravity": InertiaForceGravity,
+    "angles": AngleEncoder,
+    "gravity": LinkGravity,
+    "dynamics": lambda robot: NominalDynamics(robot, terms=TERMS),
+}
+
+
+def name_of(robot):
+    return getattr(robot, "name", str(robot))
+
+
+def rows(robot, n_rows=20, seed=0):
+    n_columns = 4 if robot is None else layout_of(robot).n_columns
+    return np.random.default_rng(seed).uniform(-3.0, 3.0, (n_rows, n_columns))
+
+
+def by_differences(features, X, step=1e-5):
+    columns = []
+    for shift in step * np.eye(X.shape[1]):
+        columns.append((features.transform(X + shift) - features.transform(X - shift)) / (2.0 * step))
+    return np.stack(columns, axis=2)
+
+
+def check(features, X):
+    features.fit(X)
+    jacobian, expected = features.jacobian(X), by_differences(features, X)
+    assert jacobian.shape == (len(X), features.transform(X[:1]).shape[1], X.shape[1])
+    assert_allclose(jacobian, expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("kind", MAPS)
+@pytest.mark.parametrize("robot", [*PLANAR, None])
+def test_on_a_thousand_states_central_differences_agree(robot, kind):
+    check(MAPS[kind](robot), rows(robot, 1000))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+@pytest.mark.parametrize("robot", ROBOTS_3D, ids=name_of)
+def test_in_three_dimensions_central_differences_agree(robot, kind):
+    check(MAPS[kind](robot), rows(robot, 60 if kind == "dynamics" else 1000))
+
+
+@pytest.mark.parametrize("term", TERMS)
+@pytest.mark.parametrize("robot", ["acrobot", "ur5", LIFT], ids=name_of)
+def test_each_term_by_itself(robot, term):
+    check(NominalDynamics(robot, terms=[term]), rows(robot))
+
+
+@pytest.mark.parametrize(
+    "features",
+    [
+        LinkGravity("iiwa14", axes="x", links=["q6", "q2"]),
+        InertiaForceGravity("acrobot", gravity=LinkGravity(links=[1])),
+        AngleEncoder(angles=[2, 0]),
+        AngleEncoder("iiwa14", angles=["q3"]),
+    ],
+    ids=str,
+)
+def test_what_is_chosen_of_a_map_is_what_is_differentiated(features):
+    check(features, rows(features.robot))
+
+
+def test_more_rows_than_fit_into_a_block():
+    X = rows("iiwa14", 1500)
+    features = LinkGravity("iiwa14").fit(X)
+    assert_array_equal(features.jacobian(X)[1400:], features.jacobian(X[1400:]))
+
+
+# --- oracles -----------------------------------------------------------------------------------------------------
+
+
+def model_of_a_unit_mass(robot, joint, lever):
+    """The robot without any mass but 1 kg on a link, at the end of a lever."""
+    model = load_robot(robot).copy()
+    for link in range(1, model.njoints):
+        here = lever if link == joint else np.zeros(3)
+        model.inertias[link] = pinocchio.Inertia(float(link == joint), here, np.zeros((3, 3)))
+    return model
+
+
+def levers(robot, joint):
+    """u_x and u_y of a joint that turns, by the documented rule; of one that slides any lever."""
+    model = load_robot(robot)
+    at_zero = pinocchio.computeJointJacobian(model, model.createData(), np.zeros(model.nv), joint)
+    motion = at_zero.reshape(6, -1)[:, joint - 1]
+    if np.any(motion[:3]):
+        return [np.zeros(3)]
+    u_z = motion[3:]
+    u_x = np.eye(3)[(np.argmax(np.abs(u_z)) + 1) % 3]
+    u_x = u_x - (u_x @ u_z) * u_z
+    u_x /= np.linalg.norm(u_x)
+    return [u_x, np.cross(u_z, u_x)]
+
+
+@pytest.mark.parametrize("robot", [*PLANAR, *ROBOTS_3D], ids=name_of)
+def test_gravity_is_pinocchios_derivative_of_the_torque_of_a_unit_mass(robot):
+    n, X = layout_of(robot).n_joints, rows(robot, 5)
+    jacobian, feature = LinkGravity(robot).fit(X).jacobian(X), 0
+    for joint in range(1, n + 1):
+        for lever in levers(robot, joint):
+            model = model_of_a_unit_mass(robot, joint, lever)
+            data = model.createData()
+            for x, found in zip(X, jacobian[:, feature], strict=True):
+                held = pinocchio.computeGeneralizedGravityDerivatives(model, data, x[:n])[joint - 1]
+                assert_allclose(found[:n], -held, rtol=1e-10, atol=1e-11)
+            feature += 1
+    assert feature == jacobian.shape[1]
+    assert_array_equal(jacobian[:, :, n:], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("robot", "masses"),
+    [("pendulum", [[0.5]]), ("cartpole", [[0.0], [0.5]]), ("acrobot", [[1.5, 1.0], [0.0, 1.0]])],
+)
+def test_the_sines_of_a_planar_system_are_pinocchios_derivative_of_its_gravity(robot, masses):
+    """Of g(q) = G masses @ sines, in N m: mass times lever of each link, and of those that it bears."""
+    X, model = rows(robot), load_robot(robot)
+    of_sines = InertiaForceGravity(robot).fit(X).jacobian(X)[:, X.shape[1] :]
+    for x, found in zip(X, of_sines, strict=True):
+        expected = pinocchio.computeGeneralizedGravityDerivatives(model, model.createData(), x[: model.nv]).copy()
+        assert_allclose(G * np.array(masses) @ found[:, : model.nv], expected, rtol=1e-11, atol=1e-12)
+    assert_array_equal(of_sines[:, :, model.nv :], 0.0)
+
+
+def test_closed_forms_of_the_pendulum():
+    X = rows("pendulum", 50)
+    q, zero, one = X[:, 0], np.zeros(50), np.ones(50)
+    acceleration = np.column_stack([-G * 0.5 * np.cos(q), -0.1 * one, one]) / 0.25
+    gravity = np.column_stack([G * 0.5 * np.cos(q), zero, zero])
+    by_input = np.column_stack([zero, zero, one]) / 0.25
+    expected = np.stack([acceleration, gravity, gravity, by_input], axis=1)
+    assert_allclose(NominalDynamics("pendulum", terms=TERMS).fit(X).jacobian(X), expected, rtol=1e-11, atol=1e-12)
+    encoded = np.zeros((50, 4, 3))
+    encoded[:, 0, 0], encoded[:, 1, 0], encoded[:, 2, 1], encoded[:, 3, 2] = np.cos(q), -np.sin(q), 1.0, 1.0
+    assert_array_equal(AngleEncoder("pendulum").fit(X).jacobian(X), encoded)
+
+
+def test_accelerations_move_with_the_inputs_by_the_inverse_mass_matrix():
+    model, X = load_robot("acrobot"), rows("acrobot")
+    for terms in (["acceleration"], ["input"]):
+        by_input = NominalDynamics("acrobot", terms=terms).fit(X).jacobian(X)[:, :, 4:]
+        for x, found in zip(X, by_input, strict=True):
+            mass = pinocchio.crba(model, model.createData(), x[:2])
+            assert_allclose(found, np.linalg.inv(mass)[:, [1]], rtol=1e-10)
+
+
+def test_damping_of_the_model_counts():
+    damped, free, X = load_robot("iiwa14"), load_robot("iiwa14"), rows("iiwa14", 4)
+    damped.damping = np.linspace(0.1, 0.7, 7)
+    difference = NominalDynamics(damped).fit(X).jacobian(X) - NominalDynamics(free).fit(X).jacobian(X)
+    for x, found in zip(X, difference, strict=True):
+        inverse = np.linalg.inv(pinocchio.crba(free, free.createData(), x[:7]))
+        assert_allclose(found[:, 7:14], -inverse * damped.damping, rtol=1e-8, atol=1e-8)
+
+
+# --- the method --------------------------------------------------------------------------------------------------
+
+
+def test_terms_come_in_the_order_given():
+    X = rows("acrobot")
+    both = NominalDynamics("acrobot", terms=["bias", "input"]).fit(X).jacobian(X)
+    each = [NominalDynamics("acrobot", terms=[term]).fit(X).jacobian(X) for term in ("bias", "input")]
+    assert_array_equal(both, np.concatenate(each, axis=1))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_it_is_validated_as_transform_is(kind):
+    X = rows("cartpole")
+    with pytest.raises(NotFittedError):
+        MAPS[kind]("cartpole").jacobian(X)
+    features = MAPS[kind]("cartpole").fit(X)
+    with pytest.raises(ValueError, match="X has 4 features, but .* is expecting 5 features"):
+        features.jacobian(X[:, :4])
+    with pytest.raises(ValueError, match="contains NaN"):
+        features.jacobian(np.where(X[0, 0] == X, np.nan, X))
+    assert_array_equal(features.jacobian(X.tolist()), features.jacobian(X))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_a_data_frame_gives_an_array(kind):
+    X = rows("pendulum")
+    frame = pd.DataFrame(X, columns=["angle", "speed", "torque"])
+    features = MAPS[kind]("pendulum").set_output(transform="pandas").fit(frame)
+    assert_array_equal(features.jacobian(frame), MAPS[kind]("pendulum").fit(X).jacobian(X))
+
+
+@pytest.mark.parametrize("kind", MAPS)
+@pytest.mark.parametrize("robot", ["iiwa14", "acrobot", None])
+def test_a_single_row_gives_the_same_as_many_and_so_does_a_pickled_map(robot, kind):
+    X = rows(robot, 30)
+    features = MAPS[kind](robot).fit(X)
+    expected = features.jacobian(X)
+    assert_array_equal(np.concatenate([features.jacobian(x[np.newaxis]) for x in X]), expected)
+    assert_array_equal(pickle.loads(pickle.dumps(features)).jacobian(X), expected)
+
+
+@pytest.mark.parametrize("kind", MAPS)
+def test_what_is_returned_may_be_changed(kind):
+    X = rows("acrobot")
+    features = MAPS[kind]("acrobot").fit(X)
+    expected = features.jacobian(X)
+    changed = features.jacobian(X)
+    changed += 1.0
+    assert_array_equal(features.jacobian(X), expected)
+
+
+@pytest.mark.parametrize("kind", ["gravity", "dynamics"])
+def test_several_threads_get_the_same_numbers(kind):
+    features = MAPS[kind]("iiwa14").fit(rows("iiwa14"))
+    batches = [rows("iiwa14", 1 + 40 * (seed % 3), seed) for seed in range(40)]
+    with ThreadPoolExecutor(4) as threads:
+        together = list(threads.map(features.jacobian, batches))
+    for batch, result in zip(batches, together, strict=True):
+        assert_array_equal(result, MAPS[kind]("iiwa14").fit(batch).jacobian(batch))
+
+
+def test_dynamics_that_overflow_are_an_error():
+    features = NominalDynamics("acrobot").fit(rows("acrobot"))
+    x = np.array([[0.1, 0.2, 1e90, 1e90, 1e99]]) * 1e99 ** np.array([0, 0, 1, 1, 1])
+    with pytest.raises(ValueError, match="The dynamics of the robot 'acrobot' are not finite"):
+        features.jacobian(x)
