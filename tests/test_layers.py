@@ -230,6 +230,7 @@ def test_the_walk_of_fits_in_threads_is_no_longer():
 # What has tests of its own elsewhere, or nothing to test.
 TESTED_WITH = {
     "fitting/learned.py": "fitting/test_sparse.py",
+    "kernels/traced.py": "kernels/test_function.py",
     "optimizers/minimum.py": "optimizers/test_lbfgs.py",
     "outputs/fit.py": "outputs/test_plan.py",
     "outputs/fitted.py": "test_sharing.py",

@@ -16,8 +16,9 @@ from .constant import Constant
 from .cosine import Cosine, Wave
 from .covariances import Covariance, Product, Sum
 from .dot_product import DotProduct
-from .function import Function, FunctionKernel
+from .function import FunctionKernel
 from .stationary import SquaredExponential
+from .traced import Function
 
 # What works: a kernel's type -> its covariance on so many columns, with the kernel's hyperparameters in its order.
 BUILDERS: dict[type[sk.Kernel], Callable[[Any, int], Covariance]] = {
