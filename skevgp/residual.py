@@ -19,6 +19,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ._sklearn import HasMethods, fit_context, safe_indexing
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
 from .prediction.compiled import CompiledPredictor
+from .prediction.functions import FunctionSamples
 
 
 def _regressor_has(method: str) -> Callable[[Any], bool]:
@@ -267,6 +268,27 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         """
         check_is_fitted(self)
         return CompiledPredictor(self.regressor_, include_noise, self.base_)
+
+    @available_if(_regressor_has("sample_functions"))
+    def sample_functions(self, n: int = 1, random_state: Any = 0, **params: Any) -> FunctionSamples:
+        """Draw functions from the posterior, to be evaluated and differentiated anywhere, if the regressor can.
+
+        Parameters
+        ----------
+        n : int, default=1
+            How many functions.
+        random_state : int, RandomState instance or None, default=0
+            Draws them.
+        **params : dict
+            For the regressor's ``sample_functions``.
+
+        Returns
+        -------
+        functions : FunctionSamples
+            As of `EVGPRegressor.sample_functions`, of the sum.
+        """
+        check_is_fitted(self)
+        return self.regressor_.sample_functions(n, random_state, **params).with_base(self.base_)
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.

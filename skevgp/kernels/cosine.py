@@ -138,12 +138,12 @@ class Wave(Covariance):
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return np.cos((inputs - others) @ self._frequencies(hyperparameters))
+        return np.cos((inputs - others) @ self.frequencies(hyperparameters))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> WaveAt:
-        return WaveAt(self._frequencies(hyperparameters), self.rows.centred(inducing_points), self.isotropic)
+        return WaveAt(self.frequencies(hyperparameters), self.rows.centred(inducing_points), self.isotropic)
 
-    def _frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
+    def frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
         """2π / ℓ of each column."""
         return np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
 

@@ -187,7 +187,7 @@ class _Combination(Covariance):
     def centred(self, centre: np.ndarray) -> _Combination:
         return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
-    def _own(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
+    def own(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
         """Each part with its hyperparameters."""
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
         return zip(self.parts, np.split(hyperparameters, ends), strict=True)
@@ -196,7 +196,7 @@ class _Combination(Covariance):
         given = self.preparations
         return [
             _Part(part.at(values, inducing_points), _choice(part.preparations, given))
-            for part, values in self._own(hyperparameters)
+            for part, values in self.own(hyperparameters)
         ]
 
 
@@ -221,7 +221,7 @@ class Sum(_Combination):
     """Σ k̃ᵢ(x, x')."""
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return reduce(add, (part.paired(own, inputs, others) for part, own in self._own(hyperparameters)))
+        return reduce(add, (part.paired(own, inputs, others) for part, own in self.own(hyperparameters)))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> SumAt:
         return SumAt(self._parts_at(hyperparameters, inducing_points))
@@ -231,7 +231,7 @@ class Product(_Combination):
     """Π k̃ᵢ(x, x')."""
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        return reduce(mul, (part.paired(own, inputs, others) for part, own in self._own(hyperparameters)))
+        return reduce(mul, (part.paired(own, inputs, others) for part, own in self.own(hyperparameters)))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ProductAt:
         return ProductAt(self._parts_at(hyperparameters, inducing_points))

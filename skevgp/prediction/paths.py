@@ -38,8 +38,7 @@ class Paths:
 
     def __init__(self, predictor: Predictor, n: int, n_steps: int, rng: np.random.RandomState):
         self.predictor = predictor
-        p = predictor.offset.shape[1] if predictor.shared else 0
-        common = rng.standard_normal((n, 1, p))
+        common = common_normals(predictor, n, rng)
         self._groups = [_GroupPaths(group, n, n_steps, common, rng) for group in predictor.groups]
 
     def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
@@ -65,17 +64,14 @@ class _GroupPaths:
     group : PredictorGroup
     n, n_steps : int
     common : ndarray of shape (n, 1, p)
-        The normals of weights that all outputs share; p is 0 if they share none.
+        `common_normals`.
     rng : RandomState
     """
 
     def __init__(self, group: PredictorGroup, n: int, n_steps: int, common: np.ndarray, rng: np.random.RandomState):
-        o, k, _ = group.root.shape
-        normals = rng.standard_normal((n, o, k))
-        normals[:, :, k - common.shape[2] :] = common if common.shape[2] else normals[:, :, k:]
+        o = len(group.signal)
         self.group, self._hyperparameters = group, np.log(group.hyperparameters)
-        # Of each function, what P = [V; Hᵀ] is multiplied by.
-        self._weights = group.mean + np.einsum("nok,okj->noj", normals, group.root, optimize=True)
+        self._weights = drawn_weights(group, n, common, rng)
         self._innovations = rng.standard_normal((n, n_steps, o))
         self._V = np.empty((n, n_steps, len(group.points)))
         self._inputs = np.empty((n, n_steps, group.points.shape[1]))
@@ -102,6 +98,20 @@ class _GroupPaths:
         self._V[:, t], self._inputs[:, t] = V, rows.inputs
         self._t = t + 1
         return values + np.sqrt(group.signal) * residual
+
+
+def common_normals(predictor: Predictor, n: int, rng: np.random.RandomState) -> np.ndarray:
+    """The normals (n, 1, p) of weights that all outputs share; p is 0 if they share none."""
+    return rng.standard_normal((n, 1, predictor.offset.shape[1] if predictor.shared else 0))
+
+
+def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
+    """What P = [V; Hᵀ] is multiplied by in n functions drawn from q, (n, o, m + p)."""
+    o, k, _ = group.root.shape
+    normals, p = rng.standard_normal((n, o, k)), common.shape[2]
+    if p:
+        normals[:, :, k - p :] = common
+    return group.mean + np.einsum("nok,okj->noj", normals, group.root, optimize=True)
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
