@@ -80,6 +80,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Differentiable):
     coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_, coef_names_ = (_OfWeights() for _ in range(6))
 
     _fitted: Fitted
+    _predictor: Predictor
 
     def predict(
         self,
@@ -220,23 +221,32 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Differentiable):
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
 
+    def _set_posterior(self) -> None:
+        """What is known of weights, if there are any, and noise."""
+        self._predictor = self._fitted.predictor()
+        if self.feature_map_ is not None:
+            mean, covariance = self._predictor.coefficients()
+            first = self._of_weights
+            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+        self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
+
+    @property
+    def _of_weights(self) -> int | slice:
+        """Which rows of arrays (n_outputs, ...) of weights attributes hold."""
+        return 0 if self._single_output or self._predictor.shared else slice(None)
+
     def _set_common_attributes(self) -> None:
-        """What is known of weights, if there are any, noise and kernel."""
-        fitted, prior = self._fitted, self._fitted.units.prior
-        self._predictor: Predictor = fitted.predictor()
-        first = 0 if self._single_output else slice(None)
+        """The same, and what stays as it is when there are more rows: the prior of weights, and the kernel."""
         for name, attribute in vars(ExplicitGaussianProcess).items():
             if isinstance(attribute, _OfWeights):
                 self.__dict__.pop(name, None)
+        self._set_posterior()
+        fitted, prior = self._fitted, self._fitted.units.prior
         if self.feature_map_ is not None:
-            mean, covariance = self._predictor.coefficients()
-            first = 0 if prior.shared else first
-            self.coef_, self.coef_cov_ = mean[first], covariance[first]
-            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-            columns = getattr(self, "feature_names_in_", None)
+            columns, first = getattr(self, "feature_names_in_", None), self._of_weights
             self.coef_names_ = coef_names(self.feature_map_, columns, self.coef_.shape[-1])
             self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
-        self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
         kernels = [
             self._spec.to_sklearn(
                 group.hyperparameters,

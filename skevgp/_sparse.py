@@ -97,7 +97,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
             self._fitted = self._fitted.updated(source, self.forgetting_factor)
             self._training_data = None
-            self._set_attributes()
+            self._set_posterior()
             self._set_weights(chosen)
         return self
 
@@ -162,6 +162,23 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
     def __getstate__(self) -> dict[str, Any]:
         return {name: value for name, value in super().__getstate__().items() if name != "_training_data"}
 
+    @property
+    def lower_bound_(self) -> float:
+        """On the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
+        return self._known("lower_bound")
+
+    @property
+    def upper_bound_(self) -> float:
+        """What the log marginal likelihood cannot exceed; likewise."""
+        return self._known("upper_bound")
+
+    def _known(self, name: str) -> float:
+        # After partial_fit they are found when somebody asks.
+        if not hasattr(self, "_fitted"):
+            raise AttributeError(f"{type(self).__name__} has {name}_ only after fit.")
+        with single_threaded_libraries():
+            return float(getattr(self._fitted, name))
+
     def _set_weights(self, chosen: Any) -> None:
         """How much each of the user's rows is doubted."""
         scales = self._fitted.row_scales
@@ -181,7 +198,6 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if len(self._predictor.groups) == 1:
             self.inducing_points_ = points[0]
         self.sharing_ = fitted.sharing
-        self.lower_bound_, self.upper_bound_ = fitted.lower_bound, fitted.upper_bound
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter
         self.n_parameters_ = fitted.n_parameters

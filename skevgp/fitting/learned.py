@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cached_property, partial
 from typing import Protocol
 
 import numpy as np
@@ -13,7 +13,7 @@ from ..inference.bounds import bounds_at_optimum
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
-from ..inference.statistics import SufficientStatistics
+from ..inference.statistics import SufficientStatistics, Whitening
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from .advice import far_from_prior, signal_gone
@@ -47,8 +47,6 @@ class Learned:
         Of the model's parameters, in internal units.
     statistics : list of SufficientStatistics
         At ``values``, one for each set of inducing points.
-    bound, upper_bound : float
-        On the log marginal likelihood, in nats, of the residuals in internal units.
     predictor : Predictor
         In internal units.
     loss_curve : list of float
@@ -59,19 +57,33 @@ class Learned:
         Whether rows near each other were found to be alike.
     doubts : Doubts, optional
         Of the rows, if the noise has heavy tails.
+    known_bound, known_upper_bound : float, optional
+        `bound` and `upper_bound`, where they are known better than from the statistics.
     """
 
     model: SparseModel
     table: ParameterTable
     values: Values
     statistics: list[SufficientStatistics]
-    bound: float
-    upper_bound: float
     predictor: Predictor
     loss_curve: list[float]
     message: str
     dependent: bool = False
     doubts: Doubts | None = None
+    known_bound: float | None = None
+    known_upper_bound: float | None = None
+
+    @cached_property
+    def bound(self) -> float:
+        """On the log marginal likelihood, in nats, of the residuals in internal units."""
+        return self.model.bound(self.values, self.statistics) if self.known_bound is None else self.known_bound
+
+    @cached_property
+    def upper_bound(self) -> float:
+        """What it cannot exceed."""
+        if self.known_upper_bound is not None:
+            return self.known_upper_bound
+        return self.model.upper_bound(self.values, self.statistics)
 
     @classmethod
     def of(cls, task: SparseTask, fit: Fit, doubts: Doubts | None = None) -> Learned:
@@ -87,22 +99,22 @@ class Learned:
         if found is not None:
             values = values | {"signal": found.signal, "noise": found.noise}
             advice.append(signal_gone(found.gone, len(found.noise)))
-        bound, predictor = model.at_optimum(values, statistics)
+        bound, predictor = None, None
         if found is None:
             # Summed row by row, which keeps its digits where the noise is low.
-            bound = fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else bound
-            predictor = predictor if fit.predictor is None else fit.predictor
+            bound = fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else None
+            predictor = fit.predictor
         learned = cls(
             model,
             task.table,
             values,
             statistics,
-            bound,
-            model.upper_bound(values, statistics, task.blocks),
-            predictor,
+            model.at_optimum(values, statistics) if predictor is None else predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
             found is not None and found.dependent,
+            known_bound=bound,
+            known_upper_bound=model.upper_bound(values, statistics, task.blocks),
         )
         return learned if doubts is None else doubts.told(replace(learned, doubts=doubts))
 
@@ -156,12 +168,12 @@ class Learned:
         n_inducing = self.values["inducing_points"].shape[1]
         # Whatever its points were of the rows before.
         model = replace(self.model, complete=False)
-        new = model.statistics(self.values, model.blocks(rows, n_inducing))
+        whitenings = [group.whitening for group in self.predictor.groups]
+        new = model.statistics(self.values, model.blocks(rows, n_inducing), whitenings)
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        return replace(self, model=model, statistics=statistics)._at_optimum()
+        return replace(self, model=model, statistics=statistics)._at_optimum(whitenings)
 
-    def _at_optimum(self) -> Learned:
-        bound, predictor = self.model.at_optimum(self.values, self.statistics)
-        upper_bound = self.model.upper_bound(self.values, self.statistics)
-        learned = replace(self, bound=bound, upper_bound=upper_bound, predictor=predictor)
+    def _at_optimum(self, whitenings: list[Whitening]) -> Learned:
+        predictor = self.model.at_optimum(self.values, self.statistics, whitenings)
+        learned = replace(self, predictor=predictor, known_bound=None, known_upper_bound=None)
         return learned if self.doubts is None else self.doubts.told(learned)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +11,15 @@ from .._linalg import JITTER, Jitter
 from ..optimizers.parameters import Parameter, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
-from .bounds import Group, PosteriorFamily, bounds_at_optimum, diagonal_root, log_variances, upper_bound
+from .bounds import (
+    Group,
+    PosteriorFamily,
+    bounds_at_optimum,
+    diagonal_root,
+    log_variances,
+    optimal_posteriors,
+    upper_bound,
+)
 from .posterior import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect
 
@@ -72,14 +80,21 @@ class SparseModel:
         for index, points in enumerate(values["inducing_points"]):
             yield Whitening.of(*self.kernel_of(values, index), points, self.jitter)
 
-    def groups_on(self, values: Values, blocks: Blocks) -> Iterator[Group]:
+    def groups_on(
+        self, values: Values, blocks: Blocks, whitenings: Iterable[Whitening] | None = None
+    ) -> Iterator[Group]:
         """Each group with the statistics of some rows: a pass over them for each, when it is asked for."""
-        for outputs, whitening in zip(self.groups, self.whitenings(values), strict=True):
+        for outputs, whitening in zip(self.groups, whitenings or self.whitenings(values), strict=True):
             yield self.group(values, outputs, whitening, collect(blocks, whitening, outputs))
 
-    def groups_of(self, values: Values, statistics: Sequence[SufficientStatistics]) -> Iterator[Group]:
+    def groups_of(
+        self,
+        values: Values,
+        statistics: Sequence[SufficientStatistics],
+        whitenings: Iterable[Whitening] | None = None,
+    ) -> Iterator[Group]:
         """Each group with its statistics, which were collected for the same hyperparameters and inducing points."""
-        for outputs, whitening, own in zip(self.groups, self.whitenings(values), statistics, strict=True):
+        for outputs, whitening, own in zip(self.groups, whitenings or self.whitenings(values), statistics, strict=True):
             yield self.group(values, outputs, whitening, own)
 
     def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
@@ -89,28 +104,40 @@ class SparseModel:
             statistics = replace(statistics, unexplained=0.0)
         return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs), self.complete)
 
-    def statistics(self, values: Values, blocks: Blocks) -> list[SufficientStatistics]:
+    def statistics(
+        self, values: Values, blocks: Blocks, whitenings: Iterable[Whitening] | None = None
+    ) -> list[SufficientStatistics]:
         """The statistics of each group."""
-        return [group.statistics for group in self.groups_on(values, blocks)]
+        return [group.statistics for group in self.groups_on(values, blocks, whitenings)]
 
-    def at_optimum(self, values: Values, statistics: Sequence[SufficientStatistics]) -> tuple[float, Predictor]:
-        """The bound and the predictor with q at its optimum.
+    def bound(self, values: Values, statistics: Sequence[SufficientStatistics]) -> float:
+        """The bound with q at its optimum."""
+        bounds = bounds_at_optimum(list(self.groups_of(values, statistics)), self.family)
+        return sum(bound.value(bound.residuals()) for bound in bounds)
+
+    def at_optimum(
+        self,
+        values: Values,
+        statistics: Sequence[SufficientStatistics],
+        whitenings: Iterable[Whitening] | None = None,
+    ) -> Predictor:
+        """The predictor with q at its optimum.
 
         Parameters
         ----------
         values : dict
         statistics : sequence of SufficientStatistics
             What `statistics` returns for these values.
+        whitenings : iterable of Whitening, default=None
+            What `whitenings` yields for these values, if it is there already.
         """
-        total, whitenings, mean, root = 0.0, [], [], []
-        for bound in bounds_at_optimum(list(self.groups_of(values, statistics)), self.family):
-            total += bound.value(bound.residuals())
-            whitenings.append(bound.group.whitening)
-            L_inv = bound.group.whitening.L_inv
-            for q in bound.posteriors:
+        groups, mean, root = list(self.groups_of(values, statistics, whitenings)), [], []
+        for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
+            L_inv = group.whitening.L_inv
+            for q in posteriors:
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
-        return total, self.predictor(values, whitenings, mean, root)
+        return self.predictor(values, [group.whitening for group in groups], mean, root)
 
     def upper_bound(
         self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None

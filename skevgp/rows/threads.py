@@ -6,7 +6,9 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import lru_cache
 from itertools import islice
+from sys import modules
 from threading import Lock
 from typing import Any, TypeVar
 
@@ -46,7 +48,13 @@ def single_threaded_libraries() -> Iterator[None]:
 
 def _one_thread(user_api: str) -> Any:
     """A limit on these libraries only: one of `threadpool_limits`, when lifted, also sets the others back."""
-    return ThreadpoolController().select(user_api=user_api).limit(limits=1)
+    return _controller(len(modules)).select(user_api=user_api).limit(limits=1)
+
+
+@lru_cache(maxsize=1)
+def _controller(n_modules: int) -> ThreadpoolController:
+    """What controls the libraries that are loaded: to look for them takes milliseconds, and imports load more."""
+    return ThreadpoolController()
 
 
 def _take_control() -> None:

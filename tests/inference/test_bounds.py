@@ -173,7 +173,7 @@ def bounds_of(model, rows, values, from_rows=True):
     """The lower and the upper bound."""
     blocks = rows.blocks(model.kernel, 17)
     statistics = model.statistics(values, blocks)
-    return model.at_optimum(values, statistics)[0], model.upper_bound(values, statistics, blocks if from_rows else None)
+    return model.bound(values, statistics), model.upper_bound(values, statistics, blocks if from_rows else None)
 
 
 @pytest.mark.parametrize("from_rows", [True, False])

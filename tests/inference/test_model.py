@@ -71,7 +71,8 @@ def test_known_statistics_cost_no_pass(shared):
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_the_bound_at_the_optimum_is_that_of_the_data(family, shared):
     model, rows, values, blocks = started(family, shared)
-    bound, predictor = model.at_optimum(values, model.statistics(values, blocks))
+    statistics = model.statistics(values, blocks)
+    bound, predictor = model.bound(values, statistics), model.at_optimum(values, statistics)
     expected = collapsed_bound(
         values["hyperparameters"],
         values["signal"],
@@ -93,7 +94,7 @@ def test_at_the_optimum_both_families_have_one_mean_and_the_diagonal_one_the_inv
     roots = {}
     for family in ("full", "diagonal"):
         model, _, values, blocks = started(family, shared)
-        _, predictor = model.at_optimum(values, model.statistics(values, blocks))
+        predictor = model.at_optimum(values, model.statistics(values, blocks))
         group = next(iter(predictor.groups))
         # In the coordinates (f_m, β): f_m = s L v, and what the root multiplies is [s V; c H].
         to_values = np.eye(9)
@@ -116,10 +117,10 @@ def test_sums_of_rows_that_came_later_are_those_of_all():
         type(rows)(rows.inputs[own], rows.features[own], rows.residuals[own]) for own in (slice(25), slice(25, 60))
     ]
     first, second = (model.statistics(values, part.blocks(model.kernel, 20))[0] for part in parts)
-    found = model.at_optimum(values, [first + second])
-    expected = model.at_optimum(values, model.statistics(values, blocks))
-    assert found[0] == pytest.approx(expected[0], rel=1e-9)
-    assert relative_error(found[1].groups[0].mean, expected[1].groups[0].mean) < 1e-9
+    found, expected = [first + second], model.statistics(values, blocks)
+    assert model.bound(values, found) == pytest.approx(model.bound(values, expected), rel=1e-9)
+    means = [model.at_optimum(values, statistics).groups[0].mean for statistics in (found, expected)]
+    assert relative_error(*means) < 1e-9
 
 
 @pytest.mark.parametrize("family", ["full", "diagonal"])

@@ -60,7 +60,7 @@ class RowDoubts:
     def told(self, learned: Learned) -> Learned:
         """What is said of the noise is that of rows that are no outliers; no upper bound is known."""
         predictor = replace(learned.predictor, noise=learned.values["noise"] * self.noise_factor)
-        return replace(learned, upper_bound=np.inf, predictor=predictor)
+        return replace(learned, known_upper_bound=np.inf, predictor=predictor)
 
     def updated(self, learned: Learned, rows: Rows) -> Learned:
         """Fold new rows in, which are doubted first for what is predicted of them, and then by turns with q.
@@ -170,7 +170,7 @@ def _tolerance(task: SparseTask, fit: Fit) -> float:
 
 def predictor_at(task: SparseTask, values: Values) -> Predictor:
     """With q at its optimum; of residuals."""
-    return of_residuals(task.model.at_optimum(values, task.model.statistics(values, task.blocks))[1])
+    return of_residuals(task.model.at_optimum(values, task.model.statistics(values, task.blocks)))
 
 
 def of_residuals(predictor: Predictor) -> Predictor:
