@@ -14,7 +14,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ._coef_prior import coef_names
-from ._derivatives import Differentiable
+from ._control import ForControl
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
@@ -57,7 +57,7 @@ class _OfWeights:
         )
 
 
-class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Differentiable):
+class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, ForControl):
     """A Gaussian process with explicit features, however it is fitted."""
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {

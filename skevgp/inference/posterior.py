@@ -266,6 +266,18 @@ class Predictor:
                 covariance[:, :, output] = signal * unexplained + deviation.T @ deviation
         return mean, covariance
 
+    def novelty(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """Var[f(x) | data] / Var[f(x)] of each output, (n, o)."""
+        parts = []
+        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
+            V = own.P[: len(group.points)]
+            left = np.outer(group.signal, own.unexplained)
+            left += np.square(group.root[:, :, : len(V)] @ V).sum(axis=1)
+            prior = np.outer(group.signal, group.whitening.covariance.diagonal(own.prepared) * np.ones(len(features)))
+            # Of a linear kernel at the origin there is nothing to know.
+            parts.append(np.minimum(left / np.where(prior > 0.0, prior, np.inf), 1.0))
+        return self.in_order(parts).T
+
     def common(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """What outputs with the same weights have in common: M (k, n, o) with the covariance M_iᵀ M_j of two of them.
 

@@ -71,6 +71,24 @@ def test_the_gradient_of_the_exact_model_is_the_formula(data):
         np.testing.assert_allclose(own_cov, prior - slopes.T @ np.linalg.solve(K, slopes), rtol=1e-6, atol=1e-9)
 
 
+def test_novelty_is_the_share_of_the_variance_of_f_that_is_left(model, data):
+    novelty = model.novelty(np.vstack([data[2], 3.0 * data[2], data[0]]))
+    assert novelty.shape == (18 + len(data[0]), N_OUTPUTS)
+    assert (novelty >= 0.0).all()
+    assert (novelty <= 1.0).all()
+    assert np.median(novelty[18:]) < np.median(novelty[9:18])
+
+
+def test_novelty_without_features_is_variance_over_prior_variance(data):
+    X, Y, X_new = data
+    model = EVGPRegressor(n_inducing=15, **QUICK).fit(X, Y)
+    std = model.predict(X_new, return_std=True, include_noise=False)[1]
+    prior = np.column_stack([kernel.diag(X_new) for kernel in model.kernel_])
+    np.testing.assert_allclose(model.novelty(X_new), std**2 / prior, rtol=1e-9)
+    np.testing.assert_allclose(model.novelty(1e6 * X_new), 1.0, rtol=1e-9)
+    assert EVGPRegressor(n_inducing=5, **QUICK).fit(X, Y[:, 0]).novelty(X_new).shape == (9,)
+
+
 def test_one_output_has_no_axis(data):
     X, Y, X_new = data
     for y in (Y[:, 0], Y[:, :1]):

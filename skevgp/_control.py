@@ -1,4 +1,4 @@
-"""What controllers ask of a Gaussian process beside its predictions: their derivatives."""
+"""What controllers ask of a Gaussian process: derivatives, a fast predictor, functions drawn from it, what is new."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ._intake import Intake
+from ._shapes import like_y
 from ._validation import check_integer, is_plain
 from .inference.posterior import Predictor
 from .prediction.compiled import CompiledPredictor
@@ -25,8 +26,8 @@ from .rows.dask import is_dask
 _NUMBERS = 2**20
 
 
-class Differentiable(Intake):
-    """An estimator whose predictions can be differentiated in the columns of X."""
+class ForControl(Intake):
+    """An estimator that control loops can use."""
 
     feature_map_: Any
     kernel_map_: Any
@@ -149,6 +150,41 @@ class Differentiable(Intake):
         cov = np.concatenate(covariances)
         cov = cov[:, 0] if cov.shape[1] == 1 else cov
         return gradient, cov if return_cov else np.sqrt(np.einsum("...ii->...i", cov))
+
+    def novelty(self, X: ArrayLike) -> np.ndarray:
+        """Say how far rows are outside of the data, as the kernel sees them.
+
+        It is the share of the prior variance of f that is left, Var[f(x) | data] / Var[f(x)]: near 0 where f is known,
+        and 1 where the data say nothing of it: there only the features speak. It has no unit, so that one threshold
+        serves all outputs.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Numbers.
+
+        Returns
+        -------
+        novelty : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            From 0 to 1.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If X does not fit the training data, is not finite, or is a Dask array.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import EVGPRegressor
+        >>> X = np.linspace(0.0, 6.0, 60)[:, np.newaxis]
+        >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, np.sin(X[:, 0]))
+        >>> model.novelty([[3.0], [60.0]]).round(3)
+        array([0., 1.])
+        """
+        functions = self._functions()
+        parts = [self._predictor.novelty(*functions.mapped(rows)) for rows in self._in_pieces(X)]
+        return like_y(np.concatenate(parts))
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
         """Make a predictor for control loops: of few rows, several times as fast, without validation.
