@@ -13,7 +13,7 @@ from .conftest import BENCHMARKS
 ROOT = BENCHMARKS.parent
 SCRIPTS = [path for path in sorted(BENCHMARKS.rglob("*.py")) if "__main__" in path.read_text()]
 # They have no options, and run in the tests of the scripts that start them.
-WORKERS = [BENCHMARKS / name for name in ("peers/models.py", "speed/checkout_job.py")]
+WORKERS = [BENCHMARKS / name for name in ("peers/models.py", "speed/checkout_job.py", "speed/latency_job.py")]
 PAGES = [ROOT / "README.md", ROOT / "REPRODUCTION.md", *BENCHMARKS.rglob("*.txt"), *SCRIPTS]
 
 
