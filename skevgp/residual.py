@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from numbers import Integral
+from pathlib import Path
 from typing import Any, ClassVar, Self
 
 import numpy as np
@@ -17,6 +19,8 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._sklearn import HasMethods, fit_context, safe_indexing
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
+from .export.c_code import write_c
+from .export.casadi import with_base
 
 
 def _regressor_has(method: str) -> Callable[[Any], bool]:
@@ -182,6 +186,81 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         X = self._validated(X)
         samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
         return samples + _columns(X, self.base_).reshape(*samples.shape[:-1], 1)
+
+    @available_if(_regressor_has("to_casadi"))
+    def to_casadi(self, name: str = "evgp", *, include_noise: bool = True, parametric: bool = False) -> Any:
+        """Write mean and variance as a CasADi function, if the regressor can.
+
+        Parameters
+        ----------
+        name : str, default="evgp"
+            Of the function.
+        include_noise, parametric : bool
+            As of `EVGPRegressor.to_casadi`.
+
+        Returns
+        -------
+        function : casadi.Function
+            x of shape (n_features,) -> (mean, variance), each of shape (n_outputs,), base columns included.
+
+        Raises
+        ------
+        ImportError, ValueError, TypeError, sklearn.exceptions.NotFittedError
+            As of `EVGPRegressor.to_casadi`.
+        """
+        check_is_fitted(self)
+        function = self.regressor_.to_casadi(name, include_noise=include_noise, parametric=parametric)
+        return with_base(function, self.base_)
+
+    @available_if(_regressor_has("to_casadi_parameters"))
+    def to_casadi_parameters(self, out: np.ndarray | None = None) -> np.ndarray:
+        """Give what the function of ``to_casadi(parametric=True)`` takes beside x, as the regressor now is.
+
+        Parameters
+        ----------
+        out : ndarray of shape (n_parameters,), default=None
+            Where to put it; None makes a new array.
+
+        Returns
+        -------
+        parameters : ndarray of shape (n_parameters,)
+            As of `EVGPRegressor.to_casadi_parameters`.
+        """
+        check_is_fitted(self)
+        return self.regressor_.to_casadi_parameters(out)
+
+    @available_if(_regressor_has("to_c"))
+    def to_c(
+        self,
+        path: str | os.PathLike[str],
+        name: str = "evgp",
+        *,
+        jacobian: bool = True,
+        include_noise: bool = True,
+    ) -> tuple[Path, Path]:
+        """Write mean and variance, and their Jacobians, as C, base columns included, if the regressor can.
+
+        Parameters
+        ----------
+        path : str or path-like
+            A folder, or the file that ends in ``.c``; the header goes beside it.
+        name : str, default="evgp"
+            What the names of the C functions begin with, and of the files in a folder.
+        jacobian, include_noise : bool, default=True
+            As of `EVGPRegressor.to_c`.
+
+        Returns
+        -------
+        source, header : Path
+            The files.
+
+        Raises
+        ------
+        ImportError, ValueError, TypeError, sklearn.exceptions.NotFittedError
+            As of `EVGPRegressor.to_c`.
+        """
+        function = self.to_casadi(name, include_noise=include_noise)
+        return write_c(function, path, jacobian, getattr(self, "feature_names_in_", None), include_noise)
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.
