@@ -62,11 +62,12 @@ def _common_eigenvectors(roots: list[np.ndarray], group: PredictorGroup) -> tupl
     rounding = np.finfo(float).eps * np.einsum("ji,ji->i", np.abs(V), np.abs(L_inv) @ np.abs(L @ V))
     allowed = _BESIDE * np.outer(group.signal, rounding)
     variances = np.array([np.einsum("ij,ij->j", own @ V, own @ V) for own in roots])
-    best, least = (np.eye(len(L)), np.full((len(roots), len(L)), np.nan)), np.inf
+    best, least = (np.eye(len(L)), np.full((len(roots), len(L)), np.nan)), (len(roots), np.inf)
     for covariance in covariances:
         _, U = np.linalg.eigh(covariance)
         squares = np.einsum("oij,ij->oj", covariances @ U, U).clip(0.0)
         excess = (np.abs(variances - squares @ (U.T @ V) ** 2) / allowed).max(axis=1)
-        if (worst := np.sum(excess > 1.0) + excess.max()) < least:
-            best, least = (U, np.where(excess[:, np.newaxis] > 1.0, np.nan, squares)), worst
+        kept = excess <= 1.0
+        if (worst := (int(np.sum(~kept)), float(excess.max()))) < least:
+            best, least = (U, np.where(kept[:, np.newaxis], squares, np.nan)), worst
     return best

@@ -82,10 +82,11 @@ class Exportable:
         Returns
         -------
         parameters : ndarray of shape (n_parameters,)
-            For each group of outputs that share inducing points, of which there are m: the weights of the mean, of
-            shape (outputs of the group, m + n_h), then the roots of the covariance, (outputs of the group, m + n_h,
-            m + n_h). After all groups what is added to the weights of features, (n_outputs, n_h), what is added to the
-            mean, (n_outputs,), and the noise variances, (n_outputs,). Rows follow each other.
+            For each group of outputs that share inducing points, of which there are m, in the order of their first
+            outputs: the weights of the mean, of shape (outputs of the group, m + n_h), then the roots of the
+            covariance, (outputs of the group, m + n_h, m + n_h). After all groups what is added to the weights of
+            features, (n_outputs, n_h), what is added to the mean, (n_outputs,), and the noise variances, (n_outputs,).
+            Rows follow each other. (`partial_fit` changes weights and roots.)
 
         Raises
         ------

@@ -108,7 +108,7 @@ def _is_dropped(part: Any) -> bool:
 def _times(row: Mapped, weight: float) -> Mapped:
     if weight == 1.0:
         return row
-    return [weight * own for own in row] if isinstance(row, list) else weight * row
+    return [own * float(weight) for own in row] if isinstance(row, list) else row * float(weight)
 
 
 def _side_by_side(parts: list[Mapped]) -> Mapped:
@@ -206,7 +206,6 @@ _UFUNCS: dict[Any, str] = {
     np.log: "log",
     np.log1p: "log1p",
     np.sqrt: "sqrt",
-    np.square: "sq",
     np.abs: "fabs",
 }
 
