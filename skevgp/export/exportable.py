@@ -86,7 +86,7 @@ class Exportable:
             outputs: the weights of the mean, of shape (outputs of the group, m + n_h), then the roots of the
             covariance, (outputs of the group, m + n_h, m + n_h). After all groups what is added to the weights of
             features, (n_outputs, n_h), what is added to the mean, (n_outputs,), and the noise variances, (n_outputs,).
-            Rows follow each other. (`partial_fit` changes weights and roots.)
+            Rows follow each other. Of these `partial_fit` changes weights and roots.
 
         Raises
         ------
