@@ -218,7 +218,7 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
     return [
         "# A prediction by CasADi and in C",
         f"The {SYSTEM}'s four states, one group of outputs, the angle encoded; noise of {100 * NOISE:g} % of each. f: "
-        "mean and variance. J: the mean's Jacobian. all: mean, variance and the Jacobians of both. Processor time of one "
+        "mean and variance. J: the mean's Jacobian. all: mean, variance and the Jacobians of both. Processor time of a "
         "row, in µs: the least of several rounds, through CasADi's buffers and, of C (gcc -O2), ctypes.",
         tables[0],
         "What is done once, new parameters of a model that has learned, and the largest difference from `predict` on "
