@@ -19,6 +19,7 @@ from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
 from ._validation import check_integer, is_plain
+from .export.exportable import Exportable
 from .fitting.units import Units
 from .inference.posterior import Predictor
 from .rows.dask import as_rows, is_dask, predict_chunks
@@ -57,7 +58,7 @@ class _OfWeights:
         )
 
 
-class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, ForControl):
+class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForControl):
     """A Gaussian process with explicit features, however it is fitted."""
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {

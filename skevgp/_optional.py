@@ -10,6 +10,7 @@ _PACKAGES = {
     "pinocchio": ("pin", "physics"),
     "matplotlib": ("matplotlib", "plot"),
     "dask": ("'dask[array,distributed]'", "dask"),
+    "casadi": ("casadi", "casadi"),
 }
 
 

@@ -2,35 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import replace
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn import get_config
-from sklearn.base import BaseEstimator, MetaEstimatorMixin, RegressorMixin, clone
+from sklearn.base import MetaEstimatorMixin, RegressorMixin, clone
 from sklearn.utils import Bunch, Tags, get_tags
 from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, process_routing
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._sklearn import HasMethods, fit_context, safe_indexing
+from ._residual_control import ResidualForControl, columns_of, regressor_has
+from ._sklearn import HasMethods, fit_context
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
-from .prediction.compiled import CompiledPredictor
-from .prediction.functions import FunctionSamples
 
 
-def _regressor_has(method: str) -> Callable[[Any], bool]:
-    def has(self: Any) -> bool:
-        getattr(self.regressor_ if hasattr(self, "regressor_") else self.regressor, method)
-        return True
-
-    return has
-
-
-class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
+class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
     """Fit a regressor to what y adds to some columns of X, and predict the sum.
 
     For x = (state, input) and y the next state, the regressor learns the change of state: RES-VGP and RES-DBNN of the
@@ -110,7 +99,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         with unchanged_if_it_fails(self):
             return self._fit("fit", X, y, params)
 
-    @available_if(_regressor_has("partial_fit"))
+    @available_if(regressor_has("partial_fit"))
     @fit_context(prefer_skip_nested_validation=False)
     def partial_fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
         """Go on with some rows, if the regressor can.
@@ -158,10 +147,10 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         X = self._validated(X)
         predicted = self.regressor_.predict(X, **params)
         mean, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
-        mean = mean + _columns(X, self.base_).reshape(mean.shape)
+        mean = mean + columns_of(X, self.base_).reshape(mean.shape)
         return (mean, *spread) if spread else mean
 
-    @available_if(_regressor_has("sample_y"))
+    @available_if(regressor_has("sample_y"))
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = 0, **params: Any) -> np.ndarray:
         """Draw functions from the posterior at some rows, if the regressor can.
 
@@ -184,111 +173,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         X = self._validated(X)
         samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
-        return samples + _columns(X, self.base_).reshape(*samples.shape[:-1], 1)
-
-    @available_if(_regressor_has("value_and_jacobian"))
-    def value_and_jacobian(self, X: ArrayLike, return_std: bool = False, **params: Any) -> Any:
-        """Predict y, and how that changes with the columns of X, if the regressor can.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Numbers.
-        return_std : bool, default=False
-            Whether to return the standard deviation and its derivatives too.
-        **params : dict
-            For the regressor's ``value_and_jacobian``.
-
-        Returns
-        -------
-        mean, jacobian : ndarray
-            As of `EVGPRegressor.value_and_jacobian`: base columns add 1 to the derivatives in them.
-        std, std_jacobian : ndarray
-            If ``return_std``.
-        """
-        check_is_fitted(self)
-        X = self._validated(X)
-        mean, jacobian, *spread = self.regressor_.value_and_jacobian(X, return_std=return_std, **params)
-        return mean + _columns(X, self.base_).reshape(mean.shape), self._with_base(jacobian), *spread
-
-    @available_if(_regressor_has("jacobian"))
-    def jacobian(self, X: ArrayLike) -> np.ndarray:
-        """Differentiate the mean in the columns of X, if the regressor can.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Numbers.
-
-        Returns
-        -------
-        jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            ∂mean/∂x: base columns add 1 to the derivatives in them.
-        """
-        check_is_fitted(self)
-        return self._with_base(self.regressor_.jacobian(self._validated(X)))
-
-    @available_if(_regressor_has("predict_gradient"))
-    def predict_gradient(self, X: ArrayLike, **params: Any) -> Any:
-        """Predict the gradient of the noise-free function, with its uncertainty, if the regressor can.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, n_features)
-            Numbers.
-        **params : dict
-            For the regressor's ``predict_gradient``, such as ``return_std`` and ``return_cov``.
-
-        Returns
-        -------
-        gradient : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            Its mean: that of `jacobian`.
-        std or cov : ndarray
-            If the regressor was asked for them: as it returns them.
-        """
-        check_is_fitted(self)
-        predicted = self.regressor_.predict_gradient(self._validated(X), **params)
-        gradient, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
-        gradient = self._with_base(gradient)
-        return (gradient, *spread) if spread else gradient
-
-    @available_if(_regressor_has("compile"))
-    def compile(self, include_noise: bool = True) -> CompiledPredictor:
-        """Make a predictor for control loops, if the regressor can.
-
-        Parameters
-        ----------
-        include_noise : bool, default=True
-            Whether its standard deviations are of y, with the learned noise, or of the noise-free function.
-
-        Returns
-        -------
-        compiled : CompiledPredictor
-            As of `EVGPRegressor.compile`, of the sum.
-        """
-        check_is_fitted(self)
-        return CompiledPredictor(self.regressor_, include_noise, self.base_)
-
-    @available_if(_regressor_has("sample_functions"))
-    def sample_functions(self, n: int = 1, random_state: Any = 0, **params: Any) -> FunctionSamples:
-        """Draw functions from the posterior, to be evaluated and differentiated anywhere, if the regressor can.
-
-        Parameters
-        ----------
-        n : int, default=1
-            How many functions.
-        random_state : int, RandomState instance or None, default=0
-            Draws them.
-        **params : dict
-            For the regressor's ``sample_functions``.
-
-        Returns
-        -------
-        functions : FunctionSamples
-            As of `EVGPRegressor.sample_functions`, of the sum.
-        """
-        check_is_fitted(self)
-        return self.regressor_.sample_functions(n, random_state, **params).with_base(self.base_)
+        return samples + columns_of(X, self.base_).reshape(*samples.shape[:-1], 1)
 
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.
@@ -332,21 +217,10 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         routed = {method: params}
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
-        residuals = y - _columns(X, base).reshape(y.shape)
+        residuals = y - columns_of(X, base).reshape(y.shape)
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
-
-    @available_if(_regressor_has("_functions"))
-    def _functions(self) -> Any:
-        """The posterior as functions to be drawn and followed."""
-        return replace(self.regressor_._functions(), base=self.base_)
-
-    def _with_base(self, jacobian: np.ndarray) -> np.ndarray:
-        """A Jacobian of changes as one of what they lead to."""
-        found, outputs = jacobian.copy(), np.arange(len(self.base_))
-        found.reshape(len(found), len(self.base_), -1)[:, outputs, self.base_] += 1.0
-        return found
 
     def _validated(self, X: Any) -> Any:
         """X as the regressor shall see it: a data frame stays one, and the regressor looks at what it holds."""
@@ -379,15 +253,3 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         if (base < -self.n_features_in_).any() or (base >= self.n_features_in_).any():
             raise ValueError(f"base={self.base!r} must be below the {self.n_features_in_} columns of X.")
         return base.astype(np.intp) % self.n_features_in_
-
-
-def _columns(X: Any, indices: np.ndarray) -> np.ndarray:
-    """Columns of an array or a data frame as numbers, (n, len(indices))."""
-    if not is_frame(X):
-        return X[:, indices]
-    columns = np.column_stack(
-        [as_floats(safe_indexing(X, index, axis=1), f"Column {index} of X, a base,") for index in indices.tolist()]
-    )
-    if not np.isfinite(columns).all():
-        raise ValueError("The base columns of X must be finite; they contain NaN or infinity.")
-    return columns

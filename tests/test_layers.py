@@ -229,13 +229,15 @@ def test_the_walk_of_fits_in_threads_is_no_longer():
 
 # What has tests of its own elsewhere, or nothing to test.
 TESTED_WITH = {
+    "export/exportable.py": "export/test_casadi.py",
+    "export/package.py": "export/test_casadi.py",
     "fitting/learned.py": "fitting/test_sparse.py",
     "kernels/traced.py": "kernels/test_function.py",
     "optimizers/minimum.py": "optimizers/test_lbfgs.py",
     "outputs/fit.py": "outputs/test_plan.py",
     "outputs/fitted.py": "test_sharing.py",
 }
-FLOORS = ("fitting", "inference", "kernels", "network", "optimizers", "outputs", "prediction", "rows")
+FLOORS = ("export", "fitting", "inference", "kernels", "network", "optimizers", "outputs", "prediction", "rows")
 
 
 @pytest.mark.parametrize(
