@@ -37,6 +37,14 @@ def test_sparse_gp(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
+def test_online(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_online.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    assert "forgetting factor" in capsys.readouterr().out
+    after = [np.median(error[names["change"] :]) for error in names["errors"].values()]
+    assert after[2] < after[0]  # what forgets follows
+    assert (tmp_path / "online.png").stat().st_size > 10_000
+
+
 @pytest.mark.parametrize("system", ["pendulum", "cartpole"])
 def test_learn_dynamics(monkeypatch, capsys, tmp_path, system):
     run(LEARN, "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
