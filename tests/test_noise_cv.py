@@ -198,6 +198,16 @@ def test_the_order_of_the_rows_does_not_matter():
     np.testing.assert_array_equal(m.noise_variance_, fitted().noise_variance_)
 
 
+@pytest.mark.parametrize("n_groups", [1, 2])
+def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch):
+    """Not as they are kept: up to 10,000 rows are sorted by the columns of X."""
+    settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
+    settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
+    m = fitted(**settings)
+    monkeypatch.setattr("skevgp.rows.chosen.ORDERED_ROWS", 0)
+    np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
+
+
 def test_rows_of_weight_0_have_groups_too():
     weights = np.ones(len(X))
     weights[::7] = 0.0
