@@ -334,8 +334,8 @@ class EVGPRegressor(SparseGaussianProcess):
         groups : array-like of shape (n_samples,), default=None
             Which rows belong together, by any labels: for rows of trajectories their numbers, such as
             ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
-            ones; of fewer than three groups, blocks of rows that follow each other inside a group. None: rows are
-            independent, and folds random.
+            ones; where half of the rows or more are of one group, blocks of rows that follow each other inside a group.
+            None: rows are independent, and folds random.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
             Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
             With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.

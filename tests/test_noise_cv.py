@@ -296,6 +296,14 @@ def test_others_are_not(fit):
         fit()
 
 
+def test_a_group_of_most_rows_is_not_predicted_from_the_few_others():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-3, 3, (400, 2))
+    y = np.sin(3 * X[:, 0]) * np.cos(2 * X[:, 1]) + 0.1 * rng.randn(400)
+    m = EVGPRegressor(n_inducing=80, max_iter=50, random_state=0).fit(X, y, groups=np.repeat([0, 1, 2], [380, 10, 10]))
+    assert 0.05 < np.sqrt(m.noise_variance_) < 0.2
+
+
 def test_what_groups_do_not_have_in_common_is_told():
     """Each has a level of its own: within it rows say a lot of each other, and nothing of other groups."""
     rng = np.random.RandomState(0)

@@ -10,9 +10,10 @@ import numpy as np
 FEWEST_ROWS = 50
 # A standard deviation needs no more than so many rows: of more, so many are drawn to be predicted.
 PREDICTED_ROWS = 2000
-# Fewer groups than this are no sample of groups: blocks of consecutive rows are left out, and of each block so much at
-# either end, which is like its neighbours, is not predicted.
-_FEWEST_GROUPS, _GAP = 3, 0.15
+# Groups of which one has this share of the rows, as one of two has, are no sample of groups, and too few rows are left
+# to predict it from. Blocks of consecutive rows are then left out; so much of each at either end, which is like its
+# neighbours, is not predicted.
+_LARGEST_SHARE, _GAP = 0.5, 0.15
 
 
 @dataclass(frozen=True)
@@ -84,7 +85,7 @@ def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState
         The rows as they follow each other, by which a group is cut where it must be.
     """
     names, own, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-    if len(names) < _FEWEST_GROUPS:
+    if sizes.max() >= _LARGEST_SHARE * len(groups):
         return folds_in_order(order[np.argsort(own[order], kind="stable")], n_folds, rng, gap=True)
     n_folds = min(n_folds, len(names))
     # The largest first, each to the fold that has least; which of equal ones comes first is left to chance.

@@ -77,6 +77,15 @@ def test_fewer_than_three_groups_are_left_out_in_blocks_of_which_the_inside_is_p
         np.testing.assert_array_equal(fold.predicted, np.sort(expected[7:-7]))
 
 
+@pytest.mark.parametrize(("sizes", "whole"), [((190, 5, 5), False), ((90, 60, 50), True)])
+def test_a_group_of_most_rows_is_cut(sizes, whole):
+    groups = np.repeat(np.arange(len(sizes)), sizes)
+    folds = of_groups(groups, 4)
+    assert_parts(folds, 200)
+    assert (max(len(fold.rows) for fold in folds) == max(sizes)) == whole
+    assert (sum(len(fold.predicted) for fold in folds) == 200) == whole
+
+
 def test_folds_in_order_are_of_rows_that_follow_each_other_in_it():
     order = np.arange(100)[::-1]
     folds = folds_in_order(order, 3, rng())
