@@ -109,7 +109,8 @@ class EVGPRegressor(SparseGaussianProcess):
         within their bounds. (The bound takes what inducing points cannot represent for noise: ``std`` of rows of a
         table is then too large. And it takes rows of a trajectory for independent: on new ones ``std`` is too small.)
         Up to 2,000 rows are predicted, and random folds are of 50,000 rows at most; it takes a few passes over these,
-        and memory for twice as many matrices (m, m) as folds. q is then at its optimum, after Adam too. It is left out
+        and memory for a few times as many matrices (m + n_h, m + n_h) as folds. With hundreds of features it takes
+        longer than 20 iterations. q is then at its optimum, after Adam too. It is left out
         with None, with ``max_iter=0``, of fewer than 50 rows, and when a fit is interrupted or out of time;
         `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
