@@ -205,6 +205,21 @@ def _map_prior(
     return mean, scale, correlation
 
 
+def says_shared(feature_map: Any) -> bool:
+    """Whether a fitted feature map says that all outputs have the same weights; a union if all of its parts do."""
+    if hasattr(feature_map, "share_coef"):
+        return bool(feature_map.share_coef)
+    if isinstance(feature_map, Pipeline):
+        parts = [step for _, step in feature_map.steps if step not in ("passthrough", None)][-1:]
+    elif isinstance(feature_map, FeatureUnion):
+        parts = [part for _, part in feature_map.transformer_list if part != "drop"]
+    elif isinstance(feature_map, ColumnTransformer):
+        parts = [part for _, part, _ in feature_map.transformers_ if part != "drop"]
+    else:
+        return False
+    return bool(parts) and all(map(says_shared, parts))
+
+
 def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a map's ``coef_prior`` says, checked."""
     (k, p), prior = shape, feature_map.coef_prior(n_outputs)

@@ -91,8 +91,9 @@ class EVGPRegressor(SparseGaussianProcess):
         Whether all outputs have the same weights, as torques of a robot's joints have one set of inertial parameters:
         then ``coef_mean``, ``coef_scale`` and what ``coef_prior`` returns have no axis of outputs, and outputs depend
         on each other (``predict(X, return_cov="joint")``, `sample_y`). ``"auto"``: if the fitted ``feature_map`` has
-        an attribute ``share_coef`` that is true. Each output keeps its own f, noise and kernel (by ``sharing``), and
-        all are fitted together; with ``solver="adam"`` or ``posterior="diagonal"`` it is an error, as are correlations.
+        an attribute ``share_coef`` that is true (a pipeline's last step, all parts of a union). Each output keeps its
+        own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
+        ``posterior="diagonal"`` it is an error, as are correlations.
     noise : {"gaussian", "student-t"}, default="gaussian"
         ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
         Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.compose import make_column_transformer
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
-from sklearn.pipeline import make_union
+from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -34,6 +35,9 @@ class Rows(TransformerMixin, BaseEstimator):
 
     def fit(self, X, y=None):
         return self
+
+    def __sklearn_is_fitted__(self):
+        return True
 
     def transform(self, X):
         phases = np.arange(O)[:, np.newaxis] * self.per_output
@@ -363,6 +367,25 @@ def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
     with_more = EGPRegressor(union, KERNEL, share_coef=True, **options).fit(X, Y)
     assert with_more.coef_.shape == (P + 2,)
     assert_allclose(with_more.coef_prior_scale_[:P], np.sqrt(np.diagonal(Sigma)))
+
+
+@pytest.mark.parametrize(
+    ("feature_map", "shared"),
+    [
+        (make_pipeline(FunctionTransformer(), Rows(share_coef=True)), True),
+        (make_pipeline(Rows(share_coef=True, per_output=False), FunctionTransformer()), False),
+        (make_union(Rows(share_coef=True), make_pipeline(Rows(width=2, share_coef=True))), True),
+        (make_union(Rows(share_coef=True), Rows(width=2)), False),
+        (make_column_transformer((Rows(share_coef=True, per_output=False), [0]), ("drop", [1])), True),
+        (make_column_transformer((Rows(share_coef=True, per_output=False), [0]), ("passthrough", [1])), False),
+        (FunctionTransformer(), False),
+    ],
+    ids=["last step", "first step", "union", "union of both", "columns", "columns of both", "none"],
+)
+def test_of_a_union_all_parts_must_say_that_weights_are_shared(data, feature_map, shared):
+    X, Y, *_ = data
+    model = EGPRegressor(feature_map, max_iter=0).fit(X, Y)
+    assert model.coef_.ndim == (1 if shared else 2)
 
 
 def test_a_diagonal_covariance_is_a_scale(data):
