@@ -118,7 +118,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Differentiable):
             If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
             of the rows of a Dask array.
         """
-        if return_cov not in (False, True, "joint"):
+        if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")

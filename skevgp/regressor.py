@@ -16,7 +16,7 @@ from sklearn.utils import check_random_state
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
-from ._validation import unchanged_if_it_fails
+from ._validation import check_integer, unchanged_if_it_fails
 from .exceptions import DependentRowsWarning
 from .fitting.advice import DEPENDENT_ROWS
 from .outputs.fit import fit_outputs
@@ -366,6 +366,8 @@ class EVGPRegressor(SparseGaussianProcess):
             large if blocks of them were left out: ``groups`` should say which belong together.
         """
         solver = resolved(self.solver, self.posterior)
+        if not isinstance(self.n_inducing, str):
+            check_integer(self.n_inducing, "n_inducing", minimum=1)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         if self.noise == "student-t" and (isinstance(solver, Adam) or is_dask(X)):

@@ -77,6 +77,11 @@ def test_std_and_covariance_together_are_refused():
         model(max_iter=0).fit(X, Y).predict(X, return_std=True, return_cov=True)
 
 
+def test_a_number_of_points_is_no_truth_value():
+    with pytest.raises(TypeError, match="n_inducing must be an integer; got True"):
+        EVGPRegressor(n_inducing=True).fit(np.eye(4), np.arange(4.0))
+
+
 def test_noise_is_included_unless_told_otherwise():
     m = model(tol=1e9).fit(X, Y)
     _, with_noise = m.predict(X_NEW, return_std=True)
