@@ -18,6 +18,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._sklearn import HasMethods, fit_context, safe_indexing
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
+from .rows.dask import aligned, as_rows, is_dask
 
 
 def _regressor_has(method: str) -> Callable[[Any], bool]:
@@ -88,8 +89,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
-            A data frame stays one for the regressor; only its base columns need be numbers here.
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            A data frame stays one for the regressor; only its base columns need be numbers here. So does a Dask array,
+            whose chunks are not loaded here.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets in the units of their base columns.
         **params : dict
@@ -156,7 +158,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         X = self._validated(X)
         predicted = self.regressor_.predict(X, **params)
         mean, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
-        mean = mean + _columns(X, self.base_).reshape(mean.shape)
+        mean = mean + _columns(X, self.base_, mean.ndim)
         return (mean, *spread) if spread else mean
 
     @available_if(_regressor_has("sample_y"))
@@ -207,7 +209,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         check_is_fitted(self)
         X = self._validated(X)
         mean, jacobian, *spread = self.regressor_.value_and_jacobian(X, return_std=return_std, **params)
-        return mean + _columns(X, self.base_).reshape(mean.shape), self._with_base(jacobian), *spread
+        return mean + _columns(X, self.base_, mean.ndim), self._with_base(jacobian), *spread
 
     @available_if(_regressor_has("jacobian"))
     def jacobian(self, X: ArrayLike) -> np.ndarray:
@@ -281,6 +283,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         first = method == "fit" or not hasattr(self, "regressor_")
         if is_frame(X):
             y = validate_frame(self, X, y, reset=first)
+        elif is_dask(X):
+            validate_data(self, X, reset=first, skip_check_array=True)
+            X, y = aligned(X, y)
         else:
             X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=FLOATS)
             y = y if y.dtype.kind == "f" else as_floats(y, "y")
@@ -292,7 +297,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         routed = {method: params}
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
-        residuals = y - _columns(X, base).reshape(y.shape)
+        residuals = y - _columns(X, base, y.ndim)
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
@@ -313,6 +318,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         if is_frame(X):
             validate_frame(self, X, reset=False)
             return X
+        if is_dask(X):
+            validate_data(self, X, reset=False, skip_check_array=True)
+            return as_rows(X, "X", known=False)
         return validate_data(self, X, reset=False, dtype=FLOATS)
 
     def _base(self, n_outputs: int) -> np.ndarray:
@@ -341,8 +349,10 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, BaseEstimator):
         return base.astype(np.intp) % self.n_features_in_
 
 
-def _columns(X: Any, indices: np.ndarray) -> np.ndarray:
-    """Columns of an array or a data frame as numbers, (n, len(indices))."""
+def _columns(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
+    """Columns of an array or a data frame as numbers, (n, len(indices)), or (n,) of a single one."""
+    if ndim == 1:
+        return _columns(X, indices)[:, 0]
     if not is_frame(X):
         return X[:, indices]
     columns = np.column_stack(
