@@ -12,6 +12,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 
 from ._sklearn import safe_indexing
 from ._validation import as_floats, check_magnitude
+from .rows.maps import transformed
 
 # Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
 _WIDE = 10.0
@@ -265,7 +266,7 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
         for name, part in feature_map.transformer_list:
             if part == "drop":
                 continue
-            width = np.shape(first if part == "passthrough" else part.transform(first))[-1]
+            width = np.shape(first if part == "passthrough" else transformed(part, first))[-1]
             weight = _weight(feature_map, name)
             if weight != 0.0:
                 yield part, first, np.arange(start, start + width), weight

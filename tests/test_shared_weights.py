@@ -3,6 +3,7 @@
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -386,6 +387,17 @@ def test_of_a_union_all_parts_must_say_that_weights_are_shared(data, feature_map
     X, Y, *_ = data
     model = EGPRegressor(feature_map, max_iter=0).fit(X, Y)
     assert model.coef_.ndim == (1 if shared else 2)
+
+
+@pytest.mark.parametrize("around", [lambda union: union, lambda union: make_union(make_pipeline(union))])
+def test_priors_of_unions_in_a_frame_with_rows_for_each_output(data, around):
+    X, Y, Sigma, mean, _ = data
+    frame = pd.DataFrame(X, columns=[f"x{j}" for j in range(O + 1)])
+    rows = make_union(FunctionTransformer(), Opinionated(prior=(mean, Sigma)))
+    rows = make_pipeline(FunctionTransformer(lambda X: X.to_numpy()), around(rows))
+    model = EGPRegressor(rows, max_iter=0, share_coef=True).fit(frame, Y)
+    assert_allclose(model.coef_prior_scale_[-P:], np.sqrt(np.diagonal(Sigma)))
+    assert model.predict(frame).shape == Y.shape
 
 
 def test_a_diagonal_covariance_is_a_scale(data):
