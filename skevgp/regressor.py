@@ -100,7 +100,9 @@ class EVGPRegressor(SparseGaussianProcess):
         freedom, thirty times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are
         fitted together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std``
         and ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With
-        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
+        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before. Memory
+        grows with the rows: by some ten numbers for each during the fit, and then by one (not in pickles) and
+        ``weights_``.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5
