@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -19,6 +18,7 @@ from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
 from ._validation import check_integer, is_plain
+from .exceptions import warn_user
 from .fitting.units import Units
 from .inference.posterior import Predictor
 from .rows.dask import as_rows, is_dask, predict_chunks
@@ -251,7 +251,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Differentiable):
     def _warn_of(self, messages: tuple[str, ...]) -> None:
         """Tell the user of ``fit`` how it ended."""
         for message in (*messages, *(self._at_bounds() if self.max_iter != 0 else ())):
-            warnings.warn(message, ConvergenceWarning, stacklevel=4)
+            warn_user(message, ConvergenceWarning)
 
     def _at_bounds(self) -> list[str]:
         """Which parameters of the user's kernel ended at its bounds; what outputs share, once."""

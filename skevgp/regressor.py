@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -17,7 +16,7 @@ from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import check_integer, unchanged_if_it_fails
-from .exceptions import DependentRowsWarning
+from .exceptions import DependentRowsWarning, warn_user
 from .fitting.advice import DEPENDENT_ROWS
 from .outputs.fit import fit_outputs
 from .outputs.plan import Sharing
@@ -391,5 +390,5 @@ class EVGPRegressor(SparseGaussianProcess):
             self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         if self._fitted.dependent:
-            warnings.warn(DEPENDENT_ROWS, DependentRowsWarning, stacklevel=3)
+            warn_user(DEPENDENT_ROWS, DependentRowsWarning)
         return self
