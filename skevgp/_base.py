@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Protocol
 
@@ -19,6 +18,7 @@ from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
 from ._theta import OfKernel, value_at
 from ._validation import check_integer, is_plain
+from .exceptions import warn_user
 from .export.exportable import Exportable
 from .fitting.units import Units
 from .inference.posterior import Predictor
@@ -120,7 +120,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
             If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
             of the rows of a Dask array.
         """
-        if return_cov not in (False, True, "joint"):
+        if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
@@ -262,7 +262,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
     def _warn_of(self, messages: tuple[str, ...]) -> None:
         """Tell the user of ``fit`` how it ended."""
         for message in (*messages, *(self._at_bounds() if self.max_iter != 0 else ())):
-            warnings.warn(message, ConvergenceWarning, stacklevel=4)
+            warn_user(message, ConvergenceWarning)
 
     def _at_bounds(self) -> list[str]:
         """Which parameters of the user's kernel ended at its bounds; what outputs share, once."""

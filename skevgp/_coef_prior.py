@@ -12,6 +12,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 
 from ._sklearn import safe_indexing
 from ._validation import as_floats, check_magnitude
+from .rows.maps import transformed
 
 # Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
 _WIDE = 10.0
@@ -76,7 +77,11 @@ def resolve_coef_prior(
     ValueError
         If a shape does not fit, a value is not finite, a scale is negative, or a covariance is none.
     """
-    shape = wide.shape
+    shape, shared = wide.shape, (n_outputs or len(wide)) > len(wide)
+    given: dict[str, Any] = {"coef_mean": coef_mean, "coef_scale": coef_scale, "coef_cov": coef_cov}
+    for name, value in given.items():
+        if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
+            raise ValueError(f"{name} needs a feature_map: without one there are no weights.")
     if coef_cov is not None and _word(coef_scale) != "auto":
         raise ValueError(f"coef_cov and coef_scale={coef_scale!r} both say how far weights may be; give one of them.")
     auto_mean, auto_scale, correlation = np.zeros(shape), wide, _independent(shape)
@@ -84,10 +89,10 @@ def resolve_coef_prior(
         first = safe_indexing(X, slice(0, 1))
         auto_mean, scale, correlation = _map_prior(feature_map, first, n_outputs or shape[0], shape)
         auto_scale = np.where(np.isnan(scale), auto_scale, scale)
-    mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape)
+    mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape, shared)
     scale = auto_scale
     if _word(coef_scale) != "auto":
-        scale, correlation = _as_table(coef_scale, "coef_scale", shape), _independent(shape)
+        scale, correlation = _as_table(coef_scale, "coef_scale", shape, shared), _independent(shape)
     if coef_cov is not None:
         scale, correlation = _of_covariance(coef_cov, "coef_cov", shape)
     finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
@@ -114,9 +119,10 @@ def _of_covariance(covariance: ArrayLike, name: str, shape: tuple[int, int]) -> 
     k, p = shape
     values = as_floats(covariance, name)
     if values.shape not in ((p, p), (k, p, p)):
+        each = f", or one such for each output, {(k, p, p)}" if k > 1 else ""
         raise ValueError(
-            f"{name} must be of the shape (n_features_out, n_features_out) = {(p, p)}, or one such for each output, "
-            f"{(k, p, p)}; got the shape {values.shape}."
+            f"{name} must be of the shape (n_features_out, n_features_out) = {(p, p)}{each}; got the shape "
+            f"{values.shape}."
         )
     values = np.broadcast_to(values, (k, p, p))
     if not np.isfinite(values).all():
@@ -146,15 +152,27 @@ def _word(value: Any) -> str | None:
     return value if isinstance(value, str) else None
 
 
-def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int]) -> np.ndarray:
+def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int], shared: bool) -> np.ndarray:
     array = as_floats(value, name)
-    # With one output, or one row for all, it may stand alone.
-    if array.shape not in ((), shape, (shape[1],) if shape[0] == 1 else ()):
+    if array.shape not in ((), *_shapes(shape)):
         raise ValueError(
-            f"{name} must be 'auto', a number or an array of the shape (n_outputs, n_features_out) = {shape}; got the "
-            f"shape {array.shape}."
+            f"{name} must be 'auto', a number or an array of {_shapes_text(shape, shared)}; got the shape "
+            f"{array.shape}."
         )
     return np.broadcast_to(array, shape)
+
+
+def _shapes(shape: tuple[int, int]) -> list[tuple[int, ...]]:
+    """What may stand for (k, p): of one output, or one row for all, that row alone."""
+    return [shape, shape[1:]] if shape[0] == 1 else [shape]
+
+
+def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
+    """The same for errors."""
+    if shared:
+        return f"the shape (n_features_out,) = {shape[1:]}, since the outputs share their weights (share_coef)"
+    alone = f", or {shape[1:]} for the one output" if shape[0] == 1 else ""
+    return f"the shape (n_outputs, n_features_out) = {shape}{alone}"
 
 
 def wide_scale(
@@ -205,21 +223,37 @@ def _map_prior(
     return mean, scale, correlation
 
 
+def says_shared(feature_map: Any) -> bool:
+    """Whether a fitted feature map says that all outputs have the same weights; a union if all of its parts do."""
+    if hasattr(feature_map, "share_coef"):
+        return bool(feature_map.share_coef)
+    if isinstance(feature_map, Pipeline):
+        parts = [step for _, step in feature_map.steps if step not in ("passthrough", None)][-1:]
+    elif isinstance(feature_map, FeatureUnion):
+        parts = [part for _, part in feature_map.transformer_list if part != "drop"]
+    elif isinstance(feature_map, ColumnTransformer):
+        parts = [part for _, part, _ in feature_map.transformers_ if part != "drop"]
+    else:
+        return False
+    return bool(parts) and all(map(says_shared, parts))
+
+
 def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """What a map's ``coef_prior`` says, checked."""
-    (k, p), prior = shape, feature_map.coef_prior(n_outputs)
-    allowed = [shape, (p,)] if k == 1 else [shape]
-    shapes = [np.shape(part) for part in prior] if isinstance(prior, (tuple, list)) else type(prior).__name__
+    (k, p), prior, allowed = shape, feature_map.coef_prior(n_outputs), _shapes(shape)
+    called = f"coef_prior of {feature_map!r}"
+    parts = [as_floats(part, f"What {called} returns") for part in prior] if isinstance(prior, (tuple, list)) else []
+    shapes = [part.shape for part in parts]
     if len(shapes) != 2 or shapes[0] not in allowed or shapes[1] not in [*allowed, (p, p), (k, p, p)]:
         raise ValueError(
-            f"coef_prior of {feature_map!r} must return two arrays of the shape (n_outputs, n_features_out) = {shape}, "
-            f"of which the second may be the covariance, {(k, p, p)}; got {shapes}."
+            f"{called} must return two arrays of {_shapes_text(shape, n_outputs > k)}, of which the second may be the "
+            f"covariance, {(k, p, p) if k > 1 else (p, p)}; got {shapes or type(prior).__name__}."
         )
-    mean = np.asarray(prior[0], dtype=float).reshape(shape)
+    mean = parts[0].reshape(shape)
     if shapes[1] not in allowed:
-        scale, correlation = _of_covariance(prior[1], f"The covariance of coef_prior of {feature_map!r}", shape)
+        scale, correlation = _of_covariance(parts[1], f"The covariance of {called}", shape)
         return mean, scale, correlation
-    return mean, np.asarray(prior[1], dtype=float).reshape(shape), _independent(shape)
+    return mean, parts[1].reshape(shape), _independent(shape)
 
 
 def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarray, float]]:
@@ -232,7 +266,7 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
         for name, part in feature_map.transformer_list:
             if part == "drop":
                 continue
-            width = np.shape(first if part == "passthrough" else part.transform(first))[-1]
+            width = np.shape(first if part == "passthrough" else transformed(part, first))[-1]
             weight = _weight(feature_map, name)
             if weight != 0.0:
                 yield part, first, np.arange(start, start + width), weight

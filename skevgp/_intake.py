@@ -13,7 +13,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils.validation import validate_data
 
-from ._coef_prior import resolve_coef_prior, wide_scale
+from ._coef_prior import resolve_coef_prior, says_shared, wide_scale
 from ._row_weights import chosen_rows
 from ._validation import (
     FLOATS,
@@ -134,7 +134,7 @@ class Intake(BaseEstimator):
         """The weights' prior, in the user's units, and which of them (o, p) are vague."""
         o, shared = len(targets.mean), self.share_coef
         if isinstance(shared, str):
-            shared = bool(getattr(self.feature_map_, "share_coef", False))
+            shared = says_shared(self.feature_map_)
         elif shared and self.feature_map_ is None:
             raise ValueError("share_coef=True needs a feature_map: without one there are no weights to share.")
         shared = shared and o > 1 and self.feature_map_ is not None

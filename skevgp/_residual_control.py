@@ -30,8 +30,10 @@ def regressor_has(method: str) -> Callable[[Any], bool]:
     return has
 
 
-def columns_of(X: Any, indices: np.ndarray) -> np.ndarray:
-    """Columns of an array or a data frame as numbers, (n, len(indices))."""
+def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
+    """Columns of an array or a data frame as numbers, (n, len(indices)), or (n,) of a single one."""
+    if ndim == 1:
+        return columns_of(X, indices)[:, 0]
     if not is_frame(X):
         return X[:, indices]
     columns = np.column_stack(
@@ -71,7 +73,7 @@ class ResidualForControl(BaseEstimator):
         check_is_fitted(self)
         X = self._validated(X)
         mean, jacobian, *spread = self.regressor_.value_and_jacobian(X, return_std=return_std, **params)
-        return mean + columns_of(X, self.base_).reshape(mean.shape), self._with_base(jacobian), *spread
+        return mean + columns_of(X, self.base_, mean.ndim), self._with_base(jacobian), *spread
 
     @available_if(regressor_has("jacobian"))
     def jacobian(self, X: ArrayLike) -> np.ndarray:

@@ -102,20 +102,23 @@ def check_not_vanishing(largest: np.ndarray, name: str) -> None:
 
 def as_floats(values: Any, name: str) -> np.ndarray:
     """Real numbers as an array of floats, or an error that names them."""
-    array = np.asarray(values)
-    if array.dtype.kind in "cSUMm":
-        raise ValueError(f"{name} must be real numbers; got the type {array.dtype}.")
     try:
-        return np.asarray(array, dtype=np.float64)
+        array = np.asarray(values)
+        if array.dtype.kind not in "cSUMm":
+            return np.asarray(array, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"{name} must be real numbers: {error}.") from error
+    raise ValueError(f"{name} must be real numbers; got the type {array.dtype}.")
 
 
 def checked_groups(groups: Any, n_samples: int) -> np.ndarray | None:
     """Numbers 0, 1, ... (n_samples,) in place of the labels of groups; None for None."""
     if groups is None:
         return None
-    labels = np.asarray(groups.compute() if hasattr(groups, "__dask_graph__") else groups)
+    try:
+        labels = np.asarray(groups.compute() if hasattr(groups, "__dask_graph__") else groups)
+    except ValueError as error:
+        raise ValueError(f"groups must be one label for each row: {error}") from error
     if labels.shape != (n_samples,):
         raise ValueError(f"groups must have the shape (n_samples,) = ({n_samples},); got {labels.shape}.")
     try:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -19,6 +18,7 @@ from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
+from .exceptions import warn_user
 from .network.model import VariationalNetwork
 from .network.training import Scaling, train
 from .rows.chosen import Chosen, rows_of
@@ -205,7 +205,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
         with unchanged_if_it_fails(self), single_threaded_libraries():
             message = self._fit(X, y, sample_weight)
         if message:
-            warnings.warn(message, ConvergenceWarning, stacklevel=3)
+            warn_user(message, ConvergenceWarning)
         return self
 
     def predict(

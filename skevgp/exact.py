@@ -43,7 +43,9 @@ class EGPRegressor(ExplicitGaussianProcess):
         x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
         it. None has no explicit features. It may return a row for each output, (n, n_outputs, n_h).
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f, as of `EVGPRegressor`; outputs share its shape, and have signal variances of their own.
+        Covariance of f, as of `EVGPRegressor`; outputs share its shape, and have signal variances of their own. Of
+        outputs that vary along different columns, or at different scales, it can learn one at the cost of the others:
+        ``MultiOutputRegressor(EGPRegressor(...))`` of scikit-learn fits each by itself (its predictions have no std).
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
         It may return a row for each output, (n, n_outputs, d).

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import inspect
+import warnings
+
 __all__ = ["DependentRowsWarning"]
 
 
@@ -24,3 +27,11 @@ class DependentRowsWarning(UserWarning):
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", DependentRowsWarning)
     """
+
+
+def warn_user(message: str, category: type[Warning]) -> None:
+    """Warn of the user's line: the first on the stack that is neither of this package nor of scikit-learn."""
+    frame, level = inspect.currentframe(), 1
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("skevgp", "sklearn"):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, category, stacklevel=level)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
@@ -16,8 +15,8 @@ from sklearn.utils import check_random_state
 from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
-from ._validation import unchanged_if_it_fails
-from .exceptions import DependentRowsWarning
+from ._validation import check_integer, unchanged_if_it_fails
+from .exceptions import DependentRowsWarning, warn_user
 from .fitting.advice import DEPENDENT_ROWS
 from .outputs.fit import fit_outputs
 from .outputs.plan import Sharing
@@ -91,15 +90,18 @@ class EVGPRegressor(SparseGaussianProcess):
         Whether all outputs have the same weights, as torques of a robot's joints have one set of inertial parameters:
         then ``coef_mean``, ``coef_scale`` and what ``coef_prior`` returns have no axis of outputs, and outputs depend
         on each other (``predict(X, return_cov="joint")``, `sample_y`). ``"auto"``: if the fitted ``feature_map`` has
-        an attribute ``share_coef`` that is true. Each output keeps its own f, noise and kernel (by ``sharing``), and
-        all are fitted together; with ``solver="adam"`` or ``posterior="diagonal"`` it is an error, as are correlations.
+        an attribute ``share_coef`` that is true (a pipeline's last step, all parts of a union). Each output keeps its
+        own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
+        ``posterior="diagonal"`` it is an error, as are correlations.
     noise : {"gaussian", "student-t"}, default="gaussian"
         ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
         Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
         freedom, thirty times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are
         fitted together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std``
         and ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With
-        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before.
+        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before. Memory
+        grows with the rows: by some ten numbers for each during the fit, and then by one (not in pickles) and
+        ``weights_``.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5
@@ -109,7 +111,8 @@ class EVGPRegressor(SparseGaussianProcess):
         within their bounds. (The bound takes what inducing points cannot represent for noise: ``std`` of rows of a
         table is then too large. And it takes rows of a trajectory for independent: on new ones ``std`` is too small.)
         Up to 2,000 rows are predicted, and random folds are of 50,000 rows at most; it takes a few passes over these,
-        and memory for twice as many matrices (m, m) as folds. q is then at its optimum, after Adam too. It is left out
+        and memory for a few times as many matrices (m + n_h, m + n_h) as folds. With hundreds of features it takes
+        longer than 20 iterations. q is then at its optimum, after Adam too. It is left out
         with None, with ``max_iter=0``, of fewer than 50 rows, and when a fit is interrupted or out of time;
         `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
@@ -334,8 +337,8 @@ class EVGPRegressor(SparseGaussianProcess):
         groups : array-like of shape (n_samples,), default=None
             Which rows belong together, by any labels: for rows of trajectories their numbers, such as
             ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
-            ones; of fewer than three groups, blocks of rows that follow each other inside a group. None: rows are
-            independent, and folds random.
+            ones; where half of the rows or more are of one group, blocks of rows that follow each other inside a group.
+            None: rows are independent, and folds random.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
             Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
             With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
@@ -364,6 +367,8 @@ class EVGPRegressor(SparseGaussianProcess):
             large if blocks of them were left out: ``groups`` should say which belong together.
         """
         solver = resolved(self.solver, self.posterior)
+        if not isinstance(self.n_inducing, str):
+            check_integer(self.n_inducing, "n_inducing", minimum=1)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
         if self.noise == "student-t" and (isinstance(solver, Adam) or is_dask(X)):
@@ -385,5 +390,5 @@ class EVGPRegressor(SparseGaussianProcess):
             self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)
         if self._fitted.dependent:
-            warnings.warn(DEPENDENT_ROWS, DependentRowsWarning, stacklevel=3)
+            warn_user(DEPENDENT_ROWS, DependentRowsWarning)
         return self

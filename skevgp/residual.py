@@ -17,6 +17,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 from ._residual_control import ResidualForControl, columns_of, regressor_has
 from ._sklearn import HasMethods, fit_context
 from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
+from .rows.dask import aligned, as_rows, is_dask
 
 
 class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
@@ -79,8 +80,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
 
         Parameters
         ----------
-        X : array-like of shape (n_samples, n_features)
-            A data frame stays one for the regressor; only its base columns need be numbers here.
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            A data frame stays one for the regressor; only its base columns need be numbers here. So does a Dask array,
+            whose chunks are not loaded here.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Targets in the units of their base columns.
         **params : dict
@@ -147,7 +149,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         X = self._validated(X)
         predicted = self.regressor_.predict(X, **params)
         mean, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
-        mean = mean + columns_of(X, self.base_).reshape(mean.shape)
+        mean = mean + columns_of(X, self.base_, mean.ndim)
         return (mean, *spread) if spread else mean
 
     @available_if(regressor_has("sample_y"))
@@ -206,6 +208,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         first = method == "fit" or not hasattr(self, "regressor_")
         if is_frame(X):
             y = validate_frame(self, X, y, reset=first)
+        elif is_dask(X):
+            validate_data(self, X, reset=first, skip_check_array=True)
+            X, y = aligned(X, y)
         else:
             X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=FLOATS)
             y = y if y.dtype.kind == "f" else as_floats(y, "y")
@@ -217,7 +222,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         routed = {method: params}
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
-        residuals = y - columns_of(X, base).reshape(y.shape)
+        residuals = y - columns_of(X, base, y.ndim)
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
@@ -227,6 +232,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         if is_frame(X):
             validate_frame(self, X, reset=False)
             return X
+        if is_dask(X):
+            validate_data(self, X, reset=False, skip_check_array=True)
+            return as_rows(X, "X", known=False)
         return validate_data(self, X, reset=False, dtype=FLOATS)
 
     def _base(self, n_outputs: int) -> np.ndarray:

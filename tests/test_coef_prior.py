@@ -177,7 +177,7 @@ def test_a_table_of_another_shape_is_named(name, shape):
 
 
 def test_one_output_does_not_take_a_row_of_another_width():
-    with pytest.raises(ValueError, match=r"coef_mean must be .* \(1, 3\); got the shape \(2,\)"):
+    with pytest.raises(ValueError, match=r"coef_mean must be .* \(1, 3\), or \(3,\) .*; got the shape \(2,\)"):
         resolve(FunctionTransformer(), coef_mean=[1.0, 2.0], targets=TARGETS[:, :1])
 
 

@@ -9,9 +9,10 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Matern, WhiteKernel
+from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.datasets import make_dynamics, make_toy
 from skevgp.features import InertiaForceGravity
 
@@ -375,9 +376,13 @@ def test_too_few_iterations_warn_and_say_what_to_change():
 
 
 def test_warnings_point_at_the_line_that_fits():
-    for model in (EGPRegressor(max_iter=2), EVGPRegressor(n_inducing=5, max_iter=2)):
+    sparse, network = EVGPRegressor(n_inducing=5, max_iter=2), BayesianMLPRegressor([4], max_iter=2, random_state=0)
+    models = [EGPRegressor(max_iter=2), sparse, network]
+    models += [ResidualRegressor(sparse, base=0), make_pipeline(StandardScaler(), sparse)]
+    fits = [model.fit for model in models]
+    for fit in [*fits, clone(sparse).partial_fit, ResidualRegressor(sparse, base=0).partial_fit]:
         with pytest.warns(ConvergenceWarning) as warned:
-            model.fit(X, Y)
+            fit(X, Y[:, 0])
         assert {warning.filename for warning in warned} == {__file__}
 
 

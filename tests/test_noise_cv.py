@@ -198,6 +198,16 @@ def test_the_order_of_the_rows_does_not_matter():
     np.testing.assert_array_equal(m.noise_variance_, fitted().noise_variance_)
 
 
+@pytest.mark.parametrize("n_groups", [1, 2])
+def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch):
+    """Not as they are kept: up to 10,000 rows are sorted by the columns of X."""
+    settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
+    settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
+    m = fitted(**settings)
+    monkeypatch.setattr("skevgp.rows.chosen.ORDERED_ROWS", 0)
+    np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
+
+
 def test_rows_of_weight_0_have_groups_too():
     weights = np.ones(len(X))
     weights[::7] = 0.0
@@ -210,6 +220,11 @@ def test_rows_of_weight_0_have_groups_too():
 def test_groups_of_a_wrong_length_are_refused(groups):
     with pytest.raises(ValueError, match=r"groups must have the shape \(n_samples,\) = \(2000,\); got \("):
         fitted(groups)
+
+
+def test_labels_are_one_for_each_row():
+    with pytest.raises(ValueError, match="groups must be one label for each row"):
+        fitted([[1], [1, 2]] * 1000)
 
 
 @pytest.mark.parametrize("noise_cv", [1, 0, -3, True, 2.0, "10"])
@@ -284,6 +299,14 @@ def test_others_are_not(fit):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DependentRowsWarning)
         fit()
+
+
+def test_a_group_of_most_rows_is_not_predicted_from_the_few_others():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-3, 3, (400, 2))
+    y = np.sin(3 * X[:, 0]) * np.cos(2 * X[:, 1]) + 0.1 * rng.randn(400)
+    m = EVGPRegressor(n_inducing=80, max_iter=50, random_state=0).fit(X, y, groups=np.repeat([0, 1, 2], [380, 10, 10]))
+    assert 0.05 < np.sqrt(m.noise_variance_) < 0.2
 
 
 def test_what_groups_do_not_have_in_common_is_told():

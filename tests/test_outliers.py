@@ -135,6 +135,18 @@ def test_where_it_cannot_be_it_is_refused():
     np.testing.assert_array_equal(model.predict(GRID), before)
 
 
+def test_a_pickle_has_nothing_of_the_rows_but_their_weights():
+    """And goes on as the model does."""
+    rows = np.tile(X, (4, 1)) + np.linspace(0.0, 0.1, 4 * N)[:, np.newaxis]
+    few, more = (evgp(max_iter=2).fit(rows[: n * N], np.tile(WRONG, (n, 1))) for n in (1, 4))
+    sizes = [len(pickle.dumps(model)) - model.weights_.nbytes for model in (few, more)]
+    assert abs(sizes[1] - sizes[0]) < 4 * N
+    again = pickle.loads(pickle.dumps(few)).partial_fit(X[:50], WRONG[:50])
+    few.partial_fit(X[:50], WRONG[:50])
+    np.testing.assert_array_equal(again.weights_, few.weights_)
+    np.testing.assert_array_equal(again.predict(GRID), few.predict(GRID))
+
+
 def test_partial_fit_doubts_new_rows():
     first, rest = slice(0, 150), slice(150, None)
     model = evgp().fit(X[first], WRONG[first]).partial_fit(X[rest], WRONG[rest])

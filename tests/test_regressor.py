@@ -77,6 +77,11 @@ def test_std_and_covariance_together_are_refused():
         model(max_iter=0).fit(X, Y).predict(X, return_std=True, return_cov=True)
 
 
+def test_a_number_of_points_is_no_truth_value():
+    with pytest.raises(TypeError, match="n_inducing must be an integer; got True"):
+        EVGPRegressor(n_inducing=True).fit(np.eye(4), np.arange(4.0))
+
+
 def test_noise_is_included_unless_told_otherwise():
     m = model(tol=1e9).fit(X, Y)
     _, with_noise = m.predict(X_NEW, return_std=True)
@@ -418,7 +423,7 @@ def test_a_fitted_model_refuses_a_wrong_forgetting_factor(factor):
 def test_an_interrupted_partial_fit_counts_no_row(monkeypatch):
     m, expected = (model(max_iter=0).fit(X, Y) for _ in range(2))
     with monkeypatch.context() as patch:
-        patch.setattr(EVGPRegressor, "_set_attributes", lambda self: 1 / 0)
+        patch.setattr(EVGPRegressor, "_set_posterior", lambda self: 1 / 0)
         with pytest.raises(ZeroDivisionError):
             m.partial_fit(X, -Y)
     np.testing.assert_array_equal(

@@ -1,5 +1,6 @@
 import pickle
 
+import dask.array as da
 import numpy as np
 import pandas as pd
 import pytest
@@ -16,7 +17,7 @@ from sklearn.preprocessing import OneHotEncoder, StandardScaler
 from sklearn.svm import SVR
 from sklearn.utils import get_tags
 
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.features import AngleEncoder
 
 RNG = np.random.RandomState(0)
@@ -120,6 +121,24 @@ def test_numbers_of_other_types_do_not_wrap_around(dtype):
     target = np.array([1, 2, 3], dtype=dtype)
     m = ResidualRegressor(Recorder()).fit(states, target)
     np.testing.assert_array_equal(m.regressor_.fit_given_[1], [-2.0, -3.0, -6.0])
+
+
+@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["1-D", "(n, 1)", "(n, 2)"])
+@pytest.mark.parametrize("method", ["fit", "partial_fit"])
+def test_dask_arrays_stay_where_they_are(method, y, base):
+    lazy, targets = da.from_array(X, chunks=(25, 2)), da.from_array(y, chunks=-1)
+    found = getattr(ResidualRegressor(evgp(), base=base), method)(lazy, targets)
+    expected = evgp().fit(lazy, da.from_array(y - X[:, base].reshape(y.shape), chunks=(25, *y.shape[1:])))
+    new = da.from_array(X_NEW, chunks=(10, 3))
+    new = new[new[:, 0] > 0.0]  # of unknown lengths
+    some = X_NEW[X_NEW[:, 0] > 0.0]
+    mean, std = found.predict(new, return_std=True)
+    for own, other in zip((mean, std), expected.predict(some, return_std=True), strict=True):
+        assert isinstance(own, da.Array)
+        base_columns = some[:, base].reshape(other.shape) if own is mean else 0.0
+        np.testing.assert_allclose(own.compute(), other + base_columns, rtol=1e-7)
+    with pytest.raises(TypeError, match="X is a Dask array, but the exact model"):
+        ResidualRegressor(EGPRegressor()).fit(lazy, targets)
 
 
 def test_the_regressor_itself_is_left_alone():

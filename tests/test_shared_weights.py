@@ -3,12 +3,14 @@
 import pickle
 
 import numpy as np
+import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.compose import make_column_transformer
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
-from sklearn.pipeline import make_union
+from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -34,6 +36,9 @@ class Rows(TransformerMixin, BaseEstimator):
 
     def fit(self, X, y=None):
         return self
+
+    def __sklearn_is_fitted__(self):
+        return True
 
     def transform(self, X):
         phases = np.arange(O)[:, np.newaxis] * self.per_output
@@ -365,6 +370,36 @@ def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
     assert_allclose(with_more.coef_prior_scale_[:P], np.sqrt(np.diagonal(Sigma)))
 
 
+@pytest.mark.parametrize(
+    ("feature_map", "shared"),
+    [
+        (make_pipeline(FunctionTransformer(), Rows(share_coef=True)), True),
+        (make_pipeline(Rows(share_coef=True, per_output=False), FunctionTransformer()), False),
+        (make_union(Rows(share_coef=True), make_pipeline(Rows(width=2, share_coef=True))), True),
+        (make_union(Rows(share_coef=True), Rows(width=2)), False),
+        (make_column_transformer((Rows(share_coef=True, per_output=False), [0]), ("drop", [1])), True),
+        (make_column_transformer((Rows(share_coef=True, per_output=False), [0]), ("passthrough", [1])), False),
+        (FunctionTransformer(), False),
+    ],
+    ids=["last step", "first step", "union", "union of both", "columns", "columns of both", "none"],
+)
+def test_of_a_union_all_parts_must_say_that_weights_are_shared(data, feature_map, shared):
+    X, Y, *_ = data
+    model = EGPRegressor(feature_map, max_iter=0).fit(X, Y)
+    assert model.coef_.ndim == (1 if shared else 2)
+
+
+@pytest.mark.parametrize("around", [lambda union: union, lambda union: make_union(make_pipeline(union))])
+def test_priors_of_unions_in_a_frame_with_rows_for_each_output(data, around):
+    X, Y, Sigma, mean, _ = data
+    frame = pd.DataFrame(X, columns=[f"x{j}" for j in range(O + 1)])
+    rows = make_union(FunctionTransformer(), Opinionated(prior=(mean, Sigma)))
+    rows = make_pipeline(FunctionTransformer(lambda X: X.to_numpy()), around(rows))
+    model = EGPRegressor(rows, max_iter=0, share_coef=True).fit(frame, Y)
+    assert_allclose(model.coef_prior_scale_[-P:], np.sqrt(np.diagonal(Sigma)))
+    assert model.predict(frame).shape == Y.shape
+
+
 def test_a_diagonal_covariance_is_a_scale(data):
     X, Y, _, _, X_new = data
     scale = np.array([0.5, 1.0, 2.0, 0.1])
@@ -403,7 +438,17 @@ def _not_symmetric(Sigma):
         ({"coef_cov": np.eye(P) + 0.1, "solver": "adam"}, r'coef_cov\) needs solver="lbfgs"'),
         ({"share_coef": True, "posterior": "diagonal"}, r'share_coef=True needs posterior="full"'),
         ({"share_coef": True, "solver": "adam"}, r'share_coef=True needs solver="lbfgs"'),
-        ({"share_coef": True, "coef_mean": np.ones((O, P))}, "coef_mean must be 'auto', a number or an array"),
+        ({"share_coef": True, "coef_mean": np.ones((O, P))}, r"= \(4,\), since the outputs share .* \(share_coef\)"),
+        (
+            {"share_coef": True, "feature_map": Opinionated(prior=(np.ones((O, P)),) * 2)},
+            r"= \(4,\), since the outputs",
+        ),
+        ({"feature_map": Opinionated(prior=(np.full((O, P), "a"),) * 2)}, "coef_prior of .* must be real numbers"),
+        ({"feature_map": Opinionated(prior=([[1], [1, 2]], 1))}, "coef_prior of .* must be real numbers"),
+        ({"feature_map": Opinionated(prior=3)}, "must return two arrays .* got int"),
+        ({"coef_cov": [[1], [1, 2]]}, "coef_cov must be real numbers"),
+        ({"feature_map": None, "coef_cov": np.eye(P)}, "coef_cov needs a feature_map"),
+        ({"feature_map": None, "coef_mean": [1.0] * P}, "coef_mean needs a feature_map"),
         ({"share_coef": "yes"}, "share_coef"),
         ({"share_coef": True, "feature_map": None}, "share_coef=True needs a feature_map"),
         ({"sharing": "all"}, "sharing='all' joins outputs by their inducing points"),
@@ -413,7 +458,7 @@ def _not_symmetric(Sigma):
 )
 def test_what_cannot_be_is_refused_by_name(data, options, message):
     X, Y, _, _, _ = data
-    with pytest.raises(ValueError, match=message):
+    with pytest.raises(ValueError, match=f"(?s){message}"):
         EVGPRegressor(
             **{"feature_map": Rows(), "kernel_map": FunctionTransformer(own_columns), "max_iter": 1, **options}
         ).fit(X, Y)
@@ -442,8 +487,9 @@ def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
 def test_the_joint_covariance_is_asked_for_by_name(data):
     X, Y, _, _, X_new = data
     model = EVGPRegressor(max_iter=0, n_inducing=5).fit(X, Y)
-    with pytest.raises(ValueError, match="return_cov must be False, True or 'joint'; got 'all'"):
-        model.predict(X_new, return_cov="all")
+    for word in ("all", np.array([1, 2])):
+        with pytest.raises(ValueError, match="return_cov must be False, True or 'joint'; got "):
+            model.predict(X_new, return_cov=word)
     cov = model.predict(X_new, return_cov=True)[1]
     joint = model.predict(X_new, return_cov="joint")[1].reshape(len(X_new), O, len(X_new), O)
     for i in range(O):

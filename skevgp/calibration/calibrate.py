@@ -99,7 +99,7 @@ def calibrated(
     if by.groups is None and len(rows) > _MOST_ROWS:
         # So many tell as much, and what says which rows are where does not grow with them.
         rows = rows.some_of(np.unique(np.linspace(0, len(rows) - 1, _MOST_ROWS).astype(int)), 1.0)
-    folds = by.folds(len(rows), rng)
+    folds = by.folds(rows.as_given(), rng)
     if len(folds) < 2 or not any(table[name].free.any() for name in ("signal", "noise")):
         return None
     try:
@@ -135,8 +135,7 @@ def _by_folds(
         groups = [by.groups[fold.predicted] for fold in folds]
         found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
-        order = rows.as_given()
-        in_order = folds_in_order(np.arange(len(rows)) if order is None else order, by.n_folds, rng)
+        in_order = folds_in_order(rows.as_given(), by.n_folds, rng)
         alone = replace(limits, free_signal=False)
         blocks = _searches(model, values, in_order, rows, alone, lowest)
         chance = [search.with_limits(alone, lowest[search.output]) for search in searches]

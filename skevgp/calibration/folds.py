@@ -10,9 +10,10 @@ import numpy as np
 FEWEST_ROWS = 50
 # A standard deviation needs no more than so many rows: of more, so many are drawn to be predicted.
 PREDICTED_ROWS = 2000
-# Fewer groups than this are no sample of groups: blocks of consecutive rows are left out, and of each block so much at
-# either end, which is like its neighbours, is not predicted.
-_FEWEST_GROUPS, _GAP = 3, 0.15
+# Groups of which one has this share of the rows, as one of two has, are no sample of groups, and too few rows are left
+# to predict it from. Blocks of consecutive rows are then left out; so much of each at either end, which is like its
+# neighbours, is not predicted.
+_LARGEST_SHARE, _GAP = 0.5, 0.15
 
 
 @dataclass(frozen=True)
@@ -34,13 +35,13 @@ class CrossValidation:
     groups: np.ndarray | None = None
     wide: bool = True
 
-    def folds(self, n_rows: int, rng: np.random.RandomState) -> list[Fold]:
-        """Folds of all rows; none if these are too few."""
-        if n_rows < FEWEST_ROWS:
+    def folds(self, order: np.ndarray, rng: np.random.RandomState) -> list[Fold]:
+        """Folds of all rows; none if these are too few. ``order`` are the rows (n,) as they follow each other."""
+        if len(order) < FEWEST_ROWS:
             return []
         if self.groups is None:
-            return random_folds(n_rows, self.n_folds, rng)
-        return folds_of_groups(self.groups, self.n_folds, rng)
+            return random_folds(len(order), self.n_folds, rng)
+        return folds_of_groups(self.groups, self.n_folds, rng, order)
 
 
 @dataclass(frozen=True)
@@ -71,11 +72,21 @@ def folds_in_order(order: np.ndarray, n_folds: int, rng: np.random.RandomState, 
     return _thinned(parts, rng, [part[end : len(part) - end] for part, end in zip(parts, ends, strict=True)])
 
 
-def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState) -> list[Fold]:
-    """Folds of whole groups, of nearly equal numbers of rows; ``groups`` (n,) says to which group each row belongs."""
+def folds_of_groups(groups: np.ndarray, n_folds: int, rng: np.random.RandomState, order: np.ndarray) -> list[Fold]:
+    """Folds of whole groups, of nearly equal numbers of rows.
+
+    Parameters
+    ----------
+    groups : ndarray of shape (n,)
+        To which group each row belongs.
+    n_folds : int
+    rng : RandomState
+    order : ndarray of shape (n,)
+        The rows as they follow each other, by which a group is cut where it must be.
+    """
     names, own, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-    if len(names) < _FEWEST_GROUPS:
-        return folds_in_order(np.argsort(own, kind="stable"), n_folds, rng, gap=True)
+    if sizes.max() >= _LARGEST_SHARE * len(groups):
+        return folds_in_order(order[np.argsort(own[order], kind="stable")], n_folds, rng, gap=True)
     n_folds = min(n_folds, len(names))
     # The largest first, each to the fold that has least; which of equal ones comes first is left to chance.
     shuffled = rng.permutation(len(names))

@@ -16,8 +16,9 @@ and a row is predicted as
     mean: ρ zᵀ D⁻¹ t + a(x)ᵀ C w,   variance: σ² (1 + ρ (zᵀ D⁻¹ z + k̃(x, x) - |v|²)) + a(x)ᵀ C Cov[w] Cᵀ a(x),
 
 with a = h - ρ Xᵀ D⁻¹ z: what the Gaussian process does not explain of the features. But for C all of this is common to
-the outputs of a group, and the same trick makes the precision of w diagonal for all σ². Where outputs share w, what the
-others know of it takes the place of its prior.
+the outputs of a group, and the same trick makes the precision of w diagonal for all σ². Of many more features than
+inducing points that of I + σ⁻² Cᵀ HᵀH C is made so, once for all ρ, and the inducing points change it by a matrix of
+rank m. Where outputs share w, what the others know of it takes the place of its prior.
 """
 
 from __future__ import annotations
@@ -34,6 +35,9 @@ from .._linalg import diagonal_of, jittered_cholesky, triangular_inverse
 from ..inference.bounds import Group, PosteriorFamily
 from ..inference.statistics import SufficientStatistics, Whitening
 from ..rows.blocks import AnyBlock
+
+# Of so many times more features than inducing points, w is made diagonal once.
+_MANY_FEATURES = 4
 
 
 @dataclass(frozen=True)
@@ -97,39 +101,80 @@ class Weights:
 
 
 @dataclass(frozen=True)
-class _AtRatio:
-    """What is common to outputs: known ρ zᵀ D⁻¹ t (n, o), a (n, p), variance in units of σ² (n,), and M and its row."""
+class _Diagonal:
+    """Coordinates in which a precision of w, what is known of it and σ⁻² times a matrix, is diagonal for all σ².
 
-    known: np.ndarray
-    features: np.ndarray
-    variance: np.ndarray
-    M: np.ndarray
-    Mr: np.ndarray
+    Attributes
+    ----------
+    basis : ndarray of shape (p, p)
+    eigenvalues : ndarray of shape (p,)
+        As λ of the module's text, with the fitted noise as reference.
+    """
+
+    basis: np.ndarray
+    eigenvalues: np.ndarray
+
+    @classmethod
+    def of(cls, matrix: np.ndarray, noise: float, known: Weights | None) -> _Diagonal:
+        """``known`` None is an identity."""
+        precision = matrix / noise
+        if known is None:
+            diagonal_of(precision)[...] += 1.0
+        else:
+            precision += known.precision
+        root_inv = triangular_inverse(jittered_cholesky(precision))
+        beside = root_inv if known is None else root_inv @ known.precision
+        eigenvalues, W = eigh(beside @ root_inv.T, overwrite_a=True, check_finite=False)
+        return cls(W.T @ root_inv, np.clip(eigenvalues, 0.0, 1.0))
 
 
 @dataclass(frozen=True)
-class _WeightsAtRatio:
-    """Of an output, in coordinates in which the precision of w is diagonal for all σ².
+class _AtRatio:
+    """An output at a ratio, with weights in coordinates of a `_Diagonal`.
 
     Attributes
     ----------
     ratio : float
-    beside : Weights
-        What is known of w beside the output's own data.
+    beside : Weights or None
+        What is known of w beside the output's own data; None is its prior.
+    error, variance : ndarray of shape (n,)
+        Of the rows, but for the weights; the variance in units of σ².
     eigenvalues : ndarray of shape (p,)
-        As λ of the module's text, with the fitted noise as reference.
     coordinates : ndarray of shape (n, p)
         Of the rows.
     told, known : ndarray of shape (p,)
         The linear terms, of the output's own data in units of σ⁻², and of what is known beside.
+    less : ndarray of shape (m, p), optional
+        U: the precision is the diagonal one minus σ⁻² Uᵀ U.
     """
 
     ratio: float
-    beside: Weights
+    beside: Weights | None
+    error: np.ndarray
+    variance: np.ndarray
     eigenvalues: np.ndarray
     coordinates: np.ndarray
     told: np.ndarray
     known: np.ndarray
+    less: np.ndarray | None = None
+
+    def of_weights(self, noise: np.ndarray, fitted: float) -> tuple[np.ndarray, np.ndarray]:
+        """What w adds to mean and variance (n, g) of the rows for noise variances (g,)."""
+        eigenvalues = self.eigenvalues[:, np.newaxis]
+        precision = eigenvalues + (1.0 - eigenvalues) * (fitted / noise)
+        linear = np.outer(self.told, 1.0 / noise) + self.known[:, np.newaxis]
+        mean, variance = self.coordinates @ (linear / precision), self.coordinates**2 @ (1.0 / precision)
+        if self.less is not None:
+            for g in range(len(noise)):
+                # (E - σ⁻² Uᵀ U)⁻¹ = E⁻¹ + E⁻¹ Uᵀ (σ² I - U E⁻¹ Uᵀ)⁻¹ U E⁻¹
+                scaled = self.less / precision[:, g]
+                inner = -(scaled @ self.less.T)
+                diagonal_of(inner)[...] += noise[g]
+                scaled = triangular_inverse(jittered_cholesky(inner)) @ scaled
+                seen = self.coordinates @ scaled.T
+                mean[:, g] += seen @ (scaled @ linear[:, g])
+                variance[:, g] += np.einsum("nm,nm->n", seen, seen)
+        return mean, variance
 
 
 class LeftOut:
@@ -162,34 +207,16 @@ class LeftOut:
             L_inv = group.whitening.L_inv
             self._squares, self._at_zero = (rows.V @ L_inv) ** 2, np.einsum("ji,ji->i", L_inv, L_inv)
             self._slope = np.einsum("ji,jk,ki->i", L_inv, statistics.VV, L_inv, optimize=True)
-        self._roots, self._at = group.prior.roots(), dict[float, _AtRatio]()
-        self._priors = [prior_of(group, output) for output in range(len(group.noise))]
-        self._last: dict[int, _WeightsAtRatio] = {}
-
-    def _at_ratio(self, ratio: float) -> _AtRatio:
-        if ratio not in self._at:
-            statistics, rows = self.group.statistics, self.rows
-            factor = ratio / (self._eigenvalues + (ratio / self._ratio) * (1.0 - self._eigenvalues))
-            both = factor[:, np.newaxis] * np.hstack([self._X, self._T])
-            p = self._X.shape[1]
-            seen, told = self._Z @ both, self._X.T @ both
-            variance = self._squares @ (1.0 / (self._at_zero + ratio * self._slope))
-            if not self.group.complete:
-                variance += rows.unexplained
-            self._at[ratio] = _AtRatio(
-                seen[:, p:],
-                rows.features - seen[:, :p],
-                rows.noise + ratio * variance,
-                statistics.HH - told[:, :p],
-                statistics.HR - told[:, p:],
-            )
-        return self._at[ratio]
+        # Only the last ratio of each output is kept: each has a matrix (n, p).
+        self._last: dict[int, _AtRatio] = {}
+        self._without: dict[int, tuple[Weights | None, _Diagonal]] = {}
 
     def says(self, output: int) -> Weights:
         """What the other folds say of w through an output as it was fitted."""
         noise = self.group.noise[output]
-        at, C = self._at_ratio(float(self.group.signal[output] / noise)), self._roots[output]
-        return Weights(C.T @ at.M @ C / noise, C.T @ at.Mr[:, output] / noise)
+        factor = self._factor(float(self.group.signal[output] / noise))
+        told = self._times_root(output, self._told(output, factor))
+        return Weights(self._within_root(output, self._unexplained(factor)) / noise, told / noise)
 
     def predicted(
         self, output: int, ratio: float, noise: np.ndarray, known: Weights | None = None
@@ -198,43 +225,79 @@ class LeftOut:
 
         ``known`` is what is known of w beside the output's own data; None is its prior.
         """
-        at, C = self._at_ratio(ratio), self._roots[output]
-        error = (self.rows.residuals[:, output] - at.known[:, output])[:, np.newaxis]
-        variance = np.multiply.outer(at.variance, noise)
-        if len(C) == 0:
+        at = self._last.get(output)
+        if at is None or at.ratio != ratio or at.beside is not known:
+            at = self._last[output] = self._at(output, ratio, known)
+        error, variance = at.error[:, np.newaxis], np.multiply.outer(at.variance, noise)
+        if not len(at.eigenvalues):
             return error, variance
-        known = self._priors[output] if known is None else known
-        own = self._weights_at(output, ratio, known)
-        eigenvalues = own.eigenvalues[:, np.newaxis]
-        precision = eigenvalues + (1.0 - eigenvalues) * (self.group.noise[output] / noise)
-        weights = (np.outer(own.told, 1.0 / noise) + own.known[:, np.newaxis]) / precision
-        error = error - own.coordinates @ weights
+        mean, of_weights = at.of_weights(noise, float(self.group.noise[output]))
         if self._is_diagonal:
-            squares = (self.rows.features @ C) ** 2
-            diagonal = np.einsum("ji,jk,ki->i", C, self.group.statistics.HH, C)
-            precision = np.diagonal(known.precision)[:, np.newaxis] + np.outer(diagonal, 1.0 / noise)
-        else:
-            squares = own.coordinates**2
-        return error, variance + squares @ (1.0 / precision)
+            prior = 1.0 if known is None else np.diagonal(known.precision)[:, np.newaxis]
+            own = np.diagonal(self._within_root(output, self.group.statistics.HH))[:, np.newaxis]
+            of_weights = self._times_root(output, self.rows.features) ** 2 @ (1.0 / (prior + own / noise))
+        return error - mean, variance + of_weights
 
-    def _weights_at(self, output: int, ratio: float, known: Weights) -> _WeightsAtRatio:
-        """Kept until another ratio is asked for."""
-        found = self._last.get(output)
-        if found is None or found.ratio != ratio or found.beside is not known:
-            at, C = self._at_ratio(ratio), self._roots[output]
-            M = C.T @ at.M @ C
-            root_inv = triangular_inverse(jittered_cholesky(known.precision + M / self.group.noise[output]))
-            eigenvalues, W = eigh(root_inv @ known.precision @ root_inv.T, overwrite_a=True, check_finite=False)
-            basis = W.T @ root_inv
-            found = self._last[output] = _WeightsAtRatio(
-                ratio,
-                known,
-                np.clip(eigenvalues, 0.0, 1.0),
-                at.features @ (C @ basis.T),
-                basis @ (C.T @ at.Mr[:, output]),
-                basis @ known.linear,
-            )
-        return found
+    def _at(self, output: int, ratio: float, known: Weights | None) -> _AtRatio:
+        rows, factor, prior = self.rows, self._factor(ratio), self.group.prior
+        m, p = self._X.shape
+        error = rows.residuals[:, output] - self._Z @ (factor * self._T[:, output])
+        variance = self._squares @ (1.0 / (self._at_zero + ratio * self._slope))
+        if not self.group.complete:
+            variance += rows.unexplained
+        variance = rows.noise + ratio * variance
+        if p == 0:
+            none = np.empty(0)
+            return _AtRatio(ratio, known, error, variance, none, np.empty((len(error), 0)), none, none)
+        features = rows.features - self._Z @ (factor[:, np.newaxis] * self._X)
+        less = None
+        if p > _MANY_FEATURES * m:
+            diagonal = self._diagonal_without(output, known)
+            less = self._times_root(output, np.sqrt(factor)[:, np.newaxis] * self._X) @ diagonal.basis.T
+        else:
+            matrix = self._within_root(output, self._unexplained(factor))
+            diagonal = _Diagonal.of(matrix, self.group.noise[output], known)
+        return _AtRatio(
+            ratio,
+            known,
+            error,
+            variance,
+            diagonal.eigenvalues,
+            self._times_root(output, features) @ diagonal.basis.T,
+            diagonal.basis @ self._times_root(output, self._told(output, factor)),
+            diagonal.basis @ (-prior.reference[output] if known is None else known.linear),
+            less,
+        )
+
+    def _diagonal_without(self, output: int, known: Weights | None) -> _Diagonal:
+        """Of w without a Gaussian process."""
+        beside, diagonal = self._without.get(output, (None, None))
+        if diagonal is None or beside is not known:
+            matrix = self._within_root(output, self.group.statistics.HH)
+            diagonal = _Diagonal.of(matrix, self.group.noise[output], known)
+            self._without[output] = known, diagonal
+        return diagonal
+
+    def _factor(self, ratio: float) -> np.ndarray:
+        """ρ D⁻¹."""
+        return ratio / (self._eigenvalues + (ratio / self._ratio) * (1.0 - self._eigenvalues))
+
+    def _unexplained(self, factor: np.ndarray) -> np.ndarray:
+        """M (p, p), with ``factor`` = ρ D⁻¹."""
+        return self.group.statistics.HH - self._X.T @ (factor[:, np.newaxis] * self._X)
+
+    def _told(self, output: int, factor: np.ndarray) -> np.ndarray:
+        """Hᵀr - ρ Xᵀ D⁻¹ t (p,) of an output."""
+        return self.group.statistics.HR[:, output] - self._X.T @ (factor * self._T[:, output])
+
+    def _times_root(self, output: int, values: np.ndarray) -> np.ndarray:
+        """Rows (..., p) times C of an output."""
+        prior = self.group.prior
+        return values * prior.scale[output] if prior.root is None else values @ prior.root[output]
+
+    def _within_root(self, output: int, matrix: np.ndarray) -> np.ndarray:
+        """Cᵀ A C of a symmetric matrix A."""
+        return self._times_root(output, self._times_root(output, matrix).T)
 
 
 def prior_of(group: Group, output: int) -> Weights:

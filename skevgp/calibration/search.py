@@ -130,7 +130,9 @@ class Search:
         s2, noise = (self._at_bound(name) for name in ("signal", "noise"))
         if not self.limits.free_signal and not self.limits.free_noise:
             return s2, noise
-        begin = float(np.round(np.log2(s2 / noise)))
+        (s_low, s_high), (low, high) = self._range("signal"), self._range("noise")
+        # Where the bound was highest may be far from what is allowed here.
+        begin = float(np.clip(np.round(np.log2(s2 / noise)), np.log2(s_low / high), np.log2(s_high / low)))
         tried: dict[float, tuple[float, float]] = {}
 
         def loss(k: float) -> float:

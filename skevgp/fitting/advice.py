@@ -105,11 +105,18 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
         nothing &= alike_neighbours(rows)
     if not nothing.any():
         return ""
+    cause = ""
+    if len(noise) > nothing.sum():
+        cause = "If they share its kernel's shape with outputs of which it learned, that may be why: " + (
+            'sharing="none" gives each its own. Or raise '
+            if sparse
+            else "MultiOutputRegressor(EGPRegressor(...)) fits each by itself. Or raise "
+        )
     return (
         f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
         "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
-        f"Raise {'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, let kernel or noise_variance "
-        "start elsewhere, or look at the scales of the kernel's columns."
+        f"{cause or 'Raise '}{'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, let kernel or "
+        "noise_variance start elsewhere, or look at the scales of the kernel's columns."
     )
 
 

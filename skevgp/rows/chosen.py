@@ -138,7 +138,9 @@ def _columns(X: Any) -> list[np.ndarray]:
 def _as_numbers(column: np.ndarray) -> np.ndarray:
     if column.dtype.kind in "fiub":
         return column
-    return np.unique(column.astype(str), return_inverse=True)[1]
+    # 1 and "1", None and "None" are as different to a map as any other words.
+    words = [f"{type(value).__name__} {value!r}" for value in column.tolist()]
+    return np.unique(words, return_inverse=True)[1]
 
 
 def _differ_from_the_one_before(keys: Sequence[np.ndarray], order: np.ndarray) -> np.ndarray:

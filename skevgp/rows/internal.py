@@ -178,10 +178,10 @@ class Rows:
         raw, order = self.source.take(chosen), rng.permutation(size)
         return replace(self, source=LocalSource.holding(raw[order]))
 
-    def as_given(self) -> np.ndarray | None:
-        """The rows, by index, in the order in which the user gave them; None if that is theirs."""
+    def as_given(self) -> np.ndarray:
+        """The rows, by index, in the order in which the user gave them."""
         positions = self.source.positions
-        return None if positions is None else np.argsort(positions)
+        return np.arange(len(self)) if positions is None else np.argsort(positions)
 
     def some_of(self, chosen: np.ndarray, share: float) -> Rows:
         """Rows by index, in ascending order where the source is Dask's, with a share of the memory."""

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import issparse
 from sklearn.base import clone
 from sklearn.gaussian_process.kernels import Kernel
-from sklearn.pipeline import FeatureUnion
+from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.utils.validation import has_fit_parameter
 
 from .._sklearn import safe_indexing
@@ -94,7 +94,7 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
         rows = X if n_rows <= MAP_ROWS else take_rows(X, slice(first, first + MAP_ROWS))
-        values = _transform(fitted_map, rows)
+        values = transformed(fitted_map, rows)
         if not _is_good(values, rows.shape[0]):
             values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
         if blocks and values.shape[1:] != blocks[0].shape[1:]:
@@ -106,22 +106,41 @@ def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
 
-def _transform(fitted_map: Any, rows: Any) -> Any:
-    """What the map returns; for a row of a union, its own bookkeeping would take longer than all its parts."""
-    if type(fitted_map) is FeatureUnion and type(rows) is np.ndarray and fitted_map.transformer_weights is None:
-        maps = [part for _, part in fitted_map.transformer_list]
-        if not any(isinstance(part, str) for part in maps):
-            parts = [part.transform(rows) for part in maps]
-            if all(type(part) is np.ndarray and part.shape[:1] == rows.shape[:1] for part in parts):
-                return _side_by_side(parts)
+def transformed(fitted_map: Any, rows: Any) -> Any:
+    """What a fitted map returns of rows.
+
+    Unions, by themselves or last in a pipeline, are put together here: scikit-learn's take no rows for each output, and
+    for a row their bookkeeping takes longer than all parts.
+    """
+    if type(fitted_map) is Pipeline:
+        steps = [step for _, step in fitted_map.steps if step not in (None, "passthrough")]
+        if steps and type(steps[-1]) in (Pipeline, FeatureUnion):
+            for step in steps[:-1]:
+                rows = step.transform(rows)
+            return transformed(steps[-1], rows)
+    if type(fitted_map) is FeatureUnion:
+        parts = [(name, part) for name, part in fitted_map.transformer_list if not isinstance(part, str)]
+        values = [_dense(transformed(part, rows)) for _, part in parts]
+        if values and all(part.shape[:1] == rows.shape[:1] for part in values):
+            if weights := fitted_map.transformer_weights:
+                names = [name for name, _ in parts]
+                each = [1.0 if weights.get(name) is None else weights[name] for name in names]
+                values = [part * weight for part, weight in zip(values, each, strict=True)]
+            return _side_by_side(values)
     return fitted_map.transform(rows)
+
+
+def _dense(values: Any) -> np.ndarray:
+    return np.asarray(values.toarray() if issparse(values) else values)
 
 
 def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:
     """Columns of all parts; of parts with a row per output, and others with one for all, those of each output."""
     n_outputs = {part.shape[1] for part in parts if part.ndim == 3}
-    if len(n_outputs) != 1:
+    if not n_outputs:
         return np.hstack(parts)
+    if len(n_outputs) > 1:
+        raise ValueError(f"Parts of a union have rows for different numbers of outputs: {sorted(n_outputs)}.")
     (o,) = n_outputs
     each = [part if part.ndim == 3 else np.repeat(part[:, np.newaxis], o, axis=1) for part in parts]
     return np.concatenate(each, axis=2)

@@ -74,6 +74,19 @@ def test_the_noise_is_not_below_its_lowest():
     assert search.best()[1] >= 0.5
 
 
+@pytest.mark.parametrize("fixed", [False, True])
+def test_nor_if_it_began_far_below(fixed):
+    model, rows, table, values = small()
+    table = table.with_fixed("signal") if fixed else table
+    values = values | {"noise": np.full(2, 1e-7)}
+    search = replace(search_of(0, model, rows, table, values), lowest=0.1)
+    signal, noise = search.best()
+    assert noise >= 0.1
+    best = search._losses(signal / noise, np.array([noise]))[0]
+    for n2 in {0.1, max(0.1, 0.7 * noise), 1.4 * noise}:
+        assert search._losses(signal / n2, np.array([n2]))[0] > best - 1e-3
+
+
 def test_variances_of_few_groups_are_larger_the_less_groups_agree():
     search = search_of(0, *small())
     rows = [fold.rows.residuals.shape[0] for fold in search.folds]

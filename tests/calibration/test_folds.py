@@ -15,6 +15,10 @@ def rng():
     return np.random.RandomState(0)
 
 
+def of_groups(groups, n_folds):
+    return folds_of_groups(groups, n_folds, rng(), np.arange(len(groups)))
+
+
 def assert_parts(folds, n_rows):
     """Each row is left out once, and all that is predicted is left out."""
     np.testing.assert_array_equal(np.sort(np.concatenate([fold.rows for fold in folds])), np.arange(n_rows))
@@ -50,7 +54,7 @@ def test_of_many_rows_some_are_predicted_from_all():
 def test_groups_stay_whole_and_folds_are_of_nearly_equal_length():
     groups = np.repeat(np.arange(23), rng().randint(1, 40, 23))
     groups = rng().permutation(groups)
-    folds = folds_of_groups(groups, 5, rng())
+    folds = of_groups(groups, 5)
     assert_parts(folds, len(groups))
     assert sorted(np.concatenate([np.unique(groups[fold.rows]) for fold in folds]).tolist()) == list(range(23))
     sizes = [len(fold.rows) for fold in folds]
@@ -58,18 +62,28 @@ def test_groups_stay_whole_and_folds_are_of_nearly_equal_length():
 
 
 def test_there_are_no_more_folds_than_groups():
-    assert len(folds_of_groups(np.repeat(["a", "b", "c"], 20), 10, rng())) == 3
+    assert len(of_groups(np.repeat(["a", "b", "c"], 20), 10)) == 3
 
 
 @pytest.mark.parametrize("names", [["only"], ["one", "other"]])
 def test_fewer_than_three_groups_are_left_out_in_blocks_of_which_the_inside_is_predicted(names):
     groups = np.array(names * (200 // len(names)))
-    order = np.argsort(groups, kind="stable")
-    folds = folds_of_groups(groups, 4, rng())
+    given = rng().permutation(200)
+    order = given[np.argsort(groups[given], kind="stable")]
+    folds = folds_of_groups(groups, 4, rng(), given)
     assert_parts(folds, 200)
     for fold, expected in zip(folds, np.split(order, 4), strict=True):
         np.testing.assert_array_equal(fold.rows, np.sort(expected))
         np.testing.assert_array_equal(fold.predicted, np.sort(expected[7:-7]))
+
+
+@pytest.mark.parametrize(("sizes", "whole"), [((190, 5, 5), False), ((90, 60, 50), True)])
+def test_a_group_of_most_rows_is_cut(sizes, whole):
+    groups = np.repeat(np.arange(len(sizes)), sizes)
+    folds = of_groups(groups, 4)
+    assert_parts(folds, 200)
+    assert (max(len(fold.rows) for fold in folds) == max(sizes)) == whole
+    assert (sum(len(fold.predicted) for fold in folds) == 200) == whole
 
 
 def test_folds_in_order_are_of_rows_that_follow_each_other_in_it():
@@ -80,5 +94,5 @@ def test_folds_in_order_are_of_rows_that_follow_each_other_in_it():
 
 
 def test_few_rows_are_left_alone():
-    assert CrossValidation(5).folds(FEWEST_ROWS - 1, rng()) == []
-    assert len(CrossValidation(5).folds(FEWEST_ROWS, rng())) == 5
+    assert CrossValidation(5).folds(np.arange(FEWEST_ROWS - 1), rng()) == []
+    assert len(CrossValidation(5).folds(np.arange(FEWEST_ROWS), rng())) == 5

@@ -1,5 +1,6 @@
 """What other folds say of rows, against a posterior per fold from the data."""
 
+import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -123,6 +124,28 @@ def test_left_out_rows_are_predicted_as_by_refits_without_their_fold(family, sha
         rows,
         folds if n_folds < 60 else folds[:2] + [np.sort(np.concatenate(folds[2:]))],
     )
+
+
+@pytest.mark.parametrize("joint", [True, False])
+@pytest.mark.parametrize("family", ["full", "diagonal"])
+def test_of_many_features_too(family, joint, monkeypatch):
+    """More of them than inducing points are not made diagonal at each ratio."""
+    monkeypatch.setattr("skevgp.calibration.left_out._MANY_FEATURES", 0)
+    model, rows, table = problem(family, p=7)
+    if joint:
+        reference = np.repeat(model.prior.reference[:1], 2, axis=0)
+        model = replace(model, prior=replace(model.prior, reference=reference, shared=True))
+    assert_as_refitted(model, table.values(table.start()), rows, parts(len(rows), 3), joint=joint)
+
+
+def test_what_is_kept_does_not_grow_with_the_ratios_that_were_tried():
+    model, rows, table = problem(p=7)
+    ((one, *_),) = left_out(model, table.values(table.start()), rows, parts(len(rows), 3))
+    sizes = []
+    for ratio in 2.0 ** np.arange(10):
+        one.predicted(0, ratio, np.ones(1))
+        sizes.append(len(pickle.dumps(one)))
+    assert sizes[-1] == sizes[0]
 
 
 @pytest.mark.parametrize("family", ["full", "diagonal"])

@@ -61,7 +61,16 @@ def test_what_noise_explains_is_told_where_neighbours_are_alike():
     assert "of 1 of 2 outputs" in nothing_learned(scatter, rows)
     assert nothing_learned(0.9 * scatter, rows) == ""
     assert "n_inducing, or n_restarts of the solver" in nothing_learned(scatter, rows)
-    assert "Raise n_restarts" in nothing_learned(scatter, rows, sparse=False)
+    alone = identity_rows(LINE, WAVE)
+    assert "Raise n_restarts" in nothing_learned(alone.scatter(), alone, sparse=False)
+
+
+def test_a_kernel_that_outputs_share_is_named():
+    rows = identity_rows(LINE, np.hstack([WAVE, WAVE]))
+    noise = rows.scatter() * [1.0, 0.1]
+    assert 'sharing="none" gives each its own' in nothing_learned(noise, rows)
+    assert "MultiOutputRegressor(EGPRegressor(...)) fits each" in nothing_learned(noise, rows, sparse=False)
+    assert "share" not in nothing_learned(rows.scatter(), rows)
 
 
 MODELS = {

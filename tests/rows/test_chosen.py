@@ -89,3 +89,16 @@ def test_a_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
     np.testing.assert_array_equal(chosen.positions, [1, 0, 3])
     np.testing.assert_array_equal(chosen.counts, [1.0, 2.0, 1.0])
     assert rows_of(frame, chosen.positions)["word"].tolist() == ["b", "a", "b"]
+
+
+@pytest.mark.parametrize("words", [[None, "None"], [1, "1"], [1, 1.0], [True, "True"], ["a", "a\0"]])
+def test_what_only_looks_alike_is_told_apart(words):
+    frame = pd.DataFrame({"word": pd.Series(words * 5, dtype=object)})
+    assert Chosen.of(frame, np.zeros(10)).n_rows == 2
+    assert Chosen.of(frame[::2], np.zeros(5)).n_rows == 1
+
+
+@pytest.mark.parametrize("dtype", ["category", "string", "datetime64[ns]", object])
+def test_columns_of_any_type_have_their_rows_told_apart(dtype):
+    frame = pd.DataFrame({"word": pd.Series(["2001-01-01", "2002-01-01", "2001-01-01"]).astype(dtype)})
+    assert Chosen.of(frame, np.zeros(3)).n_rows == 2

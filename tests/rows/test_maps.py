@@ -9,7 +9,7 @@ from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.linear_model import LinearRegression
-from sklearn.pipeline import FeatureUnion, make_union
+from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 from sklearn.utils.validation import check_is_fitted
 
@@ -208,3 +208,36 @@ def test_a_union_of_arrays_gives_what_it_gives_by_itself():
         FeatureUnion([("a", StandardScaler()), ("b", PolynomialFeatures(1))], transformer_weights={"a": 2.0}),
     ):
         assert_array_equal(apply_map(union.fit(X), X, "feature_map"), union.transform(X))
+
+
+def per_output(X):
+    """A row for each of two outputs."""
+    values = np.asarray(X)
+    return np.stack([values[:, :2], 2.0 * values[:, :2]], axis=1)
+
+
+@pytest.mark.parametrize("rows", [X, pd.DataFrame(X, columns=list("abc")), X[:1]], ids=["array", "frame", "row"])
+@pytest.mark.parametrize(
+    ("around", "weights"),
+    [
+        (lambda union: union, None),
+        (lambda union: union, {"own": 3.0, "all": None}),
+        (lambda union: make_pipeline(FunctionTransformer(), union), None),
+        (lambda union: make_union(make_pipeline(union)), None),
+    ],
+    ids=["union", "weights", "pipeline", "nested"],
+)
+def test_a_union_may_have_rows_for_each_output(around, weights, rows):
+    one_hot = FunctionTransformer(lambda X: csr_array(np.asarray(X)[:, :1]))
+    parts = [("own", FunctionTransformer(per_output)), ("all", StandardScaler()), ("sparse", one_hot), ("no", "drop")]
+    fitted = fit_map(around(FeatureUnion(parts, transformer_weights=weights)), rows, Y[: len(rows)], "feature_map")
+    own, scaled, first = per_output(rows), StandardScaler().fit_transform(rows), np.asarray(rows)[:, :1]
+    own = own * (3.0 if weights else 1.0)
+    expected = [np.hstack([own[:, j], scaled, first]) for j in range(2)]
+    assert_array_equal(apply_map(fitted, rows, "feature_map"), np.stack(expected, axis=1))
+
+
+def test_parts_of_a_union_agree_on_the_number_of_outputs():
+    union = make_union(FunctionTransformer(per_output), FunctionTransformer(lambda X: per_output(X)[:, [0, 1, 0]]))
+    with pytest.raises(ValueError, match=r"different numbers of outputs: \[2, 3\]"):
+        apply_map(union.fit(X), X, "feature_map")

@@ -24,6 +24,7 @@ logarithm of their sum. To its other terms the row has the noise variance σ² v
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.special import expit, gammaln
@@ -46,6 +47,10 @@ class RowScales:
 
     n_outputs: int
     distances: np.ndarray
+
+    def __getstate__(self) -> dict[str, Any]:
+        # The rows are in no copy or pickle of a model, and new ones get distances of their own.
+        return {**vars(self), "distances": np.empty(0)}
 
     @property
     def mean(self) -> np.ndarray:
