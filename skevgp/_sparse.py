@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from dataclasses import replace
 from functools import partial
 from typing import Any, Literal, Self
 
@@ -11,12 +12,15 @@ from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 
 from ._base import ExplicitGaussianProcess
+from ._input_noise import fit_to_noisy_inputs, input_covariance, variance_by_inputs
 from ._intake import Problem
+from ._progress import Monitor
 from ._row_weights import chosen_rows
 from ._sklearn import fit_context
 from ._validation import check_magnitude, unchanged_if_it_fails
 from .calibration.folds import CrossValidation
 from .fitting.inducing import Placement
+from .outputs.fit import fit_outputs
 from .outputs.fitted import FittedOutputs
 from .outputs.plan import Request, Sharing
 from .rows.dask import is_dask
@@ -34,6 +38,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
     posterior: Literal["full", "diagonal"]
     noise: Literal["gaussian", "student-t"]
     noise_cv: int | None
+    input_noise: ArrayLike | None
     solver: Literal["lbfgs", "adam"] | LBFGS | Adam
     max_iter: int | None
     tol: float | Literal["auto"]
@@ -95,7 +100,11 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             source = self._source(given, X, y, chosen, self._row_shapes)
             residuals = self._fitted.units.rows(source).residuals
             check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
-            self._fitted = self._fitted.updated(source, self.forgetting_factor)
+            noisier = None
+            if self.input_noise is not None:
+                covariance = input_covariance(self.input_noise, self.n_features_in_)
+                noisier = 1.0 + variance_by_inputs(self, given, X, chosen, covariance) / self._predictor.noise
+            self._fitted = self._fitted.updated(source, self.forgetting_factor, noisier)
             self._training_data = None
             self._set_posterior()
             self._set_weights(chosen)
@@ -133,6 +142,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             return self.lower_bound_
         if self._predictor.shared:
             raise ValueError("lower_bound(theta) needs outputs with weights of their own: no share_coef.")
+        if self.input_noise is not None:
+            raise ValueError("lower_bound(theta) needs rows whose noise does not hang on the kernel: no input_noise.")
         if self._training_data is None:
             raise ValueError(
                 "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
@@ -201,6 +212,29 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         self.loss_curve_ = fitted.loss_curve
         self.n_iter_ = fitted.n_iter
         self.n_parameters_ = fitted.n_parameters
+
+    def _check_noise(self, solver: LBFGS | Adam, X: Any) -> None:
+        """Noise that not all solvers and rows can have."""
+        asked = ('noise="student-t"', self.noise == "student-t"), ("input_noise", self.input_noise is not None)
+        for name, is_asked in asked:
+            if is_asked and (isinstance(solver, Adam) or is_dask(X)):
+                raise ValueError(
+                    f'{name} needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
+                    f"solver={self.solver!r} and X of type {type(X).__name__}."
+                )
+        if all(is_asked for _, is_asked in asked):
+            raise ValueError('input_noise and noise="student-t" do not go together; give one of them.')
+
+    def _with_noisy_inputs(self, request: Request, rng: np.random.RandomState, monitor: Monitor) -> FittedOutputs:
+        """The fit once its rows are as noisy as their inputs make them."""
+        assert self.input_noise is not None
+        assert self._training_data is not None
+        covariance = input_covariance(self.input_noise, self.n_features_in_)
+
+        def refit(variance: np.ndarray, before: FittedOutputs) -> FittedOutputs:
+            return fit_outputs(replace(request, row_variance=variance), rng, monitor, before)
+
+        return fit_to_noisy_inputs(self, self._fitted, self._training_data, covariance, refit, monitor)
 
     def _request(self, problem: Problem, solver: LBFGS | Adam) -> Request:
         """What the fits of all outputs are asked for."""

@@ -21,7 +21,6 @@ from .fitting.advice import DEPENDENT_ROWS
 from .outputs.fit import fit_outputs
 from .outputs.plan import Sharing
 from .outputs.sharing import with_groups
-from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS, Adam, check_weights, resolved
 
@@ -102,6 +101,10 @@ class EVGPRegressor(SparseGaussianProcess):
         L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before. Memory
         grows with the rows: by some ten numbers for each during the fit, and then by one (not in pickles) and
         ``weights_``.
+    input_noise : float or array-like of shape (n_features,) or (n_features, n_features), default=None
+        Standard deviations, or the covariance, of noise in X itself: to first order a row's noise variance is then σ² +
+        ∂g Σ ∂gᵀ (McHutchon & Rasmussen 2011), the mean of outputs fitted together. Fits follow each other until σ²
+        settles; it and ``std`` are of rows that are known exactly. Not for Dask arrays, Adam or Student-t noise.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
     noise_cv : int, default=5
@@ -246,6 +249,7 @@ class EVGPRegressor(SparseGaussianProcess):
         "posterior": [StrOptions({"full", "diagonal"})],
         "noise": [StrOptions({"gaussian", "student-t"})],
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
+        "input_noise": ["array-like", Real, None],
         "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
         "tol": [StrOptions({"auto"}), Interval(Real, 0, None, closed="left")],
@@ -270,6 +274,7 @@ class EVGPRegressor(SparseGaussianProcess):
         coef_cov: ArrayLike | None = None,
         share_coef: bool | Literal["auto"] = "auto",
         noise: Literal["gaussian", "student-t"] = "gaussian",
+        input_noise: ArrayLike | None = None,
         noise_variance: float | None = None,
         noise_cv: int | None = 5,
         normalize_y: bool = False,
@@ -296,6 +301,7 @@ class EVGPRegressor(SparseGaussianProcess):
         self.coef_cov = coef_cov
         self.share_coef = share_coef
         self.noise = noise
+        self.input_noise = input_noise
         self.noise_variance = noise_variance
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
@@ -371,11 +377,7 @@ class EVGPRegressor(SparseGaussianProcess):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        if self.noise == "student-t" and (isinstance(solver, Adam) or is_dask(X)):
-            raise ValueError(
-                'noise="student-t" needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
-                f"solver={self.solver!r} and X of type {type(X).__name__}."
-            )
+        self._check_noise(solver, X)
         progress = monitor_of(self.verbose, solver.callback, self.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y, sample_weight, relative_variance, groups)
@@ -386,6 +388,8 @@ class EVGPRegressor(SparseGaussianProcess):
             rng = check_random_state(self.random_state)
             request = with_groups(request, rng, monitor, previous)
             self._fitted = fit_outputs(request, rng, monitor, previous)
+            if self.input_noise is not None:
+                self._fitted = self._with_noisy_inputs(request, rng, monitor)
             self._set_attributes()
             self._set_weights(problem.data[-1])
         self._warn_of(self._fitted.messages)

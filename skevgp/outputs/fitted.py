@@ -45,10 +45,11 @@ class FittedOutputs:
         each = [one.doubts.scales.mean for one in self.learned if isinstance(one.doubts, RowDoubts)]
         return np.column_stack(each) if each else None
 
-    def updated(self, source: Source, weight: float = 1.0) -> FittedOutputs:
+    def updated(self, source: Source, weight: float = 1.0, row_variance: np.ndarray | None = None) -> FittedOutputs:
         """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
         rows = self.units.rows(source)
-        learned = (one.updated(rows.outputs(own), weight) for own, one in zip(self.outputs, self.learned, strict=True))
+        models = zip(self.outputs, self.learned, strict=True)
+        learned = (one.updated(rows.outputs(own).noisier(row_variance), weight) for own, one in models)
         return replace(self, learned=tuple(learned))
 
     def predictor(self) -> Predictor:

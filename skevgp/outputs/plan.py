@@ -60,6 +60,8 @@ class Request:
         Whether the groups were found and not given.
     heavy_tails : bool, default=False
         Whether the noise has a Student-t's tails.
+    row_variance : ndarray of shape (n, n_outputs), optional
+        Noise variances of the rows in units of σ², beside what the source knows; outputs of a model share their mean.
     """
 
     source: Source
@@ -76,6 +78,7 @@ class Request:
     per_output: bool = False
     found: bool = False
     heavy_tails: bool = False
+    row_variance: np.ndarray | None = None
 
 
 def plan(
@@ -120,7 +123,7 @@ def plan(
                     stay,
                     kernels if model.split else None,
                 ),
-                rows.outputs(outputs, share),
+                rows.outputs(outputs, share).noisier(request.row_variance),
                 table,
                 placement,
                 solver,

@@ -124,6 +124,15 @@ class Rows:
         """Of the residuals of all outputs."""
         return self._moments[1]
 
+    def noisier(self, variance: np.ndarray | None) -> Rows:
+        """With noise variances (n, n_outputs) of all outputs in units of σ², of which these share the mean."""
+        if variance is None:
+            return self
+        if not isinstance(self.source, LocalSource):
+            raise TypeError("Rows of Dask arrays have no noise of their own.")
+        own = variance[:, self.columns].mean(axis=1)
+        return replace(self, source=self.source.weighed(1.0 / own, np.log(own)))
+
     @property
     def total(self) -> float:
         """Σ w: rows, each as often as it counts."""

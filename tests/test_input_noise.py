@@ -1,0 +1,130 @@
+"""Noise in X: what a row's noise variance grows by, and what a fit that knows of it learns."""
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.preprocessing import FunctionTransformer, StandardScaler
+
+from skevgp import EVGPRegressor
+from skevgp._input_noise import variance_by_inputs
+from skevgp.metrics import containing_ratios, prediction_error
+
+
+def waves(n, x_noise, y_noise, seed=0):
+    """Steep on one side, flat on the other: X as measured, y, and the truth behind."""
+    rng = np.random.RandomState(seed)
+    x = rng.uniform(-2.0, 2.0, (n, 1))
+    g = np.where(x > 0.0, np.sin(6.0 * x), 0.2 * x)[:, 0] + 0.0
+    return x + x_noise * rng.randn(n, 1), g + y_noise * rng.randn(n), x, g
+
+
+def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
+    """There ∂g Σ ∂gᵀ is the same of all rows, and σ² what it leaves of the noise."""
+    rng = np.random.RandomState(0)
+    x = rng.uniform(-1.0, 1.0, (3000, 2))
+    X, y = x + [0.1, 0.05] * rng.randn(3000, 2), x @ [2.0, -1.0] + 0.1 * rng.randn(3000)
+    kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
+    options = {"kernel": kernel, "n_inducing": 5, "coef_scale": 10.0, "random_state": 0}
+    plain = EVGPRegressor(FunctionTransformer(), **options).fit(X, y)
+    found = EVGPRegressor(FunctionTransformer(), input_noise=[0.1, 0.05], **options).fit(X, y)
+    by_inputs = (2.0 * 0.1) ** 2 + 0.05**2
+    assert plain.noise_variance_ == pytest.approx(0.01 + by_inputs, rel=0.1)
+    # Weights that are learned from noisy X are a little too small, and what they leave counts as noise.
+    assert found.noise_variance_ == pytest.approx(0.012, rel=0.4)
+    covariance = np.diag([0.1**2, 0.05**2])
+    variance = variance_by_inputs(found, *found._training_data[:2], found._training_data[3], covariance)
+    np.testing.assert_allclose(variance, by_inputs, rtol=0.15)
+
+
+def test_where_the_function_is_steep_rows_count_less():
+    X, y, _, _ = waves(600, 0.02, 0.02)
+    options = {"n_inducing": 40, "random_state": 0}
+    plain = EVGPRegressor(**options).fit(X, y)
+    found = EVGPRegressor(input_noise=0.02, **options).fit(X, y)
+    assert np.sqrt(found.noise_variance_) == pytest.approx(0.02, rel=0.3)
+    assert np.sqrt(plain.noise_variance_) > 0.04
+    _, _, x, g = waves(2000, 0.0, 0.0, seed=1)
+    flat = x[:, 0] < -0.3
+    mean, std = found.predict(x[flat], return_std=True, include_noise=False)
+    # Where rows are good it says so, and that holds.
+    assert std.mean() < 0.6 * plain.predict(x[flat], return_std=True, include_noise=False)[1].mean()
+    assert containing_ratios(g[flat], mean, std)[1] > 0.7
+    assert prediction_error(g, found.predict(x)) < 1.3 * prediction_error(g, plain.predict(x))
+
+
+def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
+    monkeypatch.setattr("skevgp._input_noise._ROWS_AT_ONCE", 7)
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-1.0, 1.0, (40, 2))
+    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, tol=1e6).fit(
+        X, np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
+    )
+    covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
+    given, used, _, chosen = model._training_data
+    found = chosen.as_given(variance_by_inputs(model, given, used, chosen, covariance))
+    slopes = model.jacobian(X)
+    np.testing.assert_allclose(found, np.einsum("noi,ij,noj->no", slopes, covariance, slopes), rtol=1e-10)
+
+
+@pytest.mark.parametrize("sharing", ["all", "none", "kernel"])
+def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-1.0, 1.0, (80, 2))
+    Y = np.column_stack([np.sin(3.0 * X[:, 0]), X[:, 1]]) + 0.02 * rng.randn(80, 2)
+    frame = pd.DataFrame(X, columns=["a", "b"])
+    model = EVGPRegressor(
+        kernel_map=StandardScaler(),
+        input_noise=np.diag([0.01, 0.0]),
+        sharing=sharing,
+        n_inducing=8,
+        max_iter=10,
+        tol=1e6,
+    )
+    model.fit(frame, Y, sample_weight=np.arange(80) % 3)
+    before = model.predict(frame)
+    model.partial_fit(frame[:10], Y[:10] + 0.5)
+    assert np.isfinite(model.predict(frame)).all()
+    assert np.abs(model.predict(frame) - before).max() > 0.0
+    assert np.isfinite(model.lower_bound_)
+
+
+def test_rows_that_are_noisier_say_less_when_they_come_later():
+    X, y, _, _ = waves(300, 0.0, 0.05)
+    options = {"n_inducing": 15, "random_state": 0, "max_iter": 0}
+    exact = EVGPRegressor(**options).fit(X[:100], y[:100]).partial_fit(X[100:], y[100:])
+    noisy = EVGPRegressor(**options).fit(X[:100], y[:100]).set_params(input_noise=0.5).partial_fit(X[100:], y[100:])
+    grid = np.linspace(-2.0, 2.0, 50)[:, np.newaxis]
+    stds = [each.predict(grid, return_std=True, include_noise=False)[1] for each in (exact, noisy)]
+    assert (stds[1] >= stds[0] * (1.0 - 1e-9)).all()
+    assert stds[1].mean() > 1.02 * stds[0].mean()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"input_noise": [0.1, 0.1, 0.1]}, "n_features=2 columns of X"),
+        ({"input_noise": [-0.1, 0.1]}, "must not be negative"),
+        ({"input_noise": np.nan}, "input_noise must be finite"),
+        ({"input_noise": [[1.0, 0.5], [0.0, 1.0]]}, "symmetric and positive semi-definite"),
+        ({"input_noise": [[1.0, 2.0], [2.0, 1.0]]}, "symmetric and positive semi-definite"),
+        ({"input_noise": "much"}, "input_noise"),
+        ({"input_noise": 0.1, "solver": "adam"}, 'input_noise needs solver="lbfgs"'),
+        ({"input_noise": 0.1, "noise": "student-t"}, "do not go together"),
+    ],
+)
+def test_what_cannot_be_is_refused_by_name(options, message):
+    X = np.random.RandomState(0).randn(30, 2)
+    with pytest.raises((ValueError, TypeError), match=message):
+        EVGPRegressor(n_inducing=5, max_iter=3, tol=1e6, **options).fit(X, X[:, 0])
+
+
+def test_bounds_of_other_kernels_and_dask_arrays_are_refused():
+    da = pytest.importorskip("dask.array")
+    X = np.random.RandomState(0).randn(30, 2)
+    model = EVGPRegressor(n_inducing=5, max_iter=10, tol=1e6, input_noise=0.1)
+    with pytest.raises(ValueError, match="input_noise needs"):
+        model.fit(da.from_array(X), da.from_array(X[:, 0]))
+    model.fit(X, X[:, 0])
+    with pytest.raises(ValueError, match="no input_noise"):
+        model.lower_bound(model.kernel_.theta)
