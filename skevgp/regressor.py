@@ -370,7 +370,9 @@ class EVGPRegressor(SparseGaussianProcess):
             prior mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
         skevgp.exceptions.DependentRowsWarning
             If rows near each other, in the order given, are so alike that the noise would be more than four times as
-            large if blocks of them were left out: ``groups`` should say which belong together.
+            large if blocks of them were left out, or rows follow a path (two directions of the kernel's inputs change
+            slowly, and none is sorted) and their log density would be lower by 0.1: ``groups`` should say which belong
+            together.
         """
         solver = resolved(self.solver, self.posterior)
         if not isinstance(self.n_inducing, str):

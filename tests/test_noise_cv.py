@@ -11,7 +11,9 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
+from skevgp.features import InertiaForceGravity
 from skevgp.metrics import containing_ratios, negative_log_predictive_density
 from skevgp.solvers import LBFGS
 
@@ -284,16 +286,31 @@ def test_rows_of_trajectories_without_groups_are_warned_of_once():
     assert len([own for own in caught if own.category is DependentRowsWarning]) == 1
 
 
+def test_trajectories_are_warned_of_even_if_their_noise_would_not_be_much_larger():
+    """Where nothing is known, std is large anyway: log density tells."""
+    data = make_dynamics("pendulum", 10, random_state=0)
+    with pytest.warns(DependentRowsWarning):
+        model(feature_map=InertiaForceGravity("pendulum"), n_inducing=60).fit(data.data, data.target)
+
+
+def _sorted_by_y():
+    """Of a function whose highest values are in a corner, where blocks of rows are predicted worse."""
+    X, _ = independent(400)
+    y = np.exp(X[:, 0]) + 0.3 * np.random.RandomState(1).randn(400)
+    return X[np.argsort(y)], np.sort(y)
+
+
 @pytest.mark.parametrize(
     "fit",
     [
         lambda: fitted(),
+        lambda: fitted(None, *_sorted_by_y()),
         lambda: fitted(None, noise_cv=None),
         lambda: fitted(None, *(part[np.random.RandomState(0).permutation(len(X))] for part in (X, Y))),
         lambda: fitted(None, *independent()),
         lambda: fitted(None, *(part[np.argsort(independent()[0][:, 0])] for part in independent())),
     ],
-    ids=["groups", "not calibrated", "shuffled", "independent", "sorted"],
+    ids=["groups", "sorted by y", "not calibrated", "shuffled", "independent", "sorted"],
 )
 def test_others_are_not(fit):
     with warnings.catch_warnings():

@@ -85,12 +85,14 @@ def small():
     return make_dynamics("pendulum", n_trajectories=12, n_steps=30, random_state=0)
 
 
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_cross_validation_over_trajectories(small):
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0, tol=1.0)
     scores = cross_val_score(model, small.data, small.target, groups=small.groups, cv=GroupKFold(3))
     assert scores.min() > 0.999
 
 
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 @pytest.mark.slow
 def test_grid_search_over_the_number_of_inducing_points(small):
     search = GridSearchCV(
@@ -104,6 +106,7 @@ def test_grid_search_over_the_number_of_inducing_points(small):
     assert search.best_params_["n_inducing"] in (5, 10)
 
 
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_inside_a_pipeline_with_the_scaling_in_kernel_map(small):
     """A step that keeps the columns' units; z-scores go to the kernel only."""
     model = Pipeline(

@@ -30,7 +30,7 @@ from ..inference.model import SparseModel
 from ..inference.statistics import SufficientStatistics, collect
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
-from .folds import CrossValidation, Fold, folds_in_order
+from .folds import CrossValidation, Fold, folds_in_order, follow_a_path
 from .left_out import LeftOut, Seen, Weights, prior_of, sums_of_others
 from .search import Limits, Search
 
@@ -41,8 +41,10 @@ _LEFT_OVER = 0.4
 _MOST_ROWS = 50_000
 # The signal's limits in a fit are so many times wider here, if they are not the user's.
 _WIDER = 1e4
-# Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds.
-_DEPENDENT = 4.0
+# Rows depend on those near them if the noise by blocks of consecutive rows is so many times that by random folds. So do
+# rows along a path if log density by blocks is so much lower, in nats per row. (Of a sorted table it may be, too: there
+# blocks are where no other rows are.)
+_DEPENDENT, _WORSE = 4.0, 0.1
 # Of so many rows that can be seen.
 _FEWEST_DEPENDENT = 200
 # What explained more than so much of an output holds for no other group if it gains less than this, in nats per row
@@ -135,14 +137,31 @@ def _by_folds(
         groups = [by.groups[fold.predicted] for fold in folds]
         found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
-        in_order = folds_in_order(rows.as_given(), by.n_folds, rng)
-        alone = replace(limits, free_signal=False)
-        blocks = _searches(model, values, in_order, rows, alone, lowest)
-        chance = [search.with_limits(alone, lowest[search.output]) for search in searches]
-        each = (np.array([noise for _, noise in rows.threads(Search.best, own)]) for own in (blocks, chance))
-        dependent = bool((next(each) > _DEPENDENT * next(each)).any())
+        dependent = _dependent(model, values, rows, by, rng, searches, found, lowest)
     signal, noise = np.array(found).T
     return Calibrated(signal, noise, gone, dependent)
+
+
+def _dependent(
+    model: SparseModel,
+    values: Values,
+    rows: Rows,
+    by: CrossValidation,
+    rng: np.random.RandomState,
+    searches: list[Search],
+    found: list[tuple[float, float]],
+    lowest: np.ndarray,
+) -> bool:
+    """Whether rows near each other are alike: left out in blocks, they are predicted worse than by ``searches``."""
+    order = rows.as_given()
+    alone = replace(searches[0].limits, free_signal=False)
+    blocks = _searches(model, values, folds_in_order(order, by.n_folds, rng), rows, alone, lowest)
+    worse = [block.loss(*best) - own.loss(*best) for block, own, best in zip(blocks, searches, found, strict=True)]
+    if max(worse) > _WORSE and follow_a_path(order, lambda some: rows.some(some).inputs):
+        return True
+    chance = [search.with_limits(alone, lowest[search.output]) for search in searches]
+    each = (np.array([noise for _, noise in rows.threads(Search.best, own)]) for own in (blocks, chance))
+    return bool((next(each) > _DEPENDENT * next(each)).any())
 
 
 def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:

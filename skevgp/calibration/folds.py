@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,11 @@ PREDICTED_ROWS = 2000
 # to predict it from. Blocks of consecutive rows are then left out; so much of each at either end, which is like its
 # neighbours, is not predicted.
 _LARGEST_SHARE, _GAP = 0.5, 0.15
+# Along slow directions the square of a step from row to row is this share of that between any two rows, on average. One
+# direction may be slow in a sorted table. So many steps are looked at.
+_SLOW, _SLOW_DIRECTIONS, _STEPS = 0.1, 2, 2000
+# Directions along which inputs vary less than this, in standard deviations of their columns, say nothing.
+_FLAT = 1e-3
 
 
 @dataclass(frozen=True)
@@ -108,3 +114,27 @@ def _thinned(parts: list[np.ndarray], rng: np.random.RandomState, inner: list[np
             own = rng.permutation(own)[: max(round(share * len(own)), 1)]
         folds.append(Fold(np.sort(rows), np.sort(own)))
     return folds
+
+
+def follow_a_path(order: np.ndarray, inputs: Callable[[np.ndarray], np.ndarray]) -> bool:
+    """Whether rows that follow each other are near each other, as in a trajectory and not as in a sorted table.
+
+    Parameters
+    ----------
+    order : ndarray of shape (n,)
+        The rows as they follow each other.
+    inputs : callable
+        Of rows by index, (n, ...).
+    """
+    first = np.unique(np.linspace(0, len(order) - 2, min(len(order) - 1, _STEPS)).astype(int))
+    here, there = (inputs(order[rows]).reshape(len(rows), -1) for rows in (first, first + 1))
+    scale = here.std(axis=0)
+    here, there, scale = here[:, scale > 0.0], there[:, scale > 0.0], scale[scale > 0.0]
+    steps = (there - here) / scale
+    if steps.shape[1] < _SLOW_DIRECTIONS or (steps >= 0.0).all(axis=0).any() or (steps <= 0.0).all(axis=0).any():
+        return False
+    _, sizes, directions = np.linalg.svd((here - here.mean(axis=0)) / scale / np.sqrt(len(here)), full_matrices=False)
+    kept = sizes > _FLAT
+    along = steps @ (directions[kept].T / sizes[kept])
+    shares = np.linalg.eigvalsh(along.T @ along / (2.0 * len(along)))
+    return bool(np.sum(shares < _SLOW) >= _SLOW_DIRECTIONS)

@@ -20,7 +20,7 @@ _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 DEPENDENT_ROWS = (
-    "Rows near each other are alike: left out in blocks, they are predicted much worse than at random, and std is too "
+    "Rows near each other are alike: left out in blocks, they are predicted worse than at random, and std is too "
     "small for new trajectories. Say in fit(X, y, groups=...) which rows belong together, such as the number of each "
     "row's trajectory. (Where rows are sorted but independent, shuffle them, or ignore this warning.)"
 )

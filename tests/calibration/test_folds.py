@@ -7,6 +7,7 @@ from skevgp.calibration.folds import (
     CrossValidation,
     folds_in_order,
     folds_of_groups,
+    follow_a_path,
     random_folds,
 )
 
@@ -96,3 +97,47 @@ def test_folds_in_order_are_of_rows_that_follow_each_other_in_it():
 def test_few_rows_are_left_alone():
     assert CrossValidation(5).folds(np.arange(FEWEST_ROWS - 1), rng()) == []
     assert len(CrossValidation(5).folds(np.arange(FEWEST_ROWS), rng())) == 5
+
+
+def _walks(n, columns):
+    """Smooth, and an input that is drawn for each row anew."""
+    t = np.linspace(0.0, 20.0, n)[:, np.newaxis]
+    slow = np.sin(t * np.linspace(1.0, 1.7, columns) + np.arange(columns))
+    return np.hstack([slow, rng().randn(n, 1)])
+
+
+def _sorted_by_first(X):
+    return X[np.argsort(X[:, 0])]
+
+
+TABLE = rng().randn(400, 3)
+GRID = np.stack(np.meshgrid(np.arange(30.0), np.arange(30.0)), axis=-1).reshape(-1, 2)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "expected"),
+    [
+        (_walks(400, 2), True),
+        (_walks(400, 2)[:, [0, 1, 0, 2]] * [1.0, 1e6, 1e-3, 1.0], True),
+        (np.hstack([_walks(400, 3), np.ones((400, 1))]), True),
+        (_walks(5000, 2), True),
+        (_walks(400, 2)[rng().permutation(400)], False),
+        (_walks(400, 1), False),
+        (TABLE, False),
+        (_sorted_by_first(TABLE), False),
+        (_sorted_by_first(TABLE) @ [[1.0, 5.0, 5.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]], False),
+        (_sorted_by_first(TABLE)[::-1] * [1.0, 1.0, 0.0], False),
+        (_sorted_by_first(TABLE)[:, [0, 0, 0]] ** [1, 2, 3], False),
+        (GRID, False),
+        (np.ones((400, 2)), False),
+    ],
+    ids=[
+        *("a walk", "its columns twice", "a constant", "long", "shuffled", "one slow column", "a table", "sorted"),
+        *("correlated", "backwards", "powers", "a grid", "all the same"),
+    ],
+)
+def test_a_path_is_no_sorted_table(inputs, expected):
+    order = rng().permutation(len(inputs))
+    kept = np.empty_like(inputs)
+    kept[order] = inputs
+    assert follow_a_path(order, lambda rows: kept[rows]) == expected

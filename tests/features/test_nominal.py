@@ -343,6 +343,7 @@ def error(model, data):
 
 
 @pytest.mark.filterwarnings("ignore:The bound was still rising")
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_a_wrong_model_and_encoded_angles_help_the_regressor():
     data = [make_dynamics("acrobot", n_trajectories=n, n_steps=40, random_state=n) for n in (16, 20)]
     nominal = union("acrobot", NominalDynamics(perturb_robot("acrobot", 0.2, random_state=0)))
