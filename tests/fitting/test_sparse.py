@@ -30,7 +30,7 @@ def task_of(monitor=None, seed=0, **changes):
 def started(task, **options):
     """A fit that ended where it started."""
     values = task.table.values_at_start()
-    bound, _ = task.model.at_optimum(values, task.model.statistics(values, task.blocks))
+    bound = task.model.bound(values, task.model.statistics(values, task.blocks))
     return Fit(values, **{"bound": bound, **options})
 
 
@@ -139,7 +139,7 @@ def test_what_is_kept_is_where_the_fit_ended():
     assert learned.loss_curve == [3.0, 2.0]
     assert learned.bound == fit.bound
     assert learned.message == ""
-    expected = task.model.at_optimum(fit.values, learned.statistics)[1]
+    expected = task.model.at_optimum(fit.values, learned.statistics)
     for found, value in zip(learned.predictor.predict(X, H, True), expected.predict(X, H, True), strict=True):
         np.testing.assert_array_equal(found, value)
 
@@ -234,7 +234,8 @@ def test_calibrated_are_signal_and_noise_and_q_is_at_its_optimum_for_them():
         assert (learned.values[name] != fit.values[name]).all()
     for name in ("hyperparameters", "inducing_points"):
         np.testing.assert_array_equal(learned.values[name], fit.values[name])
-    bound, predictor = task.model.at_optimum(learned.values, learned.statistics)
+    bound = task.model.bound(learned.values, learned.statistics)
+    predictor = task.model.at_optimum(learned.values, learned.statistics)
     assert learned.bound == bound
     np.testing.assert_array_equal(learned.predictor.groups[0].mean, predictor.groups[0].mean)
     assert learned.loss_curve == plain.loss_curve
@@ -379,7 +380,7 @@ def test_a_fit_that_begins_with_samples_ends_with_all_rows():
     fits = [Learned.of(own, search(own)) for own in (task, plain)]
     assert fits[0].bound > fits[1].bound - 0.02 * (fits[1].bound - task.alone)
     at = task.model.statistics(fits[0].values, task.blocks)
-    assert fits[0].bound == pytest.approx(task.model.at_optimum(fits[0].values, at)[0], rel=1e-6)
+    assert fits[0].bound == pytest.approx(task.model.bound(fits[0].values, at), rel=1e-6)
     assert fits[0].loss_curve[-1] == pytest.approx(-fits[0].bound, rel=1e-9)
 
 
@@ -396,4 +397,4 @@ def test_a_fit_that_ctrl_c_ended_on_a_sample_has_the_bound_of_all_rows():
     assert fit.n_rows == 15
     learned = Learned.of(task, fit)
     at = task.model.statistics(fit.values, task.blocks)
-    assert learned.bound == pytest.approx(task.model.at_optimum(fit.values, at)[0])
+    assert learned.bound == pytest.approx(task.model.bound(fit.values, at))

@@ -139,7 +139,7 @@ def test_predictions_are_of_y():
             "noise": np.full(1, 0.01),
             "inducing_points": X[np.newaxis, :20],
         }
-        parts.append(model.at_optimum(values, model.statistics(values, rows.outputs(own).blocks(kernel, 20)))[1])
+        parts.append(model.at_optimum(values, model.statistics(values, rows.outputs(own).blocks(kernel, 20))))
     predictor = units.predictor(parts, [[0], [1]])
     mean, variance = predictor.predict(X, H, return_variance=True)
     np.testing.assert_allclose(predictor.noise, 0.01 * units.target_unit**2)

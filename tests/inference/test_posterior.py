@@ -157,7 +157,7 @@ def test_it_is_frozen_and_keeps_no_row():
 def problem_of(n):
     model, rows, table = problem(n=n)
     values = table.values_at_start()
-    return model.at_optimum(values, model.statistics(values, rows.blocks(model.kernel, 17)))[1]
+    return model.at_optimum(values, model.statistics(values, rows.blocks(model.kernel, 17)))
 
 
 @pytest.mark.parametrize("shared", [True, False])
