@@ -78,12 +78,16 @@ def _looked_at(
         CompiledPredictor(model, include_noise=False),
         model._numbers(given, reset=False)[0] if is_frame(given) else X,
     )
+    # Where y is what was added to columns of X, their noise is in y too.
+    base = getattr(model, "_columns_changed", None)
     positions = np.arange(len(rows)) if chosen.positions is None else chosen.positions
     variances, squares = [], []
     for first in range(0, len(positions), _ROWS_AT_ONCE):
         own = positions[first : first + _ROWS_AT_ONCE]
         some = np.asarray(rows[own], dtype=np.float64)
         slopes = fast.value_and_jacobian(some)[1].reshape(len(some), -1, some.shape[1])
+        if base is not None:
+            slopes[:, np.arange(len(base)), base] += 1.0
         variances.append(np.einsum("noi,ij,noj->no", slopes, covariance, slopes, optimize=True))
         if y is not None:
             mean, std = (part.reshape(len(some), -1) for part in fast.predict(some, return_std=True))
@@ -91,13 +95,26 @@ def _looked_at(
     return np.concatenate(variances), np.concatenate(squares) if squares else np.empty((0, 0))
 
 
-def _own_variance(squares: np.ndarray, by_inputs: np.ndarray) -> float:
-    """The σ² under which squared errors (n,) of variance σ² + v are most likely."""
-    whole = float(np.mean(squares))
+def relative_noise(by_inputs: np.ndarray, own: np.ndarray, chosen: Any) -> np.ndarray:
+    """(v σ² + ∂g Σ ∂gᵀ) / v σ² of rows and outputs, (n, o): what multiplies the noise that rows have anyway."""
+    _, variance = _weights(chosen, len(by_inputs))
+    return np.minimum(1.0 + by_inputs / (own * variance[:, np.newaxis]), LARGEST)
+
+
+def _weights(chosen: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """How often rows count, and their noise variances v in units of σ², (n,) each."""
+    if chosen.counts is None:
+        return np.ones(n), np.ones(n)
+    return chosen.counts, chosen.counts / chosen.precision
+
+
+def _own_variance(squares: np.ndarray, by_inputs: np.ndarray, counts: np.ndarray, variance: np.ndarray) -> float:
+    """The σ² under which squared errors (n,) of variance v σ² + ∂g Σ ∂gᵀ are most likely."""
+    whole = float(counts @ (squares / variance) / counts.sum())
 
     def loss(log_variance: float) -> float:
-        variance = np.exp(log_variance) + by_inputs
-        return float(np.mean(np.log(variance) + squares / variance))
+        each = np.exp(log_variance) * variance + by_inputs
+        return float(counts @ (np.log(each) + squares / each) / counts.sum())
 
     limits = np.log(whole * _LEAST), np.log(whole)
     return float(np.exp(minimize_scalar(loss, bounds=limits, method="bounded").x)) if whole > 0.0 else 0.0
@@ -133,11 +150,13 @@ def fit_to_noisy_inputs(
         model._predictor = fitted.predictor()
         by_inputs, squares = _looked_at(model, given, X, y, chosen, covariance)
         least = np.finfo(float).tiny
-        own = np.array([max(_own_variance(*each), least) for each in zip(squares.T, by_inputs.T, strict=True)])
+        weights = _weights(chosen, len(by_inputs))
+        each = zip(squares.T, by_inputs.T, strict=True)
+        own = np.array([max(_own_variance(*of_output, *weights), least) for of_output in each])
         if before is not None and (np.abs(np.log(own / before)) < _SETTLED).all():
             break
         before = own
-        fitted = refit(np.minimum(1.0 + by_inputs / own, LARGEST), fitted)
+        fitted = refit(relative_noise(by_inputs, own, chosen), fitted)
         if monitor.stopped or monitor.out_of_time:
             break
     return fitted

@@ -12,7 +12,7 @@ from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 
 from ._base import ExplicitGaussianProcess
-from ._input_noise import fit_to_noisy_inputs, input_covariance, variance_by_inputs
+from ._input_noise import fit_to_noisy_inputs, input_covariance, relative_noise, variance_by_inputs
 from ._intake import Problem
 from ._progress import Monitor
 from ._row_weights import chosen_rows
@@ -103,7 +103,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             noisier = None
             if self.input_noise is not None:
                 covariance = input_covariance(self.input_noise, self.n_features_in_)
-                noisier = 1.0 + variance_by_inputs(self, given, X, chosen, covariance) / self._predictor.noise
+                by_inputs = variance_by_inputs(self, given, X, chosen, covariance)
+                noisier = relative_noise(by_inputs, self._predictor.noise, chosen)
             self._fitted = self._fitted.updated(source, self.forgetting_factor, noisier)
             self._training_data = None
             self._set_posterior()

@@ -223,6 +223,9 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
         residuals = y - columns_of(X, base, y.ndim)
+        if getattr(regressor, "input_noise", None) is not None:
+            # The noise of these columns is in what is learned too.
+            regressor._columns_changed = base
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self

@@ -6,7 +6,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import EVGPRegressor
+from skevgp import EVGPRegressor, ResidualRegressor
 from skevgp._input_noise import variance_by_inputs
 from skevgp.metrics import containing_ratios, prediction_error
 
@@ -128,3 +128,30 @@ def test_bounds_of_other_kernels_and_dask_arrays_are_refused():
     model.fit(X, X[:, 0])
     with pytest.raises(ValueError, match="no input_noise"):
         model.lower_bound(model.kernel_.theta)
+
+
+def test_changes_of_noisy_columns_are_noisy_by_these_too():
+    """What is learned of y - x has -η in it: σ² is that of y learned directly."""
+    rng = np.random.RandomState(0)
+    z = rng.uniform(-2.0, 2.0, (800, 1))
+    X, y = z + 0.03 * rng.randn(800, 1), z[:, 0] + 0.3 * np.sin(2.0 * z[:, 0]) + 0.01 * rng.randn(800)
+    options = {"n_inducing": 15, "random_state": 0, "input_noise": 0.03}
+    direct = EVGPRegressor(FunctionTransformer(), **options).fit(X, y)
+    changes = ResidualRegressor(EVGPRegressor(**options)).fit(X, y)
+    assert np.sqrt(direct.noise_variance_) == pytest.approx(0.01, rel=0.4)
+    assert np.sqrt(changes.regressor_.noise_variance_) == pytest.approx(0.01, rel=0.4)
+    before = changes.predict(X, return_std=True)[1].mean()
+    assert changes.partial_fit(X[:50], y[:50]).predict(X, return_std=True)[1].mean() == pytest.approx(before, rel=0.1)
+
+
+def test_known_differences_between_rows_noise_are_beside_that_of_inputs():
+    """A row's noise variance is v σ² + ∂g Σ ∂gᵀ."""
+    rng = np.random.RandomState(0)
+    x, v = rng.uniform(-1.0, 1.0, (4000, 1)), np.where(np.arange(4000) % 2, 1.0, 100.0)
+    X, y = x + 0.05 * rng.randn(4000, 1), 2.0 * x[:, 0] + 0.05 * np.sqrt(v) * rng.randn(4000)
+    kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
+    model = EVGPRegressor(
+        FunctionTransformer(), kernel, n_inducing=5, coef_scale=10.0, input_noise=0.05, random_state=0
+    )
+    model.fit(X, y, relative_variance=v)
+    assert model.noise_variance_ == pytest.approx(0.0025, rel=0.25)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
+from sklearn.utils.validation import check_is_fitted
 
 from .._shapes import like_y
 from ..inference.posterior import Predictor, PredictorGroup
@@ -53,6 +54,8 @@ class CompiledPredictor:
     ((2,), (60, 2, 1))
     """
 
+    _state: tuple[Predictor, tuple[_Group, ...], np.ndarray]
+
     def __init__(self, model: Model, include_noise: bool = True, base: np.ndarray | None = None):
         self.include_noise, self.base = include_noise, base
         self._kernel_map = None if model.kernel_map_ is None else direct_map(model.kernel_map_)
@@ -66,10 +69,20 @@ class CompiledPredictor:
 
         Parameters
         ----------
-        model : EVGPRegressor or EGPRegressor
-            With the maps that this one was made with: of the same fit.
+        model : EVGPRegressor, EGPRegressor or ResidualRegressor
+            Of the same fit: with the same maps, kernel and inducing points.
+
+        Raises
+        ------
+        ValueError
+            If it is of another fit.
+        NotFittedError
+            If it is of none.
         """
-        predictor = model._predictor if self.base is None else getattr(model, "regressor_", model)._predictor
+        check_is_fitted(model)
+        predictor = getattr(model, "regressor_", model)._predictor
+        if hasattr(self, "_state") and not _goes_on(self._state[0], predictor):
+            raise ValueError("update takes on the weights of the same fit; compile a model that was fitted anew.")
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
         groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
         self._state = (predictor, groups, noise)
@@ -140,6 +153,16 @@ class CompiledPredictor:
         std = np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)
         by_std = (0.5 / np.where(std > 0.0, std, np.inf)).T[:, :, np.newaxis]
         return mean, jacobian, *_shaped(X, std, by_std * predictor.in_order([by for _, by in slopes]))
+
+
+def _goes_on(before: Predictor, predictor: Predictor) -> bool:
+    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell."""
+    if before.offset.shape != predictor.offset.shape or len(before.groups) != len(predictor.groups):
+        return False
+    return all(
+        np.array_equal(old.points, new.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
+        for old, new in zip(before.groups, predictor.groups, strict=True)
+    )
 
 
 class _Moments(NamedTuple):

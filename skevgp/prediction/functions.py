@@ -101,8 +101,11 @@ class FunctionSamples(Sequence["SampledFunction"]):
 
     def _values(self, X: np.ndarray, which: slice) -> np.ndarray:
         rows = X if X.ndim == 2 else X[np.newaxis]
-        inputs, features = self._posterior.mapped(rows)
-        return self._shaped(X, self._finished(rows, [own.values(inputs, features, which) for own in self._groups]))
+        parts = []
+        for piece in self._pieces(rows):
+            inputs, features = self._posterior.mapped(piece)
+            parts.append(self._finished(piece, [own.values(inputs, features, which) for own in self._groups]))
+        return self._shaped(X, np.concatenate(parts, axis=1))
 
     def _values_and_jacobians(self, X: np.ndarray, which: slice) -> tuple[np.ndarray, np.ndarray]:
         rows, maps = X if X.ndim == 2 else X[np.newaxis], (self._posterior.feature_map, self._posterior.kernel_map)

@@ -53,7 +53,9 @@ def rollout(
         ``"sample"``: particles, of which each follows one function drawn from the posterior: what is not known of the
         system is the same at each step and each time that it comes back to a state. For `EVGPRegressor` and
         `EGPRegressor`, also within a `ResidualRegressor`, that is exact: inducing values and weights are drawn from q,
-        and what they leave of f is drawn given the particle's own path so far. Other regressors draw each step anew.
+        and what they leave of f is drawn given the particle's own path so far: time for a particle grows with the cube
+        of the steps (1 s for 400 particles of 100 steps, minutes for 100 of 1000). Other regressors draw each step
+        anew.
 
         ``"linearized"``: mean and covariance to first order, Σ' = A Σ Aᵀ + Q, with A by the regressor's ``jacobian``
         (else differences) and Q what it does not know of a step. Steps count as independent, which they are not if

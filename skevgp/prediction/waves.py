@@ -17,7 +17,7 @@ from operator import mul
 from typing import Any
 
 import numpy as np
-from scipy.special import ive
+from scipy.special import ive, kve
 
 from ..kernels.constant import Constant
 from ..kernels.cosine import Wave
@@ -26,8 +26,10 @@ from ..kernels.dot_product import DotProduct
 from ..kernels.profiles import Exponential, ExpSineSquared, Matern, Matern12, Matern32, Matern52, RationalQuadratic
 from ..kernels.stationary import Stationary
 
-# How much wider than by the spectral density frequencies are drawn too.
-_WIDER = np.array([1.0, 1.5, 2.0])
+# How much wider than by the spectral density frequencies are drawn too: one that falls fast, or with heavy tails.
+_WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(8)
+# Above this a rational quadratic is as a squared exponential, and its density's Bessel functions overflow.
+_LARGE_ALPHA = 50.0
 _NU: dict[type, float] = {Matern12: 0.5, Matern32: 1.5, Matern52: 2.5}
 # Of the Fourier series of a periodic covariance.
 _HARMONICS = 10_000
@@ -199,17 +201,18 @@ def _spectrum(
     """Frequencies (L, d) for lengthscales of 1, and how much each counts (L,), 1 in the mean."""
     (size, d), normals = shape, rng.standard_normal(shape)
     if isinstance(profile, Exponential):
-        return _widened(normals, lambda squares: -0.5 * squares)
+        return _widened(normals, lambda squares: -0.5 * squares, _WIDER)
     if isinstance(profile, Matern12 | Matern32 | Matern52 | Matern):
         # A Student-t with 2ν degrees of freedom (Rasmussen & Williams 2006, eq. 4.15).
         degrees = 2.0 * (profile.nu if isinstance(profile, Matern) else _NU[type(profile)])
         drawn = normals / np.sqrt(rng.chisquare(degrees, size) / degrees)[:, np.newaxis]
-        return _widened(drawn, lambda squares: -0.5 * (degrees + d) * np.log1p(squares / degrees))
+        return _widened(drawn, lambda squares: -0.5 * (degrees + d) * np.log1p(squares / degrees), _MUCH_WIDER)
     ones = np.ones(size)
     if isinstance(profile, RationalQuadratic):
-        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there).
+        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): of normals, with a gamma's variance.
         alpha = float(np.exp(parameters[0]))
-        return normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis], ones
+        drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
+        return (drawn, ones) if alpha > _LARGE_ALPHA else _widened(drawn, _variance_gamma(alpha, d), _MUCH_WIDER)
     if isinstance(profile, ExpSineSquared) and d == 1:
         share = ive(np.arange(_HARMONICS), float(np.exp(-2.0 * parameters[0])))
         share[1:] *= 2.0
@@ -220,13 +223,26 @@ def _spectrum(
     )
 
 
-def _widened(frequencies: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (L, d) spread by `_WIDER` in turns, and density over that of the mixture, (L,): at most its length.
+def _widened(
+    frequencies: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray], widths: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Frequencies (L, d) spread by widths in turns, and density over that of the mixture, (L,): at most their number.
 
     The logarithm of their density, of |ω|² but for a constant, is ``log_density``.
     """
     size, d = frequencies.shape
-    frequencies = frequencies * _WIDER[np.arange(size) % len(_WIDER), np.newaxis]
+    frequencies = frequencies * widths[np.arange(size) % len(widths), np.newaxis]
     squares = np.einsum("ld,ld->l", frequencies, frequencies)
-    each = log_density(squares[:, np.newaxis] / _WIDER**2) - d * np.log(_WIDER)
-    return frequencies, len(_WIDER) * np.exp(log_density(squares) - np.logaddexp.reduce(each, axis=1))
+    each = log_density(squares[:, np.newaxis] / widths**2) - d * np.log(widths)
+    return frequencies, len(widths) * np.exp(log_density(squares) - np.logaddexp.reduce(each, axis=1))
+
+
+def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Of normals (d,) with a variance from the gamma distribution of shape and rate α: the density's logarithm."""
+    order = alpha - 0.5 * d
+
+    def log_density(squares: np.ndarray) -> np.ndarray:
+        x = np.sqrt(2.0 * alpha * np.maximum(squares, 1e-12))
+        return order * np.log(x) + np.log(kve(order, x)) - x
+
+    return log_density

@@ -88,6 +88,18 @@ def test_of_a_residual_regressor_it_is_of_the_sum(data):
     same(compiled.predict(X_new, return_std=True), model.predict(X_new, return_std=True))
 
 
+def test_weights_of_another_fit_are_refused(data):
+    X, Y, X_new = data
+    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, **QUICK).fit(X, Y)
+    compiled, before = model.compile(), model.predict(X_new)
+    for other in (EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y), model.fit(2.0 * X, Y)):
+        with pytest.raises(ValueError, match="weights of the same fit"):
+            compiled.update(other)
+    with pytest.raises(NotFittedError):
+        compiled.update(EVGPRegressor())
+    same([compiled.predict(X_new)], [before])
+
+
 def test_before_a_fit_there_is_nothing_to_compile():
     for model in (EVGPRegressor(), ResidualRegressor(EVGPRegressor())):
         with pytest.raises(NotFittedError):

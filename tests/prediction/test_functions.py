@@ -4,6 +4,7 @@ import pickle
 
 import numpy as np
 import pytest
+from sklearn.gaussian_process.kernels import RBF, Matern, RationalQuadratic
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.kernels import FunctionKernel
@@ -28,6 +29,32 @@ def test_they_have_the_posteriors_mean_and_covariance(model, data):
     errors = (values - mean) / std
     found = np.einsum("sio,sjo->ijo", errors, errors) / N
     assert np.abs(found - cov / (std[:, np.newaxis] * std)).max() < 0.35
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    [Matern([1.0, 1.0], nu=1.5), Matern([1.0, 1.0], nu=2.5), RationalQuadratic(1.0, 1.0), RBF([1.0, 1.0])],
+    ids=["matern 3/2", "matern 5/2", "rational quadratic", "rbf"],
+)
+def test_the_variance_between_points_is_right_for_rough_functions_too(kernel):
+    """What inducing points leave of a fitted kernel is far out in its spectrum."""
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (150, 2))
+    y = np.sin(2.0 * X[:, 0]) + X[:, 1] + 0.02 * rng.randn(150)
+    model = EVGPRegressor(kernel=kernel, n_inducing=15, random_state=0).fit(X, y)
+    rows = rng.uniform(-2.0, 2.0, (40, 2))
+    ratio = model.sample_functions(1500)(rows).var(axis=0) / model.predict(rows, True, include_noise=False)[1] ** 2
+    assert 0.9 < np.median(ratio) < 1.1
+    assert np.quantile(ratio, 0.05) > 0.75
+    assert np.quantile(ratio, 0.95) < 1.3
+
+
+def test_many_rows_are_evaluated_piece_by_piece(data, monkeypatch):
+    X, Y, X_new = data
+    functions = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y).sample_functions(2, n_waves=50)
+    expected = functions(X_new)
+    monkeypatch.setattr("skevgp.prediction.functions._NUMBERS", 600)
+    np.testing.assert_allclose(functions(X_new), expected, rtol=1e-10, atol=1e-12)
 
 
 def test_jacobians_agree_with_differences(model, data):
