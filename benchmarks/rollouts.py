@@ -7,9 +7,9 @@ noise and with noise of 1 % of each state's scatter on the states, which are inp
 tenth. Writes rows per fit to a CSV as soon as it is done (what is there already is not fitted again), and a page
 beside it.
 
-    python benchmarks/rollouts.py                                  # three systems, four models, two seeds: two hours
-    python benchmarks/rollouts.py --systems pendulum cartpole --models EVGP-IFG --seeds 1  # ten minutes of one core
-    python benchmarks/rollouts.py --quick                          # the pendulum, few rows and particles: a minute
+    python benchmarks/rollouts.py                    # three systems, four models, two seeds: two hours of one core
+    python benchmarks/rollouts.py --models EVGP-IFG  # one model: twenty minutes
+    python benchmarks/rollouts.py --quick            # the pendulum, few rows and particles: a minute
 """
 
 from __future__ import annotations
