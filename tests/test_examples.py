@@ -86,6 +86,17 @@ def test_any_robot(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "any_robot_ur5.png").stat().st_size > 10_000
 
 
+def test_rollout(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_rollout.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["rollouts"].keys() == {"pendulum", "cartpole", "acrobot"}
+    for system, ahead in names["rollouts"].items():
+        errors = np.median(np.abs(ahead.mean - names["truths"][system]), axis=(0, 2))
+        assert errors[0] < min(0.2, errors[-1])
+        assert (np.median(ahead.std, axis=(0, 2))[[0, -1]] > 0.1 * errors[[0, -1]]).all()
+    assert "share of the true states within 2 std" in capsys.readouterr().out
+    assert (tmp_path / "rollout.png").stat().st_size > 10_000
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -134,7 +145,9 @@ def test_without_an_optional_package(package, pip):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize("script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py"])
+@pytest.mark.parametrize(
+    "script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py", "plot_rollout.py"]
+)
 def test_the_stories_of_robots_without_pinocchio(script):
     result = command_line(script=EXAMPLES / script, code="sys.modules['pinocchio'] = None")
     assert result.returncode == 1

@@ -19,7 +19,7 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, Stand
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
 from skevgp.metrics import prediction_error
-from skevgp.plotting import CoefficientDisplay, LearningCurveDisplay, PosteriorDisplay
+from skevgp.plotting import CoefficientDisplay, LearningCurveDisplay, PosteriorDisplay, RolloutDisplay
 
 mpl.use("Agg")
 X, y = make_toy(30, random_state=0, return_X_y=True)
@@ -280,6 +280,7 @@ def test_without_axes_there_is_a_new_figure(trend, draw):
         PosteriorDisplay(np.arange(3.0), np.zeros(3), np.ones(3)),
         CoefficientDisplay(["a"], *np.ones((4, 1))),
         LearningCurveDisplay(np.arange(3.0), np.ones((3, 2))),
+        RolloutDisplay(np.arange(3.0), np.zeros((3, 2)), np.ones((3, 2))),
     ],
     ids=lambda display: type(display).__name__,
 )

@@ -1,7 +1,8 @@
-"""Pictures in scikit-learn's Display convention: ``from_estimator`` computes, ``plot`` draws. Needs matplotlib."""
+"""Pictures in scikit-learn's Display convention: ``from_...`` computes, ``plot`` draws. Needs matplotlib."""
 
 from .coefficients import CoefficientDisplay
 from .learning_curve import LearningCurveDisplay
 from .posterior import PosteriorDisplay
+from .rollout import RolloutDisplay
 
-__all__ = ["CoefficientDisplay", "LearningCurveDisplay", "PosteriorDisplay"]
+__all__ = ["CoefficientDisplay", "LearningCurveDisplay", "PosteriorDisplay", "RolloutDisplay"]
