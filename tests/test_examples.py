@@ -78,6 +78,17 @@ def test_any_robot(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "any_robot_ur5.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
+def test_swing_up(monkeypatch, capsys, tmp_path, system):
+    names = run(EXAMPLES / "plot_swing_up.py", "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["runs"]["EVGP-IFG"].success
+    for found in names["runs"].values():
+        assert found.distance[0] == np.pi
+        assert np.abs(found.inputs).max() <= names["task"].limit
+    assert "EVGP-IFG" in capsys.readouterr().out
+    assert (tmp_path / f"swing_up_{system}.png").stat().st_size > 10_000
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -126,7 +137,9 @@ def test_without_an_optional_package(package, pip):
     assert "Traceback" not in result.stderr
 
 
-@pytest.mark.parametrize("script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py"])
+@pytest.mark.parametrize(
+    "script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py", "plot_swing_up.py"]
+)
 def test_the_stories_of_robots_without_pinocchio(script):
     result = command_line(script=EXAMPLES / script, code="sys.modules['pinocchio'] = None")
     assert result.returncode == 1
