@@ -97,6 +97,17 @@ def test_rollout(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "rollout.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
+def test_swing_up(monkeypatch, capsys, tmp_path, system):
+    names = run(EXAMPLES / "plot_swing_up.py", "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["runs"]["EVGP-IFG"].success
+    for found in names["runs"].values():
+        assert found.distance[0] == np.pi
+        assert np.abs(found.inputs).max() <= names["task"].limit
+    assert "EVGP-IFG" in capsys.readouterr().out
+    assert (tmp_path / f"swing_up_{system}.png").stat().st_size > 10_000
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -146,7 +157,15 @@ def test_without_an_optional_package(package, pip):
 
 
 @pytest.mark.parametrize(
-    "script", ["plot_link_gravity.py", "plot_nominal_dynamics.py", "plot_any_robot.py", "plot_rollout.py"]
+    "script",
+    [
+        "plot_link_gravity.py",
+        "plot_nominal_dynamics.py",
+        "plot_any_robot.py",
+        "plot_rollout.py",
+        "plot_swing_up.py",
+        "plot_online.py",
+    ],
 )
 def test_the_stories_of_robots_without_pinocchio(script):
     result = command_line(script=EXAMPLES / script, code="sys.modules['pinocchio'] = None")
