@@ -194,7 +194,7 @@ BROKEN_LINES = SplineTransformer(4, degree=1, extrapolation="linear")
 OTHERS = [Counted(), PerOutput(), Normalizer(), FunctionTransformer(np.tanh), BROKEN_LINES]
 
 
-@pytest.mark.parametrize("transformer", OTHERS, ids=str)
+@pytest.mark.parametrize("transformer", OTHERS, ids=lambda transformer: type(transformer).__name__)
 def test_other_maps_are_differentiated_numerically(transformer):
     X, transformer = rows(1000), fitted(transformer)
     direct, expected = elementary(transformer), differences(transformer.transform, X)

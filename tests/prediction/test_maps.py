@@ -1,4 +1,5 @@
 import pickle
+import re
 import warnings
 
 import numpy as np
@@ -238,7 +239,7 @@ def test_a_class_below_a_pipeline_is_known_by_what_it_does():
         by_columns((StandardScaler(), slice(None, "second")), (PCA(), slice("fourth", None))),
         by_columns((Normalizer(), lambda frame: [name for name in frame.columns if "f" in name]), remainder=PCA()),
     ],
-    ids=str,
+    ids=lambda transformer: re.sub(r" at 0x\w+", "", str(transformer)),
 )
 def test_maps_fitted_to_data_frames_take_arrays_in_the_order_of_the_columns(transformer, frame):
     transformer = fitted(transformer, frame(dict(zip(NAMES, rows(40, seed=1).T, strict=True))))
