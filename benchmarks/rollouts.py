@@ -253,6 +253,7 @@ def error_lines(rows: Sequence[Row]) -> Iterator[list[str]]:
         sampled = values(rows, setting, "consistent", "error_median").mean(axis=0)
         yield [
             *name_of(setting),
+            str(len(values(rows, setting, "mean", "crps"))),
             *(f"{harness.figure_of(a)} ({harness.figure_of(b)})" for a, b in zip(median, p90, strict=True)),
             *map(harness.figure_of, sampled[[0, -1]]),
         ]
@@ -286,10 +287,9 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
     """The page."""
     if not rows:
         return []
-    seeds = sorted({row["seed"] for row in rows}, key=int)
     steps = [str(step) for step in HORIZONS]
     said = (
-        f"Means over seeds ({', '.join(seeds)}). Errors are of positions, relative to their scatter; CRPS is of all "
+        "Means over seeds. Errors are of positions, relative to their scatter; CRPS is of all "
         "states, relative to theirs. Noise is on the states, inputs and targets, in units of their scatter; what is "
         "predicted are the true states. Share is of the paper's trajectories. Angles are encoded but of the VGP."
     )
@@ -304,7 +304,7 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
         "# Many steps ahead",
         said,
         "## Position errors: median (90th percentile) of the mean fed back",
-        harness.table([*setting, *columns, "particles' mean: 1", steps[-1]], error_lines(rows)),
+        harness.table([*setting, "seeds", *columns, "particles' mean: 1", steps[-1]], error_lines(rows)),
         "## Do the bands hold?",
         bands,
         harness.table([*setting, "particles", *of_bands], band_lines(rows)),
