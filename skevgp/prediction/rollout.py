@@ -64,8 +64,9 @@ def rollout(
         ``"mean"``: the mean is fed back; std is that of the last step alone.
     process_noise : {"learned", "none"}, default="learned"
         Whether the learned noise σ² is drawn anew at each step. It stands for noise in the system itself, and, where
-        data have none, for what the model cannot represent. ``"none"`` leaves it out (of other regressors only if
-        their ``predict`` has ``include_noise``).
+        data have none, for what the model cannot represent. ``"none"`` leaves it out, as is right where states were
+        measured with noise that is not in the system (of other regressors only if their ``predict`` has
+        ``include_noise``).
     random_state : int, RandomState instance or None, default=None
         Draws the particles.
 
