@@ -3,9 +3,10 @@
 A pole is swung up from rest by the planner of examples/mpc.py: iLQR on the model, anew at each step of 0.03 s, with
 100 N on the cartpole's cart and 2 N m, less than half of what would hold it level, on the pendulum. Success is to be
 within 0.1 rad of upright for the last of five seconds. The model is EVGP-IFG, or without physics a Gaussian process of
-the change of state, both with sines and cosines for the kernel, learned from trajectories of 0.75 s from random states
-with random inputs. Noise is on the states to learn from, before and after a step, and on those that the planner sees,
-as a share of the states' scatter in the data. "The truth" is the same planner on the simulated system itself.
+the change of state, both with sines and cosines for the kernel, learned from short trajectories from random states with
+random inputs: the fewer and longer they are, the less of the circle they see. Noise is on the states to learn from,
+before and after a step, and on those that the planner sees, as a share of the states' scatter in the data. "The truth"
+is the same planner on the simulated system itself.
 
 Writes a row per run to a CSV as soon as it is done, and a table beside it.
 
@@ -39,6 +40,7 @@ from skevgp.exceptions import DependentRowsWarning
 
 SECONDS = (1.5, 3.0, 4.5, 9.0, 30.0)
 NOISES = (0.0, 0.01)
+LENGTHS = (10, 25)
 SYSTEMS = ("cartpole", "pendulum")
 TRUTHS = 3  # seeds; without data they differ in the first plans only
 NAMES = {"evgp-ifg": "EVGP-IFG", "gp": "without physics", "truth": "the truth"}
@@ -56,6 +58,8 @@ class Cell:
         Of data; 0 of the truth.
     noise : float
         A share of the states' scatter; the truth has none.
+    length : int
+        Steps of a trajectory to learn from; 0 of the truth.
     seed : int
     size : {"full", "quick"}
     """
@@ -64,6 +68,7 @@ class Cell:
     model: str
     seconds: float
     noise: float
+    length: int
     seed: int
     size: str
 
@@ -111,7 +116,7 @@ def run(cell: Cell) -> dict[str, Any]:
         if cell.model == "truth":
             model, noise = Truth(cell.system), 0.0
         else:
-            learned = mpc.learn(cell.system, cell.seconds, cell.model == "evgp-ifg", cell.noise, cell.seed)
+            learned = mpc.learn(cell.system, cell.seconds, cell.model == "evgp-ifg", cell.noise, cell.seed, cell.length)
             model, noise = learned.model.compile(include_noise=False), learned.noise
         middle = time.process_time()
         found = mpc.swing_up(model, task, noise, cell.seed)
@@ -134,20 +139,23 @@ def say(row: dict[str, Any]) -> str:
 
 def lines(rows: Sequence[Row]) -> list[list[str]]:
     """Of a table: successes of so many seeds, for each number of seconds."""
-    keys = sorted({(row["system"], row["model"], row["noise"]) for row in rows})
+    kinds = ("system", "model", "noise", "length")
+    keys = sorted({tuple(row[name] for name in kinds) for row in rows})
     seconds = sorted({row["seconds"] for row in rows if row["model"] != "truth"}, key=float)
     found = []
-    for system, model, noise in keys:
-        own = [row for row in rows if (row["system"], row["model"], row["noise"]) == (system, model, noise)]
+    for key in keys:
+        system, model, noise, length = key
+        own = [row for row in rows if tuple(row[name] for name in kinds) == key]
         counts = []
-        for length in ["0.0"] * len(seconds) if model == "truth" else seconds:
-            some = [row["success"] == "True" for row in own if row["seconds"] == length]
+        for n_seconds in ["0.0"] * len(seconds) if model == "truth" else seconds:
+            some = [row["success"] == "True" for row in own if row["seconds"] == n_seconds]
             counts.append(f"{sum(some)} of {len(some)}" if some else "")
         upright = [float(row["upright_from"]) for row in own if row["success"] == "True"]
         found.append(
             [
                 f"{system}, {NAMES[model]}",
                 f"{float(noise):.0%}",
+                length if model != "truth" else "",
                 *counts,
                 f"{np.median(upright):.2f}" if upright else "",
                 f"{np.median(harness.column(own, 'control_seconds')):.1f}",
@@ -161,13 +169,13 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
     if not rows:
         return []
     seconds = sorted({row["seconds"] for row in rows if row["model"] != "truth"}, key=float)
-    header = ["", "noise", *(f"{length} s" for length in seconds), "upright from, s", "processor, s"]
+    header = ["", "noise", "steps", *(f"{length} s" for length in seconds), "upright from, s", "processor, s"]
     return [
         "# Seconds of data that a swing-up needs",
         "Runs that end upright (within 0.1 rad for the last of five seconds), of so many seeds, over seconds of data. "
         "The controller plans by iLQR on the model, anew at each step of 0.03 s; the truth is the simulated system in "
-        "the model's place, and has no data. Medians: since when the pole was upright, of the runs that succeed; what "
-        "the control of a run costs.",
+        "the model's place, and has no data. Steps are those of a trajectory to learn from: the fewer, the more "
+        "starts. Medians: since when the pole was upright, of the runs that succeed; what the control of a run costs.",
         harness.table(header, lines(rows)),
         harness.provenance_text(rows),
     ]
@@ -176,17 +184,19 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
 def cells_of(options: Any) -> list[Cell]:
     """Seed by seed, so that a page of some seeds is whole."""
     if options.quick:
-        return [Cell("pendulum", model, 3.0, 0.0, 0, "quick") for model in ("evgp-ifg", "gp")]
+        return [Cell("pendulum", model, 3.0, 0.0, mpc.LENGTH, 0, "quick") for model in ("evgp-ifg", "gp")]
     found = []
     for seed in range(options.seeds or 10):
         for system in options.systems:
-            if seed < TRUTHS:
-                found.append(Cell(system, "truth", 0.0, 0.0, seed, "full"))
+            if seed < TRUTHS and "truth" in options.models:
+                found.append(Cell(system, "truth", 0.0, 0.0, 0, seed, "full"))
             found += [
-                Cell(system, model, length, noise, seed, "full")
+                Cell(system, model, seconds, noise, length, seed, "full")
+                for length in options.lengths
                 for noise in options.noises
-                for length in options.seconds
-                for model in ("evgp-ifg", "gp")
+                for seconds in options.seconds
+                for model in options.models
+                if model != "truth"
             ]
     return found
 
@@ -200,6 +210,8 @@ def main() -> None:
     )
     parser.add_argument("--seconds", nargs="+", type=float, default=SECONDS, help="of data; default: %(default)s")
     parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="on states; default: %(default)s")
+    parser.add_argument("--lengths", nargs="+", type=int, default=LENGTHS, help="of trajectories; default: %(default)s")
+    parser.add_argument("--models", nargs="+", choices=NAMES, default=list(NAMES), help="default: all")
     options = parser.parse_args()
     output, size = harness.output_path(options, "swing_up"), "quick" if options.quick else "full"
     n_failures = harness.run_missing(cells_of(options), run, output, options.jobs, say)

@@ -16,8 +16,8 @@ from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import AngleEncoder, InertiaForceGravity
 
 DT = 0.03
-# Of each trajectory to learn from.
-ROWS = 25
+# Of a trajectory to learn from, steps.
+LENGTH = 10
 # What counts as upright, rad, and how many steps it must last.
 NEAR, LAST = 0.1, 34
 # Of the line search, all tried at once.
@@ -207,19 +207,28 @@ class Planner:
         return U, Z
 
 
-def learn(system: str, seconds: float, physics: bool, noise: float = 0.0, seed: int = 0, **settings: Any) -> Bunch:
+def learn(
+    system: str,
+    seconds: float,
+    physics: bool,
+    noise: float = 0.0,
+    seed: int = 0,
+    length: int = LENGTH,
+    **settings: Any,
+) -> Bunch:
     """Learn a system from trajectories that start anywhere.
 
     Parameters
     ----------
     system : str
     seconds : float
-        Of data: trajectories of `ROWS` steps.
+        Of data, in trajectories of ``length`` steps.
     physics : bool
         Whether the model knows rough physics (EVGP-IFG), or is a Gaussian process of the change of state.
     noise : float, default=0.0
         On all states, as a share of their scatter.
     seed : int, default=0
+    length : int, default=LENGTH
     **settings
         For `EVGPRegressor`.
 
@@ -228,8 +237,8 @@ def learn(system: str, seconds: float, physics: bool, noise: float = 0.0, seed: 
     learned : Bunch
         ``model``, ``data`` (of `make_dynamics`) and ``noise``, the standard deviation of each state's.
     """
-    n_trajectories = max(round(seconds / (ROWS * DT)), 1)
-    data = make_dynamics(system, n_trajectories, ROWS, dt=DT, noise=noise, input_noise=noise, random_state=seed)
+    n_trajectories = max(round(seconds / (length * DT)), 1)
+    data = make_dynamics(system, n_trajectories, length, dt=DT, noise=noise, input_noise=noise, random_state=seed)
     settings = {"kernel_map": AngleEncoder(system), "n_inducing": 100, "random_state": seed} | settings
     if physics:
         model = EVGPRegressor(InertiaForceGravity(system, dt=DT), **settings)

@@ -21,26 +21,26 @@ def test_it_runs_resumes_and_writes_its_page(run_script, tmp_path):
     rows = read(output)
     assert {(row["model"], row["success"]) for row in rows} == {("evgp-ifg", "True"), ("gp", "True")}
     assert all(float(row["last_distance"]) < 0.1 and float(row["upright_from"]) < 4.0 for row in rows)
-    assert "| pendulum, EVGP-IFG | 0% | 1 of 1 |" in output.with_suffix(".md").read_text()
+    assert "| pendulum, EVGP-IFG | 0% | 10 | 1 of 1 |" in output.with_suffix(".md").read_text()
     assert "2 of 2 cells are in" in run_script("swing_up.py", "--quick", "--jobs", "1", "--output", output)
 
 
 def test_successes_are_counted(swing_up):
     rows = [
-        {"system": "cartpole", "model": model, "noise": "0.0", "seconds": seconds, "success": success}
+        {"system": "cartpole", "model": model, "noise": "0.0", "length": length, "seconds": seconds, "success": success}
         | {"upright_from": "2.0" if success == "True" else "5.01", "control_seconds": "4.0"}
-        for model, seconds, success in [
-            ("evgp-ifg", "4.5", "True"),
-            ("evgp-ifg", "4.5", "False"),
-            ("evgp-ifg", "30.0", "True"),
-            ("gp", "4.5", "False"),
-            ("truth", "0.0", "True"),
+        for model, length, seconds, success in [
+            ("evgp-ifg", "10", "4.5", "True"),
+            ("evgp-ifg", "10", "4.5", "False"),
+            ("evgp-ifg", "10", "30.0", "True"),
+            ("gp", "25", "4.5", "False"),
+            ("truth", "0", "0.0", "True"),
         ]
     ]
     assert swing_up.lines(rows) == [
-        ["cartpole, EVGP-IFG", "0%", "1 of 2", "1 of 1", "2.00", "4.0"],
-        ["cartpole, without physics", "0%", "0 of 1", "", "", "4.0"],
-        ["cartpole, the truth", "0%", "1 of 1", "1 of 1", "2.00", "4.0"],
+        ["cartpole, EVGP-IFG", "0%", "10", "1 of 2", "1 of 1", "2.00", "4.0"],
+        ["cartpole, without physics", "0%", "25", "0 of 1", "", "", "4.0"],
+        ["cartpole, the truth", "0%", "", "1 of 1", "1 of 1", "2.00", "4.0"],
     ]
 
 
