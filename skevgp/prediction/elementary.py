@@ -208,12 +208,12 @@ class Foreign(DirectMap):
         self._scale = scale
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return _as_floats(self._transformer.transform(self._rows(X)))
+        return _as_floats(self._transformer.transform(as_fitted(self._transformer, X)))
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
         if not _fits(self._transformer, "jacobian", "transform"):
             return self._differences(X)
-        jacobian = _as_floats(self._transformer.jacobian(self._rows(X)))
+        jacobian = _as_floats(self._transformer.jacobian(as_fitted(self._transformer, X)))
         if jacobian.ndim not in (3, 4) or (len(jacobian), jacobian.shape[-1]) != X.shape:
             raise ValueError(
                 f"The method jacobian of {self._transformer!r} must return (n_samples, n_features_out, n_features) or, "
@@ -234,10 +234,6 @@ class Foreign(DirectMap):
             difference = values[: len(X)] - values[len(X) :]
             by_columns.append(difference / step.reshape(-1, *[1] * (values.ndim - 1)))
         return np.stack(by_columns, axis=-1)
-
-    def _rows(self, X: np.ndarray) -> Any:
-        names = getattr(self._transformer, "feature_names_in_", None)
-        return X if names is None else _frame(X, list(names))
 
 
 class Splines(Foreign):
@@ -340,9 +336,15 @@ def _as_floats(values: Any) -> np.ndarray:
     return np.asarray(values.toarray() if issparse(values) else values, dtype=np.float64)
 
 
-def _frame(X: np.ndarray, names: list[str]) -> Any:
-    """Rows as a data frame, of a package that is in use or else installed; as they are if there is none."""
+def as_fitted(estimator: Any, X: np.ndarray) -> Any:
+    """Rows as an estimator takes them: as a data frame if it was fitted to one.
+
+    It is of a package that is in use or else installed; rows are as they are if there is none.
+    """
+    names = getattr(estimator, "feature_names_in_", None)
+    if names is None:
+        return X
     for package, keyword in sorted(_FRAMES, key=lambda frame: frame[0] not in modules):
         if package in modules or find_spec(package) is not None:
-            return import_module(package).DataFrame(X, **{keyword: names})
+            return import_module(package).DataFrame(X, **{keyword: list(names)})
     return X

@@ -14,6 +14,7 @@ from sklearn.utils import Bunch, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from .._validation import LARGEST, as_floats, check_integer
+from .elementary import as_fitted
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).
 Controller = Callable[[np.ndarray, int], ArrayLike]
@@ -176,24 +177,26 @@ class _OneStep:
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and std (n, n_states)."""
-        with warnings.catch_warnings():
-            # Columns are [z, u], whatever they were called.
-            warnings.filterwarnings("ignore", "X does not have valid feature names")
-            mean, std = self.regressor.predict(X, return_std=True, **self._options)
+        mean, std = self._asked(self.regressor.predict, X, return_std=True, **self._options)
         return self._checked(mean, len(X)), self._checked(std, len(X))
 
     def linearised(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Mean, its derivatives in X (n, n_states, D), and the covariance Q (n, n_states, n_states) of a step."""
         mean, std = self.predict(X)
         if hasattr(self.regressor, "jacobian"):
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "X does not have valid feature names")
-                slopes = np.asarray(self.regressor.jacobian(X)).reshape(*mean.shape, X.shape[1])
+            slopes = np.asarray(self._asked(self.regressor.jacobian, X)).reshape(*mean.shape, X.shape[1])
         else:
             slopes = _differences(lambda rows: self.predict(rows)[0], X)
         Q = std[:, :, np.newaxis] ** 2 * np.eye(self.n_states)
         functions = self.functions()
         return mean, slopes, Q if functions is None else Q + functions.between(X)
+
+    def _asked(self, method: Callable[..., Any], X: np.ndarray, **options: Any) -> Any:
+        """What a method says of rows [z, u], whose columns have the names that the regressor was fitted to."""
+        with warnings.catch_warnings():
+            # Without a package of data frames they have none.
+            warnings.filterwarnings("ignore", "X does not have valid feature names")
+            return method(as_fitted(self.regressor, X), **options)
 
     def _checked(self, values: Any, n: int) -> np.ndarray:
         found = np.asarray(values, dtype=float).reshape(n, -1)

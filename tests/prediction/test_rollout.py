@@ -5,6 +5,7 @@ import pandas as pd
 import pytest
 from scipy.stats import kstest, norm
 from sklearn.base import BaseEstimator
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -205,6 +206,25 @@ def test_names_of_columns_do_not_matter(data, inputs):
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(pd.DataFrame(X, columns=["angle", "speed", "torque"]), y)
     for method in ("mean", "linearized", "sample"):
         assert np.isfinite(rollout(model, Z0, inputs, method=method, n_samples=3, random_state=0).mean).all()
+
+
+@pytest.mark.parametrize("residual", [False, True])
+def test_maps_that_take_columns_by_name_see_them(data, inputs, residual):
+    X, y = data
+    frame = pd.DataFrame(X, columns=["angle", "speed", "torque"])
+
+    def made(scaled, angle):
+        by_names = ColumnTransformer([("s", StandardScaler(), scaled), ("a", FunctionTransformer(np.sin), angle)])
+        model = EVGPRegressor(kernel_map=by_names, n_inducing=10, **QUICK | {"max_iter": 0})
+        return ResidualRegressor(model) if residual else model
+
+    named, numbered = made(["speed", "torque"], ["angle"]).fit(frame, y), made([1, 2], [0]).fit(X, y)
+    for method in ("mean", "linearized", "sample"):
+        found, expected = (
+            rollout(each, Z0, inputs, method=method, n_samples=3, random_state=0) for each in (named, numbered)
+        )
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(found.std, expected.std, rtol=1e-6, atol=1e-8)
 
 
 def test_a_system_without_inputs_and_with_one_state():
