@@ -161,7 +161,7 @@ class ForControl(Intake):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers.
+            As of `predict`.
 
         Returns
         -------
@@ -182,8 +182,13 @@ class ForControl(Intake):
         >>> model.novelty([[3.0], [60.0]]).round(3)
         array([0., 1.])
         """
-        functions = self._functions()
-        parts = [self._predictor.novelty(*functions.mapped(rows)) for rows in self._in_pieces(X)]
+        check_is_fitted(self)
+        if is_dask(X):
+            raise ValueError("novelty needs rows in memory: not for Dask arrays. Give it X.compute().")
+        given, array = (X, X) if is_plain(self, X) else self._validated(X)[:2]
+        size = self._predictor.rows_at_once
+        pieces = (slice(first, first + size) for first in range(0, len(array), size))
+        parts = [self._predictor.novelty(*self._inputs_and_features(given, array, rows)) for rows in pieces]
         return like_y(np.concatenate(parts))
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:

@@ -176,16 +176,20 @@ class Intake(BaseEstimator):
         return (given if is_frame(given) else X), X, target
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]:
-        """X and y as arrays of numbers."""
+        """X and y as arrays of numbers: what the kernel sees without a map, and what derivatives are in."""
         options = {"multi_output": True, "y_numeric": True} if y else {}
         try:
             validated = validate_data(self, X, *y, reset=reset, dtype=FLOATS, **options)
         except ValueError as error:
             if is_frame(X) and (words := words_of(X)):
-                raise ValueError(
-                    f"The columns {words} of X are not numbers, but with kernel_map=None the kernel sees all columns: "
-                    "give a kernel_map that encodes them or leaves them out."
-                ) from error
+                if (self.kernel_map if reset else self.kernel_map_) is None:
+                    reason = (
+                        "with kernel_map=None the kernel sees all columns: give a kernel_map that encodes them or "
+                        "leaves them out."
+                    )
+                else:
+                    reason = "derivatives are in all columns, and need numbers."
+                raise ValueError(f"The columns {words} of X are not numbers, but {reason}") from error
             raise
         X, target = validated if y else (validated, np.empty(0))
         check_magnitude(X, "X")

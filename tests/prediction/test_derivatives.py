@@ -3,9 +3,10 @@
 import numpy as np
 import pandas as pd
 import pytest
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 
@@ -122,6 +123,27 @@ def test_data_frames(data):
         model.jacobian(new[["b", "a"]])
 
 
+def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
+    X, Y, X_new = data
+    encoder = ColumnTransformer([("words", OneHotEncoder(), ["c"]), ("numbers", StandardScaler(), ["a", "b"])])
+
+    def frame_of(rows):
+        return pd.DataFrame(rows, columns=["a", "b"]).assign(c=np.where(rows[:, 0] > 0.5, "high", "low"))
+
+    model = EVGPRegressor(kernel_map=encoder, n_inducing=10, **QUICK).fit(frame_of(X), Y[:, 0])
+    _, std = model.predict(frame_of(X_new), return_std=True, include_noise=False)
+    expected = std**2 / model._predictor.signal
+    np.testing.assert_allclose(model.novelty(frame_of(X_new)), expected, rtol=1e-6, atol=1e-9)
+    many = model.novelty(frame_of(np.repeat(X_new, 1000, axis=0)))
+    np.testing.assert_allclose(many, np.repeat(expected, 1000), rtol=1e-6, atol=1e-9)
+    message = r"\['c'\] of X are not numbers, but derivatives"
+    for method in (model.jacobian, model.value_and_jacobian, model.predict_gradient):
+        with pytest.raises(ValueError, match=message):
+            method(frame_of(X_new))
+    with pytest.raises(ValueError, match=message):
+        model.set_params(input_noise=0.1).fit(frame_of(X), Y[:, 0])
+
+
 def test_what_a_residual_regressor_says_is_of_the_sum(data):
     X, Y, X_new = data
     model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0])
@@ -162,3 +184,5 @@ def test_derivatives_are_not_for_dask_arrays(data):
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
     with pytest.raises(ValueError, match="not for Dask arrays"):
         model.jacobian(da.from_array(X))
+    with pytest.raises(ValueError, match="novelty needs rows in memory"):
+        model.novelty(da.from_array(X))
