@@ -185,7 +185,10 @@ class ForControl(Intake):
         check_is_fitted(self)
         if is_dask(X):
             raise ValueError("novelty needs rows in memory: not for Dask arrays. Give it X.compute().")
-        given, array = (X, X) if is_plain(self, X) else self._validated(X)[:2]
+        given: Any = X
+        array: Any = X
+        if not is_plain(self, X):
+            given, array, _ = self._validated(X)
         size = self._predictor.rows_at_once
         pieces = (slice(first, first + size) for first in range(0, len(array), size))
         parts = [self._predictor.novelty(*self._inputs_and_features(given, array, rows)) for rows in pieces]
