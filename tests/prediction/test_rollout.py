@@ -102,6 +102,31 @@ def test_without_a_jacobian_differences_do(model, inputs):
     np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
 
 
+@pytest.mark.parametrize("unit", [1e-7, 1e5])
+def test_differences_are_in_the_units_of_the_states(data, inputs, unit):
+    X, y = data
+    scales = np.array([unit, unit, 1.0])
+    model = GaussianProcessRegressor(
+        RBF([2.0, 2.0, 2.0] * scales) + WhiteKernel(1e-3), normalize_y=True, optimizer=None
+    )
+    model.fit(X * scales, y * unit)
+    same = GaussianProcessRegressor(RBF(2.0) + WhiteKernel(1e-3), normalize_y=True, optimizer=None).fit(X, y)
+    feedback = np.array([-0.5, -0.3])
+
+    def controlled(regressor, size):
+        return rollout(
+            regressor,
+            np.array(Z0) * size,
+            lambda z, t: np.tanh(z / size @ feedback)[:, np.newaxis],
+            n_steps=6,
+            method="linearized",
+        )
+
+    for ask in (lambda each, size: rollout(each, np.array(Z0) * size, inputs, method="linearized"), controlled):
+        found, expected = ask(model, unit), ask(same, 1.0)
+        np.testing.assert_allclose(found.std / unit, expected.std, rtol=1e-4)
+
+
 class _Hidden(BaseEstimator):
     """A regressor that can do nothing but predict."""
 
