@@ -207,9 +207,11 @@ def test_what_a_residual_regressor_says_is_of_the_sum(data):
     gradient, std = model.predict_gradient(X_new, return_std=True)
     np.testing.assert_array_equal(gradient, jacobian)
     np.testing.assert_array_equal(std, model.regressor_.predict_gradient(X_new, return_std=True)[1])
+    np.testing.assert_array_equal(model.novelty(X_new), model.regressor_.novelty(X_new))
     single = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=1).fit(X, Y[:, 0])
     close(single.jacobian(X_new), differences(single.predict, X_new), 1e-6)
-    assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), "value_and_jacobian")
+    for method in ("value_and_jacobian", "novelty"):
+        assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), method)
 
 
 def test_what_cannot_be_is_refused_by_name(data):
