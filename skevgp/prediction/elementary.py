@@ -205,7 +205,8 @@ class Foreign(DirectMap):
     transformer : transformer
         Fitted. One that was fitted to a data frame gets its rows as one.
     example : array-like of shape (n, d), optional
-        Some rows of those that it was fitted to: their deviations are the scale. By default it is max(|x|, 1).
+        Some rows of those that it was fitted to, of the same type: their deviations are the scale. By default it is
+        max(|x|, 1), and a data frame is of any package.
     """
 
     by_example = True
@@ -213,14 +214,15 @@ class Foreign(DirectMap):
     def __init__(self, transformer: Any, example: Any = None):
         self._transformer = transformer
         self._scale = None if example is None else _scale_of(example)
+        self._package = package_of(example)
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return _as_floats(self._transformer.transform(as_fitted(self._transformer, X)))
+        return _as_floats(self._transformer.transform(as_fitted(self._transformer, X, self._package)))
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
         if not _fits(self._transformer, "jacobian", "transform"):
             return self._differences(X)
-        jacobian = _as_floats(self._transformer.jacobian(as_fitted(self._transformer, X)))
+        jacobian = _as_floats(self._transformer.jacobian(as_fitted(self._transformer, X, self._package)))
         if jacobian.ndim not in (3, 4) or (len(jacobian), jacobian.shape[-1]) != X.shape:
             raise ValueError(
                 f"The method jacobian of {self._transformer!r} must return (n_samples, n_features_out, n_features) or, "
@@ -355,15 +357,21 @@ def _scale_of(example: Any) -> np.ndarray:
     return np.where(deviation > _STEP**2 * size, deviation, np.where(size > 0.0, size, 1.0))
 
 
-def as_fitted(estimator: Any, X: np.ndarray) -> Any:
+def package_of(values: Any) -> str:
+    """Where the class of some values is from."""
+    return type(values).__module__.partition(".")[0]
+
+
+def as_fitted(estimator: Any, X: np.ndarray, package: str) -> Any:
     """Rows as an estimator takes them: as a data frame if it was fitted to one.
 
-    It is of a package that is in use or else installed; rows are as they are if there is none.
+    It is of the package, if that is one of data frames, else of one that is in use, or installed; rows are as they are
+    if there is none.
     """
     names = getattr(estimator, "feature_names_in_", None)
     if names is None:
         return X
-    for package, keyword in sorted(_FRAMES, key=lambda frame: frame[0] not in modules):
-        if package in modules or find_spec(package) is not None:
-            return import_module(package).DataFrame(X, **{keyword: list(names)})
+    for name, keyword in sorted(_FRAMES, key=lambda frame: (frame[0] != package, frame[0] not in modules)):
+        if name in modules or find_spec(name) is not None:
+            return import_module(name).DataFrame(X, **{keyword: list(names)})
     return X

@@ -14,7 +14,7 @@ from sklearn.utils import Bunch, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from .._validation import LARGEST, as_floats, check_integer
-from .elementary import as_fitted
+from .elementary import as_fitted, package_of
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).
 Controller = Callable[[np.ndarray, int], ArrayLike]
@@ -166,6 +166,7 @@ class _OneStep:
 
     def __init__(self, regressor: Any, n_states: int, noisy: bool):
         self.regressor, self.n_states, self.noisy = regressor, n_states, noisy
+        self._package = package_of(getattr(getattr(regressor, "regressor_", regressor), "_example", None))
         parameters = signature(regressor.predict).parameters
         anything = any(each.kind == each.VAR_KEYWORD for each in parameters.values())
         if "return_std" not in parameters and not anything:
@@ -201,7 +202,7 @@ class _OneStep:
         with warnings.catch_warnings():
             # Without a package of data frames they have none.
             warnings.filterwarnings("ignore", "X does not have valid feature names")
-            return method(as_fitted(self.regressor, X), **options)
+            return method(as_fitted(self.regressor, X, self._package), **options)
 
     def _checked(self, values: Any, n: int) -> np.ndarray:
         found = np.asarray(values, dtype=float).reshape(n, -1)

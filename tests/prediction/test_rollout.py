@@ -2,6 +2,7 @@
 
 import numpy as np
 import pandas as pd
+import polars
 import pytest
 from scipy.stats import kstest, norm
 from sklearn.base import BaseEstimator
@@ -233,17 +234,22 @@ def test_names_of_columns_do_not_matter(data, inputs):
         assert np.isfinite(rollout(model, Z0, inputs, method=method, n_samples=3, random_state=0).mean).all()
 
 
-@pytest.mark.parametrize("residual", [False, True])
-def test_maps_that_take_columns_by_name_see_them(data, inputs, residual):
-    X, y = data
-    frame = pd.DataFrame(X, columns=["angle", "speed", "torque"])
+def sine_of_polars(frame):
+    return frame.select(polars.all().sin()).to_numpy()
 
-    def made(scaled, angle):
-        by_names = ColumnTransformer([("s", StandardScaler(), scaled), ("a", FunctionTransformer(np.sin), angle)])
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize(("frame_of", "sine"), [(pd.DataFrame, np.sin), (polars.DataFrame, sine_of_polars)])
+def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_of, sine):
+    X, y = data
+    frame = frame_of(dict(zip(["angle", "speed", "torque"], X.T, strict=True)))
+
+    def made(scaled, angle, sine):
+        by_names = ColumnTransformer([("s", StandardScaler(), scaled), ("a", FunctionTransformer(sine), angle)])
         model = EVGPRegressor(kernel_map=by_names, n_inducing=10, **QUICK | {"max_iter": 0})
         return ResidualRegressor(model) if residual else model
 
-    named, numbered = made(["speed", "torque"], ["angle"]).fit(frame, y), made([1, 2], [0]).fit(X, y)
+    named, numbered = made(["speed", "torque"], ["angle"], sine).fit(frame, y), made([1, 2], [0], np.sin).fit(X, y)
     for method in ("mean", "linearized", "sample"):
         found, expected = (
             rollout(each, Z0, inputs, method=method, n_samples=3, random_state=0) for each in (named, numbered)
