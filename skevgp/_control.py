@@ -16,9 +16,8 @@ from ._validation import check_integer, is_plain
 from .inference.posterior import Predictor
 from .prediction.compiled import CompiledPredictor
 from .prediction.derivatives import gradient_covariance, mapped
-from .prediction.elementary import DirectMap
 from .prediction.functions import FunctionSamples
-from .prediction.maps import direct_map
+from .prediction.maps import maps_of
 from .prediction.paths import Functions
 from .rows.dask import is_dask
 
@@ -39,7 +38,7 @@ class ForControl(Intake):
         Derivatives go through kernel, kernel map and feature map. They are exact for this package's transformers and
         kernels, for scikit-learn's scalers, PolynomialFeatures and PCA, pipelines and unions of these, and for any map
         with a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features); of other maps they are
-        central differences, good to about ten digits.
+        central differences, good to about ten digits where the map is smooth on the scale of the rows of `fit`.
 
         Parameters
         ----------
@@ -138,7 +137,7 @@ class ForControl(Intake):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        fast, maps = self.compile(), self._direct_maps()
+        fast, maps = self.compile(), maps_of(self)
         parts, covariances = [], []
         for rows in self._in_pieces(X):
             parts.append(fast.value_and_jacobian(rows)[1])
@@ -161,7 +160,7 @@ class ForControl(Intake):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers.
+            As of `predict`.
 
         Returns
         -------
@@ -182,8 +181,16 @@ class ForControl(Intake):
         >>> model.novelty([[3.0], [60.0]]).round(3)
         array([0., 1.])
         """
-        functions = self._functions()
-        parts = [self._predictor.novelty(*functions.mapped(rows)) for rows in self._in_pieces(X)]
+        check_is_fitted(self)
+        if is_dask(X):
+            raise ValueError("novelty needs rows in memory: not for Dask arrays. Give it X.compute().")
+        given: Any = X
+        array: Any = X
+        if not is_plain(self, X):
+            given, array, _ = self._validated(X)
+        size = self._predictor.rows_at_once
+        pieces = (slice(first, first + size) for first in range(0, len(array), size))
+        parts = [self._predictor.novelty(*self._inputs_and_features(given, array, rows)) for rows in pieces]
         return like_y(np.concatenate(parts))
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
@@ -204,6 +211,8 @@ class ForControl(Intake):
         ------
         NotFittedError
             Before `fit`.
+        ValueError
+            If columns of X were no numbers.
 
         Examples
         --------
@@ -246,8 +255,8 @@ class ForControl(Intake):
         Raises
         ------
         ValueError, TypeError
-            If ``n`` or ``n_waves`` is not a positive integer, or functions of the kernel cannot be drawn, as those of a
-            `FunctionKernel`.
+            If ``n`` or ``n_waves`` is not a positive integer, columns of X were no numbers, or functions of the kernel
+            cannot be drawn, as those of a `FunctionKernel`.
 
         References
         ----------
@@ -272,14 +281,7 @@ class ForControl(Intake):
 
     def _functions(self) -> Functions:
         """The posterior as functions to be drawn and followed."""
-        return Functions(self._predictor, *self._direct_maps())
-
-    def _direct_maps(self) -> tuple[DirectMap | None, DirectMap | None]:
-        """Feature map and kernel map without validation."""
-        features, inputs = (
-            None if each is None else direct_map(each) for each in (self.feature_map_, self.kernel_map_)
-        )
-        return features, inputs
+        return Functions(self._predictor, *maps_of(self))
 
     def _in_pieces(self, X: Any) -> Iterator[np.ndarray]:
         """Rows as floats, few enough at once that derivatives fit into memory."""

@@ -32,6 +32,7 @@ class Model(Protocol):
 
     feature_map_: Any
     kernel_map_: Any
+    _example: Any
     _predictor: Predictor
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]: ...

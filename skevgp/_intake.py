@@ -27,9 +27,9 @@ from ._validation import (
 from .fitting.units import Units
 from .inference.posterior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
-from .rows.dask import DaskSource, aligned, fit_map_to_chunks, is_dask
+from .rows.dask import DaskSource, aligned, dask_example, fit_map_to_chunks, is_dask
 from .rows.mapped import MappedRows, RowShapes, check_shapes, map_rows
-from .rows.maps import fit_map, take_rows
+from .rows.maps import example_of, fit_map, take_rows
 from .rows.source import LocalSource, Moments, Source, moments_of_rows
 
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
@@ -82,6 +82,7 @@ class Intake(BaseEstimator):
     noise_variance: float | None
     normalize_y: bool
 
+    _example: Any
     _spec: KernelSpec
     _row_shapes: RowShapes
 
@@ -101,6 +102,9 @@ class Intake(BaseEstimator):
         fit_to = fit_map_to_chunks if is_dask(X) else partial(fit_map, chosen=chosen)
         self.feature_map_ = fit_to(self.feature_map, given, y, "feature_map")
         self.kernel_map_ = fit_to(self.kernel_map, given, y, "kernel_map")
+        self._example = None
+        if self.feature_map_ is not None or self.kernel_map_ is not None:
+            self._example = dask_example(X) if is_dask(X) else example_of(given, chosen)
         source = self._source(given, X, y, chosen)
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
@@ -176,16 +180,20 @@ class Intake(BaseEstimator):
         return (given if is_frame(given) else X), X, target
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]:
-        """X and y as arrays of numbers."""
+        """X and y as arrays of numbers: what the kernel sees without a map, and what derivatives are in."""
         options = {"multi_output": True, "y_numeric": True} if y else {}
         try:
             validated = validate_data(self, X, *y, reset=reset, dtype=FLOATS, **options)
         except ValueError as error:
             if is_frame(X) and (words := words_of(X)):
-                raise ValueError(
-                    f"The columns {words} of X are not numbers, but with kernel_map=None the kernel sees all columns: "
-                    "give a kernel_map that encodes them or leaves them out."
-                ) from error
+                if (self.kernel_map if reset else self.kernel_map_) is None:
+                    reason = (
+                        "with kernel_map=None the kernel sees all columns: give a kernel_map that encodes them or "
+                        "leaves them out."
+                    )
+                else:
+                    reason = "derivatives in all columns need them to be."
+                raise ValueError(f"The columns {words} of X are not numbers, but {reason}") from error
             raise
         X, target = validated if y else (validated, np.empty(0))
         check_magnitude(X, "X")

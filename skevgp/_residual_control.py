@@ -116,6 +116,23 @@ class ResidualForControl(BaseEstimator):
         gradient = self._with_base(gradient)
         return (gradient, *spread) if spread else gradient
 
+    @available_if(regressor_has("novelty"))
+    def novelty(self, X: ArrayLike) -> np.ndarray:
+        """Say how far rows are outside of the data, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            As of `predict`.
+
+        Returns
+        -------
+        novelty : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            From 0 to 1, as of `EVGPRegressor.novelty`: base columns are known, and change nothing.
+        """
+        check_is_fitted(self)
+        return self.regressor_.novelty(self._validated(X))
+
     @available_if(regressor_has("compile"))
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
         """Make a predictor for control loops, if the regressor can.

@@ -16,6 +16,26 @@ from .package import casadi
 # CasADi explains each instruction, matrices and all.
 _EXPLANATION = re.compile(r"^ *\/\* #\d+:.*?\*\/\n", re.MULTILINE | re.DOTALL)
 
+# Names that are taken where the generated C is compiled: words of the language and variables that it uses, ...
+_WORDS = """
+auto break case char const continue default do double else enum extern float for goto if inline int long register
+restrict return short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof alignas
+alignof bool constexpr false nullptr static_assert thread_local true typeof_unqual linux unix main
+x mean variance arg res iw w abort abs calloc exit free labs malloc memcpy memset printf puts strcpy strlen
+fpclassify isfinite isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered signgam
+HUGE_VAL HUGE_VALF HUGE_VALL INFINITY NAN math_errhandling
+"""
+# ... functions of <math.h>, of which there are three each, ...
+_FUNCTIONS = """
+acos asin atan atan2 cos sin tan acosh asinh atanh cosh sinh tanh exp exp2 exp10 expm1 frexp ilogb ldexp log log10 log1p
+log2 logb modf scalb scalbn scalbln cbrt fabs hypot pow sqrt erf erfc lgamma tgamma gamma ceil floor nearbyint rint
+lrint llrint round lround llround trunc fmod remainder drem remquo copysign nan nextafter nexttoward fdim fmax fmin fma
+isinf isnan finite significand j0 j1 jn y0 y1 yn sincos
+"""
+_TAKEN = {*_WORDS.split(), *(f"{name}{kind}" for name in _FUNCTIONS.split() for kind in ("", "f", "l"))}
+# ... and what begins like this.
+_TAKEN_STARTS = ("casadi_", "FP_", "MATH_")
+
 _HEADER = """\
 /* {name}: mean and variance of {n_outputs} outputs, given {n_features} inputs.
 
@@ -26,7 +46,7 @@ _HEADER = """\
    All functions return 0. Results may be NULL. They use the stack alone, at most {stack} bytes of it, and keep nothing
    between calls: threads may share them.
 
-   Build: cc -std=c99 -O2 -c {name}.c, and link with -lm.
+   Build: cc -std=c99 -O2 -c {source}, and link with -lm.
    Written by skevgp {version} with CasADi {casadi}. */
 #ifndef {guard}_H
 #define {guard}_H
@@ -101,9 +121,11 @@ def write_c(
     Raises
     ------
     ValueError
-        If the folder is not there.
+        If the folder is not there, or the name is taken in C.
     """
     ca, name = casadi(), function.name()
+    if name in _TAKEN or name.startswith(_TAKEN_STARTS):
+        raise ValueError(f"name={name!r} means something else in C; give it another one.")
     source = Path(path)
     source = source if source.suffix == ".c" else source / f"{name}.c"
     if not source.parent.is_dir():
@@ -117,17 +139,23 @@ def write_c(
         own: f"int {own}(const double *x, {', '.join(f'double *{result}' for result in results)})"
         for own, (_, results) in parts.items()
     }
-    told = {"name": name, "version": _version(), "casadi": ca.CasadiMeta.version(), "header": header.name}
+    told = {
+        "name": name,
+        "version": _version(),
+        "casadi": ca.CasadiMeta.version(),
+        "header": header.name,
+        "source": source.name,
+    }
     definitions = [_definition(declared[own], part, results) for own, (part, results) in parts.items()]
     generated = _EXPLANATION.sub("", generator.dump())
     source.write_text(_SOURCE.format(generated=generated, definitions="\n".join(definitions), **told), encoding="utf-8")
     names = "" if columns is None else f":\n   {', '.join(columns)}"
     header.write_text(
         _HEADER.format(
-            guard=re.sub(r"\W", "_", header.stem).upper(),
+            guard=_as_macro(header.stem),
             n_features=function.numel_in(0),
             n_outputs=function.numel_out(0),
-            columns=names.replace("*/", "* /"),
+            columns=names.replace("/*", "/ *").replace("*/", "* /"),
             of="that of y, with its noise" if include_noise else "without the noise of y",
             stack=max(map(_stack, (part for part, _ in parts.values()))),
             declarations="\n".join(f"{text};" for text in declared.values()),
@@ -136,6 +164,12 @@ def write_c(
         encoding="utf-8",
     )
     return source, header
+
+
+def _as_macro(stem: str) -> str:
+    """A file's name as that of a macro."""
+    macro = re.sub(r"\W", "_", stem, flags=re.ASCII).upper()
+    return f"MODEL_{macro}" if macro[0].isdigit() else macro
 
 
 def _parts_of(function: Any, jacobian: bool) -> dict[str, tuple[Any, list[str]]]:

@@ -124,7 +124,7 @@ class Exportable:
         Raises
         ------
         ImportError, ValueError, TypeError, sklearn.exceptions.NotFittedError
-            As `to_casadi`, and if there is no such folder.
+            As `to_casadi`, and if there is no such folder, or the name is taken in C, as ``int`` and ``sin`` are.
 
         Notes
         -----

@@ -12,7 +12,7 @@ from .._shapes import like_y
 from ..inference.posterior import Predictor, PredictorGroup
 from ..rows.source import of_outputs
 from .derivatives import MappedRows, chained, mapped
-from .maps import direct_map
+from .maps import maps_of
 
 _NONE = np.empty((0, 0))
 # As of `Whitening.unexplained`: what is left of a row that is an inducing point is rounding.
@@ -24,6 +24,7 @@ class Model(Protocol):
 
     feature_map_: Any
     kernel_map_: Any
+    _example: Any
     _predictor: Predictor
 
 
@@ -58,8 +59,7 @@ class CompiledPredictor:
 
     def __init__(self, model: Model, include_noise: bool = True, base: np.ndarray | None = None):
         self.include_noise, self.base = include_noise, base
-        self._kernel_map = None if model.kernel_map_ is None else direct_map(model.kernel_map_)
-        self._feature_map = None if model.feature_map_ is None else direct_map(model.feature_map_)
+        self._feature_map, self._kernel_map = maps_of(model)
         self.update(model)
 
     def update(self, model: Model) -> None:

@@ -23,6 +23,8 @@ from sklearn.preprocessing import (
 
 # The step of central differences whose errors of truncation and of rounding are about the same.
 _STEP = np.cbrt(np.finfo(np.float64).eps)
+# And what it is at least, in units of the spacing of numbers like x.
+_SPACINGS = 256.0
 # Packages of data frames, and what they call the names of columns.
 _FRAMES = (("pandas", "columns"), ("polars", "schema"))
 
@@ -36,9 +38,12 @@ class DirectMap:
     ----------
     linear : bool
         Whether its Jacobian is known to be the same for all rows; `chain` then uses nothing of them but their number.
+    by_example : bool
+        Whether rows that are an example say how it is used.
     """
 
     linear = False
+    by_example = False
 
     def value(self, X: np.ndarray) -> np.ndarray:
         """h(x) of each row, (n, width); of a map with a row for each output (n, n_outputs, width)."""
@@ -192,28 +197,32 @@ def _one_less(powers: tuple[int, ...]) -> Iterator[tuple[int, tuple[int, ...]]]:
 class Foreign(DirectMap):
     """A map of which only `transform` is known and, if it has one, `jacobian`; else its Jacobian is by differences.
 
-    Central differences of a column by steps of ε^⅓ max(|x|, scale), all rows in one call of `transform`: they err by
+    Central differences of a column by steps of ε^⅓ times its scale, all rows in one call of `transform`: they err by
     some 1e-10 of the values where the map is smooth on that scale.
 
     Parameters
     ----------
     transformer : transformer
         Fitted. One that was fitted to a data frame gets its rows as one.
-    scale : ndarray of shape (d,), optional
-        Of the columns; 1 by default.
+    example : array-like of shape (n, d), optional
+        Some rows of those that it was fitted to, of the same type: their deviations are the scale. By default it is
+        max(|x|, 1), and a data frame is of any package.
     """
 
-    def __init__(self, transformer: Any, scale: np.ndarray | None = None):
+    by_example = True
+
+    def __init__(self, transformer: Any, example: Any = None):
         self._transformer = transformer
-        self._scale = scale
+        self._scale = None if example is None else _scale_of(example)
+        self._package = package_of(example)
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return _as_floats(self._transformer.transform(self._rows(X)))
+        return _as_floats(self._transformer.transform(as_fitted(self._transformer, X, self._package)))
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
         if not _fits(self._transformer, "jacobian", "transform"):
             return self._differences(X)
-        jacobian = _as_floats(self._transformer.jacobian(self._rows(X)))
+        jacobian = _as_floats(self._transformer.jacobian(as_fitted(self._transformer, X, self._package)))
         if jacobian.ndim not in (3, 4) or (len(jacobian), jacobian.shape[-1]) != X.shape:
             raise ValueError(
                 f"The method jacobian of {self._transformer!r} must return (n_samples, n_features_out, n_features) or, "
@@ -223,7 +232,9 @@ class Foreign(DirectMap):
         return jacobian
 
     def _differences(self, X: np.ndarray) -> np.ndarray:
-        steps = _STEP * np.maximum(np.abs(X), 1.0 if self._scale is None else self._scale)
+        size = np.abs(X)
+        steps = _STEP * (np.maximum(size, 1.0) if self._scale is None else self._scale)
+        steps = np.maximum(steps, _SPACINGS * np.spacing(size))
         by_columns = []
         for column in range(X.shape[1]):
             both = np.concatenate([X, X])
@@ -235,13 +246,11 @@ class Foreign(DirectMap):
             by_columns.append(difference / step.reshape(-1, *[1] * (values.ndim - 1)))
         return np.stack(by_columns, axis=-1)
 
-    def _rows(self, X: np.ndarray) -> Any:
-        names = getattr(self._transformer, "feature_names_in_", None)
-        return X if names is None else _frame(X, list(names))
-
 
 class Splines(Foreign):
     """A fitted SplineTransformer: derivatives of B-splines are B-splines."""
+
+    by_example = False
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
         splines = self._transformer.bsplines_
@@ -290,7 +299,7 @@ def _fits(transformer: Any, name: str, *others: str) -> bool:
     return all(at_home is None or at_home is now for at_home, now in there)
 
 
-def elementary(transformer: Any, scale: np.ndarray | None = None) -> DirectMap:
+def elementary(transformer: Any, example: Any = None) -> DirectMap:
     """The direct map of a fitted transformer that has no parts.
 
     Parameters
@@ -298,14 +307,15 @@ def elementary(transformer: Any, scale: np.ndarray | None = None) -> DirectMap:
     transformer : transformer
         Ours, or a class of scikit-learn in the registry; what is below such a class may do something else, so that it
         is `Foreign` as all others are.
-    scale : ndarray of shape (d,), optional
-        Of the columns, for `Foreign`.
+    example : array-like of shape (n, d), optional
+        For `Foreign`.
     """
     if _is_own(transformer):
         return Own(transformer)
     known = _KNOWN.get(type(transformer))
     if known is None or (known is Splines and transformer.extrapolation == "linear" and transformer.degree <= 1):
-        return Foreign(transformer, scale)  # such splines go on from another knot in the first column than in the rest
+        # Such splines go on from another knot in the first column than in the rest.
+        return Foreign(transformer, example)
     return known(transformer)
 
 
@@ -340,9 +350,28 @@ def _as_floats(values: Any) -> np.ndarray:
     return np.asarray(values.toarray() if issparse(values) else values, dtype=np.float64)
 
 
-def _frame(X: np.ndarray, names: list[str]) -> Any:
-    """Rows as a data frame, of a package that is in use or else installed; as they are if there is none."""
-    for package, keyword in sorted(_FRAMES, key=lambda frame: frame[0] not in modules):
-        if package in modules or find_spec(package) is not None:
-            return import_module(package).DataFrame(X, **{keyword: names})
+def _scale_of(example: Any) -> np.ndarray:
+    """Of each column its standard deviation; its size if it is constant, and 1 if it is 0."""
+    values = np.asarray(example, dtype=np.float64)
+    size, deviation = np.abs(values).max(axis=0), values.std(axis=0)
+    return np.where(deviation > _STEP**2 * size, deviation, np.where(size > 0.0, size, 1.0))
+
+
+def package_of(values: Any) -> str:
+    """Where the class of some values is from."""
+    return type(values).__module__.partition(".")[0]
+
+
+def as_fitted(estimator: Any, X: np.ndarray, package: str) -> Any:
+    """Rows as an estimator takes them: as a data frame if it was fitted to one.
+
+    It is of the package, if that is one of data frames, else of one that is in use, or installed; rows are as they are
+    if there is none.
+    """
+    names = getattr(estimator, "feature_names_in_", None)
+    if names is None:
+        return X
+    for name, keyword in sorted(_FRAMES, key=lambda frame: (frame[0] != package, frame[0] not in modules)):
+        if name in modules or find_spec(name) is not None:
+            return import_module(name).DataFrame(X, **{keyword: list(names)})
     return X

@@ -14,6 +14,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
+from operator import index as as_index
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,10 @@ class FunctionSamples(Sequence["SampledFunction"]):
     def __getitem__(self, index: Any) -> Any:
         if isinstance(index, slice):
             return [self[i] for i in range(*index.indices(len(self)))]
-        if not -len(self) <= index < len(self):
+        position = as_index(index)
+        if not -len(self) <= position < len(self):
             raise IndexError(f"There are {len(self)} functions; got the index {index}.")
-        return SampledFunction(self, int(index) % len(self))
+        return SampledFunction(self, position % len(self))
 
     def __call__(self, X: np.ndarray) -> np.ndarray:
         """All functions at rows.

@@ -11,14 +11,17 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.sparse import issparse
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.preprocessing import FunctionTransformer
 
+from .._sklearn import safe_indexing
+from .._validation import is_frame, words_of
 from .elementary import DirectMap, Foreign, Identity, elementary
 
 
-def map_jacobian(transformer: Any, X: np.ndarray, *, scale: np.ndarray | None = None) -> np.ndarray:
+def map_jacobian(transformer: Any, X: np.ndarray, *, example: Any = None) -> np.ndarray:
     """Differentiate a fitted map by the columns of X.
 
     Parameters
@@ -27,7 +30,7 @@ def map_jacobian(transformer: Any, X: np.ndarray, *, scale: np.ndarray | None = 
         As `direct_map` takes it.
     X : ndarray of shape (n, d)
         Finite rows of float64, with the columns that it was fitted to.
-    scale : ndarray of shape (d,), optional
+    example : array-like of shape (n, d), optional
         As in `direct_map`.
 
     Returns
@@ -46,7 +49,7 @@ def map_jacobian(transformer: Any, X: np.ndarray, *, scale: np.ndarray | None = 
             [ 4.],
             [12.]]])
     """
-    return direct_map(transformer, scale=scale).jacobian(X)
+    return direct_map(transformer, example=example).jacobian(X)
 
 
 def direct(transformer: Any) -> Callable[[np.ndarray], np.ndarray]:
@@ -54,12 +57,32 @@ def direct(transformer: Any) -> Callable[[np.ndarray], np.ndarray]:
     return direct_map(transformer).value
 
 
-def direct_jacobian(transformer: Any, *, scale: np.ndarray | None = None) -> Callable[[np.ndarray], np.ndarray]:
+def direct_jacobian(transformer: Any, *, example: Any = None) -> Callable[[np.ndarray], np.ndarray]:
     """The derivatives of the same: `DirectMap.jacobian`."""
-    return direct_map(transformer, scale=scale).jacobian
+    return direct_map(transformer, example=example).jacobian
 
 
-def direct_map(transformer: Any, *, scale: np.ndarray | None = None) -> DirectMap:
+def maps_of(model: Any) -> tuple[DirectMap | None, DirectMap | None]:
+    """Feature map and kernel map of a fitted model, and None for one that it does not have.
+
+    Raises
+    ------
+    ValueError
+        If columns of X were no numbers.
+    """
+    if is_frame(model._example) and (words := words_of(model._example)):
+        raise ValueError(
+            f"The columns {words} of X are not numbers: derivatives, functions to be drawn and predictors without "
+            "validation need them to be."
+        )
+    features, inputs = (
+        None if each is None else direct_map(each, example=model._example)
+        for each in (model.feature_map_, model.kernel_map_)
+    )
+    return features, inputs
+
+
+def direct_map(transformer: Any, *, example: Any = None) -> DirectMap:
     """Read a fitted map.
 
     Parameters
@@ -70,9 +93,9 @@ def direct_map(transformer: Any, *, scale: np.ndarray | None = None) -> DirectMa
         FeatureUnion and ColumnTransformer of any maps. Any other map is used by its `transform`, and by its
         ``jacobian(X)`` if it has one, else by central differences: see `Foreign`. None and ``"passthrough"`` are the
         identity. It is read now: fit it again, and it has to be read again.
-    scale : ndarray of shape (d,), optional
-        Of the columns of X, such as their standard deviations: what central differences take for a unit. By default
-        1, and also inside a pipeline after its first step.
+    example : array-like of shape (n, d), optional
+        Some rows of those that it was fitted to, of the same type: central differences take their deviations for a
+        unit, also of what the rows become inside a pipeline.
 
     Returns
     -------
@@ -84,21 +107,26 @@ def direct_map(transformer: Any, *, scale: np.ndarray | None = None) -> DirectMa
     if kind is FunctionTransformer and transformer.func is None:
         return Identity()
     if kind is Pipeline:
-        return Chained(transformer, scale)
+        return Chained(transformer, example)
     if kind is FeatureUnion:
-        return SideBySide(transformer, scale)
+        return SideBySide(transformer, example)
     if kind is ColumnTransformer and not any(np.isscalar(columns) for _, _, columns in transformer.transformers_):
-        return OfColumns(transformer, scale)
-    return elementary(transformer, scale)
+        return OfColumns(transformer, example)
+    return elementary(transformer, example)
 
 
 class Chained(DirectMap):
     """A pipeline."""
 
-    def __init__(self, pipeline: Pipeline, scale: np.ndarray | None):
+    def __init__(self, pipeline: Pipeline, example: Any):
+        self._whole = Foreign(pipeline, example)
         steps = [step for _, step in pipeline.steps]
-        self._steps = [direct_map(steps[0], scale=scale), *map(direct_map, steps[1:])]
-        self._whole = Foreign(pipeline, scale)
+        self._steps = [direct_map(step) for step in steps]
+        last = max((index for index, own in enumerate(self._steps) if own.by_example), default=-1)
+        for index, step in enumerate(steps[: last + 1]):
+            self._steps[index] = direct_map(step, example=example)
+            example = _behind(step, self._steps[index], example) if index < last else None
+        self.by_example = last >= 0
         self.linear = all(step.linear for step in self._steps)
 
     def value(self, X: np.ndarray) -> np.ndarray:
@@ -131,11 +159,12 @@ class Chained(DirectMap):
 class SideBySide(DirectMap):
     """A union: the columns of its parts, times their weights."""
 
-    def __init__(self, union: FeatureUnion, scale: np.ndarray | None):
+    def __init__(self, union: FeatureUnion, example: Any):
         weights = union.transformer_weights or {}
         parts = [(name, part) for name, part in union.transformer_list if not _is_dropped(part)]
-        self._parts = [(direct_map(part, scale=scale), weights.get(name)) for name, part in parts]
+        self._parts = [(direct_map(part, example=example), weights.get(name)) for name, part in parts]
         self.linear = all(part.linear for part, _ in self._parts)
+        self.by_example = any(part.by_example for part, _ in self._parts)
 
     def value(self, X: np.ndarray) -> np.ndarray:
         return _joined([_times(part.value(X), weight) for part, weight in self._parts], len(X))
@@ -152,16 +181,17 @@ class SideBySide(DirectMap):
 class OfColumns(DirectMap):
     """A column transformer: the columns of its parts, each of some columns of X."""
 
-    def __init__(self, transformer: ColumnTransformer, scale: np.ndarray | None):
+    def __init__(self, transformer: ColumnTransformer, example: Any):
         weights = transformer.transformer_weights or {}
         names = list(getattr(transformer, "feature_names_in_", []))
         self._parts = []
         for name, part, columns in transformer.transformers_:
             chosen = _indices(columns, names, transformer.n_features_in_)
             if len(chosen) and not _is_dropped(part):
-                own = direct_map(part, scale=None if scale is None else scale[chosen])
+                own = direct_map(part, example=None if example is None else safe_indexing(example, chosen, axis=1))
                 self._parts.append((own, chosen, weights.get(name)))
         self.linear = all(part.linear for part, *_ in self._parts)
+        self.by_example = any(part.by_example for part, *_ in self._parts)
 
     def value(self, X: np.ndarray) -> np.ndarray:
         parts = [_times(part.value(X.take(own, axis=1)), weight) for part, own, weight in self._parts]
@@ -177,6 +207,15 @@ class OfColumns(DirectMap):
             rows = X if part.linear else X.take(own, axis=1)
             parts.append(_times(part.chain(rows, inner.take(own, axis=1)), weight))
         return _joined(parts, len(X), inner.shape[2])
+
+
+def _behind(step: Any, direct: DirectMap, example: Any) -> Any:
+    """What a step of a pipeline makes of an example, as the next one sees it; None if these are no rows."""
+    if example is None or isinstance(direct, Identity):
+        return example
+    found = step.transform(example)
+    found = found.toarray() if issparse(found) else found
+    return found if len(found.shape) == 2 else None
 
 
 def _is_dropped(part: Any) -> bool:

@@ -14,12 +14,15 @@ from sklearn.utils import Bunch, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from .._validation import LARGEST, as_floats, check_integer
+from .elementary import as_fitted, package_of
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).
 Controller = Callable[[np.ndarray, int], ArrayLike]
 
 _METHODS = ("sample", "linearized", "mean")
 _NOISES = ("learned", "none")
+# Of standard deviations: differences over as much.
+_SHARE = 0.01
 
 
 def rollout(
@@ -154,11 +157,11 @@ class _Drive:
             )
         return np.broadcast_to(given, (len(states), self.n_inputs))
 
-    def slopes(self, t: int, states: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """∂u/∂z (n, n_inputs, n_states), by central differences."""
+    def slopes(self, t: int, states: np.ndarray, deviations: np.ndarray, of: np.ndarray) -> np.ndarray:
+        """∂u/∂z (n, n_inputs, n_states), of states with deviations (n, n_states), by central differences."""
         if self.inputs is not None:
             return np.zeros((len(states), self.n_inputs, states.shape[1]))
-        return _differences(lambda own: self.at(t, own, of), states)
+        return _differences(lambda own: self.at(t, own, of), states, deviations)
 
 
 class _OneStep:
@@ -166,6 +169,7 @@ class _OneStep:
 
     def __init__(self, regressor: Any, n_states: int, noisy: bool):
         self.regressor, self.n_states, self.noisy = regressor, n_states, noisy
+        self._package = package_of(getattr(getattr(regressor, "regressor_", regressor), "_example", None))
         parameters = signature(regressor.predict).parameters
         anything = any(each.kind == each.VAR_KEYWORD for each in parameters.values())
         if "return_std" not in parameters and not anything:
@@ -179,24 +183,29 @@ class _OneStep:
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Mean and std (n, n_states)."""
-        with warnings.catch_warnings():
-            # Columns are [z, u], whatever they were called.
-            warnings.filterwarnings("ignore", "X does not have valid feature names")
-            mean, std = self.regressor.predict(X, return_std=True, **self._options)
+        mean, std = self._asked(self.regressor.predict, X, return_std=True, **self._options)
         return self._checked(mean, len(X)), self._checked(std, len(X))
 
-    def linearised(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean, its derivatives in X (n, n_states, D), and the covariance Q (n, n_states, n_states) of a step."""
+    def linearised(self, X: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean, its derivatives in X (n, n_states, D), and the covariance Q (n, n_states, n_states) of a step.
+
+        Deviations (n, D) are those of X: differences, if there are to be any, are of a share of them.
+        """
         mean, std = self.predict(X)
         if hasattr(self.regressor, "jacobian"):
-            with warnings.catch_warnings():
-                warnings.filterwarnings("ignore", "X does not have valid feature names")
-                slopes = np.asarray(self.regressor.jacobian(X)).reshape(*mean.shape, X.shape[1])
+            slopes = np.asarray(self._asked(self.regressor.jacobian, X)).reshape(*mean.shape, X.shape[1])
         else:
-            slopes = _differences(lambda rows: self.predict(rows)[0], X)
+            slopes = _differences(lambda rows: self.predict(rows)[0], X, deviations)
         Q = std[:, :, np.newaxis] ** 2 * np.eye(self.n_states)
         functions = self.functions()
         return mean, slopes, Q if functions is None else Q + functions.between(X)
+
+    def _asked(self, method: Callable[..., Any], X: np.ndarray, **options: Any) -> Any:
+        """What a method says of rows [z, u], whose columns have the names that the regressor was fitted to."""
+        with warnings.catch_warnings():
+            # Without a package of data frames they have none.
+            warnings.filterwarnings("ignore", "X does not have valid feature names")
+            return method(as_fitted(self.regressor, X, self._package), **options)
 
     def _checked(self, values: Any, n: int) -> np.ndarray:
         found = np.asarray(values, dtype=float).reshape(n, -1)
@@ -260,8 +269,11 @@ def _fed_back(model: _OneStep, batch: np.ndarray, drive: _Drive, linearised: boo
         u = drive.at(t, z, of)
         X = np.hstack([z, u])
         if linearised:
-            following, slopes, Q = model.linearised(X)
-            A = slopes[:, :, :n_states] + slopes[:, :, n_states:] @ drive.slopes(t, z, of)
+            of_states = _deviations(Sigma)
+            feedback = drive.slopes(t, z, of_states, of)
+            of_inputs = _deviations(feedback @ Sigma @ np.swapaxes(feedback, 1, 2))
+            following, slopes, Q = model.linearised(X, np.hstack([of_states, of_inputs]))
+            A = slopes[:, :, :n_states] + slopes[:, :, n_states:] @ feedback
             Sigma = A @ Sigma @ np.swapaxes(A, 1, 2) + Q
         else:
             following, std = model.predict(X)
@@ -314,12 +326,22 @@ def _within_limits(values: np.ndarray, t: int) -> np.ndarray:
     return values
 
 
-def _differences(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """Central differences (n, k, d) of function(rows) (n, k)."""
-    step = np.cbrt(np.finfo(float).eps) * np.maximum(np.abs(rows), 1.0)
+def _deviations(covariance: np.ndarray) -> np.ndarray:
+    """Standard deviations (n, k) of covariances (n, k, k)."""
+    return np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+
+
+def _differences(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Central differences (n, k, d) of function(rows) (n, k), for rows that have deviations (n, d).
+
+    Over a small share of these: there a linear step has to hold, and little is lost to rounding. Derivatives in what
+    does not deviate lead to nothing, and are 0.
+    """
+    step = np.where(deviations > 0.0, np.maximum(_SHARE * deviations, 256.0 * np.spacing(np.abs(rows))), 0.0)
     found = []
     for column in range(rows.shape[1]):
         shift = np.zeros_like(rows)
         shift[:, column] = step[:, column]
-        found.append((function(rows + shift) - function(rows - shift)) / (2.0 * step[:, column, np.newaxis]))
+        width = np.where(step[:, column] > 0.0, 2.0 * step[:, column], 1.0)
+        found.append((function(rows + shift) - function(rows - shift)) / width[:, np.newaxis])
     return np.stack(found, axis=2)

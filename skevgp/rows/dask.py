@@ -16,7 +16,7 @@ from .._validation import as_floats, check_magnitude
 from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
 from .chosen import Chosen
 from .mapped import MappedRows, RowShapes
-from .maps import fit_map, fresh_map
+from .maps import EXAMPLE_ROWS, fit_map, fresh_map, spread
 from .source import LocalSource, RawRows
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
 
@@ -78,13 +78,18 @@ def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
     delayed = _dask().delayed
     fitted = fresh_map(feature_map, name)
     if not hasattr(fitted, "partial_fit"):
-        chosen = np.unique(np.linspace(0, len(X) - 1, min(len(X), _MAP_SAMPLE)).astype(int))
+        chosen = spread(len(X), _MAP_SAMPLE)
         sample_X, sample_y = _dask().compute(X[chosen], y[chosen])
         return fit_map(feature_map, sample_X, sample_y, name)
     fitted = delayed(fitted, traverse=False)
     for X_chunk, y_chunk in zip(X.to_delayed().ravel(), y.to_delayed().ravel(), strict=True):
         fitted = delayed(_partly_fitted)(fitted, X_chunk, y_chunk)
     return fitted.compute()
+
+
+def dask_example(X: Any) -> np.ndarray:
+    """A few of the rows, evenly spread."""
+    return np.asarray(X[spread(len(X), EXAMPLE_ROWS)].compute(), dtype=np.float64)
 
 
 @dataclass(frozen=True)

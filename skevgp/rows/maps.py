@@ -17,6 +17,8 @@ from .chosen import Chosen, rows_of
 
 # Rows that a map sees at once.
 MAP_ROWS = 16_384
+# Rows that show what those of a fit are like.
+EXAMPLE_ROWS = 64
 
 
 def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str, chosen: Chosen | None = None) -> Any:
@@ -68,6 +70,17 @@ def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
         return np.asarray(X[rows], dtype=np.float64)
     # A slice of a pyarrow table must end within it.
     return safe_indexing(X, slice(*rows.indices(len(X))) if isinstance(rows, slice) else rows)
+
+
+def example_of(X: Any, chosen: Chosen) -> Any:
+    """A few of the rows that count, evenly spread, as the maps see them."""
+    rows = spread(chosen.n_rows, EXAMPLE_ROWS)
+    return take_rows(X, rows if chosen.positions is None else chosen.positions[rows])
+
+
+def spread(n_rows: int, n_some: int) -> np.ndarray:
+    """Positions of some rows, evenly spread; of all if they are not more."""
+    return np.unique(np.linspace(0, n_rows - 1, min(n_rows, n_some)).astype(int))
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:

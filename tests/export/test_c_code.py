@@ -142,6 +142,27 @@ def test_the_header_says_what_is_what(tmp_path):
     assert "int evgp_predict(const double *x, double *mean, double *variance);" in text
 
 
+def test_files_may_be_called_otherwise_than_functions(tmp_path):
+    source, header = fitted(sparse()).to_c(tmp_path / "2dof-arm.c", "arm", jacobian=False)
+    compiled(source)
+    assert "-c 2dof-arm.c," in header.read_text()
+    assert "#define MODEL_2DOF_ARM_N_FEATURES 5" in header.read_text()
+
+
+def test_names_of_columns_do_not_end_or_begin_a_comment(tmp_path):
+    pandas = pytest.importorskip("pandas")
+    X, y = data()
+    source, _ = sparse().fit(pandas.DataFrame(X, columns=["/*", "*/", "/*/", "*/*", "w"]), y).to_c(tmp_path)
+    compiled(source)
+
+
+@pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])
+def test_a_name_that_is_taken_in_c_is_refused(name, tmp_path):
+    with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
+        fitted(sparse()).to_c(tmp_path, name)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_that_is_not_there_is_told(tmp_path):
     model = fitted(sparse())
     with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):

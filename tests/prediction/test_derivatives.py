@@ -1,11 +1,17 @@
 """Derivatives of predictions, against differences of `predict` and the Gaussian process of the gradient written out."""
 
+from copy import copy
+
 import numpy as np
 import pandas as pd
+import polars
 import pytest
+from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
 
@@ -110,6 +116,44 @@ def test_many_rows_are_as_one_after_the_other(data, model):
         np.testing.assert_allclose(many[some], few, rtol=1e-9, atol=1e-11)
 
 
+class Squashed(TransformerMixin, BaseEstimator):
+    """The map that the next test has differentiated, with its derivative."""
+
+    def __init__(self, unit, offset):
+        self.unit, self.offset = unit, offset
+
+    def fit(self, X, y=None):
+        return self
+
+    def transform(self, X):
+        return np.tanh((X - self.offset) / self.unit)
+
+    def jacobian(self, X):
+        return (1.0 - self.transform(X) ** 2)[:, :, np.newaxis] * np.eye(D) / self.unit
+
+
+@pytest.mark.parametrize(("unit", "offset"), [(1e-6, 0.0), (1.0, 1e8), (1e7, 0.0), (1e-6, -3.0)])
+@pytest.mark.parametrize("frame", [None, pd.DataFrame, polars.DataFrame], ids=["array", "pandas", "polars"])
+@pytest.mark.parametrize("split", ["together", "in a pipeline", "of columns"])
+def test_differences_take_steps_in_the_units_of_the_columns(data, unit, offset, frame, split):
+    X, Y, X_new = data
+    names = slice(0, 2) if frame is None else ["a", "b"]
+    centred, together = FunctionTransformer(lambda X: X - offset), FunctionTransformer(Squashed(unit, offset).transform)
+    kernel_map = {
+        "together": together,
+        "in a pipeline": make_pipeline(centred, FunctionTransformer(lambda X: np.tanh(X / unit))),
+        "of columns": ColumnTransformer([("all", together, names)]),
+    }[split]
+    X, X_new = X * unit + offset, X_new * unit + offset
+    given = X if frame is None else frame({"a": X[:, 0], "b": X[:, 1]})
+    model = EVGPRegressor(kernel_map=kernel_map, n_inducing=10, **QUICK).fit(given, Y[:, 0])
+    exact = copy(model)
+    exact.kernel_map_ = Squashed(unit, offset)
+    for ask in (EVGPRegressor.compile, lambda model: model.sample_functions(2, n_waves=20)):
+        found, expected = (ask(each).value_and_jacobian(X_new)[1] for each in (model, exact))
+        np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
+
+
 def test_data_frames(data):
     X, Y, X_new = data
     frame, new = (pd.DataFrame(rows, columns=["a", "b"]) for rows in (X, X_new))
@@ -120,6 +164,34 @@ def test_data_frames(data):
     )
     with pytest.raises(ValueError, match="feature names"):
         model.jacobian(new[["b", "a"]])
+
+
+def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
+    X, Y, X_new = data
+    encoder = ColumnTransformer([("words", OneHotEncoder(), ["c"]), ("numbers", StandardScaler(), ["a", "b"])])
+
+    def frame_of(rows):
+        return pd.DataFrame(rows, columns=["a", "b"]).assign(c=np.where(rows[:, 0] > 0.5, "high", "low"))
+
+    model = EVGPRegressor(kernel_map=encoder, n_inducing=10, **QUICK).fit(frame_of(X), Y[:, 0])
+    _, std = model.predict(frame_of(X_new), return_std=True, include_noise=False)
+    expected = std**2 / model._predictor.signal
+    np.testing.assert_allclose(model.novelty(frame_of(X_new)), expected, rtol=1e-6, atol=1e-9)
+    many = model.novelty(frame_of(np.repeat(X_new, 1000, axis=0)))
+    np.testing.assert_allclose(many, np.repeat(expected, 1000), rtol=1e-6, atol=1e-9)
+    message = r"\['c'\] of X are not numbers.* derivatives"
+    for method in (model.jacobian, model.value_and_jacobian, model.predict_gradient):
+        with pytest.raises(ValueError, match=message):
+            method(frame_of(X_new))
+    for method in (model.compile, model.sample_functions):
+        with pytest.raises(ValueError, match=message):
+            method()
+    with pytest.raises(ValueError, match=message):
+        model.set_params(input_noise=0.1).fit(frame_of(X), Y[:, 0])
+    numbers = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=10, **QUICK)
+    numbers.fit(pd.DataFrame(X, columns=["a", "c"]), Y[:, 0])
+    with pytest.raises(ValueError, match=message):
+        numbers.jacobian(frame_of(X_new)[["a", "c"]])
 
 
 def test_what_a_residual_regressor_says_is_of_the_sum(data):
@@ -135,9 +207,11 @@ def test_what_a_residual_regressor_says_is_of_the_sum(data):
     gradient, std = model.predict_gradient(X_new, return_std=True)
     np.testing.assert_array_equal(gradient, jacobian)
     np.testing.assert_array_equal(std, model.regressor_.predict_gradient(X_new, return_std=True)[1])
+    np.testing.assert_array_equal(model.novelty(X_new), model.regressor_.novelty(X_new))
     single = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=1).fit(X, Y[:, 0])
     close(single.jacobian(X_new), differences(single.predict, X_new), 1e-6)
-    assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), "value_and_jacobian")
+    for method in ("value_and_jacobian", "novelty"):
+        assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), method)
 
 
 def test_what_cannot_be_is_refused_by_name(data):
@@ -162,3 +236,5 @@ def test_derivatives_are_not_for_dask_arrays(data):
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
     with pytest.raises(ValueError, match="not for Dask arrays"):
         model.jacobian(da.from_array(X))
+    with pytest.raises(ValueError, match="novelty needs rows in memory"):
+        model.novelty(da.from_array(X))

@@ -201,7 +201,7 @@ def test_a_union_of_rows_for_each_output_and_rows_for_all():
 
 
 def test_the_scale_of_columns_reaches_the_parts_that_are_not_known():
-    X, unit = rows() * 1e-6, np.full(5, 1e-6)
+    X = rows() * 1e-6
     curved = FunctionTransformer(lambda X: np.tanh(X / 1e-6))
     exact = (1.0 - np.tanh(X / 1e-6) ** 2)[:, :, np.newaxis] * np.eye(5) / 1e-6
     for transformer in [
@@ -210,7 +210,7 @@ def test_the_scale_of_columns_reaches_the_parts_that_are_not_known():
         by_columns((curved, slice(0, 5))),
         by_columns((curved, [0, 1]), remainder=curved),
     ]:
-        found = map_jacobian(fitted(transformer, X), X, scale=unit)
+        found = map_jacobian(fitted(transformer, X), X, example=X)
         assert_allclose(found, exact, rtol=0.0, atol=1e-8 * np.abs(exact).max())
 
 
@@ -262,3 +262,33 @@ def test_a_pipeline_whose_steps_make_frames():
     assert type(direct(transformer)(rows())) is np.ndarray
     assert_allclose(direct(transformer)(rows()), expected, rtol=1e-12, atol=1e-12)
     assert map_jacobian(transformer, rows()).shape == (100, 21, 5)
+
+
+def of_pandas(frame):
+    return frame.loc[:, ["first"]].to_numpy()
+
+
+def of_polars(frame):
+    return frame.select(polars.col("first").sin()).to_numpy()
+
+
+@pytest.mark.parametrize(
+    ("frame", "output", "function"),
+    [
+        (pd.DataFrame, "default", of_pandas),
+        (polars.DataFrame, "default", of_polars),
+        (pd.DataFrame, "polars", of_polars),
+        (polars.DataFrame, "pandas", of_pandas),
+    ],
+)
+def test_frames_are_of_the_package_that_maps_were_fitted_to(frame, output, function):
+    given = frame(dict(zip(NAMES, rows(40, seed=1).T, strict=True)))
+    new = frame(dict(zip(NAMES, rows().T, strict=True)))
+    steps = [FunctionTransformer(function, check_inverse=False)]
+    if output != "default":
+        steps = [StandardScaler().set_output(transform=output), *steps]
+    for transformer in (make_pipeline(*steps), FeatureUnion([("a", make_pipeline(*steps))])):
+        fitted(transformer, given)
+        read = direct_map(transformer, example=given)
+        assert_allclose(read.value(rows()), transformer.transform(new), rtol=1e-12, atol=1e-12)
+        assert read.jacobian(rows()).shape == (100, 1, 5)

@@ -2,9 +2,11 @@
 
 import numpy as np
 import pandas as pd
+import polars
 import pytest
 from scipy.stats import kstest, norm
 from sklearn.base import BaseEstimator
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -99,6 +101,31 @@ def test_the_linearised_covariance_goes_through_the_derivatives(sparse, inputs, 
 def test_without_a_jacobian_differences_do(model, inputs):
     ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
     np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
+
+
+@pytest.mark.parametrize("unit", [1e-7, 1e5])
+def test_differences_are_in_the_units_of_the_states(data, inputs, unit):
+    X, y = data
+    scales = np.array([unit, unit, 1.0])
+    model = GaussianProcessRegressor(
+        RBF([2.0, 2.0, 2.0] * scales) + WhiteKernel(1e-3), normalize_y=True, optimizer=None
+    )
+    model.fit(X * scales, y * unit)
+    same = GaussianProcessRegressor(RBF(2.0) + WhiteKernel(1e-3), normalize_y=True, optimizer=None).fit(X, y)
+    feedback = np.array([-0.5, -0.3])
+
+    def controlled(regressor, size):
+        return rollout(
+            regressor,
+            np.array(Z0) * size,
+            lambda z, t: np.tanh(z / size @ feedback)[:, np.newaxis],
+            n_steps=6,
+            method="linearized",
+        )
+
+    for ask in (lambda each, size: rollout(each, np.array(Z0) * size, inputs, method="linearized"), controlled):
+        found, expected = ask(model, unit), ask(same, 1.0)
+        np.testing.assert_allclose(found.std / unit, expected.std, rtol=1e-4)
 
 
 class _Hidden(BaseEstimator):
@@ -205,6 +232,30 @@ def test_names_of_columns_do_not_matter(data, inputs):
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(pd.DataFrame(X, columns=["angle", "speed", "torque"]), y)
     for method in ("mean", "linearized", "sample"):
         assert np.isfinite(rollout(model, Z0, inputs, method=method, n_samples=3, random_state=0).mean).all()
+
+
+def sine_of_polars(frame):
+    return frame.select(polars.all().sin()).to_numpy()
+
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize(("frame_of", "sine"), [(pd.DataFrame, np.sin), (polars.DataFrame, sine_of_polars)])
+def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_of, sine):
+    X, y = data
+    frame = frame_of(dict(zip(["angle", "speed", "torque"], X.T, strict=True)))
+
+    def made(scaled, angle, sine):
+        by_names = ColumnTransformer([("s", StandardScaler(), scaled), ("a", FunctionTransformer(sine), angle)])
+        model = EVGPRegressor(kernel_map=by_names, n_inducing=10, **QUICK | {"max_iter": 0})
+        return ResidualRegressor(model) if residual else model
+
+    named, numbered = made(["speed", "torque"], ["angle"], sine).fit(frame, y), made([1, 2], [0], np.sin).fit(X, y)
+    for method in ("mean", "linearized", "sample"):
+        found, expected = (
+            rollout(each, Z0, inputs, method=method, n_samples=3, random_state=0) for each in (named, numbered)
+        )
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(found.std, expected.std, rtol=1e-6, atol=1e-8)
 
 
 def test_a_system_without_inputs_and_with_one_state():
