@@ -21,6 +21,9 @@ from sklearn.preprocessing import (
     StandardScaler,
 )
 
+from .._sklearn import safe_indexing
+from .._validation import is_frame
+
 # The step of central differences whose errors of truncation and of rounding are about the same.
 _STEP = np.cbrt(np.finfo(np.float64).eps)
 # And what it is at least, in units of the spacing of numbers like x.
@@ -351,10 +354,13 @@ def _as_floats(values: Any) -> np.ndarray:
 
 
 def _scale_of(example: Any) -> np.ndarray:
-    """Of each column its standard deviation; its size if it is constant, and 1 if it is 0."""
-    values = np.asarray(example, dtype=np.float64)
-    size, deviation = np.abs(values).max(axis=0), values.std(axis=0)
-    return np.where(deviation > _STEP**2 * size, deviation, np.where(size > 0.0, size, 1.0))
+    """Of each column its standard deviation; its size, or 1 if that is more, if it is constant."""
+    if is_frame(example):  # as a whole, one of pandas with gaps may not become numbers
+        columns = (safe_indexing(example, index, axis=1) for index in range(example.shape[1]))
+        example = np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
+    values = np.ma.masked_invalid(example)
+    size, deviation = np.abs(values).max(axis=0).filled(0.0), values.std(axis=0).filled(0.0)
+    return np.where(deviation > _STEP**2 * size, deviation, np.maximum(size, 1.0))
 
 
 def package_of(values: Any) -> str:

@@ -222,6 +222,16 @@ def test_steps_are_measured_by_the_scale_of_each_column(unit):
     assert_allclose(found, exact, rtol=0.0, atol=1e-8 * np.abs(exact).max())
 
 
+@pytest.mark.parametrize(
+    "given", [np.asarray, pd.DataFrame, lambda rows: pd.DataFrame(rows).convert_dtypes(), polars.DataFrame]
+)
+def test_a_constant_column_is_no_scale_and_one_of_gaps_neither(given):
+    example = given(np.tile([0.0, 1e-12, 1.0, np.nan, 1e3], (4, 1)))
+    exact = WithJacobian().jacobian(rows(50))
+    found = elementary(fitted(Counted()), example=example).jacobian(rows(50))
+    assert_allclose(found, exact, rtol=0.0, atol=1e-5 * np.abs(exact).max())
+
+
 def test_a_jacobian_that_a_map_has_is_asked():
     X, transformer = rows(), fitted(WithJacobian(2.0))
     assert_array_equal(elementary(transformer).jacobian(X), transformer.jacobian(X))
