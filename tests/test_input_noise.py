@@ -78,7 +78,6 @@ def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
         input_noise=np.diag([0.01, 0.0]),
         sharing=sharing,
         n_inducing=8,
-        max_iter=10,
         tol=1e6,
     )
     model.fit(frame, Y, sample_weight=np.arange(80) % 3)

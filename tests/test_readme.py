@@ -30,9 +30,18 @@ def test_any_robot_runs():
 
 
 @pytest.mark.slow
+def test_control_runs():
+    names = {}
+    exec(SNIPPETS[3], names)
+    assert names["ahead"].mean.shape == (50, 4)
+    assert names["A_B"].shape == (50, 4, 5)
+    assert names["mean"].shape == names["std"].shape == (4,)
+
+
+@pytest.mark.slow
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
-    files, chunks = SNIPPETS[3:]
+    files, chunks = SNIPPETS[4:]
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (500, 2))
     np.save(tmp_path / "X.npy", X)

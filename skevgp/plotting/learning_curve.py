@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import clone
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_consistent_length
+from sklearn.utils.validation import check_consistent_length, has_fit_parameter
 
 from .._optional import require
 from .._sklearn import num_samples, safe_indexing
@@ -103,7 +103,8 @@ class LearningCurveDisplay:
         sizes : array-like of shape (n_sizes,)
             Numbers of groups to learn from, from 1 to all of them, ascending.
         groups : array-like of shape (n_samples,), default=None
-            The trajectory of each row, as in `make_dynamics`; None is a group per row.
+            The trajectory of each row, as in `make_dynamics`; None is a group per row. A regressor whose ``fit`` takes
+            groups is told of them.
         n_runs : int, default=4
             Orders of the groups, at least 1.
         score : callable, default=prediction_error
@@ -133,6 +134,7 @@ class LearningCurveDisplay:
         """
         require("matplotlib.pyplot", "Plotting")  # before the fits, not after them
         check_consistent_length(X, y, groups)
+        told = groups is not None and has_fit_parameter(estimator, "groups")
         groups = np.arange(num_samples(X)) if groups is None else groups
         labels, group_of_row = np.unique(groups, return_inverse=True)
         steps = np.ravel(sizes).tolist()
@@ -147,7 +149,8 @@ class LearningCurveDisplay:
             place_of_row = rng.permutation(len(labels))[group_of_row]
             for index, size in enumerate(steps):
                 rows = np.flatnonzero(place_of_row < size)
-                fitted = clone(estimator).fit(safe_indexing(X, rows), safe_indexing(y, rows))
+                known = {"groups": group_of_row[rows]} if told else {}
+                fitted = clone(estimator).fit(safe_indexing(X, rows), safe_indexing(y, rows), **known)
                 n_rows[index, run], scores[index, run] = len(rows), score(y_test, fitted.predict(X_test))
         name = getattr(score, "__name__", "score").replace("_", " ")
         return cls(n_rows.mean(axis=1), scores, name).plot(ax, log_scale=log_scale, label=label, color=color)

@@ -66,6 +66,15 @@ def test_a_cell_asked_for_twice_runs_once(harness, tmp_path, capsys):
     assert "0 of 2 cells" in capsys.readouterr().out
 
 
+@pytest.fixture
+def interruptible():
+    """Also in the background of a shell, whose jobs ignore Ctrl-C."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_of_the_main_process_ends_the_fits(harness, tmp_path):
     with pytest.raises(SystemExit, match="Interrupted"):
         harness.run_missing([Cell("a"), Cell("b")], interrupt, tmp_path / "t.csv", 1, str)

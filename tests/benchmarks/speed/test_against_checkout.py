@@ -13,6 +13,7 @@ from ..conftest import BENCHMARKS, read
 
 
 @pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")  # old checkouts know no groups
 def test_runs_take_turns_and_tell_what_a_fit_tells(run_script, tmp_path):
     output = tmp_path / "pairs.csv"
     options = ("--quick", "--systems", "pendulum", "--max-iter", "pendulum=3", "--output", output)
