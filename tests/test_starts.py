@@ -244,9 +244,7 @@ def test_noise_that_explains_what_a_kernel_could_is_told():
     """One inducing point cannot follow forty waves, whatever the start."""
     x = np.linspace(0, 1, 2000)[:, np.newaxis]
     y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(2000)])
-    with pytest.warns(
-        ConvergenceWarning, match=r"noise explains everything .* of 1 of 2 outputs .* raise n_inducing"
-    ):
+    with pytest.warns(ConvergenceWarning, match=r"noise explains everything .* of 1 of 2 outputs .* raise n_inducing"):
         model(n_inducing=1).fit(x, y)
 
 
