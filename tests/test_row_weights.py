@@ -326,3 +326,14 @@ def test_a_residual_regressor_hands_weights_on():
 def test_warnings_are_those_of_a_fit_without_weights():
     with pytest.warns(ConvergenceWarning, match="max_iter=2"):
         evgp(max_iter=2).fit(X, Y, NOISE)
+
+
+def test_rows_that_are_all_noisy_are_not_far_from_their_prior():
+    """Their noise variance is σ² times a number: σ² is small, and y as it is."""
+    rng = np.random.RandomState(0)
+    X = rng.randn(60, 1)
+    y = np.sin(2.0 * X[:, 0]) + 0.1 * rng.randn(60)
+    found = EVGPRegressor(n_inducing=8, random_state=0).fit(X, y, relative_variance=np.full(60, 1e10))
+    expected = EVGPRegressor(n_inducing=8, random_state=0).fit(X, y)
+    np.testing.assert_allclose(1e10 * found.noise_variance_, expected.noise_variance_, rtol=1e-2)
+    np.testing.assert_allclose(found.predict(X), expected.predict(X), atol=1e-2)

@@ -16,6 +16,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 
 from ..features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 from ..features.gravity import SineGravity
+from ..prediction.maps import column_indices
 from .package import casadi
 from .rigid_body import SymbolicRigidBody
 
@@ -82,23 +83,10 @@ def _columns(transformer: ColumnTransformer, x: Any, name: str) -> Mapped:
     names = list(getattr(transformer, "feature_names_in_", []))
     parts = []
     for called, part, columns in transformer.transformers_:
-        indices = _indices(columns, names, transformer.n_features_in_)
+        indices = column_indices(columns, names, transformer.n_features_in_).tolist()
         if indices and not _is_dropped(part):
             parts.append(_times(mapped(part, _taken(x, indices), name), weights.get(called, 1.0)))
     return _side_by_side(parts)
-
-
-def _indices(columns: Any, names: list[str], n_columns: int) -> list[int]:
-    """Of columns as a ColumnTransformer is told them: by index, name, mask or slice."""
-    if isinstance(columns, slice):
-        start, stop = (names.index(end) if isinstance(end, str) else end for end in (columns.start, columns.stop))
-        # A slice of names holds its last one.
-        last = stop + 1 if isinstance(columns.stop, str) else stop
-        return list(range(n_columns)[start : last : columns.step])
-    given = np.atleast_1d(np.asarray(columns))
-    if given.dtype.kind in "OUT":
-        return [names.index(column) if isinstance(column, str) else int(column) for column in given.tolist()]
-    return [int(column) for column in np.arange(n_columns)[given]] if given.size else []
 
 
 def _is_dropped(part: Any) -> bool:

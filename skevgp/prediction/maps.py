@@ -186,7 +186,7 @@ class OfColumns(DirectMap):
         names = list(getattr(transformer, "feature_names_in_", []))
         self._parts = []
         for name, part, columns in transformer.transformers_:
-            chosen = _indices(columns, names, transformer.n_features_in_)
+            chosen = column_indices(columns, names, transformer.n_features_in_)
             if len(chosen) and not _is_dropped(part):
                 own = direct_map(part, example=None if example is None else safe_indexing(example, chosen, axis=1))
                 self._parts.append((own, chosen, weights.get(name)))
@@ -222,7 +222,7 @@ def _is_dropped(part: Any) -> bool:
     return part is None or (isinstance(part, str) and part == "drop")
 
 
-def _indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
+def column_indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
     """Indices of the columns that a column transformer was given: by index or name, a slice, a list or a mask."""
     if isinstance(columns, slice):
         if isinstance(columns.start, str) or isinstance(columns.stop, str):  # names: the last is taken too
@@ -232,7 +232,7 @@ def _indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
         return np.arange(n_columns)[columns]
     if isinstance(columns, UserList):  # the rest, in scikit-learn 1.6: to look into it would warn
         columns = columns.data
-    listed = np.asarray(columns).tolist()
+    listed = np.atleast_1d(np.asarray(columns)).tolist()
     if not listed:
         return np.empty(0, dtype=int)
     return np.arange(n_columns)[[names.index(name) for name in listed] if isinstance(listed[0], str) else listed]
