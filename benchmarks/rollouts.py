@@ -7,7 +7,7 @@ noise and with noise of 1 % of each state's scatter on the states, which are inp
 tenth. Writes rows per fit to a CSV as soon as it is done (what is there already is not fitted again), and a page
 beside it.
 
-    python benchmarks/rollouts.py                    # three systems, four models, two seeds: two hours of one core
+    python benchmarks/rollouts.py                    # three systems, four models, two seeds: hours of one core
     python benchmarks/rollouts.py --models EVGP-IFG  # one model: twenty minutes
     python benchmarks/rollouts.py --quick            # the pendulum, few rows and particles: a minute
 """

@@ -10,7 +10,7 @@ is the same planner on the simulated system itself.
 
 Writes a row per run to a CSV as soon as it is done, and a table beside it.
 
-    python benchmarks/swing_up.py                         # an hour of one core
+    python benchmarks/swing_up.py                         # hours of one core
     python benchmarks/swing_up.py --systems pendulum --seconds 1.5 3 --noises 0
     python benchmarks/swing_up.py --quick                 # the pendulum, one seed: half a minute
 """

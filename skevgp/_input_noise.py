@@ -75,10 +75,8 @@ def _looked_at(
     model: Model, given: Any, X: Any, y: np.ndarray | None, chosen: Any, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same, and E(y - g)² (n, o)."""
-    fast, rows = (
-        CompiledPredictor(model, include_noise=False),
-        model._numbers(given, reset=False)[0] if is_frame(given) else X,
-    )
+    fast = CompiledPredictor(model, include_noise=False)
+    rows = model._numbers(given, reset=False)[0] if is_frame(given) else X
     # Where y is what was added to columns of X, their noise is in y too.
     base = getattr(model, "_columns_changed", None)
     positions = np.arange(len(rows)) if chosen.positions is None else chosen.positions

@@ -23,6 +23,8 @@ from .prediction.functions import FunctionSamples
 
 
 def regressor_has(method: str) -> Callable[[Any], bool]:
+    """For `available_if`: the fitted regressor has a method or, before `fit`, the one that is given."""
+
     def has(self: Any) -> bool:
         getattr(self.regressor_ if hasattr(self, "regressor_") else self.regressor, method)
         return True

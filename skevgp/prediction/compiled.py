@@ -55,7 +55,7 @@ class CompiledPredictor:
     ((2,), (60, 2, 1))
     """
 
-    _state: tuple[Predictor, tuple[_Group, ...], np.ndarray]
+    _state: _State
 
     def __init__(self, model: Model, include_noise: bool = True, base: np.ndarray | None = None):
         self.include_noise, self.base = include_noise, base
@@ -104,19 +104,12 @@ class CompiledPredictor:
         std : ndarray of the same shape
             If ``return_std``.
         """
-        rows = X if X.ndim == 2 else X[np.newaxis]
-        predictor, groups, noise = self._state
+        rows, state = X if X.ndim == 2 else X[np.newaxis], self._state
         inputs = rows if self._kernel_map is None else self._kernel_map.value(rows)
         features = _NONE if self._feature_map is None else self._feature_map.value(rows)
-        found = [group.moments(inputs, features, return_std) for group in groups]
-        mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
-        if self.base is not None:
-            mean += rows[:, self.base]
+        _, mean, std = self._said(state, rows, inputs, features, return_std)
         mean = like_y(mean if X.ndim == 2 else mean[0])
-        if not return_std:
-            return mean
-        std = np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)
-        return mean, like_y(std if X.ndim == 2 else std[0])
+        return (mean, like_y(std if X.ndim == 2 else std[0])) if return_std else mean
 
     def value_and_jacobian(self, X: np.ndarray, return_std: bool = False) -> Any:
         """Predict y, and how that changes with the columns of X.
@@ -137,22 +130,32 @@ class CompiledPredictor:
         std, std_jacobian : ndarray of these shapes
             If ``return_std``.
         """
-        rows = X if X.ndim == 2 else X[np.newaxis]
-        predictor, groups, noise = self._state
+        rows, state = X if X.ndim == 2 else X[np.newaxis], self._state
+        predictor, groups, _ = state
         behind = mapped(rows, self._feature_map, self._kernel_map)
-        found = [group.moments(behind.inputs, behind.features, return_std) for group in groups]
-        mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
+        found, mean, std = self._said(state, rows, behind.inputs, behind.features, return_std)
         slopes = [group.slopes(each, behind) for group, each in zip(groups, found, strict=True)]
         jacobian = predictor.in_order([by for by, _ in slopes])
         if self.base is not None:
-            mean += rows[:, self.base]
             jacobian[np.arange(len(jacobian)), :, self.base] += 1.0
         mean, jacobian = _shaped(X, mean, jacobian)
         if not return_std:
             return mean, jacobian
-        std = np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)
         by_std = (0.5 / np.where(std > 0.0, std, np.inf)).T[:, :, np.newaxis]
         return mean, jacobian, *_shaped(X, std, by_std * predictor.in_order([by for _, by in slopes]))
+
+    def _said(
+        self, state: _State, rows: np.ndarray, inputs: np.ndarray, features: np.ndarray, return_std: bool
+    ) -> tuple[list[_Moments], np.ndarray, Any]:
+        """What each group says of rows behind both maps, and mean and (or None) std (n, o) of all outputs."""
+        predictor, groups, noise = state
+        found = [group.moments(inputs, features, return_std) for group in groups]
+        mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
+        if self.base is not None:
+            mean += rows[:, self.base]
+        if not return_std:
+            return found, mean, None
+        return found, mean, np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)
 
 
 def _goes_on(before: Predictor, predictor: Predictor) -> bool:
@@ -217,7 +220,7 @@ class _Group:
         return cls(group, product, group.mean[:, :m] @ group.whitening.L_inv)
 
     def moments(self, inputs: np.ndarray, features: np.ndarray, return_variance: bool) -> _Moments:
-        """Mean and variance at rows, given what both maps make of them (features are None without a map)."""
+        """Mean and variance at rows, given what both maps make of them (without features, whatever these are)."""
         group = self.own
         own = of_outputs(inputs, group.outputs)
         (o, k, size), m, n = group.root.shape, len(group.points), len(own)
@@ -262,3 +265,7 @@ def _shaped(X: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> tuple[np.n
     """Values (n, o) and slopes (o, n, D) as `value_and_jacobian` returns them for X."""
     slopes, values = slopes[0] if len(slopes) == 1 else slopes.transpose(1, 0, 2), like_y(values)
     return (values, slopes) if X.ndim == 2 else (values[0], slopes[0])
+
+
+# What predictions are made from: weights, groups made ready, and the noise of each output.
+_State = tuple[Predictor, tuple[_Group, ...], np.ndarray]

@@ -201,7 +201,7 @@ class _Group:
         common: np.ndarray,
         rng: np.random.RandomState,
     ) -> _Group:
-        """K functions."""
+        """Draw k functions."""
         hyperparameters, (m, d) = np.log(group.hyperparameters), group.points.shape
         waves = random_functions(group.kernel, hyperparameters, n_waves, d, rng)  # type: ignore[arg-type]
         at_points = waves.value(group.points)

@@ -7,7 +7,7 @@ chain rule is applied. What is not known here is asked by its `transform`, and d
 from __future__ import annotations
 
 from collections import UserList
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -19,47 +19,6 @@ from sklearn.preprocessing import FunctionTransformer
 from .._sklearn import safe_indexing
 from .._validation import is_frame, words_of
 from .elementary import DirectMap, Foreign, Identity, elementary
-
-
-def map_jacobian(transformer: Any, X: np.ndarray, *, example: Any = None) -> np.ndarray:
-    """Differentiate a fitted map by the columns of X.
-
-    Parameters
-    ----------
-    transformer : transformer or None
-        As `direct_map` takes it.
-    X : ndarray of shape (n, d)
-        Finite rows of float64, with the columns that it was fitted to.
-    example : array-like of shape (n, d), optional
-        As in `direct_map`.
-
-    Returns
-    -------
-    jacobian : ndarray of shape (n, width, d) or, of a map with a row per output, (n, n_outputs, width, d)
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from sklearn.preprocessing import PolynomialFeatures
-    >>> from skevgp.prediction.maps import map_jacobian
-    >>> X = np.array([[2.0]])
-    >>> map_jacobian(PolynomialFeatures(3).fit(X), X)
-    array([[[ 0.],
-            [ 1.],
-            [ 4.],
-            [12.]]])
-    """
-    return direct_map(transformer, example=example).jacobian(X)
-
-
-def direct(transformer: Any) -> Callable[[np.ndarray], np.ndarray]:
-    """What a fitted map's `transform` does with finite rows of float64, without checks: `DirectMap.value`."""
-    return direct_map(transformer).value
-
-
-def direct_jacobian(transformer: Any, *, example: Any = None) -> Callable[[np.ndarray], np.ndarray]:
-    """The derivatives of the same: `DirectMap.jacobian`."""
-    return direct_map(transformer, example=example).jacobian
 
 
 def maps_of(model: Any) -> tuple[DirectMap | None, DirectMap | None]:
@@ -100,6 +59,18 @@ def direct_map(transformer: Any, *, example: Any = None) -> DirectMap:
     Returns
     -------
     direct : DirectMap
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp.prediction.maps import direct_map
+    >>> X = np.array([[2.0]])
+    >>> direct_map(PolynomialFeatures(3).fit(X)).jacobian(X)
+    array([[[ 0.],
+            [ 1.],
+            [ 4.],
+            [12.]]])
     """
     kind = type(transformer)
     if transformer is None or isinstance(transformer, str):

@@ -148,6 +148,8 @@ class Functions:
 
     def between(self, X: np.ndarray) -> np.ndarray:
         """Covariances (n, o, o) of different outputs of a row, which are 0 but where outputs share their weights."""
+        if not self.predictor.shared:
+            return np.zeros((len(X), len(self.noise), len(self.noise)))
         common = self.predictor.common(*self.mapped(X))
         return np.einsum("kni,knj->nij", common, common) * (1.0 - np.eye(len(self.noise)))
 

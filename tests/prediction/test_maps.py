@@ -15,7 +15,7 @@ from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, Normalizer,
 
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 from skevgp.prediction.elementary import Foreign
-from skevgp.prediction.maps import direct, direct_jacobian, direct_map, map_jacobian
+from skevgp.prediction.maps import direct_map
 
 SCALED_ANGLES = make_pipeline(AngleEncoder("acrobot"), StandardScaler())
 UNION = FeatureUnion(
@@ -75,8 +75,8 @@ def differences(function, X, step=1e-6):
 
 def check(transformer, X, rtol=1e-6):
     """Value and Jacobian of a fitted map."""
-    assert_allclose(direct(transformer)(X), transformer.transform(X), rtol=1e-12, atol=1e-12)
-    jacobian, expected = map_jacobian(transformer, X), differences(transformer.transform, X)
+    assert_allclose(direct_map(transformer).value(X), transformer.transform(X), rtol=1e-12, atol=1e-12)
+    jacobian, expected = direct_map(transformer).jacobian(X), differences(transformer.transform, X)
     assert jacobian.shape == expected.shape
     assert_allclose(jacobian, expected, rtol=0.0, atol=rtol * max(np.abs(expected).max(initial=0.0), 1e-3))
 
@@ -128,7 +128,7 @@ def test_what_is_linear_is_known_through_compositions():
 @pytest.mark.parametrize("n_rows", [1, 50])
 def test_scaled_angles_are_bitwise_those_of_transform(n_rows):
     transformer = fitted(SCALED_ANGLES)
-    assert_array_equal(direct(transformer)(rows(n_rows)), transformer.transform(rows(n_rows)))
+    assert_array_equal(direct_map(transformer).value(rows(n_rows)), transformer.transform(rows(n_rows)))
 
 
 @pytest.mark.parametrize(
@@ -136,14 +136,14 @@ def test_scaled_angles_are_bitwise_those_of_transform(n_rows):
 )
 def test_identities(transformer):
     X = rows()
-    assert_array_equal(direct(transformer)(X), X)
-    assert_array_equal(direct_jacobian(transformer)(X), np.broadcast_to(np.eye(5), (100, 5, 5)))
+    assert_array_equal(direct_map(transformer).value(X), X)
+    assert_array_equal(direct_map(transformer).jacobian(X), np.broadcast_to(np.eye(5), (100, 5, 5)))
 
 
 def test_a_union_of_nothing_has_no_columns():
     transformer = fitted(FeatureUnion([("a", "drop")]))
-    assert direct(transformer)(rows()).shape == (100, 0)
-    assert map_jacobian(transformer, rows()).shape == (100, 0, 5)
+    assert direct_map(transformer).value(rows()).shape == (100, 0)
+    assert direct_map(transformer).jacobian(rows()).shape == (100, 0, 5)
 
 
 # --- parts that are not known ------------------------------------------------------------------------------------
@@ -176,7 +176,7 @@ def test_a_part_that_is_not_known_is_differentiated_numerically(transformer):
 
 def test_a_row_for_each_output_at_the_end():
     check(fitted(make_pipeline(StandardScaler(), PolynomialFeatures(2), PerOutput())), rows())
-    assert map_jacobian(fitted(make_pipeline(PCA(3), PerOutput())), rows()).shape == (100, 3, 2, 5)
+    assert direct_map(fitted(make_pipeline(PCA(3), PerOutput()))).jacobian(rows()).shape == (100, 3, 2, 5)
 
 
 def test_a_row_for_each_output_in_the_middle():
@@ -190,7 +190,7 @@ def test_a_union_of_rows_for_each_output_and_rows_for_all():
     union, X = FeatureUnion([("all", AngleEncoder("acrobot")), ("each", PerOutput())]), rows()
     for _, part in union.transformer_list:
         part.fit(X)
-    value, jacobian = direct(union)(X), map_jacobian(union, X)
+    value, jacobian = direct_map(union).value(X), direct_map(union).jacobian(X)
     assert value.shape == (100, 3, 11)
     assert jacobian.shape == (100, 3, 11, 5)
     for output in range(3):
@@ -210,7 +210,7 @@ def test_the_scale_of_columns_reaches_the_parts_that_are_not_known():
         by_columns((curved, slice(0, 5))),
         by_columns((curved, [0, 1]), remainder=curved),
     ]:
-        found = map_jacobian(fitted(transformer, X), X, example=X)
+        found = direct_map(fitted(transformer, X), example=X).jacobian(X)
         assert_allclose(found, exact, rtol=0.0, atol=1e-8 * np.abs(exact).max())
 
 
@@ -249,7 +249,7 @@ def test_maps_fitted_to_data_frames_take_arrays_in_the_order_of_the_columns(tran
 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        value, jacobian = direct(transformer)(rows()), map_jacobian(transformer, rows())
+        value, jacobian = direct_map(transformer).value(rows()), direct_map(transformer).jacobian(rows())
     assert_allclose(value, by_frame(rows()), rtol=1e-12, atol=1e-12)
     assert_allclose(jacobian, differences(by_frame, rows()), rtol=0.0, atol=1e-6 * np.abs(jacobian).max())
 
@@ -259,9 +259,9 @@ def test_a_pipeline_whose_steps_make_frames():
     transformer = make_pipeline(StandardScaler(), Normalizer(), PolynomialFeatures(2)).set_output(transform="pandas")
     transformer.fit(frame)
     expected = transformer.transform(pd.DataFrame(rows(), columns=NAMES)).to_numpy()
-    assert type(direct(transformer)(rows())) is np.ndarray
-    assert_allclose(direct(transformer)(rows()), expected, rtol=1e-12, atol=1e-12)
-    assert map_jacobian(transformer, rows()).shape == (100, 21, 5)
+    assert type(direct_map(transformer).value(rows())) is np.ndarray
+    assert_allclose(direct_map(transformer).value(rows()), expected, rtol=1e-12, atol=1e-12)
+    assert direct_map(transformer).jacobian(rows()).shape == (100, 21, 5)
 
 
 def of_pandas(frame):
