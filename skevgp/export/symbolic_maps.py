@@ -7,6 +7,7 @@ and it returns an MX of shape (n_features_out, 1), or a list of these with one p
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import wraps
 from typing import Any
 
 import numpy as np
@@ -201,6 +202,19 @@ _UFUNCS: dict[Any, str] = {
 # --- our own ---------------------------------------------------------------------------------------------------------
 
 
+def _by_steps(expression: Callable[[Any, Any], Any]) -> Callable[[Any, Any], Any]:
+    """Of features of [q, q̇, u] what `RobotMap` makes of them where a row ends with its time step."""
+
+    @wraps(expression)
+    def found(features: Any, x: Any) -> Any:
+        if not features._timed:
+            return expression(features, x)
+        return casadi().vertcat(x[: features._n_kept(features._layout)], x[-1] * expression(features, x[:-1]))
+
+    return found
+
+
+@_by_steps
 def _as_it_is(features: Any, x: Any) -> Any:
     return x
 
@@ -217,6 +231,7 @@ def _angles(encoder: Any, x: Any) -> Any:
     return row[source.tolist()]
 
 
+@_by_steps
 def _newton_gravity(features: Any, x: Any) -> Any:
     return casadi().vertcat(x, mapped(features._gravity, x, "feature_map"))
 
@@ -233,6 +248,7 @@ def _sines(features: Any, x: Any) -> Any:
     return ca.sin(ca.mtimes(ca.DM(angles), x))
 
 
+@_by_steps
 def _link_gravity(features: Any, x: Any) -> Any:
     """Gravity passed on from each link to the next, as `LinkGravity` does it."""
     if features.robot is None:
@@ -248,6 +264,7 @@ def _link_gravity(features: Any, x: Any) -> Any:
     return _taken(ca.horzcat(*weights).T, features._columns) * ca.DM(features._signs)
 
 
+@_by_steps
 def _nominal(features: Any, x: Any) -> Any:
     """As a function of scalars, inside: a tenth of the time that matrices of 6 x 6 would take."""
     if features.robot is None:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_array, check_is_fitted
 
+from .._sklearn import StrOptions
 from ..robots.loading import Robot
 from .robot_map import RobotTransformer, same_for_all
 
@@ -27,6 +28,9 @@ class AngleEncoder(RobotTransformer):
     angles : sequence of int or str, default=None
         Which columns are angles (rad), by index or by name: a column of the data frame, or a position of the robot.
         None means all revolute positions of the robot, and no column without a robot.
+    dt : "column" or None, default=None
+        ``"column"``: beside the robot's, X has a last column, the time step of each row in seconds, which stays as it
+        is.
 
     Attributes
     ----------
@@ -49,13 +53,21 @@ class AngleEncoder(RobotTransformer):
     ['x', 'sin(theta)', 'cos(theta)', 'dx/dt', 'dtheta/dt', 'u_x']
     """
 
-    def __init__(self, robot: Robot | None = None, *, angles: Sequence[int | str] | None = None):
+    def __init__(
+        self,
+        robot: Robot | None = None,
+        *,
+        angles: Sequence[int | str] | None = None,
+        dt: Literal["column"] | None = None,
+    ):
         self.robot = robot
         self.angles = angles
+        self.dt = dt
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotTransformer._parameter_constraints,
         "angles": ["array-like", None],
+        "dt": [StrOptions({"column"}), None],
     }
 
     def inverse_transform(self, X: ArrayLike) -> np.ndarray:

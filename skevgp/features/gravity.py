@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
@@ -46,7 +46,7 @@ class GravityMap(RobotMap):
             acts_on[list(term.acts_on), column] = True
         return acts_on
 
-    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
         acts_on = self._acts_on(layout)
         of_velocities = np.where(acts_on, self.unknown_scale, self.free_scale)
         scale = np.vstack([np.full(acts_on.shape, self.free_scale, dtype=float), of_velocities])
@@ -142,6 +142,10 @@ class LinkGravity(GravityMap):
         between it and the base.
     free_scale : float, default=1.0
         Prior standard deviation of the other weights; 0 pins them to 0.
+    dt : "column" or None, default=None
+        ``"column"``: X has a last column, the time step Δt of each row in seconds, with which the features are
+        multiplied. Weights are then rates (1/m for a lever) of any Δt; their prior standard deviations are those above
+        divided by 0.03 s.
 
     Attributes
     ----------
@@ -166,8 +170,8 @@ class LinkGravity(GravityMap):
 
     A link whose axis is always vertical (the first of most arms) has features that are 0.
 
-    X is the whole row [q, q̇, u], of which q alone is used. Do not scale its columns before this map: scaling belongs
-    in the regressor's ``kernel_map``, which only the kernel sees.
+    X is the whole row, of which q alone is used (and Δt, if it is a column). Do not scale its columns before this map:
+    scaling belongs in the regressor's ``kernel_map``, which only the kernel sees.
 
     Examples
     --------
@@ -197,6 +201,7 @@ class LinkGravity(GravityMap):
         outputs: Sequence[int | str] | None = None,
         unknown_scale: float = 1.0,
         free_scale: float = 1.0,
+        dt: Literal["column"] | None = None,
     ):
         self.robot = robot
         self.axes = axes
@@ -204,11 +209,13 @@ class LinkGravity(GravityMap):
         self.outputs = outputs
         self.unknown_scale = unknown_scale
         self.free_scale = free_scale
+        self.dt = dt
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **GravityMap._parameter_constraints,
         "axes": [StrOptions({"xy", "x"})],
         "links": ["array-like", None],
+        "dt": [StrOptions({"column"}), None],
     }
 
     def _prepare(self, robot: Robot | None) -> None:

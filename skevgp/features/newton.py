@@ -4,39 +4,40 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import clone
 
-from .._sklearn import Interval
+from .._sklearn import Interval, StrOptions
 from .._validation import as_floats
 from ..robots import Layout
 from ..robots.loading import Robot, named_system, read_once
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
-from .robot_map import RobotMap, same_for_all
+from .robot_map import STEP, RobotMap, same_for_all
 
 
 class _NewtonFeatures(RobotMap):
     """What `InertiaForce` and `InertiaForceGravity` share: h starts with x = [q, q̇, u]."""
 
-    dt: float
+    dt: float | Literal["column"]
     inverse_inertia: ArrayLike
     known_scale: float
     unknown_scale: float
     free_scale: float
+    _begins_with_state = True
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
-        "dt": [Interval(Real, 0, None, closed="neither")],
+        "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"})],
         "inverse_inertia": [Real, "array-like"],
         "known_scale": [Interval(Real, 0, None, closed="left")],
         "unknown_scale": [Interval(Real, 0, None, closed="left")],
         "free_scale": [Interval(Real, 0, None, closed="left")],
     }
 
-    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Euler's rule (the paper's eq. inertia_prior).
 
         Known entries (1 and Δt) have ``known_scale``; unknown ones (Δt/J) the user's guess and ``unknown_scale``; the
@@ -48,12 +49,12 @@ class _NewtonFeatures(RobotMap):
         scale = np.full((2 * n, layout.n_columns), self.free_scale, dtype=float)
         for row, column, value in (
             (joints, joints, 1.0),  # q' = q + ...
-            (joints, n + joints, self.dt),  # ... + Δt q̇
+            (joints, n + joints, dt),  # ... + Δt q̇
             (n + joints, n + joints, 1.0),  # q̇' = q̇ + ...
         ):
             mean[row, column], scale[row, column] = value, self.known_scale
         driven, inputs = n + np.array(layout.driven), 2 * n + np.arange(n_inputs)
-        mean[driven, inputs] = self.dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
+        mean[driven, inputs] = dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
         scale[driven, inputs] = self.unknown_scale
         return mean, scale
 
@@ -79,8 +80,9 @@ class InertiaForce(_NewtonFeatures):
     robot : str, path-like, System or pinocchio.Model, default=None
         A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
         Without one, any number of columns is taken as it is and the weights get the regressor's wide default prior.
-    dt : float, default=0.03
-        Length of a time step, s; that of the data.
+    dt : float or "column", default=0.03
+        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
+        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     outputs : sequence of int or str, default=None
@@ -108,6 +110,13 @@ class InertiaForce(_NewtonFeatures):
     Do not scale the columns of x before this map: the prior is in SI units. Scaling belongs in the regressor's
     ``kernel_map``, which only the kernel sees.
 
+    With ``dt="column"`` the features are :math:`[z, \Delta t\,z, \Delta t\,u]` with the state :math:`z = [q, \dot q]`,
+    for :math:`z' = z + \Delta t\,(A z + B u)`. In no time nothing moves: the weights of z itself are pinned to 1 and 0.
+    All others are rates, in SI units and the same for any Δt: 1 for :math:`\dot q` in the rows of positions,
+    ``inverse_inertia`` for u, and 0. Their prior standard deviations are those above divided by 0.03 s, so that mean
+    and covariance of h(x)β are those of ``dt=0.03`` where the column is 0.03, and the standard deviation of h(x)β is
+    proportional to Δt. A column that is any other constant has the prior mean of that ``dt``.
+
     Examples
     --------
     >>> from skevgp.features import InertiaForce
@@ -118,13 +127,25 @@ class InertiaForce(_NewtonFeatures):
     >>> mean
     array([[1.  , 0.03, 0.  ],
            [0.  , 1.  , 0.  ]])
+
+    Of a log whose rows have a time step each, and 1/J about 4:
+
+    >>> features = InertiaForce("pendulum", dt="column", inverse_inertia=4.0)
+    >>> features.fit_transform([[0.1, 1.0, 2.0, 0.01], [0.1, 1.0, 2.0, 0.02]])
+    array([[0.1  , 1.   , 0.001, 0.01 , 0.02 ],
+           [0.1  , 1.   , 0.002, 0.02 , 0.04 ]])
+    >>> features.get_feature_names_out().tolist()
+    ['q', 'dq/dt', 'dt * q', 'dt * dq/dt', 'dt * u_q']
+    >>> features.coef_prior(n_outputs=2)[0]
+    array([[1., 0., 0., 1., 0.],
+           [0., 1., 0., 0., 4.]])
     """
 
     def __init__(
         self,
         robot: Robot | None = None,
         *,
-        dt: float = 0.03,
+        dt: float | Literal["column"] = STEP,
         inverse_inertia: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
         known_scale: float = 0.1,
@@ -163,8 +184,9 @@ class InertiaForceGravity(_NewtonFeatures):
     robot : str, path-like, System or pinocchio.Model, default=None
         A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
         Without one, the sine of every column is added and the weights get the regressor's wide default prior.
-    dt : float, default=0.03
-        Length of a time step, s; that of the data.
+    dt : float or "column", default=0.03
+        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
+        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity : LinkGravity, default=None
@@ -201,6 +223,9 @@ class InertiaForceGravity(_NewtonFeatures):
     Do not scale the columns of x before this map: the sine of a z-score is not gravity. Scaling belongs in the
     regressor's ``kernel_map``, which only the kernel sees.
 
+    With ``dt="column"`` features of gravity are multiplied by Δt too, the mean of their weights is minus
+    ``gravity_gain``, and all is as `InertiaForce` says: standard deviations are those above divided by 0.03 s.
+
     Examples
     --------
     >>> from skevgp.features import InertiaForceGravity
@@ -218,13 +243,22 @@ class InertiaForceGravity(_NewtonFeatures):
     >>> arm = InertiaForceGravity("iiwa14").fit([[0.0] * 21])
     >>> arm.get_feature_names_out()[21:24].tolist()
     ['gravity(q2, u_x)', 'gravity(q2, u_y)', 'gravity(q3, u_x)']
+
+    Rows that were logged whenever there was time, each with the time until the next one:
+
+    >>> logged = InertiaForceGravity("pendulum", dt="column", inverse_inertia=4.0, gravity_gain=20.0)
+    >>> logged.fit([[0.1, 0.0, 1.0, 0.008]]).get_feature_names_out().tolist()
+    ['q', 'dq/dt', 'dt * q', 'dt * dq/dt', 'dt * u_q', 'dt * sin(q)']
+    >>> logged.coef_prior(n_outputs=2)[0]
+    array([[  1.,   0.,   0.,   1.,   0.,   0.],
+           [  0.,   1.,   0.,   0.,   4., -20.]])
     """
 
     def __init__(
         self,
         robot: Robot | None = None,
         *,
-        dt: float = 0.03,
+        dt: float | Literal["column"] = STEP,
         inverse_inertia: ArrayLike = 0.0,
         gravity: LinkGravity | None = None,
         gravity_gain: ArrayLike = 0.0,
@@ -250,16 +284,15 @@ class InertiaForceGravity(_NewtonFeatures):
     }
 
     def _prepare(self, robot: Robot | None) -> None:
-        self._gravity = self._gravity_map(robot, self.n_features_in_)
+        self._gravity = self._gravity_map(robot, self.n_features_in_ - self._timed)
 
     def _gravity_map(self, robot: Robot | None, n_columns: int) -> GravityMap:
         """The fitted features of gravity."""
         if self.gravity is not None:
             features = clone(self.gravity)
-            if features.outputs is not None:
-                raise ValueError(
-                    f"gravity={self.gravity!r} must leave outputs to {type(self).__name__}, which knows all of them."
-                )
+            if features.outputs is not None or features.dt is not None:
+                left = "outputs" if features.outputs is not None else "dt"
+                raise ValueError(f"gravity={self.gravity!r} must leave {left} to {type(self).__name__}.")
             if features.robot is None:
                 features.robot = robot
         elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
@@ -286,13 +319,13 @@ class InertiaForceGravity(_NewtonFeatures):
     def _names(self, columns: np.ndarray) -> list[str]:
         return [*columns, *self._gravity._names(columns)]
 
-    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
         fitted = hasattr(self, "_gravity")
         features = self._gravity if fitted else self._gravity_map(read_once(self.robot), layout.n_columns)
-        mean, scale = features._prior(layout)
+        mean, scale = features._prior(layout, dt)
         acts_on, gain = features._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
         if gain.shape != acts_on.shape or not np.isfinite(gain).all():
             gain = _per_term(gain, acts_on.shape[1], "gravity_gain")
-        mean[layout.n_joints :] = np.where(acts_on, 0.0 - self.dt * gain, 0.0)
-        of_inertia, scale_of_inertia = super()._prior(layout)
+        mean[layout.n_joints :] = np.where(acts_on, 0.0 - dt * gain, 0.0)
+        of_inertia, scale_of_inertia = super()._prior(layout, dt)
         return np.hstack([of_inertia, mean]), np.hstack([scale_of_inertia, scale])

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .._sklearn import Interval
+from .._sklearn import Interval, StrOptions
 from ..robots import Layout, RigidBody, load_robot
 from ..robots.loading import Robot
-from .robot_map import RobotMap, same_for_all
+from .robot_map import STEP, RobotMap, same_for_all
 
 _NAMES = {
     "acceleration": "acc({})",
@@ -44,8 +44,9 @@ class NominalDynamics(RobotMap):
         - ``"gravity"``: :math:`g(q)`, N m or N;
         - ``"bias"``: :math:`C \dot q + g`, N m or N;
         - ``"input"``: :math:`M^{-1} B u`, the part of the acceleration that is the input's.
-    dt : float, default=0.03
-        Length of a time step Δt, s; that of the data.
+    dt : float or "column", default=0.03
+        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
+        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
     outputs : sequence of int or str, default=None
         Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
     known_scale : float, default=0.3
@@ -76,6 +77,11 @@ class NominalDynamics(RobotMap):
 
     With ``"acceleration"`` the weights of ``"input"`` are corrections, of mean 0; without it their mean is Δt.
 
+    With ``dt="column"`` the features are multiplied by the Δt of their row. What says Δt above is then 1: the weight of
+    a joint's acceleration has mean 1 and ``known_scale``, and mean and covariance of h(x)β are those of ``dt=0.03``
+    where the column is 0.03. So they are at any other constant, but for ``"gravity"`` and ``"bias"``: their weights in
+    the rows of velocities are inverse inertias of scale ``unknown_scale`` divided by 0.03 s.
+
     Effort limits are not applied: u is what acted. Dry friction is left out. Do not scale the columns of x before this
     map; scaling belongs in the regressor's ``kernel_map``, which only the kernel sees.
 
@@ -93,6 +99,15 @@ class NominalDynamics(RobotMap):
            [0.03, 0.  ]])
     >>> make_union(InertiaForce("pendulum"), nominal).fit_transform([[0.1, 0.0, 1.0]]).shape
     (1, 5)
+
+    With the time step of each row as its last column:
+
+    >>> logged = NominalDynamics("pendulum", dt="column")
+    >>> logged.fit_transform([[0.1, 0.0, 1.0, 0.01], [0.1, 0.0, 1.0, 0.02]]).round(4)
+    array([[0.0204],
+           [0.0408]])
+    >>> logged.get_feature_names_out().tolist()
+    ['dt * acc(q)']
     """
 
     def __init__(
@@ -100,7 +115,7 @@ class NominalDynamics(RobotMap):
         robot: Robot | None = None,
         *,
         terms: Sequence[str] = ("acceleration",),
-        dt: float = 0.03,
+        dt: float | Literal["column"] = STEP,
         outputs: Sequence[int | str] | None = None,
         known_scale: float = 0.3,
         unknown_scale: float = 1.0,
@@ -117,7 +132,7 @@ class NominalDynamics(RobotMap):
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
         "terms": ["array-like"],
-        "dt": [Interval(Real, 0, None, closed="neither")],
+        "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"})],
         "known_scale": [Interval(Real, 0, None, closed="left")],
         "unknown_scale": [Interval(Real, 0, None, closed="left")],
         "free_scale": [Interval(Real, 0, None, closed="left")],
@@ -189,18 +204,18 @@ class NominalDynamics(RobotMap):
             return columns.tolist()
         return [_NAMES[term].format(name) for term in self._terms for name in columns[: self._layout.n_joints]]
 
-    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
         """Blocks (2 * n_joints, n_joints) of the terms, side by side."""
         self._check_terms()
         n = layout.n_joints
         own = np.eye(n, dtype=bool)
         means, scales = [], []
         for term in self.terms:
-            mean, scale = np.zeros((2 * n, n)), np.full((2 * n, n), self.free_scale * self.dt)
+            mean, scale = np.zeros((2 * n, n)), np.full((2 * n, n), self.free_scale * dt)
             if term in ("gravity", "bias"):
                 scale[n:] = self.unknown_scale
             elif term == "acceleration" or "acceleration" not in self.terms:
-                mean[n:][own], scale[n:][own] = self.dt, self.known_scale * self.dt
+                mean[n:][own], scale[n:][own] = dt, self.known_scale * dt
             means.append(mean)
             scales.append(scale)
         return np.hstack(means), np.hstack(scales)

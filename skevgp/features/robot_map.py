@@ -1,13 +1,15 @@
-"""What all maps of a robot share: they take rows x = [q, q̇, u]; those of features know which states y holds."""
+"""What all maps of a robot share: rows x = [q, q̇, u] or [q, q̇, u, Δt]; those of features know which states y holds."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, ClassVar, Self
+from numbers import Real
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.utils import assert_all_finite
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
@@ -15,6 +17,9 @@ from .._sklearn import check_feature_names_in, fit_context
 from .._validation import is_plain
 from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
+
+# s: the time step of which default prior scales are.
+STEP = 0.03
 
 
 def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
@@ -29,10 +34,13 @@ def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str,
 class RobotTransformer(TransformerMixin, BaseEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
-    What a subclass says: `_features`, their `_jacobian` and `_names`, and `_prepare` what it needs of the robot.
+    What a subclass says: `_features`, their `_jacobian` and `_names`, and `_prepare` what it needs of the robot. With
+    ``dt="column"`` rows of a robot have their time step as a last column.
     """
 
     robot: Robot | None
+    dt: float | Literal["column"] | None = None
+    _timed = False  # whether rows end with their time step, as of the last fit
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
@@ -43,7 +51,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Rows [q, q̇, u]; any width without a robot.
+            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``; any width without a robot.
         y : None
             Ignored.
 
@@ -57,26 +65,55 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         ImportError
             If the robot needs Pinocchio and it is not installed; the message gives the pip command.
         ValueError, TypeError
-            If the robot is unknown, or X does not have its 2 * n_joints + n_inputs columns.
+            If the robot is unknown, X does not have its 2 * n_joints + n_inputs columns (and one for the time step), or
+            a time step is not positive.
         """
-        validate_data(self, X, dtype=np.float64)
+        self._timed = self._takes_steps()
+        rows: np.ndarray = validate_data(self, X, dtype=np.float64, ensure_all_finite=not self._timed)
         robot = None if self.robot is None else read_once(self.robot)
         if robot is not None:
             self._layout = layout_of(robot)
-            if self.n_features_in_ != self._layout.n_columns:
-                raise ValueError(
-                    f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
-                    f"{self._layout.name!r} needs {self._layout.n_columns}: {self._layout.column_names}."
-                )
-            self._check_order()
+            self._check_columns()
+            self._check_steps(rows)
         self._prepare(robot)
         return self
 
-    def _check_order(self) -> None:
-        """Columns that bear the robot's own names must be in its order."""
-        names = list(getattr(self, "feature_names_in_", []))
-        if names != self._layout.column_names and set(names) == set(self._layout.column_names):
-            raise ValueError(f"The columns of X must be in the robot's order {self._layout.column_names}; got {names}.")
+    def _takes_steps(self) -> bool:
+        return self.robot is not None and isinstance(self.dt, str)
+
+    def _column_names(self) -> list[str]:
+        return self._layout.column_names + ["dt"] * self._timed
+
+    def _check_columns(self) -> None:
+        """As many as the robot has; those that bear its own names must be in its order, and dt the last."""
+        wanted, names = self._column_names(), list(getattr(self, "feature_names_in_", []))
+        if self.n_features_in_ != len(wanted):
+            hint = "."
+            if self._timed:
+                hint = "; the last one, dt, is the time step of each row in seconds."
+            elif self.n_features_in_ == len(wanted) + 1:
+                hint = '; if there is one more, the time step of each row, say dt="column".'
+            raise ValueError(
+                f"X has {self.n_features_in_} columns, but {type(self).__name__} of the robot "
+                f"{self._layout.name!r} needs {len(wanted)}: {wanted}{hint}"
+            )
+        misplaced = self._timed and "dt" in names[:-1]
+        if misplaced or (names != wanted and set(names) == set(wanted)):
+            raise ValueError(f"The columns of X must be in the robot's order {wanted}; got {names}.")
+
+    def _check_steps(self, X: np.ndarray) -> None:
+        """Where rows end with their time step, X has not been checked for what is not finite."""
+        if not self._timed:
+            return
+        dt = X[:, -1]
+        good = np.isfinite(dt) & (dt > 0.0)
+        if not good.all():
+            row = np.argmin(good)
+            raise ValueError(
+                f"dt, the last column of X, is the time step of each row in seconds: it must be positive and finite; "
+                f"row {row} has {dt[row]}."
+            )
+        assert_all_finite(X, estimator_name=type(self).__name__, input_name="X")
 
     def transform(self, X: ArrayLike) -> np.ndarray:
         """Evaluate the features.
@@ -91,7 +128,7 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         H : ndarray of shape (n_samples, n_features_out)
             The features h(x) of each row.
         """
-        return self._features(self._checked(X))
+        return self._values(self._checked(X))
 
     def jacobian(self, X: ArrayLike) -> np.ndarray:
         """Differentiate the features by the columns of X.
@@ -112,12 +149,16 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         bears the link, about the axis a_j: ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j). The derivatives of `NominalDynamics` are
         Pinocchio's (Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018).
         """
-        return self._jacobian(self._checked(X))
+        return self._slopes(self._checked(X))
 
     def _checked(self, X: ArrayLike) -> np.ndarray:
         if not hasattr(self, "n_features_in_"):
             check_is_fitted(self)
-        return X if is_plain(self, X) else validate_data(self, X, dtype=np.float64, reset=False)  # type: ignore[return-value]
+        rows: Any = X
+        if not is_plain(self, X):
+            rows = validate_data(self, X, dtype=np.float64, reset=False, ensure_all_finite=not self._timed)
+        self._check_steps(rows)
+        return rows
 
     def get_feature_names_out(self, input_features: ArrayLike | None = None) -> np.ndarray:
         """Name the features.
@@ -134,11 +175,23 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         """
         check_is_fitted(self)
         if self.robot is not None and input_features is None and not hasattr(self, "feature_names_in_"):
-            input_features = np.array(self._layout.column_names, dtype=object)
-        return np.array(self._names(check_feature_names_in(self, input_features)), dtype=object)
+            input_features = np.array(self._column_names(), dtype=object)
+        return np.array(self._labels(check_feature_names_in(self, input_features)), dtype=object)
 
     def _prepare(self, robot: Robot | None) -> None:
         """What `fit` keeps of the robot (read) besides the layout; nothing here."""
+
+    def _values(self, X: np.ndarray) -> np.ndarray:
+        """What `transform` returns, of rows that are known to be good."""
+        return self._features(X)
+
+    def _slopes(self, X: np.ndarray) -> np.ndarray:
+        """What `jacobian` returns, of rows that are known to be good."""
+        return self._jacobian(X)
+
+    def _labels(self, columns: np.ndarray) -> list[str]:
+        """Names of what `transform` returns, given those of the columns of X."""
+        return self._names(columns)
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         """h(x) of rows (n, n_features_in_); without a robot too."""
@@ -167,9 +220,15 @@ def _has_robot(transformer: RobotMap) -> bool:
 
 
 class RobotMap(RobotTransformer):
-    """Features of a robot that know which states y holds, and a prior of their weights: `_prior`."""
+    """Features of a robot that know which states y holds, and a prior of their weights: `_prior`.
+
+    What a subclass says is h(x) of x = [q, q̇, u] and the prior for one time step. With ``dt="column"`` its features are
+    multiplied by the row's Δt, and its prior is per second; features that begin with the state, which has been there
+    before the step, come after it: [z, Δt h(x)].
+    """
 
     outputs: Sequence[int | str] | None
+    _begins_with_state: ClassVar[bool] = False
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotTransformer._parameter_constraints,
@@ -197,7 +256,7 @@ class RobotMap(RobotTransformer):
         """
         self._validate_params()
         layout = self._layout if hasattr(self, "_layout") else layout_of(self.robot)
-        mean, scale = self._prior(layout)
+        mean, scale = self._prior_of_steps(layout)
         rows = self._predicted_states(layout)
         if n_outputs != len(rows):
             names = [layout.state_names[row] for row in rows]
@@ -214,6 +273,43 @@ class RobotMap(RobotTransformer):
             return list(range(len(names)))
         return indices_of(self.outputs, names, "outputs", "states")
 
-    def _prior(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and scale (2 * n_joints, n_features_out) of the weights for all states; before `fit` too."""
+    def _prior_of_steps(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
+        """Of rows with a time step each: the prior of `STEP`, but for the state before it, divided by it."""
+        mean, scale = self._prior(layout, float(self.dt) if isinstance(self.dt, Real) else STEP)
+        if not self._takes_steps():
+            return mean, scale
+        before = np.eye(2 * layout.n_joints, self._n_kept(layout))
+        mean[:, : before.shape[1]] -= before
+        return np.hstack([before, mean / STEP]), np.hstack([np.zeros_like(before), scale / STEP])
+
+    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and scale (2 * n_joints, n_features) of the weights for all states; before `fit` too."""
         raise NotImplementedError
+
+    def _n_kept(self, layout: Layout) -> int:
+        """How many columns of the state stand before the features that are multiplied by Δt."""
+        return 2 * layout.n_joints if self._begins_with_state else 0
+
+    def _values(self, X: np.ndarray) -> np.ndarray:
+        if not self._timed:
+            return self._features(X)
+        x, dt = X[:, :-1], X[:, -1:]
+        return np.hstack([x[:, : self._n_kept(self._layout)], dt * self._features(x)])
+
+    def _slopes(self, X: np.ndarray) -> np.ndarray:
+        if not self._timed:
+            return self._jacobian(X)
+        x, dt, n_kept = X[:, :-1], X[:, -1:], self._n_kept(self._layout)
+        features = self._features(x)
+        jacobian = np.zeros((len(X), n_kept + features.shape[1], X.shape[1]))
+        jacobian[:, :n_kept, :n_kept] = np.eye(n_kept)
+        jacobian[:, n_kept:, :-1] = dt[:, :, np.newaxis] * self._jacobian(x)
+        jacobian[:, n_kept:, -1] = features
+        return jacobian
+
+    def _labels(self, columns: np.ndarray) -> list[str]:
+        if not self._timed:
+            return self._names(columns)
+        *x, dt = columns
+        kept = x[: self._n_kept(self._layout)]
+        return [*kept, *(f"{dt} * {name}" for name in self._names(np.array(x, dtype=object)))]

@@ -281,15 +281,15 @@ class Own(DirectMap):
         self._transformer = transformer
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        return self._transformer._features(X)
+        return self._transformer._values(X)
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
-        return self._transformer._jacobian(X)
+        return self._transformer._slopes(X)
 
 
 def _is_own(transformer: Any) -> bool:
     """Whether a transformer has a value and a Jacobian beneath what validates them, as ours do."""
-    return hasattr(transformer, "_features") and _fits(transformer, "_jacobian", "transform", "jacobian")
+    return hasattr(transformer, "_values") and _fits(transformer, "_jacobian", "transform", "jacobian")
 
 
 def _fits(transformer: Any, name: str, *others: str) -> bool:

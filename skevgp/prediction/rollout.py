@@ -47,7 +47,8 @@ def rollout(
         Initial states.
     U_or_controller : array-like of shape (n_steps, n_inputs) or (n_batch, n_steps, n_inputs), or callable
         Inputs, or ``controller(z, t)`` of states (n, n_states) and the step t = 0, 1, ..., which returns inputs (n,
-        n_inputs): a function of these two alone. A system without inputs has an array of shape (n_steps, 0).
+        n_inputs): a function of these two alone. A system without inputs has an array of shape (n_steps, 0). Of maps
+        with ``dt="column"`` inputs are [u, Δt]: the time step of each step is the last.
     n_steps : int, default=None
         How many steps; only with a controller, and then needed.
     n_samples : int, default=100
@@ -108,6 +109,19 @@ def rollout(
     >>> ahead = rollout(model, test.data[0, :2], test.data[:50, 2:], random_state=0)
     >>> ahead.samples.shape, ahead.mean.shape
     ((100, 50, 2), (50, 2))
+
+    With rows of 10 ms and of 30 ms, and steps of 20 ms ahead:
+
+    >>> import numpy as np
+    >>> logs = [make_dynamics("pendulum", 10, 30, dt=dt, random_state=0) for dt in (0.01, 0.03)]
+    >>> X = np.vstack([np.column_stack([log.data, np.full(len(log.data), log.dt)]) for log in logs])
+    >>> y = np.vstack([log.target for log in logs])
+    >>> kernel_map = AngleEncoder("pendulum", dt="column")
+    >>> model = EVGPRegressor(InertiaForceGravity("pendulum", dt="column"), kernel_map=kernel_map, n_inducing=10)
+    >>> model = model.set_params(random_state=0).fit(X, y, groups=np.repeat(np.arange(20), 30))
+    >>> U = np.column_stack([np.zeros(50), np.full(50, 0.02)])  # [u, dt]
+    >>> rollout(model, [0.5, 0.0], U, random_state=0).mean.shape
+    (50, 2)
     """
     check_is_fitted(regressor)
     if method not in _METHODS:

@@ -156,7 +156,7 @@ def test_a_target_of_another_width_is_an_error(outputs, n_outputs, message):
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [
-        ({"dt": 0.0}, r"'dt' parameter .* in the range \(0.0, inf\). Got 0.0"),
+        ({"dt": 0.0}, r"'dt' parameter .* in the range \(0.0, inf\) or a str among {'column'}. Got 0.0"),
         ({"dt": np.nan}, "'dt' parameter .* Got nan"),
         ({"known_scale": -1.0}, "'known_scale' parameter .* Got -1.0"),
         ({"unknown_scale": np.inf}, "'unknown_scale' parameter .* Got inf"),
