@@ -7,7 +7,14 @@ from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRe
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 
 pytestmark = pytest.mark.slow
-MAPS = [AngleEncoder(), InertiaForce(), InertiaForceGravity(), LinkGravity(), NominalDynamics()]
+MAPS = [
+    AngleEncoder(),
+    InertiaForce(),
+    InertiaForce(dt="column"),
+    InertiaForceGravity(),
+    LinkGravity(),
+    NominalDynamics(),
+]
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.
 QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=500, tol=1e9)

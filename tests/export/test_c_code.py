@@ -6,8 +6,10 @@ from concurrent.futures import ThreadPoolExecutor
 import casadi as ca
 import numpy as np
 import pytest
+from sklearn.pipeline import make_union
 
 from skevgp import ResidualRegressor
+from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 
 from .cases import MODELS, POLYNOMIAL, data, fitted, jacobians, predicted, sparse
 
@@ -62,6 +64,19 @@ def test_c_predicts(name, tmp_path):
         for which in ("predict", "mean_jacobian"):
             for result, values in called(library, "evgp", x, 3, which).items():
                 np.testing.assert_allclose(values, found[result], rtol=1e-12, atol=1e-14)
+
+
+def test_c_predicts_rows_that_end_with_their_time_step(tmp_path):
+    X, y = data()
+    X = np.column_stack([X, np.linspace(0.005, 0.05, len(X))])
+    columns = {"dt": "column"}
+    union = make_union(InertiaForceGravity("cartpole", **columns), NominalDynamics("cartpole", **columns))
+    model = sparse(union, kernel_map=AngleEncoder("cartpole", **columns), coef_mean=0.1, coef_scale=1.0).fit(X, y)
+    library = compiled(model.to_c(tmp_path)[0])
+    for x in X[::30]:
+        found, (mean, slopes) = called(library, "evgp", x, 3), model.value_and_jacobian(x.reshape(1, -1))
+        np.testing.assert_allclose(found["mean"], mean[0], rtol=1e-9, atol=1e-9)
+        np.testing.assert_allclose(found["mean_jacobian"], slopes[0], rtol=1e-7, atol=1e-9 * np.abs(slopes).max())
 
 
 @pytest.fixture(scope="module")

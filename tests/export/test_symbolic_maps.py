@@ -19,6 +19,7 @@ from sklearn.preprocessing import (
 
 from skevgp.export.symbolic_maps import mapped
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from skevgp.robots import layout_of
 
 TERMS = ["acceleration", "gravity", "bias", "input"]
 
@@ -153,6 +154,20 @@ def test_columns_of_a_data_frame_are_found(columns):
     x, (row,) = expressions(fitted, 4)
     found = ca.Function("h", [x], [row])(X[0])
     np.testing.assert_allclose(found.full().ravel(), fitted.transform(frame[:1])[0], rtol=1e-12)
+
+
+@pytest.mark.parametrize("robot", ["pendulum", "acrobot", "iiwa14"])
+@pytest.mark.parametrize("kind", [AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics])
+def test_rows_that_end_with_their_time_step(kind, robot):
+    X = rows(layout_of(robot).n_columns + 1)
+    X[:, -1] = np.linspace(0.005, 0.05, len(X))
+    fitted = kind(robot, dt="column").fit(X)
+    x, (row,) = expressions(fitted, X.shape[1])
+    function = ca.Function("h", [x], [row, ca.jacobian(row, x)])
+    for own, values, slopes in zip(X[:5], fitted.transform(X), fitted.jacobian(X), strict=False):
+        found, jacobian = function(own)
+        np.testing.assert_allclose(found.full().ravel(), values, rtol=1e-9, atol=1e-11 * np.abs(values).max())
+        np.testing.assert_allclose(jacobian.full(), slopes, rtol=1e-8, atol=1e-10 * np.abs(slopes).max())
 
 
 def test_no_map_and_a_passthrough_leave_the_row():
