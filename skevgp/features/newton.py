@@ -115,7 +115,9 @@ class InertiaForce(_NewtonFeatures):
     All others are rates, in SI units and the same for any Δt: 1 for :math:`\dot q` in the rows of positions,
     ``inverse_inertia`` for u, and 0. Their prior standard deviations are those above divided by 0.03 s, so that mean
     and covariance of h(x)β are those of ``dt=0.03`` where the column is 0.03, and the standard deviation of h(x)β is
-    proportional to Δt. A column that is any other constant has the prior mean of that ``dt``.
+    proportional to Δt. A column that is any other constant has the prior mean of that ``dt``. What Euler's rule
+    neglects, ½ Δt times the rate of a rate, gets into the weights beyond their standard deviations: short steps tell
+    most about physics.
 
     Examples
     --------

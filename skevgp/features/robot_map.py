@@ -103,17 +103,9 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
     def _check_steps(self, X: np.ndarray) -> None:
         """Where rows end with their time step, X has not been checked for what is not finite."""
-        if not self._timed:
-            return
-        dt = X[:, -1]
-        good = np.isfinite(dt) & (dt > 0.0)
-        if not good.all():
-            row = np.argmin(good)
-            raise ValueError(
-                f"dt, the last column of X, is the time step of each row in seconds: it must be positive and finite; "
-                f"row {row} has {dt[row]}."
-            )
-        assert_all_finite(X, estimator_name=type(self).__name__, input_name="X")
+        if self._timed:
+            _steps_of(X)
+            assert_all_finite(X, estimator_name=type(self).__name__, input_name="X")
 
     def transform(self, X: ArrayLike) -> np.ndarray:
         """Evaluate the features.
@@ -206,6 +198,19 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         raise NotImplementedError
 
 
+def _steps_of(X: np.ndarray) -> np.ndarray:
+    """The time step of each row, (n, 1)."""
+    dt = X[:, -1:]
+    good = (dt > 0.0) & (dt < np.inf)
+    if not good.all():
+        row = np.argmin(good)
+        raise ValueError(
+            f"dt, the last column of X, is the time step of each row in seconds: it must be positive and finite; "
+            f"row {row} has {dt[row, 0]}."
+        )
+    return dt
+
+
 def same_for_all(jacobian: np.ndarray, n_rows: int) -> np.ndarray:
     """A copy of one row's Jacobian (n_features_out, n_features_in_) for each of the rows."""
     copies = np.empty((n_rows, *jacobian.shape))
@@ -293,13 +298,13 @@ class RobotMap(RobotTransformer):
     def _values(self, X: np.ndarray) -> np.ndarray:
         if not self._timed:
             return self._features(X)
-        x, dt = X[:, :-1], X[:, -1:]
+        x, dt = X[:, :-1], _steps_of(X)  # which rollouts have not checked
         return np.hstack([x[:, : self._n_kept(self._layout)], dt * self._features(x)])
 
     def _slopes(self, X: np.ndarray) -> np.ndarray:
         if not self._timed:
             return self._jacobian(X)
-        x, dt, n_kept = X[:, :-1], X[:, -1:], self._n_kept(self._layout)
+        x, dt, n_kept = X[:, :-1], _steps_of(X), self._n_kept(self._layout)
         features = self._features(x)
         jacobian = np.zeros((len(X), n_kept + features.shape[1], X.shape[1]))
         jacobian[:, :n_kept, :n_kept] = np.eye(n_kept)

@@ -394,8 +394,9 @@ class TestLogs:
         assert_allclose(played.mean, ahead.mean, rtol=1e-12)
         with pytest.raises(ValueError, match=r"U must be of shape \(n_steps, 2\).*rows of the regressor are \[z, u\]"):
             rollout(fitted, path[0, :2], U[:, :1])
-        with pytest.raises(ValueError, match=r"dt, the last column of X.*row 0 has 0\.0"):
-            rollout(fitted, path[0, :2], U * [1.0, 0.0], method="mean")
+        for method in ("sample", "linearized", "mean"):
+            with pytest.raises(ValueError, match=r"dt, the last column of X.*row 0 has 0\.0"):
+                rollout(fitted, path[0, :2], U * [1.0, 0.0], method=method)
 
     def test_what_is_compiled_predicts_and_is_differentiated_by_the_step_too(self):
         X, y, groups = log(6, 15, seed=0)
