@@ -201,9 +201,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 def _steps_of(X: np.ndarray) -> np.ndarray:
     """The time step of each row, (n, 1)."""
     dt = X[:, -1:]
-    good = (dt > 0.0) & (dt < np.inf)
-    if not good.all():
-        row = np.argmin(good)
+    if not (dt > 0.0).all() or not (dt < np.inf).all():
+        row = np.argmin((dt > 0.0) & (dt < np.inf))
         raise ValueError(
             f"dt, the last column of X, is the time step of each row in seconds: it must be positive and finite; "
             f"row {row} has {dt[row, 0]}."
@@ -299,7 +298,7 @@ class RobotMap(RobotTransformer):
         if not self._timed:
             return self._features(X)
         x, dt = X[:, :-1], _steps_of(X)  # which rollouts have not checked
-        return np.hstack([x[:, : self._n_kept(self._layout)], dt * self._features(x)])
+        return np.concatenate((x[:, : self._n_kept(self._layout)], dt * self._features(x)), axis=1)
 
     def _slopes(self, X: np.ndarray) -> np.ndarray:
         if not self._timed:
