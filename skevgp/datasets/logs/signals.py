@@ -123,12 +123,13 @@ def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed
     how.check_frequencies(step)
     parts, reasons = [], []
     cuts: list[Cut] = []
-    half = (how.dt or step) / 2.0
+    grid = _Grid.of(raw, step, how)
+    dt = grid.h * grid.inside
     for rows in pieces(raw.time, gap):
         piece = raw.at(rows)
         if rows.start > 0:
             cuts.append((float(raw.time[rows.start - 1]), float(piece.time[0]), "gap"))
-        done = _process_piece(piece, step, how)
+        done = _process_piece(piece, grid, how)
         if done is None:
             cuts.append((float(piece.time[0]), float(piece.time[-1]), "too short"))
             continue
@@ -137,72 +138,81 @@ def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed
         reasons.append(why)
         cuts.extend(
             (
-                max(float(signals.time[run][0]) - half, float(piece.time[0])),
-                min(float(signals.time[run][-1]) + half, float(piece.time[-1])),
+                max(float(signals.time[run][0]) - dt / 2.0, float(piece.time[0])),
+                min(float(signals.time[run][-1]) + dt / 2.0, float(piece.time[-1])),
                 reason,
             )
             for reason in ("edge", "rest")
             for run in runs(why == reason)
         )
     if not parts:
-        raise ValueError(
-            f"it is too short: no piece without gaps is longer than the {_lost(how)} that the filter loses."
-        )
+        lost = 2.0 * grid.edge * dt
+        raise ValueError(f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.")
     if not any((why == "").any() for why in reasons):
         raise ValueError(f"all of it is at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
     return Processed(_joined(parts), np.concatenate(reasons), sorted(cuts))
 
 
-def _lost(how: Processing) -> str:
-    return "rows" if how.cutoff is None else f"{2.0 * _EDGE / how.cutoff:g} s"
+@dataclass(frozen=True)
+class _Grid:
+    """Where signals are filtered and differentiated."""
+
+    h: float  # its step, s
+    inside: int  # steps in one of the rows that are returned
+    cutoff: float | None  # of the filter, Hz
+    edge: int  # rows that are cut at each end of a piece
+
+    @classmethod
+    def of(cls, raw: Signals, step: float, how: Processing) -> _Grid:
+        """No coarser than the recording: filtered there, and thinned out afterwards, fast signals do not alias."""
+        dt = step if how.dt is None else how.dt
+        inside = max(1, int(np.ceil(dt / step - 1e-6)))
+        cutoff = _BAND * 0.5 / dt if how.cutoff is None and inside > 1 else how.cutoff
+        # Without a filter: as many rows as differences are one-sided.
+        one_sided = 1 + (raw.velocity is None)
+        edge = one_sided if cutoff is None else int(np.ceil(_EDGE / (cutoff * dt) - 1e-9))
+        return cls(dt / inside, inside, cutoff, edge)
 
 
-def _process_piece(piece: Signals, step: float, how: Processing) -> tuple[Signals, np.ndarray] | None:
+def _process_piece(piece: Signals, grid: _Grid, how: Processing) -> tuple[Signals, np.ndarray] | None:
     """The signals on the grid, and why a row is left out; None if nothing is left."""
-    fine, inside = _on_grid(piece, step, how.dt)
-    h = step if how.dt is None else how.dt / inside
-    dt = h * inside
-    cutoff = _BAND * 0.5 / dt if how.cutoff is None and inside > 1 else how.cutoff
-    # Without a filter: as many rows as differences are one-sided.
-    edge = 1 + (piece.velocity is None) if cutoff is None else int(np.ceil(_EDGE / (cutoff * dt) - 1e-9))
-    n_rows = (len(fine.time) - 1) // inside + 1
-    if n_rows <= 2 * edge:
+    fine = _regular(piece, grid.h) if how.dt is None else _on_grid(piece, grid.h)
+    n_rows = (len(fine.time) - 1) // grid.inside + 1
+    if n_rows <= 2 * grid.edge:
         return None
-    if cutoff is not None:
-        fine = _filtered(fine, cutoff, h)
-    velocity = np.gradient(fine.position, h, axis=0) if fine.velocity is None else fine.velocity
-    acceleration = np.gradient(velocity, h, axis=0) if fine.acceleration is None else fine.acceleration
-    signals = replace(fine, velocity=velocity, acceleration=acceleration).at(slice(None, None, inside))
+    if grid.cutoff is not None:
+        fine = _filtered(fine, grid.cutoff, grid.h)
+    velocity = np.gradient(fine.position, grid.h, axis=0) if fine.velocity is None else fine.velocity
+    acceleration = np.gradient(velocity, grid.h, axis=0) if fine.acceleration is None else fine.acceleration
+    signals = replace(fine, velocity=velocity, acceleration=acceleration).at(slice(None, None, grid.inside))
     why = np.full(n_rows, "", dtype="<U4")
-    why[:edge] = why[n_rows - edge :] = "edge"
-    slow = (np.abs(velocity[::inside]) < how.rest_velocity).all(axis=1)
+    why[: grid.edge] = why[n_rows - grid.edge :] = "edge"
+    slow = (np.abs(velocity[:: grid.inside]) < how.rest_velocity).all(axis=1)
     for run in runs(slow):
         if signals.time[run][-1] - signals.time[run][0] >= how.rest_time:
             why[run] = "rest"
-    return (signals, why) if (why != "edge").any() else None
+    return signals, why
 
 
-def _on_grid(piece: Signals, step: float, dt: float | None) -> tuple[Signals, int]:
-    """A piece on a grid that is no coarser than the recording, and how many of its steps are in dt.
+def _regular(piece: Signals, step: float) -> Signals:
+    """The piece as it is, if its steps are all the same."""
+    irregular = np.abs(np.diff(piece.time) - step).max(initial=0.0)
+    if irregular > _JITTER * step:
+        raise ValueError(
+            f"dt=None keeps the recorded times, but they are not regular: steps differ from their median of "
+            f"{step:g} s by up to {irregular:g} s. Give dt."
+        )
+    return piece
 
-    Filtered there, and thinned out afterwards, what is faster than a coarse grid can show does not alias.
-    """
-    if dt is None:
-        irregular = np.abs(np.diff(piece.time) - step).max(initial=0.0)
-        if irregular > _JITTER * step:
-            raise ValueError(
-                f"dt=None keeps the recorded times, but they are not regular: steps differ from their median of "
-                f"{step:g} s by up to {irregular:g} s. Give dt."
-            )
-        return piece, 1
+
+def _on_grid(piece: Signals, h: float) -> Signals:
+    """Interpolated: cubic, but never beyond the recorded values."""
     if len(piece.time) < 2:
-        return piece, 1
-    inside = max(1, int(np.ceil(dt / step - 1e-6)))
-    h = dt / inside
-    time = piece.time[0] + h * np.arange(int((piece.time[-1] - piece.time[0]) / h + 1e-6) + 1)
-    # Cubic, but never beyond the recorded values.
-    on_grid = np.minimum(time, piece.time[-1])
-    return piece.each(lambda signal: PchipInterpolator(piece.time, signal, axis=0)(on_grid), time), inside
+        return piece
+    first, last = piece.time[[0, -1]]
+    time = first + h * np.arange(int((last - first) / h + 1e-6) + 1)
+    inside = np.minimum(time, last)
+    return piece.each(lambda signal: PchipInterpolator(piece.time, signal, axis=0)(inside), time)
 
 
 def _filtered(signals: Signals, cutoff: float, h: float) -> Signals:

@@ -104,7 +104,10 @@ def test_times_have_a_unit(tmp_path, expected, unit, seconds):
     ("columns", "message"),
     [
         ({**BY_NUMBER, "time": 8}, r"columns\['time'\] asks for column 8, but there are 0 to 7 only"),
-        ({**BY_NUMBER, "position": "p_*"}, r"columns\['position'\] asks for 'p_\*', which is none of the columns \['t'"),
+        (
+            {**BY_NUMBER, "position": "p_*"},
+            r"columns\['position'\] asks for 'p_\*', which is none of the columns \['t'",
+        ),
         ({**BY_NUMBER, "position": ["q_1"]}, "there are 1 columns of position, and 2 of velocity"),
         ({**BY_NUMBER, "current": [6, 6]}, r"columns\['current'\] has a column twice: \[6, 6\]"),
     ],
