@@ -169,7 +169,9 @@ class SignalsDisplay:
             known = why in {before for _, _, before in self.cuts[:number]}
             ax.axvspan(first, last, color=_COLOURS[why], alpha=0.2, linewidth=0, label=None if known else _WORDS[why])
         low, high = np.nanmin(kept), np.nanmax(kept)
-        margin = _MARGIN * (high - low) or 1.0
+        # A constant, rounding apart, has no height.
+        flat = high - low <= 1e-9 * max(abs(low), abs(high))
+        margin = 1.0 if flat else _MARGIN * (high - low)
         ax.set_ylim(low - margin, high + margin)
 
 
