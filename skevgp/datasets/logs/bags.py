@@ -85,9 +85,9 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
                 (received, store.deserialize_cdr(data, topics[chosen]))
                 for _, received, data in reader.messages(connections=connections)
             ]
-    except (_TopicError, MemoryError):
+    except _TopicError:
         raise
-    except Exception as error:  # of broken files rosbags raises whatever comes
+    except Exception as error:  # of broken files rosbags raises whatever comes, also MemoryError
         raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {error}).") from error
     if not found:
         raise ValueError(f"the topic {chosen!r} has no messages.")
