@@ -9,10 +9,10 @@ import numpy as np
 from sklearn.utils import Bunch
 
 from .._optional import require
-from ._style import BLUE, GREEN, ORANGE, PALETTE
+from ._style import BLUE, GREEN, PALETTE
 
 _PANELS = {"velocity": "velocity\n(rad/s)", "acceleration": "acceleration\n(rad/s²)", "torque": "torque\n(N m)"}
-_COLOURS = {"gap": ORANGE, "rest": GREEN, "edge": PALETTE[4], "too short": PALETTE[3]}
+_COLOURS = {"gap": "0.3", "rest": GREEN, "edge": PALETTE[4], "too short": PALETTE[3]}
 _WORDS = {"gap": "gap", "rest": "cut: rest", "edge": "cut: filter's edge", "too short": "cut: too short"}
 _MARGIN = 0.25  # of a panel's height, beyond what was processed
 
@@ -152,17 +152,16 @@ class SignalsDisplay:
         self.axes_, self.figure_ = panels, panels[0, 0].figure
         if axes is None:
             handles, labels = panels[0, 0].get_legend_handles_labels()
-            self.figure_.legend(handles, labels, loc="outside lower center", ncols=5, frameon=False)
+            self.figure_.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False)
             self.figure_.suptitle(self.title)
             self.figure_.align_ylabels(panels[:, 0])
         return self
 
     def _draw(self, ax: Any, name: str, joint: int) -> None:
-        time, values = _recorded(self.raw, name)
+        time, values = _recorded(_broken(self.raw, self.cuts), name)
         all_there = all(self.raw[panel] is not None for panel in _PANELS)
-        label = "recorded" if all_there else "recorded (where not: differences)"
+        label = "recorded" if all_there else "recorded, or differences"
         ax.plot(time, values[:, joint], color="0.6", linewidth=0.7, label=label)
-        # Rows at gaps are cut, so that no line reaches across.
         kept = np.where(self.processed.why == "", self.processed[name][:, joint], np.nan)
         ax.plot(self.processed.time, kept, color=BLUE, linewidth=1.2, label="processed")
         for number, (first, last, why) in enumerate(self.cuts):
@@ -177,6 +176,12 @@ class SignalsDisplay:
 
 def _of_joints(signals: Bunch, chosen: list[int]) -> Bunch:
     return Bunch(**{k: v[:, chosen] if v is not None and v.ndim == 2 else v for k, v in signals.items()})
+
+
+def _broken(raw: Bunch, cuts: Sequence[tuple[float, float, str]]) -> Bunch:
+    """With a row of NaN in each gap: no line reaches across. (Of processed signals the ends at gaps are cut.)"""
+    gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why == "gap"], side="right")
+    return Bunch(**{k: v if v is None else np.insert(v, gaps, np.nan, axis=0) for k, v in raw.items()})
 
 
 def _recorded(raw: Bunch, name: str) -> tuple[np.ndarray, np.ndarray]:

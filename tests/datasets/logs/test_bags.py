@@ -36,11 +36,12 @@ def state(nanoseconds, names, q, dq=(), effort=()):
 
 
 def states(start=START, names=("a", "b"), velocity=True):
-    """What a robot sends that moves as it should; received 3 ms late."""
+    """What a robot sends that moves as it should; received 3 ms late, more or less if it has a clock."""
     q, dq, _, current = motion(T)
     for row, t in enumerate(NS.tolist()):
+        late = 3_000_000 + (row % 3 * 100_000 if start else 0)
         yield (
-            START + t + 3_000_000,
+            START + t + late,
             state(start + t if start else 0, list(names), q[row], dq[row] if velocity else (), current[row]),
         )
 
