@@ -72,6 +72,9 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Rec
 
 def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]]:
     """The type of a topic's messages, when they were received (ns), and they."""
+    if path.suffix.lower() != ".mcap" and set("#?%") & set(str(path)):
+        # rosbags makes the path part of an address as it is, by which SQLite may find another file.
+        raise ValueError("SQLite recordings whose path has #, ? or % in it cannot be read: rename it.")
     rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
     typesys = require("rosbags.typesys", "Reading rosbag2 files")
     try:

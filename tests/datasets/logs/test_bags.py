@@ -222,6 +222,12 @@ def test_a_trajectory_without_efforts_is_no_data(tmp_path):
         load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory(effort=False)])}))
 
 
+def test_a_trajectory_without_points_is_no_data(tmp_path):
+    empty = TYPES[TRAJECTORY](header(0), ["a", "b"], [])
+    with pytest.raises(ValueError, match="bag.mcap: the topic has no rows"):
+        load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [(START, empty)])}))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.9], ids=str)
 @pytest.mark.parametrize("plugin", list(StoragePlugin), ids=str)
 def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
@@ -238,6 +244,14 @@ def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):
         writer.write(connection, START, b"\x00\x01\x00\x00" + b"\xff" * 40)
     with pytest.raises(ValueError, match="bag.mcap: it cannot be read as a rosbag2 recording"):
         load_log(tmp_path / "bag" / "bag.mcap")
+
+
+@pytest.mark.parametrize("mark", ["#", "?", "%20"])
+def test_names_by_which_another_file_would_be_found_are_refused(tmp_path, mark):
+    shutil.copy(UR10, tmp_path / "a b.db3")
+    file = shutil.copy(UR10, tmp_path / f"a{mark}b.db3")
+    with pytest.raises(ValueError, match="b.db3: SQLite recordings whose path has #, . or % in it cannot be read"):
+        load_log(file)
 
 
 def test_a_folder_without_metadata_is_told_with_its_name(tmp_path):

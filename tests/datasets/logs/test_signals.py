@@ -144,9 +144,10 @@ def test_what_is_a_gap_can_be_said(load):
     assert errors(log, t[0])[0] < 1e-3
 
 
-def test_pieces_too_short_for_the_filter_are_left_out(load):
+@pytest.mark.parametrize("n_rows", [1, 2, 20])
+def test_pieces_too_short_for_the_filter_are_left_out(load, n_rows):
     t = irregular_times()
-    t = t[np.r_[0:1000, 1100:1120, 1300 : len(t)]]
+    t = t[np.r_[0:1000, 1100 : 1100 + n_rows, 1300 : len(t)]]
     log = load(table_of(t))
     assert [why for *_, why in log.recordings[0].cuts if why != "edge"] == ["gap", "too short", "gap"]
     assert len(np.unique(log.pieces)) == 2
