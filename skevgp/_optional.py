@@ -11,6 +11,7 @@ _PACKAGES = {
     "matplotlib": ("matplotlib", "plot"),
     "dask": ("'dask[array,distributed]'", "dask"),
     "casadi": ("casadi", "casadi"),
+    "rosbags": ("rosbags", "logs"),
 }
 
 

@@ -229,6 +229,7 @@ def test_the_walk_of_fits_in_threads_is_no_longer():
 
 # What has tests of its own elsewhere, or nothing to test.
 TESTED_WITH = {
+    "datasets/logs/recording.py": "datasets/logs/test_bags.py",
     "export/exportable.py": "export/test_casadi.py",
     "export/package.py": "export/test_casadi.py",
     "fitting/learned.py": "fitting/test_sparse.py",
@@ -237,7 +238,7 @@ TESTED_WITH = {
     "outputs/fit.py": "outputs/test_plan.py",
     "outputs/fitted.py": "test_sharing.py",
 }
-FLOORS = ("export", "fitting", "inference", "kernels", "network", "optimizers", "outputs", "prediction", "rows")
+FLOORS = ("export", "fitting", "inference", "kernels", "logs", "network", "optimizers", "outputs", "prediction", "rows")
 
 
 @pytest.mark.parametrize(

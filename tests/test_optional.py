@@ -12,7 +12,7 @@ from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import InertiaForceGravity
 
 ROOT = Path(skevgp.__file__).parents[1]
-OPTIONAL = {"pinocchio", "example_robot_data", "matplotlib", "dask", "distributed", "casadi", "skops"}
+OPTIONAL = {"pinocchio", "example_robot_data", "matplotlib", "dask", "distributed", "casadi", "rosbags", "skops"}
 
 
 def packages_loaded_by(code):
@@ -31,6 +31,7 @@ def test_require_imports_what_is_there():
     [
         ("pinocchio", r"Simulating needs the optional package 'pin'.*pip install pin .*pip install '\.\[physics\]'"),
         ("matplotlib", r"Simulating needs .* 'matplotlib'.*pip install matplotlib .*pip install '\.\[plot\]'"),
+        ("rosbags", r"Simulating needs .* 'rosbags'.*pip install rosbags .*pip install '\.\[logs\]'"),
     ],
 )
 def test_a_missing_package_gets_the_pip_command(monkeypatch, name, message):

@@ -4,5 +4,6 @@ from .coefficients import CoefficientDisplay
 from .learning_curve import LearningCurveDisplay
 from .posterior import PosteriorDisplay
 from .rollout import RolloutDisplay
+from .signals import SignalsDisplay
 
-__all__ = ["CoefficientDisplay", "LearningCurveDisplay", "PosteriorDisplay", "RolloutDisplay"]
+__all__ = ["CoefficientDisplay", "LearningCurveDisplay", "PosteriorDisplay", "RolloutDisplay", "SignalsDisplay"]

@@ -1,0 +1,138 @@
+"""Logs that are rosbag2 recordings, read without ROS."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..._optional import require
+from .recording import Recording, Signals
+
+SUFFIXES = (".db3", ".mcap")
+_STATES, _TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+_NANO = 1e-9
+
+
+def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Recording:
+    """Read joint states, or a trajectory.
+
+    Parameters
+    ----------
+    path : Path
+        A file (its metadata.yaml is not needed) or a folder with a metadata.yaml.
+    topic : str or None
+        None is the only one with such messages.
+    joints : sequence of str or None
+        Which, in which order; None is those of the messages, in theirs.
+
+    Returns
+    -------
+    recording : Recording
+
+    Raises
+    ------
+    ValueError
+        If the file cannot be read, there is no such topic or joint, or signals are missing.
+    ImportError
+        If rosbags is not installed; the message gives the pip command.
+    """
+    kind, received, messages = _messages(path, topic)
+    if kind == _STATES:
+        stamps = np.array([_nanoseconds(message.header.stamp) for message in messages], dtype=np.int64)
+        times = stamps if stamps.all() else received  # a driver that leaves one out sets none that can be trusted
+        rows = [(m.name, m.position, m.velocity, (), m.effort) for m in messages]
+    else:
+        points = [
+            (_nanoseconds(m.header.stamp) or start, m.joint_names, point)
+            for m, start in zip(messages, received.tolist(), strict=True)
+            for point in m.points
+        ]
+        times = np.array([start + _nanoseconds(p.time_from_start) for start, _, p in points], dtype=np.int64)
+        rows = [(names, p.positions, p.velocities, p.accelerations, p.effort) for _, names, p in points]
+    if not rows:
+        raise ValueError("the topic has no rows.")
+    names = _joints([row[0] for row in rows], joints)
+    mine = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
+    position, velocity, acceleration, effort = (
+        _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed)
+        for column, (title, needed) in enumerate(
+            [("positions", True), ("velocities", False), ("accelerations", False), ("efforts", True)], start=1
+        )
+    )
+    assert position is not None
+    assert effort is not None
+    times = times[mine]
+    # The difference first: nanoseconds since 1970 have more digits than a float.
+    time = (times - times[0]) * _NANO
+    return Recording(Signals(time, position, velocity, acceleration, effort), names, float(times[0] * _NANO))
+
+
+def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]]:
+    """The type of a topic's messages, when they were received (ns), and they."""
+    if path.suffix.lower() != ".mcap" and set("#?%") & set(str(path)):
+        # rosbags makes the path part of an address as it is, by which SQLite may find another file.
+        raise ValueError("SQLite recordings whose path has #, ? or % in it cannot be read: rename it.")
+    rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
+    typesys = require("rosbags.typesys", "Reading rosbag2 files")
+    try:
+        with rosbag2.Reader(path) as reader:
+            topics = {connection.topic: connection.msgtype for connection in reader.connections}
+            chosen = _topic(topics, topic)
+            # The message types that ROS defines, not those that the file does, of which rosbags would make code.
+            store = typesys.get_typestore(typesys.Stores.LATEST)
+            connections = [connection for connection in reader.connections if connection.topic == chosen]
+            found = [
+                (received, store.deserialize_cdr(data, topics[chosen]))
+                for _, received, data in reader.messages(connections=connections)
+            ]
+    except _TopicError:
+        raise
+    except Exception as error:  # of broken files rosbags raises whatever comes, also MemoryError
+        raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {error}).") from error
+    if not found:
+        raise ValueError(f"the topic {chosen!r} has no messages.")
+    return topics[chosen], np.array([received for received, _ in found], dtype=np.int64), [m for _, m in found]
+
+
+class _TopicError(ValueError):
+    """An error of ours, which needs no other words."""
+
+
+def _topic(topics: dict[str, str], topic: str | None) -> str:
+    known = [name for name, kind in topics.items() if kind in (_STATES, _TRAJECTORY)]
+    if topic is not None and topic not in known:
+        raise _TopicError(f"topic={topic!r} is none of those with joint states or trajectories; it has {topics}.")
+    if topic is None and len(known) != 1:
+        many = f"several topics have such messages, give one of them as topic: {known}"
+        raise _TopicError(
+            f"{many}." if known else f"no topic has messages of the type {_STATES} or {_TRAJECTORY}; it has {topics}."
+        )
+    return known[0] if topic is None else topic
+
+
+def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
+    """Whose signals are taken: all messages that have all of them count, those of other robots or hands do not."""
+    if joints is None:
+        differing = {tuple(sorted(names)) for names in sets}
+        if len(differing) > 1:
+            raise ValueError(f"messages are of different joints, say by joints which you mean: {sorted(differing)}.")
+        return list(sets[0])
+    if not any(set(joints) <= set(names) for names in sets):
+        known = sorted({name for names in sets for name in names})
+        raise ValueError(f"no message has all of joints={list(joints)}; they have {known}.")
+    return list(joints)
+
+
+def _signal(rows: list[tuple[list[str], Any]], joints: list[str], title: str, needed: bool) -> np.ndarray | None:
+    if not needed and not any(len(values) for _, values in rows):
+        return None
+    if any(len(values) != len(names) for names, values in rows):
+        raise ValueError(f"there are messages without {title}, or with too few or too many.")
+    return np.array([[values[names.index(joint)] for joint in joints] for names, values in rows], dtype=np.float64)
+
+
+def _nanoseconds(stamp: Any) -> int:
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

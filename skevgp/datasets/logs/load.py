@@ -1,0 +1,343 @@
+"""A robot's own logs, as data for inverse dynamics."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Literal, overload
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.utils import Bunch
+
+from ..._validation import as_floats, check_real
+from .bags import SUFFIXES as BAGS
+from .bags import read_bag
+from .recording import Recording, Signals, naming
+from .signals import Processing, in_order, process, runs
+from .tables import SECONDS, check_columns, read_table
+from .tables import SUFFIXES as TABLES
+
+PathLike = str | os.PathLike[str]
+Columns = Mapping[str, int | str | Sequence[int | str]]
+Keep = slice | tuple[float | None, float | None]
+
+
+@overload
+def load_log(
+    path: PathLike | Sequence[PathLike],
+    *,
+    columns: Columns | None = ...,
+    time_unit: Literal["s", "ms", "us", "ns"] = ...,
+    topic: str | None = ...,
+    joints: Sequence[str] | None = ...,
+    gains: ArrayLike = ...,
+    keep: Keep | Sequence[Keep | None] | None = ...,
+    dt: float | None = ...,
+    cutoff: float | None = ...,
+    max_gap: float | None = ...,
+    rest_velocity: float = ...,
+    rest_time: float = ...,
+    return_X_y: Literal[False] = ...,
+) -> Bunch: ...
+@overload
+def load_log(
+    path: PathLike | Sequence[PathLike],
+    *,
+    columns: Columns | None = ...,
+    time_unit: Literal["s", "ms", "us", "ns"] = ...,
+    topic: str | None = ...,
+    joints: Sequence[str] | None = ...,
+    gains: ArrayLike = ...,
+    keep: Keep | Sequence[Keep | None] | None = ...,
+    dt: float | None = ...,
+    cutoff: float | None = ...,
+    max_gap: float | None = ...,
+    rest_velocity: float = ...,
+    rest_time: float = ...,
+    return_X_y: Literal[True],
+) -> tuple[np.ndarray, np.ndarray]: ...
+def load_log(
+    path: PathLike | Sequence[PathLike],
+    *,
+    columns: Columns | None = None,
+    time_unit: Literal["s", "ms", "us", "ns"] = "s",
+    topic: str | None = None,
+    joints: Sequence[str] | None = None,
+    gains: ArrayLike = 1.0,
+    keep: Keep | Sequence[Keep | None] | None = None,
+    dt: float | None = 0.01,
+    cutoff: float | None = 5.0,
+    max_gap: float | None = None,
+    rest_velocity: float = 0.01,
+    rest_time: float = 0.5,
+    return_X_y: bool = False,
+) -> Bunch | tuple[np.ndarray, np.ndarray]:
+    """Load a robot's own logs as data for inverse dynamics: [q, q̇, q̈] and the torques.
+
+    Reads tables (.csv, .txt, .tsv, perhaps with .gz; separator and header are found) and rosbag2 recordings
+    (.db3, .mcap, or their folder), without ROS. With each file this is done:
+
+    1. What ``keep`` leaves out goes; rows are sorted by time, and of rows with the same time the first one stays. Of a
+       clock that goes back by more than a gap there is an error.
+    2. Efforts become torques, times ``gains``.
+    3. Steps above ``max_gap`` cut the recording in pieces. Nothing that follows reaches across a gap.
+    4. Signals are interpolated (cubic, without overshoot) to a regular grid of ``dt``, or a finer one where rows are
+       closer than that.
+    5. All signals pass a Butterworth filter of fourth order forth and back, which shifts none in time; at ``cutoff``
+       amplitudes are halved. Then the grid is thinned out to ``dt``.
+    6. Velocities that are not recorded are central differences of the filtered positions, and so are accelerations of
+       the filtered velocities.
+    7. Two periods of ``cutoff`` (0.4 s) are cut at each end of a piece, where the filter guesses what comes (without a
+       filter: the row or two where differences are one-sided).
+    8. Rest is cut: where all joints are slower than ``rest_velocity`` for ``rest_time`` or longer, friction can have
+       any value.
+
+    Parameters
+    ----------
+    path : str, path-like or sequence of them
+        One file or several, each a group; all of the same joints.
+    columns : dict, default=None
+        For tables: which columns hold ``"time"``, ``"position"``, ``"effort"`` or ``"current"`` and, if they are there,
+        ``"velocity"`` and ``"acceleration"``. Each a number from 0, a name, a pattern of names such as
+        ``"actual_q_*"``, or a sequence of those (``range(1, 7)``), in the order of the joints.
+    time_unit : {"s", "ms", "us", "ns"}, default="s"
+        Of a table's times.
+    topic : str, default=None
+        For rosbag2: where the messages are, of type ``sensor_msgs/msg/JointState`` or
+        ``trajectory_msgs/msg/JointTrajectory``. None is the only one with such messages. Times are those in the
+        messages' headers; if some have none, those at which messages were received.
+    joints : sequence of str, default=None
+        For rosbag2: names of the joints, in the order wanted; messages without them are passed over. None is those of
+        the messages, in the order of the first. For tables: how the joints are called, by default q1, q2, ...
+    gains : float or array-like of shape (n_joints,), default=1.0
+        Torque per effort: 1 where efforts are in N m, else N m per A.
+    keep : slice, tuple or sequence of them, default=None
+        What to read: ``slice(first, stop)``, rows of the file from 0, or ``(first, last)``, seconds since its first
+        row, of which either may be None. For several files a list with one for each, None to read all of it.
+    dt : float, default=0.01
+        Step of the grid, s. None keeps the recorded times, if steps differ by less than 5 %.
+    cutoff : float, default=5.0
+        Of the filter, Hz; below half the rate of the recording and of the grid. None: no filter, but at 0.8 times half
+        the rate of the grid where it is coarser than the recording.
+    max_gap : float, default=None
+        Longest step that is no gap, s; None is 5 times the median step.
+    rest_velocity : float, default=0.01
+        In rad/s or m/s, not negative; 0 cuts no rest.
+    rest_time : float, default=0.5
+        In s, not negative.
+    return_X_y : bool, default=False
+        Whether to return ``(data, target)`` in place of a Bunch.
+
+    Returns
+    -------
+    log : :class:`~sklearn.utils.Bunch`
+        With
+
+        - ``data`` : ndarray of shape (n_rows, 3 * n_joints): positions (rad or m), velocities (per s) and accelerations
+          (per s²);
+        - ``target`` : ndarray of shape (n_rows, n_joints): torques (N m) or forces (N);
+        - ``groups`` : ndarray of shape (n_rows,): the file of each row, for `GroupKFold`;
+        - ``pieces`` : ndarray of shape (n_rows,): numbers that differ where a gap or rest lies between rows;
+        - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
+        - ``recordings`` : list of Bunch, one per file, with ``raw`` and ``processed``: each a Bunch of ``time``,
+          ``position``, ``velocity``, ``acceleration`` and ``torque`` (raw ones None where they were not recorded);
+          ``processed`` has also ``why`` of shape (n,), which is empty for the rows in ``data`` and ``"edge"`` or
+          ``"rest"`` for those that were cut; ``cuts``, a list of (first second, last second, ``"gap"``, ``"edge"``,
+          ``"rest"`` or ``"too short"``); ``start``, the first row's time by the file's own clock, s; ``n_repeated``,
+          how many rows had the time of another; and ``filename``;
+        - ``joint_names``, ``feature_names``, ``target_names``, ``filenames``, ``DESCR``.
+    (data, target) : tuple of ndarray
+        If ``return_X_y``.
+
+    Raises
+    ------
+    ValueError
+        If a file cannot be read, lacks columns, a topic or joints, holds values that are not finite or a clock that
+        goes back, is too short for the filter or all at rest; files differ in their joints; or an argument does not
+        fit them. What is wrong with a file begins with its name.
+    TypeError
+        If an argument is of the wrong type.
+    OSError
+        If a file is not there or must not be read.
+    ImportError
+        If a rosbag2 file is given and rosbags is not installed; the message gives the pip command.
+
+    See Also
+    --------
+    log_transitions : The same for forward dynamics.
+    skevgp.plotting.SignalsDisplay : Draws what was done to the signals.
+
+    Notes
+    -----
+    Neighbouring rows of filtered signals say much the same: n_rows is more than what there is to learn from.
+    Cross-validate by ``groups``, never by rows.
+
+    Examples
+    --------
+    A joint that swings, written down at 125 Hz with a few milliseconds of jitter:
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from skevgp.datasets import load_log
+    >>> t = np.arange(0.0, 6.0, 0.008) + np.random.RandomState(0).uniform(0.0, 0.004, 750)
+    >>> table = np.column_stack([t, np.sin(2.0 * t), 2.0 * np.cos(2.0 * t), 0.5 - 0.3 * np.sin(2.0 * t)])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "swing.csv"
+    ...     np.savetxt(file, table, delimiter=",", header="time,q,dq,current", comments="")
+    ...     columns = {"time": "time", "position": "q", "velocity": "dq", "current": "current"}
+    ...     log = load_log(file, columns=columns, gains=10.0)
+    >>> log.feature_names, log.target_names
+    (['q1', 'dq1/dt', 'd2q1/dt2'], ['u_q1'])
+    >>> bool(np.abs(log.data[:, 2] + 4.0 * log.data[:, 0]).max() < 0.02)  # q̈ = -4 q
+    True
+    >>> bool(np.abs(log.target[:, 0] - 5.0 + 3.0 * log.data[:, 0]).max() < 0.01)
+    True
+    """
+    how = Processing(dt, cutoff, max_gap, rest_velocity, rest_time)
+    if time_unit not in SECONDS:
+        raise ValueError(f"time_unit must be one of {list(SECONDS)}; got {time_unit!r}.")
+    if isinstance(joints, str) or (joints is not None and len(set(joints)) != len(joints)):
+        raise ValueError(f"joints must be a list of different names; got {joints!r}.")
+    asked = None if columns is None else check_columns(columns)
+    files, limits = _files(path, keep)
+    recordings, names = [], None if joints is None else list(joints)
+    for file, limit in zip(files, limits, strict=True):
+        with naming(file):
+            read = _read(file, asked, time_unit, topic, names)
+            names = read.joint_names
+            recordings.append(_recording(read, file, limit, gains, how))
+    assert names is not None
+    log = _log(recordings, names, how)
+    return (log.data, log.target) if return_X_y else log
+
+
+def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
+    """The files, and what is kept of each."""
+    if isinstance(path, (str, os.PathLike)):
+        return [Path(path)], [_check_keep(keep)]
+    files = [Path(one) for one in path]
+    if not files:
+        raise ValueError("path must be a file or several; got none.")
+    if keep is not None and (not isinstance(keep, list) or len(keep) != len(files)):
+        raise ValueError(f"keep must be a list with one for each of the {len(files)} files; got {keep!r}.")
+    return files, [None] * len(files) if keep is None else [_check_keep(one) for one in keep]
+
+
+def _check_keep(keep: Any) -> Keep | None:
+    if keep is None or isinstance(keep, slice):
+        return keep
+    if not isinstance(keep, tuple) or len(keep) != 2:
+        raise ValueError(f"keep must be slice(first row, stop row) or (first second, last second); got {keep!r}.")
+    first, last = (None if one is None else check_real(one, "keep", minimum=0.0) for one in keep)
+    if first is not None and last is not None and first >= last:
+        raise ValueError(f"keep={keep!r}: the first second must be below the last.")
+    return first, last
+
+
+def _kept(signals: Signals, keep: Keep | None) -> Signals:
+    if isinstance(keep, tuple):
+        first, last = keep
+        rows = signals.time >= (0.0 if first is None else first)
+        kept = signals.at(rows & (signals.time <= (np.inf if last is None else last)))
+    else:
+        kept = signals.at(keep or slice(None))
+    if not len(kept.time):
+        raise ValueError(f"keep={keep!r} leaves none of its {len(signals.time)} rows of {signals.time[-1]:g} s.")
+    return kept
+
+
+def _read(
+    file: Path, columns: dict[str, list[int | str]] | None, time_unit: str, topic: str | None, names: list[str] | None
+) -> Recording:
+    ending = "".join(file.suffixes[-2:]).lower()
+    if file.is_dir() or file.suffix.lower() in BAGS:
+        if columns is not None:
+            raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
+        return read_bag(file, topic, names)
+    if not ending.endswith(TABLES):
+        hint = " Convert it with: rosbags-convert --src in.bag --dst out" if ending == ".bag" else ""
+        raise ValueError(f"its name must end in one of {', '.join([*TABLES, *BAGS])}.{hint}")
+    if columns is None:
+        raise ValueError("columns must say where a table has its signals, by numbers from 0 or by names.")
+    if topic is not None:
+        raise ValueError(f"topic={topic!r} is for rosbag2 recordings; this is a table.")
+    read = read_table(file, columns, time_unit)
+    if names is not None and len(names) != len(read.joint_names):
+        raise ValueError(f"it has {len(read.joint_names)} joints; expected {len(names)}: {names}.")
+    return read if names is None else Recording(read.signals, names, read.start)
+
+
+def _recording(read: Recording, file: Path, keep: Keep | None, gains: ArrayLike, how: Processing) -> Bunch:
+    """What was recorded and what became of it."""
+    kept = _kept(read.signals, keep)
+    factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
+    if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
+        raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
+    raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap)
+    done = process(raw, step, gap, how)
+    return Bunch(
+        filename=str(file),
+        start=read.start,
+        n_repeated=len(kept.time) - len(raw.time),
+        raw=Bunch(**vars(raw)),
+        processed=Bunch(**vars(done.signals), why=done.why),
+        cuts=done.cuts,
+    )
+
+
+def _log(recordings: list[Bunch], names: list[str], how: Processing) -> Bunch:
+    """The rows of all files that are left."""
+    kept = [recording.processed.why == "" for recording in recordings]
+
+    def rows(name: str) -> np.ndarray:
+        return np.concatenate([one.processed[name][left] for one, left in zip(recordings, kept, strict=True)])
+
+    lengths = [int(left.sum()) for left in kept]
+    runs_of_all = [run.stop - run.start for left in kept for run in runs(left)]
+    return Bunch(
+        data=np.hstack([rows("position"), rows("velocity"), rows("acceleration")]),
+        target=rows("torque"),
+        groups=np.repeat(np.arange(len(recordings)), lengths),
+        # Ends of pieces are cut, so that no two of them touch.
+        pieces=np.repeat(np.arange(len(runs_of_all)), runs_of_all),
+        time=rows("time"),
+        recordings=recordings,
+        joint_names=names,
+        feature_names=[*names, *(f"d{name}/dt" for name in names), *(f"d2{name}/dt2" for name in names)],
+        target_names=[f"u_{name}" for name in names],
+        filenames=[recording.filename for recording in recordings],
+        DESCR=_description(recordings, lengths, names, how),
+    )
+
+
+def _description(recordings: list[Bunch], lengths: list[int], names: list[str], how: Processing) -> str:
+    files = "; ".join(_story(recording, length) for recording, length in zip(recordings, lengths, strict=True))
+    grid = "the recorded times" if how.dt is None else f"a grid of {how.dt:g} s"
+    filtered = (
+        "not filtered, but against aliasing where the grid is coarser than the recording"
+        if how.cutoff is None
+        else f"filtered forth and back by a Butterworth filter of fourth order at {how.cutoff:g} Hz"
+    )
+    derived = [n for n in ("velocity", "acceleration") if any(one.raw[n] is None for one in recordings)]
+    differences = f" Central differences: {' and '.join(derived)}." if derived else ""
+    return (
+        f"Logs of the joints {', '.join(names)}: positions, velocities and accelerations, and the torques, on {grid}, "
+        f"{filtered}, within pieces without gaps, whose ends are cut.{differences} Rest (all joints below "
+        f"{how.rest_velocity:g} rad/s or m/s for {how.rest_time:g} s) is cut. {files}."
+    )
+
+
+def _story(recording: Bunch, length: int) -> str:
+    raw, cuts = recording.raw, recording.cuts
+    lost = [
+        f"{sum(last - first for first, last, why in cuts if why == kind):.3g} s of {kind}"
+        for kind in sorted({why for _, _, why in cuts})
+    ]
+    return (
+        f"{recording.filename}: {length} rows of {len(raw.time)} recorded in {raw.time[-1] - raw.time[0]:.4g} s "
+        f"({recording.n_repeated} more repeated a time; cut: {', '.join(lost) or 'nothing'})"
+    )

@@ -1,0 +1,229 @@
+"""What is done to recorded signals: cut where there are gaps, put on a grid, filtered, differentiated, cut at rest."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.interpolate import PchipInterpolator
+from scipy.signal import butter, sosfiltfilt
+
+from ..._validation import check_real
+from .recording import Signals
+
+_ORDER = 4  # of the filter, which passes twice
+_GAP = 5.0  # median steps
+_JITTER = 0.05  # of the median step: times that differ by less are regular
+_EDGE = 2.0  # what is cut at each end of what was filtered, periods of the cutoff frequency
+_BAND = 0.8  # of the grid's Nyquist frequency is left where no cutoff is asked for and the grid is coarser
+_FINEST = 0.1  # of the median step: a finer grid has nothing to show
+
+Cut = tuple[float, float, str]
+
+
+@dataclass(frozen=True)
+class Processing:
+    """What is asked for, as in `load_log`."""
+
+    dt: float | None
+    cutoff: float | None
+    max_gap: float | None
+    rest_velocity: float
+    rest_time: float
+
+    def __post_init__(self) -> None:
+        for name in ("dt", "cutoff", "max_gap"):
+            if getattr(self, name) is not None:
+                check_real(getattr(self, name), name, minimum=0.0, strict=True)
+        check_real(self.rest_velocity, "rest_velocity", minimum=0.0)
+        check_real(self.rest_time, "rest_time", minimum=0.0)
+
+    def check_frequencies(self, step: float) -> None:
+        """Of a recording with such a step."""
+        if self.dt is not None and self.dt < _FINEST * step:
+            raise ValueError(
+                f"dt={self.dt:g} s is far below the recording's step of {step:g} s: it would show nothing."
+            )
+        nyquist = 0.5 / max(step, self.dt or 0.0)
+        if self.cutoff is not None and self.cutoff >= nyquist:
+            raise ValueError(
+                f"cutoff={self.cutoff:g} Hz must be below {nyquist:g} Hz, half the rate of the recording (a row every "
+                f"{step:g} s) and of the grid."
+            )
+
+
+@dataclass(frozen=True)
+class Processed:
+    """What became of a recording: all rows of its grid, and what is said of them."""
+
+    signals: Signals
+    why: np.ndarray  # (n,) of str: why a row is left out, "" where it is not
+    cuts: list[Cut]  # first and last second, and why
+
+
+def in_order(raw: Signals, max_gap: float | None) -> tuple[Signals, float, float]:
+    """Rows by their times, one for each, with the median step and what is taken for a gap.
+
+    Rows that come late by less than a gap are put where they belong (messages overtake each other); a clock that goes
+    back by more tells of a second recording, which sorting would mix with the first.
+    """
+    for name, signal in vars(raw).items():
+        if signal is not None and not np.isfinite(signal).all():
+            row = np.flatnonzero(~np.isfinite(signal.reshape(len(signal), -1)).all(axis=1))[0]
+            raise ValueError(f"the {name} of row {row} of those kept is not finite.")
+    order = np.argsort(raw.time, kind="stable")
+    steps = np.diff(raw.time[order])
+    if not (steps > 0.0).any():
+        raise ValueError(f"it has {len(order)} rows, and not two different times among them.")
+    step = float(np.median(steps[steps > 0.0]))
+    gap = _GAP * step if max_gap is None else max_gap
+    late = np.maximum.accumulate(raw.time) - raw.time
+    if late.max() > gap:
+        raise ValueError(
+            f"its clock goes back by {late.max():g} s at {raw.time[late.argmax()]:g} s: this is more than one "
+            "recording. Choose one with keep, or split the file."
+        )
+    return raw.at(order[np.r_[True, steps > 0.0]]), step, gap
+
+
+def pieces(time: np.ndarray, gap: float) -> Iterator[slice]:
+    """Rows between which no step exceeds the gap (rounding apart)."""
+    ends = np.flatnonzero(np.diff(time) > gap * (1.0 + 1e-9)) + 1
+    for start, stop in zip([0, *ends], [*ends, len(time)], strict=True):
+        yield slice(start, stop)
+
+
+def runs(flags: np.ndarray) -> Iterator[slice]:
+    """Where flags are True without a break."""
+    for start, stop in np.flatnonzero(np.diff(np.r_[False, flags, False])).reshape(-1, 2):
+        yield slice(start, stop)
+
+
+def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed:
+    """Filter and differentiate a recording, each piece between gaps for itself.
+
+    Parameters
+    ----------
+    raw : Signals
+        In order.
+    step, gap : float
+        The median step and what is taken for a gap, s.
+    how : Processing
+
+    Returns
+    -------
+    processed : Processed
+
+    Raises
+    ------
+    ValueError
+        If times are not regular and dt is None, or no row remains.
+    """
+    how.check_frequencies(step)
+    parts, reasons = [], []
+    cuts: list[Cut] = []
+    grid = _Grid.of(raw, step, how)
+    dt = grid.h * grid.inside
+    for rows in pieces(raw.time, gap):
+        piece = raw.at(rows)
+        if rows.start > 0:
+            cuts.append((float(raw.time[rows.start - 1]), float(piece.time[0]), "gap"))
+        done = _process_piece(piece, grid, how)
+        if done is None:
+            cuts.append((float(piece.time[0]), float(piece.time[-1]), "too short"))
+            continue
+        signals, why = done
+        parts.append(signals)
+        reasons.append(why)
+        cuts.extend(
+            (
+                max(float(signals.time[run][0]) - dt / 2.0, float(piece.time[0])),
+                min(float(signals.time[run][-1]) + dt / 2.0, float(piece.time[-1])),
+                reason,
+            )
+            for reason in ("edge", "rest")
+            for run in runs(why == reason)
+        )
+    if not parts:
+        lost = 2.0 * grid.edge * dt
+        raise ValueError(f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.")
+    if not any((why == "").any() for why in reasons):
+        raise ValueError(f"all of it is at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
+    return Processed(_joined(parts), np.concatenate(reasons), sorted(cuts))
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Where signals are filtered and differentiated."""
+
+    h: float  # its step, s
+    inside: int  # steps in one of the rows that are returned
+    cutoff: float | None  # of the filter, Hz
+    edge: int  # rows that are cut at each end of a piece
+
+    @classmethod
+    def of(cls, raw: Signals, step: float, how: Processing) -> _Grid:
+        """No coarser than the recording: filtered there, and thinned out afterwards, fast signals do not alias."""
+        dt = step if how.dt is None else how.dt
+        inside = max(1, int(np.ceil(dt / step - 1e-6)))
+        cutoff = _BAND * 0.5 / dt if how.cutoff is None and inside > 1 else how.cutoff
+        # Without a filter: as many rows as differences are one-sided.
+        one_sided = 1 + (raw.velocity is None)
+        edge = one_sided if cutoff is None else int(np.ceil(_EDGE / (cutoff * dt) - 1e-9))
+        return cls(dt / inside, inside, cutoff, edge)
+
+
+def _process_piece(piece: Signals, grid: _Grid, how: Processing) -> tuple[Signals, np.ndarray] | None:
+    """The signals on the grid, and why a row is left out; None if nothing is left."""
+    fine = _regular(piece, grid.h) if how.dt is None else _on_grid(piece, grid.h)
+    n_rows = (len(fine.time) - 1) // grid.inside + 1
+    if n_rows <= 2 * grid.edge:
+        return None
+    if grid.cutoff is not None:
+        fine = _filtered(fine, grid.cutoff, grid.h)
+    velocity = np.gradient(fine.position, grid.h, axis=0) if fine.velocity is None else fine.velocity
+    acceleration = np.gradient(velocity, grid.h, axis=0) if fine.acceleration is None else fine.acceleration
+    signals = replace(fine, velocity=velocity, acceleration=acceleration).at(slice(None, None, grid.inside))
+    why = np.full(n_rows, "", dtype="<U4")
+    why[: grid.edge] = why[n_rows - grid.edge :] = "edge"
+    slow = (np.abs(velocity[:: grid.inside]) < how.rest_velocity).all(axis=1)
+    for run in runs(slow):
+        if signals.time[run][-1] - signals.time[run][0] >= how.rest_time:
+            why[run] = "rest"
+    return signals, why
+
+
+def _regular(piece: Signals, step: float) -> Signals:
+    """The piece as it is, if its steps are all the same."""
+    irregular = np.abs(np.diff(piece.time) - step).max(initial=0.0)
+    if irregular > _JITTER * step:
+        raise ValueError(
+            f"dt=None keeps the recorded times, but they are not regular: steps differ from their median of "
+            f"{step:g} s by up to {irregular:g} s. Give dt."
+        )
+    return piece
+
+
+def _on_grid(piece: Signals, h: float) -> Signals:
+    """Interpolated: cubic, but never beyond the recorded values."""
+    if len(piece.time) < 2:
+        return piece
+    first, last = piece.time[[0, -1]]
+    time = first + h * np.arange(int((last - first) / h + 1e-6) + 1)
+    inside = np.minimum(time, last)
+    return piece.each(lambda signal: PchipInterpolator(piece.time, signal, axis=0)(inside), time)
+
+
+def _filtered(signals: Signals, cutoff: float, h: float) -> Signals:
+    """By the same filter, forth and back, so that no signal leads another."""
+    sos = butter(_ORDER, cutoff, fs=1.0 / h, output="sos")
+    padding = min(len(signals.time) - 1, int(np.ceil(2.0 / (cutoff * h))))
+    return signals.each(lambda signal: sosfiltfilt(sos, signal, axis=0, padlen=padding))
+
+
+def _joined(parts: list[Signals]) -> Signals:
+    def stacked(name: str) -> np.ndarray:
+        return np.concatenate([getattr(part, name) for part in parts])
+
+    return Signals(*map(stacked, ("time", "position", "velocity", "acceleration", "torque")))

@@ -1,0 +1,131 @@
+"""The same logs as state transitions, for forward dynamics."""
+
+from __future__ import annotations
+
+from typing import Literal, overload
+
+import numpy as np
+from sklearn.utils import Bunch
+
+from ..._validation import check_integer
+from .signals import runs
+
+
+@overload
+def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[False] = ...) -> Bunch: ...
+@overload
+def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[True]) -> tuple[np.ndarray, np.ndarray]: ...
+def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) -> Bunch | tuple[np.ndarray, np.ndarray]:
+    """State transitions of logs, each with its own time step: data for forward dynamics.
+
+    A row is the recorded state and the torque that acted until the next row, which is its target. Nothing is resampled
+    or filtered. Left out are transitions across a gap or through rest, as `load_log` found them, and rows with the time
+    of another.
+
+    Parameters
+    ----------
+    log : Bunch
+        What `load_log` returned.
+    stride : int, default=1
+        Recorded rows from a state to the next, at least 1. Above 1 transitions follow each other without overlap, and
+        the torque is the mean of the rows on the way, each for as long as it lasted.
+    return_X_y : bool, default=False
+        Whether to return ``(data, target)`` in place of a Bunch.
+
+    Returns
+    -------
+    transitions : :class:`~sklearn.utils.Bunch`
+        With
+
+        - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1): positions (rad or m), velocities (per s), torques
+          (N m or N) and, last, the time to the target, ``"dt"`` (s, above 0);
+        - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
+        - ``groups`` : ndarray of shape (n_rows,): the file of each row, for `GroupKFold`;
+        - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
+        - ``joint_names``, ``feature_names``, ``target_names``, ``DESCR``.
+    (data, target) : tuple of ndarray
+        If ``return_X_y``.
+
+    Raises
+    ------
+    ValueError
+        If ``stride`` is below 1, no velocities were recorded, or no transition remains.
+    TypeError
+        If ``log`` is not what `load_log` returns, or ``stride`` not an integer.
+
+    See Also
+    --------
+    load_log : Reads the files.
+
+    Notes
+    -----
+    The torque of a row is held until the next: what acts between two rows is known only at their ends, and that of the
+    second knows already of the noise of the target's state, where the robot is controlled.
+
+    Examples
+    --------
+    A mass of 2 kg that a force pushes to and fro, written down at times of its own:
+
+    >>> import tempfile
+    >>> from pathlib import Path
+    >>> import numpy as np
+    >>> from skevgp.datasets import load_log, log_transitions
+    >>> t = np.arange(0.0, 6.0, 0.008) + np.random.RandomState(0).uniform(0.0, 0.004, 750)
+    >>> table = np.column_stack([t, np.sin(t), np.cos(t), -2.0 * np.sin(t)])
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     file = Path(folder) / "mass.csv"
+    ...     np.savetxt(file, table, delimiter=",")
+    ...     log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "effort": 3})
+    >>> transitions = log_transitions(log)
+    >>> transitions.feature_names
+    ['q1', 'dq1/dt', 'u_q1', 'dt']
+    >>> q, dq, u, dt = transitions.data.T
+    >>> bool(np.abs(transitions.target[:, 1] - (dq + u / 2.0 * dt)).max() < 1e-4)
+    True
+    """
+    check_integer(stride, "stride", minimum=1)
+    if not isinstance(log, Bunch) or "recordings" not in log:
+        raise TypeError(f"log must be what load_log returns; got {type(log).__name__}.")
+    parts = [_transitions(recording, stride) for recording in log.recordings]
+    lengths = [len(part) for part in parts]
+    if not any(lengths):
+        raise ValueError(f"No {stride + 1} rows follow each other without a gap or rest: lower stride={stride}.")
+    rows, n = np.vstack(parts), len(log.joint_names)
+    data, target, time = rows[:, : 3 * n + 1], rows[:, 3 * n + 1 : -1], rows[:, -1]
+    if return_X_y:
+        return data, target
+    states = [*log.joint_names, *(f"d{name}/dt" for name in log.joint_names)]
+    return Bunch(
+        data=data,
+        target=target,
+        groups=np.repeat(np.arange(len(parts)), lengths),
+        time=time,
+        joint_names=log.joint_names,
+        feature_names=[*states, *log.target_names, "dt"],
+        target_names=states,
+        DESCR=(
+            f"{len(data)} transitions of {stride} recorded rows, of {data[:, -1].min():.4g} to {data[:, -1].max():.4g} "
+            f"s, not filtered, but for gaps and rest, of the files {', '.join(log.filenames)}."
+        ),
+    )
+
+
+def _transitions(recording: Bunch, stride: int) -> np.ndarray:
+    """Rows of state, torque, dt, next state and time."""
+    raw = recording.raw
+    if raw.velocity is None:
+        raise ValueError(f"{recording.filename}: there are no recorded velocities, which are half of the state.")
+    steps = np.diff(raw.time)
+    whole = np.ones(len(steps), dtype=bool)
+    for first, last, why in recording.cuts:
+        if why in ("gap", "rest"):
+            whole &= (raw.time[1:] <= first) | (raw.time[:-1] >= last)
+    starts = np.concatenate(
+        [np.arange(run.start, run.stop - stride + 1, stride) for run in runs(whole)] or [np.empty(0, dtype=np.intp)]
+    )
+    ends = starts + stride
+    states = np.hstack([raw.position, raw.velocity])
+    dt = (raw.time[ends] - raw.time[starts])[:, np.newaxis]
+    impulse = np.vstack([np.zeros_like(raw.torque[:1]), np.cumsum(raw.torque[:-1] * steps[:, np.newaxis], axis=0)])
+    torque = raw.torque[starts] if stride == 1 else (impulse[ends] - impulse[starts]) / dt
+    return np.hstack([states[starts], torque, dt, states[ends], raw.time[starts, np.newaxis]])

@@ -1,0 +1,265 @@
+import shutil
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from skevgp.datasets import load_log
+
+from .cases import irregular_times, motion, states_of_db3
+
+UR10 = Path(__file__).parents[2] / "data" / "ur10.db3"
+JOINTS = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+STORE = get_typestore(Stores.LATEST)
+TYPES = STORE.types
+STATES, TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+START = 1_700_000_000_123_456_789  # ns since 1970
+T = irregular_times(4.0)
+NS = np.round(T * 1e9).astype(np.int64)
+
+
+def stamp(nanoseconds, kind="builtin_interfaces/msg/Time"):
+    return TYPES[kind](sec=int(nanoseconds // 10**9), nanosec=int(nanoseconds % 10**9))
+
+
+def header(nanoseconds):
+    return TYPES["std_msgs/msg/Header"](stamp=stamp(nanoseconds), frame_id="")
+
+
+def state(nanoseconds, names, q, dq=(), effort=()):
+    arrays = (np.asarray(values, dtype=float) for values in (q, dq, effort))
+    return TYPES[STATES](header(nanoseconds), names, *arrays)
+
+
+def states(start=START, names=("a", "b"), velocity=True):
+    """What a robot sends that moves as it should; received 3 ms late, more or less if it has a clock."""
+    q, dq, _, current = motion(T)
+    for row, t in enumerate(NS.tolist()):
+        late = 3_000_000 + (row % 3 * 100_000 if start else 0)
+        yield (
+            START + t + late,
+            state(start + t if start else 0, list(names), q[row], dq[row] if velocity else (), current[row]),
+        )
+
+
+def trajectory(effort=True, start=0):
+    q, dq, ddq, current = motion(T)
+    point = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
+    points = [
+        point(
+            q[row],
+            dq[row],
+            ddq[row],
+            current[row] if effort else np.empty(0),
+            stamp(t, "builtin_interfaces/msg/Duration"),
+        )
+        for row, t in enumerate(NS.tolist())
+    ]
+    return START, TYPES[TRAJECTORY](header(start), ["a", "b"], points)
+
+
+def write(folder, topics, plugin=StoragePlugin.MCAP):
+    """A recording of topics, {name: (type, [(received, message), ...])}; returns its only file."""
+    with Writer(folder, version=9, storage_plugin=plugin) as writer:
+        for name, (kind, messages) in topics.items():
+            connection = writer.add_connection(name, kind, typestore=STORE)
+            for received, message in messages:
+                writer.write(connection, received, STORE.serialize_cdr(message, kind))
+    (file,) = [path for path in folder.iterdir() if path.suffix in (".mcap", ".db3")]
+    return file
+
+
+def write_states(folder, **arguments):
+    return write(folder, {"/joint_states": (STATES, states(**arguments))})
+
+
+def assert_recorded(log, rows=slice(None)):
+    raw = log.recordings[0].raw
+    q, dq, _, current = motion(T[rows])
+    assert_allclose(raw.time, (NS[rows] - NS[rows][0]) * 1e-9, rtol=0, atol=1e-12)
+    assert_allclose(np.hstack([raw.position, raw.velocity, raw.torque]), np.hstack([q, dq, current]), rtol=1e-15)
+
+
+def test_a_real_robots_file_is_what_is_read_by_hand():
+    stamps, names, signals = states_of_db3(UR10)
+    log = load_log(UR10)
+    raw = log.recordings[0].raw
+    assert log.joint_names == names == JOINTS
+    assert len(stamps) == 300
+    assert_allclose(raw.time, (stamps - stamps[0]) * 1e-9, rtol=0, atol=1e-12)
+    for recorded, expected in zip((raw.position, raw.velocity, raw.torque), signals, strict=True):
+        assert_array_equal(recorded, expected)
+
+
+def test_a_real_robots_accelerations_are_slopes_of_its_velocities_and_its_torques_those_recorded():
+    stamps, _, signals = states_of_db3(UR10)
+    log = load_log(UR10)
+    for joint in range(6):
+        recorded = np.interp(log.time, stamps * 1e-9, signals[2][:, joint])
+        assert np.corrcoef(recorded, log.target[:, joint])[0, 1] > 0.99
+        slopes = np.gradient(log.data[:, 6 + joint], 0.01)
+        assert_allclose(log.data[1:-1, 12 + joint], slopes[1:-1], atol=0.002 * np.abs(slopes).max())
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin), ids=str)
+@pytest.mark.parametrize("whole", [False, True], ids=["file", "folder"])
+def test_recordings_are_read_with_and_without_their_metadata(tmp_path, plugin, whole):
+    file = write(tmp_path / "bag", {"/joint_states": (STATES, states())}, plugin)
+    if not whole:
+        file = shutil.copy(file, tmp_path)
+        shutil.rmtree(tmp_path / "bag")
+    log = load_log(tmp_path / "bag" if whole else file)
+    assert_recorded(log)
+    assert log.recordings[0].start == pytest.approx((START + NS[0]) * 1e-9)
+    assert log.joint_names == ["a", "b"]
+
+
+def test_without_stamps_the_times_are_those_of_reception(tmp_path):
+    log = load_log(write_states(tmp_path / "bag", start=0))
+    assert_recorded(log)
+    assert log.recordings[0].start - (START + NS[0] + 3_000_000) * 1e-9 == pytest.approx(0.0, abs=1e-6)
+
+
+def test_messages_without_velocities_have_none(tmp_path):
+    log = load_log(write_states(tmp_path / "bag", velocity=False))
+    assert log.recordings[0].raw.velocity is None
+    assert_allclose(log.data[:, 2:4], motion(log.time + T[0])[1], atol=0.01)
+
+
+def test_a_trajectory_brings_its_accelerations(tmp_path):
+    log = load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory()])}))
+    assert_recorded(log)
+    assert_allclose(log.recordings[0].raw.acceleration, motion(T)[2], rtol=1e-15)
+    assert_allclose(log.data[:, 4:], motion(log.time + T[0])[2], atol=0.01)
+
+
+def test_trajectories_that_overlap_are_more_than_one_recording(tmp_path):
+    file = write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory(start=START), trajectory(start=START + 10**9)])})
+    with pytest.raises(ValueError, match=r"bag.mcap: its clock goes back by 2.99\d* s at 1 s: .*more than one recor"):
+        load_log(file)
+
+
+def test_joints_are_chosen_and_ordered_by_name(tmp_path):
+    file = write_states(tmp_path / "bag")
+    log, other = load_log(file), load_log(file, joints=["b", "a"])
+    assert other.joint_names == ["b", "a"]
+    assert other.feature_names == ["b", "a", "db/dt", "da/dt", "d2b/dt2", "d2a/dt2"]
+    assert_array_equal(other.target, log.target[:, ::-1])
+    assert_allclose(load_log(file, joints=["b"]).data, log.data[:, 1::2], atol=1e-12)
+
+
+def test_joints_of_the_first_file_are_those_of_all(tmp_path):
+    first, second = (write_states(tmp_path / "".join(names), names=names) for names in (("a", "b"), ("b", "a")))
+    log = load_log([first, second])
+    assert log.joint_names == ["a", "b"]
+    assert_array_equal(log.target[log.groups == 0], log.target[log.groups == 1][:, ::-1])
+
+
+def test_messages_of_other_joints_are_passed_over(tmp_path):
+    hand = [(START + t + 1, state(START + t + 1, ["finger"], [0.0])) for t in NS[::10].tolist()]
+    file = write(tmp_path / "bag", {"/joint_states": (STATES, [*states(), *hand])})
+    assert_recorded(load_log(file, joints=["a", "b"]))
+    with pytest.raises(ValueError, match=r"messages are of different joints, .*: \[\('a', 'b'\), \('finger',\)\]"):
+        load_log(file)
+
+
+def test_messages_that_overtake_each_other_are_put_in_order(tmp_path):
+    messages = list(states())
+    messages[100], messages[101] = messages[101], messages[100]
+    assert_recorded(load_log(write(tmp_path / "bag", {"/joint_states": (STATES, messages)})))
+
+
+def test_one_of_several_topics_is_chosen(tmp_path):
+    others = [(START + t, state(START + t, ["c"], [1.0], [1.0], [1.0])) for t in NS.tolist()]
+    file = write(tmp_path / "bag", {"/mine": (STATES, states()), "/other": (STATES, others)})
+    assert_recorded(load_log(file, topic="/mine"))
+    with pytest.raises(ValueError, match=r"bag.mcap: several topics .*: \['/mine', '/other'\]"):
+        load_log(file)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"topic": "/joints"}, r"topic='/joints' is none of those .* it has \{'/joint_states': 'sensor_msgs/msg/Joi"),
+        ({"joints": ["elbow"]}, r"no message has all of joints=\['elbow'\]; they have \['elbow_joint', "),
+        ({"columns": {"time": 0, "position": 1, "effort": 2}}, "columns are those of a table; in a rosbag2"),
+        ({"gains": [1.0, 2.0]}, r"gains must be .* one for each of the 6 joints; got \[1.0, 2.0\]"),
+    ],
+)
+def test_what_does_not_fit_a_recording_is_told_with_its_name(arguments, message):
+    with pytest.raises(ValueError, match=f"ur10.db3: {message}"):
+        load_log(UR10, **arguments)
+
+
+def test_a_recording_without_joint_states_lists_its_topics(tmp_path):
+    text = TYPES["std_msgs/msg/String"]
+    file = write(tmp_path / "bag", {"/said": ("std_msgs/msg/String", [(START, text("q"))])})
+    with pytest.raises(ValueError, match=r"no topic has messages of .*JointTrajectory; it has \{'/said': 'std_msgs/ms"):
+        load_log(file)
+
+
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        ([(START, state(START, ["a"], [1.0], [1.0]))], "there are messages without efforts, or with too few"),
+        ([(START, state(START, ["a"], [], [], [1.0]))], "there are messages without positions"),
+        ([(START, state(START, ["a", "b"], [1.0, 1.0], [1.0], [1.0, 1.0]))], "messages without velocities, or with"),
+        ([(START, state(START, ["a"], [1.0], [1.0], [1.0]))], "it has 1 rows, and not two different times"),
+        ([], "the topic '/joint_states' has no messages"),
+    ],
+)
+def test_missing_signals_are_told(tmp_path, messages, message):
+    with pytest.raises(ValueError, match=message):
+        load_log(write(tmp_path / "bag", {"/joint_states": (STATES, messages)}))
+
+
+def test_a_trajectory_without_efforts_is_no_data(tmp_path):
+    with pytest.raises(ValueError, match="there are messages without efforts"):
+        load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory(effort=False)])}))
+
+
+def test_a_trajectory_without_points_is_no_data(tmp_path):
+    empty = TYPES[TRAJECTORY](header(0), ["a", "b"], [])
+    with pytest.raises(ValueError, match="bag.mcap: the topic has no rows"):
+        load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [(START, empty)])}))
+
+
+@pytest.mark.parametrize("share", [0.0, 0.1, 0.9], ids=str)
+@pytest.mark.parametrize("plugin", list(StoragePlugin), ids=str)
+def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
+    file = write(tmp_path / "bag", {"/joint_states": (STATES, states())}, plugin)
+    data = file.read_bytes()
+    file.write_bytes(data[: int(share * len(data))])
+    with pytest.raises(ValueError, match=f"bag{file.suffix}: it cannot be read as a rosbag2 recording"):
+        load_log(file)
+
+
+def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
+        writer.write(connection, START, b"\x00\x01\x00\x00" + b"\xff" * 40)
+    with pytest.raises(ValueError, match="bag.mcap: it cannot be read as a rosbag2 recording"):
+        load_log(tmp_path / "bag" / "bag.mcap")
+
+
+@pytest.mark.parametrize("mark", ["#", "?", "%20"])
+def test_names_by_which_another_file_would_be_found_are_refused(tmp_path, mark):
+    shutil.copy(UR10, tmp_path / "a b.db3")
+    file = shutil.copy(UR10, tmp_path / f"a{mark}b.db3")
+    with pytest.raises(ValueError, match="b.db3: SQLite recordings whose path has #, . or % in it cannot be read"):
+        load_log(file)
+
+
+def test_a_folder_without_metadata_is_told_with_its_name(tmp_path):
+    with pytest.raises(ValueError, match=f"{tmp_path.name}: it cannot be read as a rosbag2 recording"):
+        load_log(tmp_path)
+
+
+def test_without_rosbags_the_pip_command_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
+        load_log(UR10)

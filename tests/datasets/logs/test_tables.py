@@ -1,0 +1,185 @@
+import gzip
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from skevgp.datasets import load_log
+
+from .cases import BY_NAME, BY_NUMBER, HEADER, irregular_times, table_of, write_table
+
+TABLE = table_of(irregular_times(3.0))
+
+
+@pytest.fixture
+def file(tmp_path):
+    return write_table(tmp_path / "log.csv", TABLE)
+
+
+@pytest.fixture
+def expected(file):
+    return load_log(file, columns=BY_NUMBER)
+
+
+def assert_equal(log, expected):
+    for name in ("data", "target", "time"):
+        assert_array_equal(log[name], expected[name])
+
+
+def test_the_values_are_those_of_the_file(expected):
+    raw = expected.recordings[0].raw
+    np.testing.assert_allclose(raw.time, TABLE[:, 0] - TABLE[0, 0], atol=1e-12)
+    for name, columns in (("position", [1, 2]), ("velocity", [4, 5]), ("torque", [6, 7])):
+        np.testing.assert_allclose(raw[name], TABLE[:, columns], rtol=1e-11)
+    assert raw.acceleration is None
+
+
+@pytest.mark.parametrize(
+    "columns",
+    [
+        BY_NAME,
+        {**BY_NAME, "position": ["q_1", 2]},
+        {**BY_NAME, "position": np.array([1, 2]), "velocity": "dq_?"},
+        {**BY_NAME, "acceleration": None},
+    ],
+    ids=str,
+)
+def test_columns_by_name_are_columns_by_number(file, expected, columns):
+    assert_equal(load_log(file, columns=columns), expected)
+
+
+def test_the_order_of_columns_is_that_of_joints(file, expected):
+    other = load_log(file, columns={"time": 0, "position": [2, 1], "velocity": [5, 4], "current": [7, 6]})
+    assert_array_equal(other.target, expected.target[:, ::-1])
+    assert_array_equal(other.data, expected.data[:, [1, 0, 3, 2, 5, 4]])
+
+
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+@pytest.mark.parametrize("header", [HEADER, None], ids=["header", "no header"])
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.TXT"])
+def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
+    file = write_table(tmp_path / name, TABLE, header, delimiter)
+    assert_equal(load_log(file, columns=BY_NUMBER), expected)
+
+
+@pytest.mark.parametrize(
+    "beginning",
+    [
+        "# robot: UR10\n# t,q_1,q_2,mode,dq_1,dq_2,i_1,i_2\n",
+        "\ufeff" + ",".join(HEADER) + "\n",
+        '"t", "q_1", "q_2","mode","dq_1","dq_2","i_1","i_2"\n\n',
+    ],
+    ids=["comment", "signature", "quotes"],
+)
+def test_headers_are_found(tmp_path, expected, beginning):
+    body = write_table(tmp_path / "body.csv", TABLE, None).read_text()
+    file = tmp_path / "log.csv"
+    file.write_text(beginning + body, encoding="utf-8")
+    assert_equal(load_log(file, columns=BY_NAME), expected)
+
+
+def test_words_in_other_columns_do_not_matter(tmp_path, expected):
+    lines = write_table(tmp_path / "body.csv", TABLE, None).read_text().replace(",0,", ",RUNNING,")
+    file = tmp_path / "log.csv"
+    file.write_text(lines)
+    assert_equal(load_log(file, columns=BY_NUMBER), expected)
+
+
+def test_brackets_in_names_are_brackets(tmp_path, expected):
+    file = write_table(tmp_path / "log.csv", TABLE, ["t", "q[0]", "q[1]", "mode", "d[0]", "d[1]", "i[0]", "i[1]"])
+    columns = {"time": "t", "position": ["q[0]", "q[1]"], "velocity": "d[*]", "current": "i[?]"}
+    assert_equal(load_log(file, columns=columns), expected)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+def test_times_have_a_unit(tmp_path, expected, unit, seconds):
+    table = TABLE.copy()
+    table[:, 0] /= seconds
+    log = load_log(write_table(tmp_path / "log.csv", table), columns=BY_NUMBER, time_unit=unit)
+    np.testing.assert_allclose(log.data, expected.data, atol=1e-8)
+    assert log.recordings[0].start == pytest.approx(expected.recordings[0].start)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({**BY_NUMBER, "time": 8}, r"columns\['time'\] asks for column 8, but there are 0 to 7 only"),
+        (
+            {**BY_NUMBER, "position": "p_*"},
+            r"columns\['position'\] asks for 'p_\*', which is none of the columns \['t'",
+        ),
+        ({**BY_NUMBER, "position": ["q_1"]}, "there are 1 columns of position, and 2 of velocity"),
+        ({**BY_NUMBER, "current": [6, 6]}, r"columns\['current'\] has a column twice: \[6, 6\]"),
+    ],
+)
+def test_missing_columns_are_named_with_the_file(file, columns, message):
+    with pytest.raises(ValueError, match=f"log.csv: {message}"):
+        load_log(file, columns=columns)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        ({"time": 0, "position": 1}, "columns must name 'time', 'position', one of 'effort' and 'current'"),
+        ({"time": 0, "effort": 1}, "columns must name 'time', 'position'"),
+        ({**BY_NUMBER, "effort": 1}, "one of 'effort' and 'current'"),
+        ({**BY_NUMBER, "speed": 1}, "columns must name .* got .*'speed'"),
+        ({**BY_NUMBER, "time": [0, 1]}, r"columns\['time'\] must be one column; got \[0, 1\]"),
+        ({**BY_NUMBER, "position": []}, r"columns\['position'\] must be at least one column"),
+        ({**BY_NUMBER, "position": -1}, r"columns\['position'\] must be at least 0; got -1"),
+    ],
+)
+def test_wrong_column_maps_are_errors(file, columns, message):
+    with pytest.raises(ValueError, match=message):
+        load_log(file, columns=columns)
+
+
+@pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (["t", "q"], "columns must be a dict .* got \\['t', 'q'\\]"),
+        ({**BY_NUMBER, "time": 0.0}, r"columns\['time'\] must be an integer; got 0.0"),
+    ],
+)
+def test_column_maps_of_wrong_types_are_errors(file, columns, message):
+    with pytest.raises(TypeError, match=message):
+        load_log(file, columns=columns)
+
+
+def test_names_need_a_header(tmp_path):
+    with pytest.raises(ValueError, match=r"asks for 't', but there is no header: give numbers, from 0"):
+        load_log(write_table(tmp_path / "log.csv", TABLE, None), columns=BY_NAME)
+
+
+def test_a_name_of_two_columns_is_an_error(tmp_path):
+    file = write_table(tmp_path / "log.csv", TABLE, ["t", "t", *HEADER[2:]])
+    with pytest.raises(ValueError, match="asks for 't', but several columns have this name"):
+        load_log(file, columns={**BY_NUMBER, "time": "t"})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "it is empty"),
+        (b"# only a comment\n", "it is empty"),
+        (b"t,q,u\n", "it has no rows"),
+        (b"t,q,u\n0,1,2\n1,,2\n", "could not convert string '' to float64 at row 1, column 2"),
+        (b"t,q,u\n0,1,2\n1,word,2\n", "could not convert string 'word'"),
+        (b"t,q,u\n0,1,2\n1,2\n", "invalid column index 2 at row 2 with 2 columns"),
+        (b"t,q,u\n0,1,2\n1,nan,2\n", "the position of row 1 of those kept is not finite"),
+        (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
+    ],
+)
+def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
+    file = tmp_path / "bad.csv"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=f"bad.csv: {message}"):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
+@pytest.mark.parametrize("spoil", [lambda data: b"no gzip", lambda data: data[: len(data) // 2]], ids=["no", "half"])
+def test_broken_compression_is_told_with_the_name(tmp_path, spoil):
+    file = tmp_path / "bad.csv.gz"
+    file.write_bytes(spoil(gzip.compress(b"0,1,2\n" * 1000)))
+    with pytest.raises(ValueError, match="bad.csv.gz: it is no text, or its compression is broken"):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2})

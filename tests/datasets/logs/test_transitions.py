@@ -1,0 +1,130 @@
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from sklearn.utils import Bunch
+
+from skevgp.datasets import load_log, log_transitions
+
+from .cases import BY_NUMBER, irregular_times, motion, table_of, write_table
+
+T = irregular_times(8.0)
+GAIN = 3.0
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(*tables, **arguments):
+        files = [write_table(tmp_path / f"{number}.csv", table) for number, table in enumerate(tables)]
+        return load_log(files, **{"columns": BY_NUMBER, "gains": GAIN, "rest_velocity": 0.0, **arguments})
+
+    return load
+
+
+def parts(transitions, n=2):
+    """States, torques, steps and next states."""
+    data = transitions.data
+    return data[:, : 2 * n], data[:, 2 * n : 3 * n], data[:, -1], transitions.target
+
+
+def test_a_row_is_a_recorded_state_with_its_torque_and_the_time_to_the_next(load):
+    found = log_transitions(load(table_of(T)))
+    states, torques, dt, then = parts(found)
+    q, dq, _, current = motion(T)
+    assert len(found.data) == len(T) - 1
+    assert_allclose(states, np.hstack([q, dq])[:-1], atol=1e-10)
+    assert_allclose(then, np.hstack([q, dq])[1:], atol=1e-10)
+    assert_allclose(torques, GAIN * current[:-1], atol=1e-9)
+    assert_allclose(dt, np.diff(T), atol=1e-10)
+    assert_allclose(found.time, T[:-1] - T[0], atol=1e-10)
+
+
+def test_columns_are_named_and_dt_is_the_last(load):
+    found = log_transitions(load(table_of(T), joints=["a", "b"]))
+    assert set(found) == {"data", "target", "groups", "time", "joint_names", "feature_names", "target_names", "DESCR"}
+    assert found.feature_names == ["a", "b", "da/dt", "db/dt", "u_a", "u_b", "dt"]
+    assert found.target_names == ["a", "b", "da/dt", "db/dt"]
+    assert found.data.shape == (len(T) - 1, 7)
+    assert f"{len(T) - 1} transitions of 1 recorded rows" in found.DESCR
+
+
+def test_times_are_not_those_of_the_grid(load):
+    fine, coarse = (log_transitions(load(table_of(T), dt=dt, cutoff=4.0)) for dt in (0.005, 0.1))
+    assert_array_equal(fine.data, coarse.data)
+
+
+@pytest.mark.parametrize("stride", [2, 5])
+def test_with_a_stride_states_follow_each_other_and_torques_are_means(load, stride):
+    states, torques, dt, then = parts(log_transitions(load(table_of(T)), stride=stride))
+    q, dq, _, current = motion(T)
+    starts = np.arange(0, len(T) - stride, stride)
+    assert_allclose(states, np.hstack([q, dq])[starts], atol=1e-10)
+    assert_array_equal(states[1:], then[:-1])
+    assert_allclose(dt, T[starts + stride] - T[starts], atol=1e-10)
+    for row, start in enumerate(starts):
+        way = slice(start, start + stride)
+        mean = np.average(GAIN * current[way], axis=0, weights=np.diff(T)[way])
+        assert_allclose(torques[row], mean, atol=1e-8)
+
+
+def test_repeated_rows_are_no_transitions(load):
+    found = log_transitions(load(table_of(np.sort(np.r_[T, T[::9]]))))
+    assert_array_equal(found.data, log_transitions(load(table_of(T))).data)
+    assert (found.data[:, -1] > 0.0).all()
+
+
+@pytest.mark.parametrize("stride", [1, 3])
+def test_there_is_no_transition_across_a_gap(load, stride):
+    t = np.delete(T, slice(400, 450))
+    found = log_transitions(load(table_of(t)), stride=stride)
+    assert found.data[:, -1].max() < stride * 0.0121
+    assert len(found.data) == (399 // stride) + (len(t) - 401) // stride
+
+
+def test_there_is_no_transition_at_rest(load):
+    table = table_of(T)
+    still = (T >= 3.0) & (T < 5.0)
+    table[still, 4:6] = 0.0
+    found = log_transitions(load(table, rest_velocity=0.02))
+    inside = (found.time + T[0] > 3.5) & (found.time + T[0] < 4.5)
+    assert not inside.any()
+    assert ((found.time + T[0] < 2.9).sum(), (found.time + T[0] > 5.1).sum()) == ((T < 2.9).sum(), (T[:-1] > 5.1).sum())
+
+
+def test_what_the_filter_costs_stays(load):
+    assert log_transitions(load(table_of(T), cutoff=1.0)).data.shape == (len(T) - 1, 7)
+
+
+def test_files_are_groups(load):
+    log = load(table_of(T), table_of(T[:300]))
+    found = log_transitions(log)
+    assert_array_equal(found.groups, np.repeat([0, 1], [len(T) - 1, 299]))
+
+
+def test_return_x_y_gives_the_two_arrays(load):
+    log = load(table_of(T))
+    found = log_transitions(log, stride=2)
+    X, y = log_transitions(log, stride=2, return_X_y=True)
+    assert_array_equal(X, found.data)
+    assert_array_equal(y, found.target)
+
+
+def test_velocities_must_be_recorded(load):
+    log = load(table_of(T), columns={"time": 0, "position": [1, 2], "effort": [6, 7]})
+    with pytest.raises(ValueError, match="0.csv: there are no recorded velocities"):
+        log_transitions(log)
+
+
+def test_some_transition_must_remain(load):
+    with pytest.raises(ValueError, match="No 1001 rows follow each other without a gap or rest: lower stride=1000"):
+        log_transitions(load(table_of(T)), stride=1000)
+
+
+def test_wrong_arguments_are_named(load):
+    log = load(table_of(T))
+    with pytest.raises(ValueError, match="stride must be at least 1; got 0"):
+        log_transitions(log, stride=0)
+    with pytest.raises(TypeError, match="stride must be an integer; got 1.5"):
+        log_transitions(log, stride=1.5)
+    for wrong in ("log.csv", Bunch(data=log.data)):
+        with pytest.raises(TypeError, match="log must be what load_log returns; got"):
+            log_transitions(wrong)
