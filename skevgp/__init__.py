@@ -9,6 +9,7 @@ if TYPE_CHECKING:
     from . import datasets, exceptions, features, kernels, metrics, plotting, solvers
     from .bnn import BayesianMLPRegressor
     from .exact import EGPRegressor
+    from .inverse_dynamics import InverseDynamics
     from .prediction.rollout import rollout
     from .regressor import EVGPRegressor
     from .residual import ResidualRegressor
@@ -19,6 +20,7 @@ __all__ = [
     "BayesianMLPRegressor",
     "EGPRegressor",
     "EVGPRegressor",
+    "InverseDynamics",
     "ResidualRegressor",
     "__version__",
     "datasets",
@@ -36,6 +38,7 @@ _HOME = {
     "BayesianMLPRegressor": "bnn",
     "EGPRegressor": "exact",
     "EVGPRegressor": "regressor",
+    "InverseDynamics": "inverse_dynamics",
     "ResidualRegressor": "residual",
     "rollout": "prediction.rollout",
 }

@@ -4,5 +4,13 @@ from .angles import AngleEncoder
 from .gravity import LinkGravity
 from .newton import InertiaForce, InertiaForceGravity
 from .nominal import NominalDynamics
+from .rigid_body import RigidBodyRegressor
 
-__all__ = ["AngleEncoder", "InertiaForce", "InertiaForceGravity", "LinkGravity", "NominalDynamics"]
+__all__ = [
+    "AngleEncoder",
+    "InertiaForce",
+    "InertiaForceGravity",
+    "LinkGravity",
+    "NominalDynamics",
+    "RigidBodyRegressor",
+]

@@ -217,7 +217,7 @@ def same_for_all(jacobian: np.ndarray, n_rows: int) -> np.ndarray:
     return copies
 
 
-def _has_robot(transformer: RobotMap) -> bool:
+def has_robot(transformer: RobotMap) -> bool:
     if transformer.robot is None:
         raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
     return True
@@ -239,7 +239,7 @@ class RobotMap(RobotTransformer):
         "outputs": ["array-like", None],
     }
 
-    @available_if(_has_robot)
+    @available_if(has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
         """Give the prior of the weights β.
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -188,6 +190,29 @@ class RigidBody:
         (by_q,) = self._derivatives("computeGeneralizedGravityDerivatives", q)
         return self._by_state(by_q, np.zeros_like(by_q))
 
+    def torque_regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
+        """Y(q, q̇, q̈) with `forces` = Y π, by Pinocchio's joint torque regressor.
+
+        Parameters
+        ----------
+        q, v, a : ndarray of shape (n, n_joints)
+            Positions, velocities and accelerations.
+
+        Returns
+        -------
+        regressor : ndarray of shape (n, n_joints, 10 * n_joints)
+            By the inertial parameters π of the joints' links, from the base to the tip: of each the mass m, the first
+            moments m c and the moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the joint's frame. Reflected rotor
+            inertias are no part of it.
+        """
+        n, n_joints = q.shape
+        regressor = np.empty((n, n_joints, 10 * n_joints))
+        compute = require("pinocchio", "Rigid-body dynamics").computeJointTorqueRegressor
+        with self._idle_data() as data:
+            for rows, *row in zip(regressor, q, v, a, strict=True):
+                rows[:] = compute(self.model, data, *row)  # a view of data, until its next use
+        return regressor
+
     def _by_state(self, by_q: np.ndarray, by_v: np.ndarray) -> np.ndarray:
         return np.concatenate([by_q, by_v, np.zeros((*by_q.shape[:2], len(self._driven)))], axis=2)
 
@@ -218,16 +243,22 @@ class RigidBody:
         """The matrices that one of Pinocchio's algorithms returns for each row, (n_matrices, n, n_joints, n_joints)."""
         derive = getattr(require("pinocchio", "Rigid-body dynamics"), algorithm)
         n, n_joints = rows[0].shape
-        idle = vars(self).setdefault("_idle", [])  # one for each thread that was here at once: they take long to make
+        found = np.empty((n, 1 if algorithm == "computeGeneralizedGravityDerivatives" else 3, n_joints, n_joints))
+        with self._idle_data() as data:
+            for matrices, *row in zip(found, *rows, strict=True):
+                matrices[:] = derive(self.model, data, *row)  # views of data, until its next use
+        return found.swapaxes(0, 1)
+
+    @contextmanager
+    def _idle_data(self) -> Iterator[Any]:
+        """Pinocchio's work space: one for each thread that was here at once, for they take long to make."""
+        idle = vars(self).setdefault("_idle", [])
         try:
             data = idle.pop()
         except IndexError:
             data = self.model.createData()
-        found = np.empty((n, 1 if algorithm == "computeGeneralizedGravityDerivatives" else 3, n_joints, n_joints))
-        for matrices, *row in zip(found, *rows, strict=True):
-            matrices[:] = derive(self.model, data, *row)  # views of data, until its next use
+        yield data
         idle.append(data)
-        return found.swapaxes(0, 1)
 
     def _over_rows(self, algorithm: str, *rows: np.ndarray) -> np.ndarray:
         pin = require("pinocchio", "Rigid-body dynamics")

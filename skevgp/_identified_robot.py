@@ -1,0 +1,139 @@
+"""What a fitted model of torques says of the robot: its inertias, a model with them, and what it carries."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.base import BaseEstimator
+from sklearn.utils import Bunch
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from ._joint_residual import JointResidual
+from ._payload import find_payload, payload_prior
+from ._validation import check_real, checked_groups
+from .identification.rows_of_logs import blocks_of
+from .identification.weights import Rows, Weights
+
+
+def _knows_a_robot(model: IdentifiedRobot) -> bool:
+    if not hasattr(model, "feature_map_") or model._has_robot:
+        return True
+    raise AttributeError("It needs a robot: give InverseDynamics one.")
+
+
+class IdentifiedRobot(BaseEstimator):
+    """What `InverseDynamics` knows of the robot after `fit`, and how its rows become those of a regression."""
+
+    feature_map_: Any
+    _weights: Weights
+    _joints: list[JointResidual]
+
+    @property
+    def _has_robot(self) -> bool:
+        return bool(getattr(self.feature_map_, "share_coef", False))
+
+    def _as_rows(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray | None) -> Rows:
+        n, n_outputs = y.shape
+        runs = np.zeros(n, dtype=int) if groups is None else groups
+        return Rows(self._features(X, n_outputs), y, self._speed(X, n_outputs), runs, blocks_of(groups, n))
+
+    def _speed(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
+        """q̇ of each joint, (n, o)."""
+        return X[:, n_outputs : 2 * n_outputs] if self._has_robot else np.zeros((len(X), n_outputs))
+
+    def _features(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
+        """H (n, o, p); of a map without a row for each output, weights of each output side by side, with a constant."""
+        H = self.feature_map_.transform(X)
+        if H.ndim == 3:
+            return H
+        own = np.column_stack([H, np.ones(len(H))])
+        features = np.zeros((len(H), n_outputs, n_outputs, own.shape[1]))
+        features[:, range(n_outputs), range(n_outputs)] = own[:, np.newaxis]
+        return features.reshape(len(H), n_outputs, -1)
+
+    def _own(self, X: np.ndarray, torque: np.ndarray, joint: int) -> np.ndarray:
+        """x_j, the columns that f_j sees."""
+        if not self._has_robot:
+            return X
+        return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
+
+    @available_if(_knows_a_robot)
+    def estimate_payload(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        groups: ArrayLike | None = None,
+        link: int = -1,
+        mass_scale: float = 5.0,
+        size: float = 0.2,
+    ) -> Bunch:
+        """Find what the robot carries in other logs than those of `fit`.
+
+        Torques with the load, less those of the model, are linear in the ten parameters of the load; what is still
+        uncertain of the robot, its friction and its gains is carried along.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            With the load, in the order of time.
+        y : array-like of shape (n_samples, n_joints)
+        groups : array-like of shape (n_samples,), default=None
+            As in `fit`.
+        link : int, default=-1
+            Which joint's link it is fixed to: the last.
+        mass_scale : float, default=5.0
+            Prior standard deviation of its mass, kg, around 0.
+        size : float, default=0.2
+            Its size with its distance from the joint's frame, m: prior standard deviation of its centre of mass.
+
+        Returns
+        -------
+        payload : Bunch
+            - ``mass``, ``mass_std``, kg, and ``mass_interval``, which holds 95 %;
+            - ``com``, ``com_std`` : ndarray of shape (3,), in the frame of the link's joint, m (to first order; NaN and
+              inf if the mass is not positive);
+            - ``parameters`` (10,), ``covariance`` (10, 10): as of a link.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If shapes do not fit, data are not finite, or an argument is out of its range.
+
+        References
+        ----------
+        - C. G. Atkeson, C. H. An, J. M. Hollerbach (1986): Estimation of Inertial Parameters of Manipulator Loads and
+          Links, section 2.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> rng = np.random.default_rng(0)
+        >>> X = rng.normal(size=(600, 3))
+        >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.01 * rng.normal(size=600)  # 1 kg at 0.5 m
+        >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X, y)
+        >>> payload = model.estimate_payload(X, 1.5 * y, size=0.5)  # and 0.5 kg at the same place
+        >>> (payload.parameters[[3]] / [-0.5]).round(2)  # its first moment is what torques tell
+        array([0.5])
+        """
+        check_is_fitted(self)
+        n_outputs = len(self._joints)
+        rows_x, targets = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, reset=False)
+        targets = np.asarray(targets, dtype=np.float64).reshape(len(rows_x), -1)
+        if targets.shape[1] != n_outputs:
+            raise ValueError(f"y has {targets.shape[1]} columns; the robot has {n_outputs} joints.")
+        if not -n_outputs <= link < n_outputs:
+            raise ValueError(f"link={link} must be the index of one of the {n_outputs} links.")
+        check_real(mass_scale, "mass_scale", minimum=0.0, strict=True)
+        check_real(size, "size", minimum=0.0, strict=True)
+        labels = checked_groups(groups, len(rows_x))
+        rows = self._as_rows(rows_x, targets, labels)
+
+        def missed(torque: np.ndarray) -> np.ndarray:
+            return np.column_stack([f.mean(self._own(rows_x, torque, j)) for j, f in enumerate(self._joints)])
+
+        return find_payload(rows, link % n_outputs, payload_prior(self._weights, mass_scale, size), missed)

@@ -1,0 +1,334 @@
+"""InverseDynamics: joint torques with bands, and a posterior over masses and friction, from a robot's own logs."""
+
+from __future__ import annotations
+
+from numbers import Integral, Real
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import ArrayLike
+from sklearn.base import RegressorMixin, TransformerMixin, clone
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import check_random_state
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from ._coef_prior import wide_scale
+from ._identified_robot import IdentifiedRobot
+from ._joint_residual import JointResidual, fit_joint_residual
+from ._shapes import like_y
+from ._sklearn import Interval, fit_context
+from ._validation import check_magnitude, checked_groups, unchanged_if_it_fails
+from .exceptions import warn_user
+from .features import RigidBodyRegressor
+from .identification.stiction import likeliest_noise
+from .identification.weights import Prior, Rows, identify, left_out, with_gains
+from .robots.loading import Robot
+
+
+class InverseDynamics(RegressorMixin, IdentifiedRobot):
+    r"""Joint torques of a robot with bands, and its masses and friction with their uncertainty, from logs.
+
+    .. math::
+
+        \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + f_j(x_j) + \varepsilon_j
+
+    The weights β = (π, φ) of `RigidBodyRegressor`, which all joints share, have the robot's model as prior mean; c are
+    errors of the motors' gains, if these are not known. f_j is a sparse Gaussian process (`EVGPRegressor`) of what that
+    leaves in joint j, and sees the joint's own columns only, :math:`x_j = (q_j, \dot q_j, \ddot q_j, \hat\tau_j)`, with
+    the torque that the rest predicts (friction of gears depends on load and speed): columns of other joints would be
+    excuses that hold for one trajectory. Below some speed friction has no sign: the noise is larger there by what
+    Coulomb's friction leaves open.
+
+    Parameters
+    ----------
+    robot : RigidBodyRegressor, str, path-like, System, pinocchio.Model or None, default=None
+        The approximate model: a URDF with wrong masses. `RigidBodyRegressor` sets friction and the prior's scales.
+        Without one each output has a linear model, and a Gaussian process of all columns.
+    gain_scale : float, default=0.0
+        Prior standard deviation of the relative error of each joint's gain, as between currents and torques: 0.1 for
+        gains of a catalogue. 0: y are torques. Predictions hardly depend on it, masses and their intervals do.
+    n_inducing : int, default=40
+        Inducing points of each f_j; 0 leaves f_j out.
+    max_rows : int, default=3000
+        Rows that each f_j is fitted to, evenly spread: those of a log at 100 Hz hardly differ. Weights see all.
+    max_iter : int, default=None
+        As in `EVGPRegressor`.
+    n_jobs : int, default=None
+        Joints that are fitted at the same time, in threads; None means 1, -1 all cores.
+    random_state : int, RandomState instance or None, default=None
+        Places inducing points.
+
+    Attributes
+    ----------
+    coef_, coef_std_ : ndarray of shape (n_h,)
+        Posterior means and standard deviations of β, in the order of ``coef_names_``.
+    coef_cov_ : ndarray of shape (n_h, n_h)
+    coef_names_ : ndarray of str of shape (n_h,)
+        As m(q1), mcx(q1), ..., viscous(q1), ...
+    coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
+        Where a standard deviation is still that of the prior, torques did not show it.
+    gains_, gains_std_ : ndarray of shape (n_outputs,)
+        1 + c: torques of the model times these are those of y.
+    noise_variance_ : ndarray of shape (n_outputs,)
+        σ², of a joint that moves.
+    standing_std_ : ndarray of shape (n_outputs,)
+        What friction adds at rest, a standard deviation.
+    residual_std_ : ndarray of shape (n_outputs,)
+        Standard deviation of each f_j a priori, 0 where there is none.
+    residual_models_ : list of EVGPRegressor or None
+        The f_j.
+    correlation_time_ : ndarray of shape (n_outputs,)
+        How many rows say as much about the weights as an independent one.
+    feature_map_ : transformer
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    skevgp.datasets.load_log : Positions, velocities, accelerations and torques of a log.
+    EVGPRegressor : With ``feature_map=RigidBodyRegressor(robot)`` the joint model, without what is special here.
+
+    Notes
+    -----
+    Weights are found first, by Bayesian regression in which filtered rows count as what they are worth
+    (``correlation_time_``), and as blocks or groups differ from each other; noise, its part from standing friction
+    and gains are found with them. :math:`\hat\tau` of a training row is predicted from other groups, or blocks of rows,
+    so that y is not used twice. Signal and noise of f_j are calibrated by groups that are left out; f_j is never larger
+    than the residuals, and its lengthscales (but for speeds) are no shorter than a column's standard deviation.
+    Memory: 8 bytes times n_samples * n_outputs * n_h, a few times.
+
+    References
+    ----------
+    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, sections 2.1 and 2.7.
+    - C. J. Geyer (1992): Practical Markov Chain Monte Carlo. Statistical Science.
+
+    Examples
+    --------
+    A pendulum of 1 kg that is believed to weigh 1.2, with friction:
+
+    >>> import numpy as np
+    >>> from skevgp import InverseDynamics
+    >>> from skevgp.datasets import load_robot, perturb_robot
+    >>> from skevgp.features import RigidBodyRegressor
+    >>> t = np.arange(0.0, 20.0, 0.01)
+    >>> q = np.sin(t) + 0.5 * np.sin(2.7 * t)
+    >>> dq = np.gradient(q, t)
+    >>> X = np.column_stack([q, dq, np.gradient(dq, t)])
+    >>> torque = X[:, 2] / 4 + 9.81 / 2 * np.sin(q) + 0.1 * dq + 0.3 * np.tanh(dq / 0.01)
+    >>> y = torque + 0.05 * np.random.default_rng(0).standard_normal(len(t))
+    >>> model = InverseDynamics(perturb_robot("pendulum", random_state=0), random_state=0).fit(X, y)
+    >>> mean, std = model.predict(X, return_std=True)
+    >>> round(model.score(X, y), 3)
+    1.0
+    >>> weights = dict(zip(model.coef_names_, model.coef_.round(2)))
+    >>> float(abs(weights["coulomb(q)"])), float(weights["viscous(q)"])
+    (0.3, 0.1)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "robot": "no_validation",
+        "gain_scale": [Interval(Real, 0, None, closed="left")],
+        "n_inducing": [Interval(Integral, 0, None, closed="left")],
+        "max_rows": [Interval(Integral, 10, None, closed="left")],
+        "max_iter": [Interval(Integral, 0, None, closed="left"), None],
+        "n_jobs": [Integral, None],
+        "random_state": ["random_state"],
+    }
+
+    def __init__(
+        self,
+        robot: RigidBodyRegressor | Robot | None = None,
+        *,
+        gain_scale: float = 0.0,
+        n_inducing: int = 40,
+        max_rows: int = 3000,
+        max_iter: int | None = None,
+        n_jobs: int | None = None,
+        random_state: int | np.random.RandomState | None = None,
+    ):
+        self.robot = robot
+        self.gain_scale = gain_scale
+        self.n_inducing = n_inducing
+        self.max_rows = max_rows
+        self.max_iter = max_iter
+        self.n_jobs = n_jobs
+        self.random_state = random_state
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def fit(self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None) -> Self:
+        """Find weights, noise, and what physics missed.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈] in the order of time: rad, rad/s, rad/s² (of prismatic joints m, ...).
+        y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
+            Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents.
+        groups : array-like of shape (n_samples,), default=None
+            Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least two;
+            of one, blocks of rows stand in for groups.
+
+        Returns
+        -------
+        self : InverseDynamics
+
+        Raises
+        ------
+        ImportError
+            If Pinocchio is needed and not installed; the message gives the pip command.
+        ValueError, TypeError
+            If an argument is out of its range, the data are not finite, or shapes do not fit.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If f_j of some joints holds for no group that was left out: its signal is then nearly 0.
+        """
+        with unchanged_if_it_fails(self):
+            self._fit(X, y, groups)
+        lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
+        if lost:
+            warn_user(
+                f"What physics leaves of {lost} repeats in no group of rows that was left out: these torques are "
+                "predicted by physics, and std says so. More trajectories may show more; n_inducing=0 does not look.",
+                ConvergenceWarning,
+            )
+        return self
+
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None) -> None:
+        rows_x: np.ndarray
+        rows_x, targets = validate_data(
+            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
+        )
+        targets = np.asarray(targets, dtype=np.float64)
+        self._one_dimensional = targets.ndim == 1
+        targets = targets.reshape(len(targets), -1)
+        check_magnitude(rows_x, "X")
+        check_magnitude(targets, "y")
+        labels = checked_groups(groups, len(rows_x))
+        self.feature_map_ = self._map().fit(X)
+        rows, prior = self._rows(rows_x, targets, labels)
+        self._weights = identify(rows, prior)
+        self._outputs = self._output_names(targets.shape[1])
+        self._joints = self._residuals(rows_x, rows)
+        self._set_attributes()
+
+    def _map(self) -> TransformerMixin:
+        if isinstance(self.robot, TransformerMixin):
+            return clone(self.robot)
+        return RigidBodyRegressor(self.robot)
+
+    def _rows(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray | None) -> tuple[Rows, Prior]:
+        """What the regression sees, and its prior."""
+        n_outputs = y.shape[1]
+        rows = self._as_rows(X, y, groups)
+        features = rows.features
+        names = [str(name) for name in self._names(n_outputs)]
+        if hasattr(self.feature_map_, "coef_prior"):
+            mean, covariance = self.feature_map_.coef_prior(n_outputs)
+        else:
+            size = np.sqrt(np.mean(features**2, axis=0))
+            scale = wide_scale(size, y.std(axis=0), np.abs(y).max(axis=0), shared=True)[0]
+            mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
+        coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
+        inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
+        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocity)
+        return rows, with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
+
+    @property
+    def _velocity(self) -> float:
+        return float(getattr(self.feature_map_, "stiction_velocity", 0.01))
+
+    def _names(self, n_outputs: int) -> np.ndarray:
+        names = self.feature_map_.get_feature_names_out()
+        if self._has_robot:
+            return names
+        return np.array([f"{name}({o})" for o in range(n_outputs) for name in [*names, "1"]], dtype=object)
+
+    def _output_names(self, n_outputs: int) -> list[str]:
+        layout = getattr(self.feature_map_, "_layout", None)
+        return [f"output {o}" for o in range(n_outputs)] if layout is None else list(layout.position_names)
+
+    def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
+        weights, y = self._weights, rows.targets
+        guessed = left_out(rows, weights.prior)
+        if self.n_inducing == 0:
+            coulomb = [noise.coulomb for noise in weights.noise]
+            left = (y - guessed).T
+            every = zip(left, rows.speed.T, coulomb, strict=True)
+            return [JointResidual(None, likeliest_noise(*one, self._velocity)) for one in every]
+        residual = y - weights.predict(rows.features)
+        some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
+        seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
+        options = {"n_inducing": self.n_inducing, "max_iter": self.max_iter, "random_state": seed}
+        fits = (
+            delayed(fit_joint_residual)(
+                self._own(X, guessed, j),
+                residual[:, j],
+                rows.speed[:, j],
+                weights.noise[j],
+                self._velocity,
+                rows.blocks,
+                some,
+                1 if self._has_robot else None,
+                **options,
+            )
+            for j in range(y.shape[1])
+        )
+        return Parallel(n_jobs=self.n_jobs, prefer="threads")(fits)
+
+    def _set_attributes(self) -> None:
+        weights, n_outputs = self._weights, len(self._joints)
+        p = weights.n_weights
+        std = np.sqrt(np.maximum(np.diag(weights.covariance), 0.0))
+        self.coef_, self.coef_std_, self.coef_cov_ = weights.mean[:p], std[:p], weights.covariance[:p, :p]
+        self.coef_names_ = self._names(n_outputs)
+        self.coef_prior_mean_ = weights.prior.mean[:p]
+        self.coef_prior_scale_ = np.sqrt(np.diag(weights.prior.covariance)[:p])
+        self.gains_ = weights.gains(n_outputs)
+        self.gains_std_ = std[p:] if len(std) > p else np.zeros(n_outputs)
+        noise = [joint.noise for joint in self._joints]
+        self.noise_variance_ = np.array([one.variance for one in noise])
+        self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
+        self.residual_std_ = np.array([joint.signal for joint in self._joints])
+        self.residual_models_ = [joint.model for joint in self._joints]
+        self.correlation_time_ = weights.correlation_time
+
+    def predict(
+        self, X: ArrayLike, return_std: bool = False, include_noise: bool = True
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Predict torques.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+        return_std : bool, default=False
+        include_noise : bool, default=True
+            Whether standard deviations are those of measured torques.
+
+        Returns
+        -------
+        mean : ndarray of the shape of y
+        std : ndarray of the same shape
+            If ``return_std``.
+        """
+        check_is_fitted(self)
+        rows: np.ndarray = validate_data(self, X, dtype=np.float64, reset=False)
+        check_magnitude(rows, "X")
+        n_outputs = len(self._joints)
+        features = self._features(rows, n_outputs)
+        physics = self._weights.predict(features)
+        mean = physics + np.column_stack([f.mean(self._own(rows, physics, j)) for j, f in enumerate(self._joints)])
+        if not return_std:
+            return self._like_y(mean)
+        variance = self._weights.variance(features)
+        for j, joint in enumerate(self._joints):
+            variance[:, j] += joint.variance(self._own(rows, physics, j))
+            if include_noise:
+                variance[:, j] += joint.noise.of(self._speed(rows, n_outputs)[:, j])
+        return self._like_y(mean), self._like_y(np.sqrt(variance))
+
+    def _like_y(self, values: np.ndarray) -> np.ndarray:
+        return like_y(values) if self._one_dimensional else values
