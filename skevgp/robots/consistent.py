@@ -6,10 +6,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .._validation import as_floats, check_real
-from .inertia import N_PARAMETERS, checked_parameters, from_pseudo_inertia, physical_consistency, pseudo_inertia
+from .._validation import check_real
+from .inertia import (
+    N_PARAMETERS,
+    checked_covariance,
+    checked_parameters,
+    from_pseudo_inertia,
+    physical_consistency,
+    pseudo_inertia,
+)
 
-# Variances that are added, as shares of the largest, until there is a consistent answer: pinned parameters may have none.
+# Variances that are added, as shares of the largest, until there is a consistent answer: what is pinned may have none.
 _FLOORS = (0.0, 1e-12, 1e-8, 1e-4, 1.0)
 # The barrier's weight falls by _FALL until what is lost by it is this share of the distance.
 _FALL, _LOST = 0.1, 1e-12
@@ -84,8 +91,8 @@ def nearest_consistent(mean: np.ndarray, covariance: np.ndarray, *, margin: floa
     the problem one of nonlinear least squares; with standard deviations that differ by a factor of 1e6 it is a curved
     valley as narrow.)
     """
-    mean = checked_parameters(mean, len(np.atleast_1d(np.asarray(mean, dtype=object))), "mean")
-    covariance = _checked_covariance(covariance, mean.size)
+    mean = checked_parameters(mean, None, "mean")
+    covariance = checked_covariance(covariance, mean.size)
     margin = check_real(margin, "margin", minimum=0.0, strict=True)
     if margin > 0.1:
         raise ValueError(f"margin must be in (0, 0.1]; got {margin!r}.")
@@ -106,7 +113,7 @@ def _nearest(mean: np.ndarray, covariance: np.ndarray, margin: float) -> np.ndar
     inside = np.where(physical_consistency(mean) > 0.0, np.clip(0.5 * smallest, 0.0, margin), margin)
     identity = np.einsum("aij,ij->a", _BASIS, np.eye(4))
     target = inside[:, None] * identity - scaled @ _PSEUDO.T
-    for floor in _FLOORS:
+    for floor in _FLOORS if deviations.size else _FLOORS[-1:]:
         factor = np.hstack([deviations, np.sqrt(floor) * np.eye(mean.size)]) if floor else deviations
         links = factor.reshape(*mean.shape, -1)
         z = _least_norm(_Problem(np.einsum("ap,lpk->lak", _PSEUDO, links), target))
@@ -118,17 +125,8 @@ def _nearest(mean: np.ndarray, covariance: np.ndarray, margin: float) -> np.ndar
     return from_pseudo_inertia(_clipped(pseudo_inertia(scaled), margin)) * units
 
 
-def _checked_covariance(covariance: np.ndarray, size: int) -> np.ndarray:
-    array = as_floats(covariance, "covariance")
-    if array.shape != (size, size):
-        raise ValueError(f"covariance must have the shape (10 * n_links, 10 * n_links) = {size, size}; got {array.shape}.")
-    if not np.isfinite(array).all() or (np.diag(array) < 0.0).any():
-        raise ValueError("covariance must be finite, and its variances not negative.")
-    return 0.5 * (array + array.T)
-
-
 def _units(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Of each link's parameters, by its scales of mass and second moments; what a mean near 0 hides the std may tell."""
+    """Of each link's parameters, by its scales of mass and second moments: the std's where the mean is near 0."""
     variances = np.diag(covariance).reshape(mean.shape)
     mass = _scale(np.abs(mean[:, 0]), np.sqrt(variances[:, 0]))
     moments = np.linalg.eigvalsh(pseudo_inertia(mean)[:, :3, :3])

@@ -185,14 +185,27 @@ def with_parameters(
     return copy
 
 
-def checked_parameters(parameters: Any, n_links: int, name: str = "parameters") -> np.ndarray:
-    """Finite numbers of shape (n_links, 10), or an error that names them."""
+def checked_parameters(parameters: Any, n_links: int | None = None, name: str = "parameters") -> np.ndarray:
+    """Finite numbers of shape (n_links, 10), None for any number of links, or an error that names them."""
     array = as_floats(parameters, name)
-    if array.shape != (n_links, N_PARAMETERS):
-        raise ValueError(f"{name} must have the shape (n_links, 10) = ({n_links}, 10); got {array.shape}.")
+    if array.ndim != 2 or array.shape != (n_links or len(array), N_PARAMETERS):
+        number = "" if n_links is None else f" = ({n_links}, {N_PARAMETERS})"
+        raise ValueError(f"{name} must have the shape (n_links, {N_PARAMETERS}){number}; got {array.shape}.")
     if not np.isfinite(array).all():
         raise ValueError(f"{name} must be finite.")
     return array
+
+
+def checked_covariance(covariance: Any, size: int) -> np.ndarray:
+    """A finite symmetric matrix of shape (size, size) without negative variances, or an error."""
+    array = as_floats(covariance, "covariance")
+    if array.shape != (size, size):
+        raise ValueError(
+            f"covariance must have the shape (10 * n_links, 10 * n_links) = {(size, size)}; got {array.shape}."
+        )
+    if not np.isfinite(array).all() or (np.diag(array) < 0.0).any():
+        raise ValueError("covariance must be finite, and its variances not negative.")
+    return 0.5 * (array + array.T)
 
 
 def checked_links(parameters: Any, names: list[str]) -> np.ndarray:
@@ -201,9 +214,9 @@ def checked_links(parameters: Any, names: list[str]) -> np.ndarray:
     for link, name, consistency in zip(array, names, physical_consistency(array), strict=True):
         if consistency <= 0.0 and link.any():
             raise ValueError(
-                f"No body can have the parameters of the link that the joint {name!r} moves (mass {link[0]:.3g}): their "
-                f"physical_consistency is {consistency:.3g} and must be above 0. Use nearest_consistent, which finds "
-                "the parameters nearest to them that bodies can have."
+                f"No body can have the parameters of the link that the joint {name!r} moves (mass {link[0]:.3g}): "
+                f"their physical_consistency is {consistency:.3g} and must be above 0. Use nearest_consistent, which "
+                "finds the parameters nearest to them that bodies can have."
             )
     return array
 
