@@ -18,11 +18,12 @@ from .inertia import (
 
 # Variances that are added, as shares of the largest, until there is a consistent answer: what is pinned may have none.
 _FLOORS = (0.0, 1e-12, 1e-8, 1e-4, 1.0)
-# The barrier's weight falls by _FALL until what is lost by it is this share of the distance.
-_FALL, _LOST = 0.1, 1e-12
-_STEPS = 60
+# The barrier's weight falls by _FALL until what is lost by it is this share of the distance
+# (_ROUGHLY where rounding ends it).
+_FALL, _LOST, _ROUGHLY = 0.1, 1e-12, 1e-6
+_STEPS = 100
 # Newton's decrement at which the next weight is taken, and at the last one.
-_NEAR, _THERE = 0.3, 1e-9
+_NEAR, _THERE = 0.3, 1e-6
 _LARGEST_FORCE = 1e15
 
 
@@ -119,7 +120,7 @@ def _nearest(mean: np.ndarray, covariance: np.ndarray, margin: float) -> np.ndar
         z = _least_norm(_Problem(np.einsum("ap,lpk->lak", _PSEUDO, links), target))
         if z is None:
             continue
-        found = (scaled + links @ z) * units
+        found = mean + (links @ z) * units  # what is pinned keeps its bits
         if (physical_consistency(found) > 0.0).all():
             return found
     return from_pseudo_inertia(_clipped(pseudo_inertia(scaled), margin)) * units
@@ -154,18 +155,22 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
 def _least_norm(problem: _Problem) -> np.ndarray | None:
     """The solution z = factorᵀ Z, or None if there is none within reach of numbers."""
     links = len(problem.target)
-    roots, weight = np.tile(np.eye(4), (links, 1, 1)), 1.0
+    roots = np.tile(np.eye(4), (links, 1, 1))
+    z = _pushed(problem, roots)
+    # So large that the start is near the centre: from elsewhere Newton's steps end at the cone's border.
+    weight = z @ z + np.abs(problem.target).sum()
     while True:
-        roots, z = _centre(problem, roots, weight, _NEAR)
-        if np.abs(roots).max() ** 2 > _LARGEST_FORCE:
-            return None
-        if 4 * links * weight <= _LOST * (z @ z) or weight < np.finfo(np.float64).tiny:
+        roots, z, is_near = _centre(problem, roots, weight, _NEAR)
+        lost = 4 * links * weight / max(z @ z, np.finfo(np.float64).tiny)
+        if lost <= _LOST:
             return _centre(problem, roots, weight, _THERE)[1]
+        if not is_near:
+            return z if lost <= _ROUGHLY else None
         weight *= _FALL
 
 
-def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) -> tuple[np.ndarray, np.ndarray]:
-    """Newton's steps to the minimum over Z = R Rᵀ of |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z."""
+def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) -> tuple[np.ndarray, np.ndarray, bool]:
+    """Newton's steps to the least, over Z = R Rᵀ, of |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z, if they arrive."""
     identity = np.einsum("aij,ij->a", _BASIS, np.eye(4))
     z = _pushed(problem, roots)
     for _ in range(_STEPS):
@@ -176,7 +181,7 @@ def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) ->
         step = -np.linalg.solve(factor @ factor.T + weight * np.eye(len(factor)), gradient)
         slope = gradient @ step
         if not -slope > near**2 * weight:
-            break
+            return roots, z, True
         moves = np.einsum("na,aij->nij", step.reshape(-1, N_PARAMETERS), _BASIS)
         stretch = np.linalg.eigvalsh(moves)
         pushed = step @ factor
@@ -190,7 +195,7 @@ def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) ->
         z = _pushed(problem, roots)
         if not np.abs(roots).max() ** 2 <= _LARGEST_FORCE:
             break
-    return roots, z
+    return roots, z, False
 
 
 def _pushed(problem: _Problem, roots: np.ndarray) -> np.ndarray:
