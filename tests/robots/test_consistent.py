@@ -185,6 +185,18 @@ def test_robots_whose_files_no_body_can_have(name):
     assert physical_consistency(found).min() > 0.0
 
 
+@pytest.mark.parametrize("seed", range(12))
+def test_covariances_of_all_kinds_have_an_answer(seed):
+    """Singular ones too, whose deviations differ by up to 1e8 beside pinned parameters."""
+    rng = np.random.default_rng(seed)
+    n = 10 * rng.integers(1, 5)
+    factor = 10.0 ** rng.uniform(-3, 1, (n, 1)) * rng.normal(size=(n, n)) * 10.0 ** -rng.uniform(0, 8, n)
+    factor[rng.random(n) < [0.0, 0.1, 0.5, 0.9][seed % 4]] = 0.0
+    scale = 10.0 ** rng.uniform(-6, 4)
+    found = nearest_consistent(rng.normal(size=(n // 10, 10)) * scale, factor @ factor.T * scale**2)
+    assert physical_consistency(found).min() > 0.0
+
+
 # --- arguments -----------------------------------------------------------------------------------------------------
 
 
