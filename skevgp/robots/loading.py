@@ -73,7 +73,7 @@ def load_robot(robot: Robot) -> Any:
     if system is not None:
         return _plain(_model_of_table(system), f"The system {system.name!r}")
     if isinstance(robot, (str, os.PathLike)):
-        path = _path_of(robot)
+        path = urdf_path(robot)
         pin = require("pinocchio", "Loading a robot")
         try:
             model = pin.buildModelFromUrdf(str(path))
@@ -190,8 +190,8 @@ def _axis(joint: Any) -> np.ndarray:
     return np.asarray(data.S, dtype=float).reshape(-1)
 
 
-def _path_of(robot: str | os.PathLike[str]) -> Path:
-    """The URDF file of a name or path."""
+def urdf_path(robot: str | os.PathLike[str]) -> Path:
+    """The URDF file of a name or path, or an error that lists the known names."""
     names = _collection()
     if isinstance(robot, str) and robot in names:
         return names[robot]
