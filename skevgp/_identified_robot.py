@@ -81,6 +81,7 @@ class IdentifiedRobot(BaseEstimator):
         X : array-like of shape (n_samples, 3 * n_joints)
             With the load, in the order of time.
         y : array-like of shape (n_samples, n_joints)
+            Torques with the load, in the units of `fit`.
         groups : array-like of shape (n_samples,), default=None
             As in `fit`.
         link : int, default=-1
@@ -93,6 +94,8 @@ class IdentifiedRobot(BaseEstimator):
         Returns
         -------
         payload : Bunch
+            What it carries:
+
             - ``mass``, ``mass_std``, kg, and ``mass_interval``, which holds 95 %;
             - ``com``, ``com_std`` : ndarray of shape (3,), in the frame of the link's joint, m (to first order; NaN and
               inf if the mass is not positive);

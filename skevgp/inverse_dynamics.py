@@ -10,7 +10,7 @@ from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
 from sklearn.base import RegressorMixin, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_random_state
+from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._coef_prior import wide_scale
@@ -80,6 +80,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         The f_j.
     correlation_time_ : ndarray of shape (n_outputs,)
         How many rows say as much about the weights as an independent one.
+    n_iter_ : int
+        The most iterations that an f_j took.
     feature_map_ : transformer
     n_features_in_ : int
     feature_names_in_ : ndarray of str
@@ -156,6 +158,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.n_jobs = n_jobs
         self.random_state = random_state
 
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
     @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None) -> Self:
         """Find weights, noise, and what physics missed.
@@ -173,6 +180,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Returns
         -------
         self : InverseDynamics
+            The estimator itself, fitted.
 
         Raises
         ------
@@ -208,7 +216,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_magnitude(rows_x, "X")
         check_magnitude(targets, "y")
         labels = checked_groups(groups, len(rows_x))
-        self.feature_map_ = self._map().fit(X)
+        self._map().fit(X)  # a frame's columns must be in the robot's order
+        self.feature_map_ = self._map().fit(rows_x)
         rows, prior = self._rows(rows_x, targets, labels)
         self._weights = identify(rows, prior)
         self._outputs = self._output_names(targets.shape[1])
@@ -294,6 +303,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
         self.residual_std_ = np.array([joint.signal for joint in self._joints])
         self.residual_models_ = [joint.model for joint in self._joints]
+        self.n_iter_ = max([1, *(model.n_iter_ for model in self.residual_models_ if model is not None)])
         self.correlation_time_ = weights.correlation_time
 
     def predict(
@@ -304,15 +314,18 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Parameters
         ----------
         X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈].
         return_std : bool, default=False
+            Whether standard deviations are wanted.
         include_noise : bool, default=True
             Whether standard deviations are those of measured torques.
 
         Returns
         -------
-        mean : ndarray of the shape of y
+        mean : ndarray of shape (n_samples,) or (n_samples, n_joints)
+            Torques, like y.
         std : ndarray of the same shape
-            If ``return_std``.
+            Their standard deviations; only with ``return_std``.
         """
         check_is_fitted(self)
         rows: np.ndarray = validate_data(self, X, dtype=np.float64, reset=False)

@@ -3,8 +3,15 @@ from sklearn.linear_model import LinearRegression
 from sklearn.utils import estimator_checks
 from sklearn.utils.estimator_checks import parametrize_with_checks
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp.features import (
+    AngleEncoder,
+    InertiaForce,
+    InertiaForceGravity,
+    LinkGravity,
+    NominalDynamics,
+    RigidBodyRegressor,
+)
 
 pytestmark = pytest.mark.slow
 MAPS = [
@@ -14,6 +21,7 @@ MAPS = [
     InertiaForceGravity(),
     LinkGravity(),
     NominalDynamics(),
+    RigidBodyRegressor(),
 ]
 RESIDUALS = [ResidualRegressor(LinearRegression()), ResidualRegressor(EVGPRegressor(n_inducing=5, random_state=0))]
 # Its defaults take seconds per fit.
@@ -25,7 +33,7 @@ SPARSE = [
     EVGPRegressor(sharing="auto"),
     EVGPRegressor(noise="student-t"),
 ]
-ESTIMATORS = [*SPARSE, EGPRegressor(), QUICK_NETWORK, *RESIDUALS, *MAPS]
+ESTIMATORS = [*SPARSE, EGPRegressor(), InverseDynamics(), QUICK_NETWORK, *RESIDUALS, *MAPS]
 
 
 @parametrize_with_checks(ESTIMATORS)

@@ -212,6 +212,7 @@ class RigidBodyRegressor(RobotTransformer):
         mean : ndarray of shape (n_features_out,)
             Of the robot's model: its links, armatures, damping and dry friction; offsets 0.
         covariance : ndarray of shape (n_features_out, n_features_out)
+            Of independent links; to first order in the errors of mass, centre of mass and shape.
 
         Raises
         ------

@@ -60,25 +60,48 @@ def noise_at(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: fl
     return JointNoise(float(np.exp(found.x)), coulomb, velocity)
 
 
-def likeliest_noise(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float) -> JointNoise:
-    """The same with the most likely v_s, which depends on how signals were filtered; it starts at ``velocity``."""
+def likeliest_noise(
+    errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, start: JointNoise | None = None
+) -> JointNoise:
+    """The same with the most likely v_s, which depends on how signals were filtered.
+
+    Parameters
+    ----------
+    errors, speed : ndarray of shape (n,)
+    coulomb : float
+    velocity : float
+        Where v_s starts.
+    start : JointNoise, optional
+        Of errors that were nearly the same: it starts there alone.
+
+    Returns
+    -------
+    noise : JointNoise
+    """
     if coulomb == 0.0:
         return noise_at(errors, speed, coulomb, velocity)
-    size = _size(errors, coulomb)
+    size, largest, squares = _size(errors, coulomb), coulomb**2 / 3.0, errors**2
 
-    def loss(logs: np.ndarray) -> float:
-        variance = JointNoise(np.exp(logs[0]), coulomb, np.exp(logs[1])).of(speed)
-        return float(np.mean(np.log(variance) + errors**2 / variance))
+    def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
+        ratio = speed / np.exp(logs[1])
+        sign = np.tanh(ratio)
+        standing = largest * (1.0 - sign**2)
+        variance = np.exp(logs[0]) + standing
+        slope = (1.0 - squares / variance) / variance
+        by_logs = [np.mean(slope) * np.exp(logs[0]), np.mean(slope * standing * 2.0 * sign * ratio)]
+        return float(np.mean(np.log(variance) + squares / variance)), np.array(by_logs)
 
     slowest, fastest = min(_SLOWEST, velocity), max(_FASTEST, velocity)
-    limits = [(np.log(_FLOOR * size), np.log(2.0 * size)), (np.log(slowest), np.log(fastest))]
-    fits = [
-        minimize(loss, [np.log(share * size), np.log(start)], method="L-BFGS-B", bounds=limits)
-        for share in (1.0, 0.1)
-        for start in (velocity, np.sqrt(velocity * fastest))
-    ]
-    best = min(fits, key=lambda fit: fit.fun)
-    return JointNoise(float(np.exp(best.x[0])), coulomb, float(np.exp(best.x[1])))
+    limits = np.log([[_FLOOR * size, 2.0 * size], [slowest, fastest]])
+    if start is not None and start.coulomb > 0.0:
+        starts = [np.log([start.variance, start.velocity])]
+    else:
+        starts = [
+            np.log([share * size, first]) for share in (1.0, 0.1) for first in (velocity, np.sqrt(velocity * fastest))
+        ]
+    fits = [minimize(loss, np.clip(first, *limits.T), jac=True, method="L-BFGS-B", bounds=limits) for first in starts]
+    best = np.exp(min(fits, key=lambda fit: fit.fun).x)
+    return JointNoise(float(best[0]), coulomb, float(best[1]))
 
 
 def _size(errors: np.ndarray, coulomb: float) -> float:

@@ -11,6 +11,8 @@ from .stiction import JointNoise, likeliest_noise
 
 # Noise, its correlation and gains settle in so many rounds.
 _ROUNDS = 6
+# Noise is at least this share of an output's variance.
+_LEAST = 1e-12
 
 
 @dataclass(frozen=True)
@@ -128,7 +130,8 @@ def identify(rows: Rows, prior: Prior) -> Weights:
     y = rows.targets
     n_outputs = y.shape[1]
     root = _root(prior.covariance)
-    size = np.where(y.var(axis=0) > 0.0, y.var(axis=0), np.maximum(y**2, 1e-300).max(axis=0))
+    size = np.where(y.var(axis=0) > 0.0, y.var(axis=0), np.max(y**2, axis=0))
+    size = np.where(size > 0.0, size, 1.0)
     noise = [JointNoise(float(variance), 0.0, prior.velocity) for variance in size]
     times, mean = np.ones(n_outputs), prior.mean
     for _ in range(_ROUNDS):
@@ -140,7 +143,13 @@ def identify(rows: Rows, prior: Prior) -> Weights:
         mean = prior.mean + root @ z
         left = y - _forward(rows.features, mean, prior)
         coulomb = np.zeros(n_outputs) if prior.coulomb is None else np.abs(mean[prior.coulomb])
-        noise = [likeliest_noise(*one, prior.velocity) for one in zip(left.T, rows.speed.T, coulomb, strict=True)]
+        found = [
+            likeliest_noise(*one, prior.velocity, last)
+            for *one, last in zip(left.T, rows.speed.T, coulomb, noise, strict=True)
+        ]
+        noise = [
+            one._replace(variance=max(one.variance, _LEAST * whole)) for one, whole in zip(found, size, strict=True)
+        ]
         spread = np.sqrt(_variances(noise, rows.speed))
         times = np.array([correlation_time(errors, rows.runs) for errors in (left / spread).T])
     scale = 1.0 / (spread * np.sqrt(times))
