@@ -233,14 +233,14 @@ def setting_of(row: Row) -> Setting:
 
 
 def settings_of(rows: Sequence[Row]) -> list[Setting]:
-    """In the order in which they are looked at."""
+    """In the order in which they are looked at, networks last."""
     orders = list(SYSTEMS), list(MODELS), list(NOISES), list(SHARES)
 
     def place(setting: Setting) -> tuple[int, ...]:
         system, m, model, noise, share = setting
         known = zip(orders, (system, model, noise, share), strict=True)
         first, *others = (order.index(name) for order, name in known)
-        return (first, int(m), *others)
+        return (first, int(m) or sys.maxsize, *others)
 
     return sorted({setting_of(row) for row in rows}, key=place)
 
