@@ -108,6 +108,29 @@ def test_swing_up(monkeypatch, capsys, tmp_path, system):
     assert (tmp_path / f"swing_up_{system}.png").stat().st_size > 10_000
 
 
+@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
+def test_crocoddyl(monkeypatch, capsys, tmp_path, system):
+    pytest.importorskip("crocoddyl", reason="the extra 'control' is not installed")
+    names = run(EXAMPLES / "plot_crocoddyl.py", "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["success"]["with FDDP's gains"]
+    assert not names["success"]["inputs as planned"]
+    assert names["furthest"].keys() == {"Fx", "Fu", "Lx", "Lu", "Lxx", "Lxu", "Luu"}
+    assert 0.0 < max(names["furthest"].values()) < 1e-3  # differences of 1e-5
+    # The plan keeps the limit, and is a motion of the model.
+    Z, U, limit = names["Z"], names["U"], names["task"].limit
+    assert np.abs(U).max() == pytest.approx(limit)
+    np.testing.assert_allclose(names["fast"].predict(np.hstack([Z[:-1], U])), Z[1:], rtol=0, atol=1e-6)
+    assert "particles are" in capsys.readouterr().out
+    assert (tmp_path / f"crocoddyl_{system}.png").stat().st_size > 10_000
+
+
+def test_without_crocoddyl():
+    result = command_line(script=EXAMPLES / "plot_crocoddyl.py", code="sys.modules['crocoddyl'] = None")
+    assert result.returncode == 1
+    assert "pip install pin crocoddyl matplotlib" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -164,6 +187,7 @@ def test_without_an_optional_package(package, pip):
         "plot_any_robot.py",
         "plot_rollout.py",
         "plot_swing_up.py",
+        "plot_crocoddyl.py",
         "plot_online.py",
     ],
 )

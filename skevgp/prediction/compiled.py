@@ -53,6 +53,20 @@ class CompiledPredictor:
     >>> mean, std = fast.predict(np.array([1.0]), return_std=True)
     >>> mean.shape, fast.value_and_jacobian(X)[1].shape
     ((2,), (60, 2, 1))
+
+    As a ``ResidualModel`` of L4acados, whose Jacobians have the axis of outputs first, and always have it, and whose
+    zero-order controller reads the variances of the rows that were asked for last:
+
+    >>> class LearnedResidual:  # or of l4acados.models.ResidualModel, of which no more is asked
+    ...     def __init__(self, model):
+    ...         self.model = model
+    ...
+    ...     def value_and_jacobian(self, y):
+    ...         mean, jacobian, std, _ = self.model.value_and_jacobian(y, return_std=True)
+    ...         self.current_variance = std.reshape(len(y), -1) ** 2
+    ...         return mean.reshape(len(y), -1), jacobian.reshape(len(y), -1, y.shape[1]).swapaxes(0, 1)
+    >>> LearnedResidual(fast).value_and_jacobian(X)[1].shape
+    (2, 60, 1)
     """
 
     _state: _State

@@ -19,21 +19,24 @@ def rollouts(benchmarks):
 
 def test_it_runs_resumes_and_writes_its_page(run_script, tmp_path):
     output = tmp_path / "rollouts.csv"
-    arguments = ("--quick", "--models", "EVGP-IFG", "RES-VGP", "--jobs", "1", "--output", output)
+    arguments = ("--quick", "--models", "EVGP-IFG", "RES-VGP", "RES-DBNN", "--jobs", "1", "--output", output)
     run_script("rollouts.py", *arguments)
     rows = read(output)
-    assert {(row["model"], row["n_inducing"]) for row in rows} == {("EVGP-IFG", "10"), ("RES-VGP", "40")}
+    models = {("EVGP-IFG", "10"), ("RES-VGP", "40"), ("RES-DBNN", "0")}
+    assert {(row["model"], row["n_inducing"]) for row in rows} == models
     assert {(row["noise"], row["share"]) for row in rows} == {(a, b) for a in ("0.0", "0.01") for b in ("1", "0.1")}
     of_one = [row for row in rows if (row["model"], row["noise"], row["share"]) == ("EVGP-IFG", "0.0", "1")]
     assert len({(row["method"], row["steps"]) for row in of_one}) == len(of_one) == 5 * 4
+    assert {row["method"] for row in rows if row["model"] == "RES-DBNN"} == {"independent", "mean"}
     # What has no noise to draw has less of a band.
     first = {row["method"]: float(row["errors_in_std"]) for row in of_one if row["steps"] == "1"}
     assert first["consistent, no noise"] > first["consistent"]
     page = output.with_suffix(".md").read_text()
     assert "| pendulum m=10 | EVGP-IFG | none | 1 | consistent, no noise |" in page
     assert "| pendulum m=40 | RES-VGP | 1 % | 0.1 | consistent |" in page
+    assert "| pendulum | RES-DBNN | 1 % | 0.1 | independent |" in page
     assert "| 1 % | 0.1 | consistent | CR-2 from 0.9 to 0.99 |" in page
-    assert "8 of 8 cells are in" in run_script("rollouts.py", *arguments)
+    assert "12 of 12 cells are in" in run_script("rollouts.py", *arguments)
 
 
 def test_scores_of_samples_are_those_of_their_distribution(rollouts):
@@ -72,6 +75,13 @@ def test_an_independent_regressor_hides_its_functions(rollouts):
     np.testing.assert_array_equal(hidden.predict(X, return_std=True), model.predict(X, return_std=True))
     ahead = rollout(hidden, X[0, :1], X[:3, 1:], n_samples=4, random_state=0)
     assert ahead.samples.shape == (4, 3, 1)
+
+
+@pytest.mark.slow
+def test_the_arm_is_tested_on_slower_moves(rollouts):
+    train, test = rollouts.data(rollouts.Cell("iiwa14", "EVGP-IFG", 350, "0.0", "0.1", 0, "quick", 0))
+    assert train.data.shape == (6 * 50, 21)
+    assert test.trajectories.shape == (4, 101, 14)
 
 
 def test_what_runs_away_covers_nothing(rollouts, monkeypatch):
