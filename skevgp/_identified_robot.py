@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import numpy as np
@@ -16,6 +17,14 @@ from ._payload import find_payload, payload_prior
 from ._validation import check_real, checked_groups
 from .identification.rows_of_logs import blocks_of
 from .identification.weights import Rows, Weights
+from .robots import (
+    body_parameters,
+    load_robot,
+    nearest_consistent,
+    physical_consistency,
+    with_parameters,
+    write_urdf,
+)
 
 
 def _knows_a_robot(model: IdentifiedRobot) -> bool:
@@ -30,6 +39,11 @@ class IdentifiedRobot(BaseEstimator):
     feature_map_: Any
     _weights: Weights
     _joints: list[JointResidual]
+    _outputs: list[str]
+    coef_: np.ndarray
+    coef_std_: np.ndarray
+    coef_cov_: np.ndarray
+    gains_: np.ndarray
 
     @property
     def _has_robot(self) -> bool:
@@ -59,6 +73,120 @@ class IdentifiedRobot(BaseEstimator):
         if not self._has_robot:
             return X
         return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
+
+    @available_if(_knows_a_robot)
+    def links(self) -> list[Bunch]:
+        """Say what is known of each link.
+
+        Returns
+        -------
+        links : list of Bunch
+            From the base to the tip, in the frame of the link's joint:
+
+            - ``joint`` : its name;
+            - ``mass``, ``mass_std`` : kg;
+            - ``com``, ``com_std`` : ndarray of shape (3,), the centre of mass, m;
+            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments about it: Ixx, Ixy, Iyy, Ixz, Iyz, Izz,
+              kg m²;
+            - ``consistency`` : above 0 if a body can have them (`robot_model` takes the nearest that one can have).
+
+            Standard deviations are to first order; many of them are the prior's, for torques show combinations only.
+
+        References
+        ----------
+        - P. M. Wensing, S. Kim, J.-J. E. Slotine (2017): Linear Matrix Inequalities for Physically-Consistent Inertial
+          Parameter Identification.
+        """
+        check_is_fitted(self)
+        parameters, covariance = self._inertial()
+        values, slopes = body_parameters(parameters)
+        consistency = physical_consistency(parameters)
+        found = []
+        for number, (joint, value, slope) in enumerate(zip(self._outputs, values, slopes, strict=True)):
+            of = slice(10 * number, 10 * number + 10)
+            std = np.sqrt(np.maximum(np.diag(slope @ covariance[of, of] @ slope.T), 0.0))
+            found.append(
+                Bunch(
+                    joint=joint,
+                    mass=float(value[0]),
+                    mass_std=float(std[0]),
+                    com=value[1:4],
+                    com_std=std[1:4],
+                    inertia=value[4:],
+                    inertia_std=std[4:],
+                    consistency=float(consistency[number]),
+                )
+            )
+        return found
+
+    @available_if(_knows_a_robot)
+    def robot_model(self) -> Any:
+        """Make a model of the robot as it was found.
+
+        Returns
+        -------
+        model : pinocchio.Model
+            A copy of the robot's with identified inertias (the most probable ones that bodies can have), armatures,
+            ``damping`` and ``friction``; what would be negative is 0. Offsets and what physics missed are not in it,
+            and torques are those of the model, without ``gains_``.
+
+        Raises
+        ------
+        ImportError
+            If Pinocchio is not installed; the message gives the pip command.
+        """
+        check_is_fitted(self)
+        model = load_robot(self.feature_map_.robot)
+        friction = {name: np.maximum(values, 0.0) for name, values in self._friction(self.coef_).items()}
+        return with_parameters(
+            model,
+            nearest_consistent(*self._inertial()),
+            armature=friction.get("armature"),
+            damping=friction.get("viscous"),
+            friction=friction.get("coulomb"),
+        )
+
+    @available_if(_knows_a_robot)
+    def write_urdf(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the robot's URDF file with what was found, and its standard deviations as comments.
+
+        Parameters
+        ----------
+        target : str or path-like
+            The file to write.
+        overwrite : bool, default=False
+            Whether it may be the robot's own file.
+
+        Raises
+        ------
+        ValueError
+            If the robot has no file, or is not one that can be rewritten.
+        """
+        check_is_fitted(self)
+        parameters, covariance = self._inertial()
+        friction, std = self._friction(self.coef_), self._friction(self.coef_std_)
+        write_urdf(
+            self.feature_map_.robot,
+            target,
+            nearest_consistent(parameters, covariance),
+            covariance=covariance,
+            damping=np.maximum(friction["viscous"], 0.0) if "viscous" in friction else None,
+            friction=np.maximum(friction["coulomb"], 0.0) if "coulomb" in friction else None,
+            damping_std=std.get("viscous"),
+            friction_std=std.get("coulomb"),
+            overwrite=overwrite,
+        )
+
+    def _inertial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means (n_links, 10) and covariance of the links' parameters."""
+        size = 10 * len(self._outputs)
+        return self.coef_[:size].reshape(-1, 10), self.coef_cov_[:size, :size]
+
+    def _friction(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Of weights, or their standard deviations, those of friction by name, in the model's units."""
+        n_joints = len(self._outputs)
+        rest = values[10 * n_joints :].reshape(-1, n_joints) / self.gains_
+        return dict(zip(self.feature_map_.friction, rest, strict=True))
 
     @available_if(_knows_a_robot)
     def estimate_payload(

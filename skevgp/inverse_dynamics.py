@@ -23,6 +23,7 @@ from .exceptions import warn_user
 from .features import RigidBodyRegressor
 from .identification.stiction import likeliest_noise
 from .identification.weights import Prior, Rows, identify, left_out, with_gains
+from .robots import nearest_consistent
 from .robots.loading import Robot
 
 
@@ -48,6 +49,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     gain_scale : float, default=0.0
         Prior standard deviation of the relative error of each joint's gain, as between currents and torques: 0.1 for
         gains of a catalogue. 0: y are torques. Predictions hardly depend on it, masses and their intervals do.
+    consistent : bool, default=False
+        Whether the weights are the most probable ones that bodies can have (masses above 0, pseudo-inertias positive
+        definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well.
     n_inducing : int, default=40
         Inducing points of each f_j; 0 leaves f_j out.
     max_rows : int, default=3000
@@ -90,6 +94,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     See Also
     --------
     skevgp.datasets.load_log : Positions, velocities, accelerations and torques of a log.
+    skevgp.features.RigidBodyRegressor : The features, and their prior.
     EVGPRegressor : With ``feature_map=RigidBodyRegressor(robot)`` the joint model, without what is special here.
 
     Notes
@@ -132,6 +137,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         "robot": "no_validation",
         "gain_scale": [Interval(Real, 0, None, closed="left")],
+        "consistent": ["boolean"],
         "n_inducing": [Interval(Integral, 0, None, closed="left")],
         "max_rows": [Interval(Integral, 10, None, closed="left")],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -144,6 +150,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         robot: RigidBodyRegressor | Robot | None = None,
         *,
         gain_scale: float = 0.0,
+        consistent: bool = False,
         n_inducing: int = 40,
         max_rows: int = 3000,
         max_iter: int | None = None,
@@ -152,6 +159,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     ):
         self.robot = robot
         self.gain_scale = gain_scale
+        self.consistent = consistent
         self.n_inducing = n_inducing
         self.max_rows = max_rows
         self.max_iter = max_iter
@@ -220,6 +228,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.feature_map_ = self._map().fit(rows_x)
         rows, prior = self._rows(rows_x, targets, labels)
         self._weights = identify(rows, prior)
+        if self.consistent and self._has_robot:
+            size = 10 * targets.shape[1]
+            start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
+            self._weights = self._weights.given(nearest_consistent(start.reshape(-1, 10), covariance).ravel())
         self._outputs = self._output_names(targets.shape[1])
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()

@@ -14,7 +14,7 @@ from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
 from skevgp.features import RigidBodyRegressor
 from skevgp.identification.weights import _root
-from skevgp.robots import RigidBody
+from skevgp.robots import RigidBody, inertial_parameters, physical_consistency
 
 
 def trajectory(n_joints, seed, seconds=10.0, dt=0.02):
@@ -189,6 +189,44 @@ def test_a_payload_lies_in_its_interval():
     nothing = model.estimate_payload(arm.X, arm.y, groups=arm.groups)
     assert nothing.mass_interval[0] < 0.0 < nothing.mass_interval[1]
     assert abs(nothing.mass) < 0.1
+
+
+def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
+    truth = arm.torque(arm.new)
+    q, v, a = np.split(arm.new, 3, axis=1)
+
+    def error(model):
+        torque = RigidBody(model).forces(q, v, a)
+        torque += np.array(model.damping) * v + np.array(model.friction) * np.tanh(v / 0.01)
+        return (np.sqrt(np.mean((torque - truth) ** 2, axis=0)) / truth.std(axis=0)).max()
+
+    found = rigid.robot_model()
+    assert error(found) < 0.02
+    assert (physical_consistency(inertial_parameters(found)) > 0.0).all()
+    from_file = InverseDynamics("ur5", n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
+    from_file.write_urdf(tmp_path / "found.urdf")
+    assert "standard deviations: mass=" in (tmp_path / "found.urdf").read_text()
+    assert "±" in (tmp_path / "found.urdf").read_text() or "std" in (tmp_path / "found.urdf").read_text()
+    loaded = load_robot(tmp_path / "found.urdf")
+    assert_allclose(inertial_parameters(loaded), inertial_parameters(found), rtol=1e-6, atol=1e-9)
+    assert_allclose(loaded.damping, found.damping, rtol=1e-9)
+    with pytest.raises(ValueError, match="file"):
+        rigid.write_urdf(tmp_path / "none.urdf")
+
+
+def test_links_are_told_with_their_uncertainty(arm, rigid):
+    links = rigid.links()
+    assert [link.joint for link in links] == list(arm.nominal.names)[1:]
+    for link, true in zip(links, list(arm.model.inertias)[1:], strict=True):
+        assert abs(link.mass - true.mass) < 4.0 * link.mass_std
+        assert (np.abs(link.com - true.lever) < 5.0 * link.com_std).all()
+    assert links[0].mass_std == pytest.approx(0.2 * arm.nominal.inertias[1].mass, rel=1e-3)
+
+
+def test_consistent_weights_predict_as_well(arm, rigid):
+    model = arm.fit(n_inducing=0, consistent=True)
+    assert all(link.consistency > 0.0 for link in model.links())
+    assert_allclose(model.predict(arm.new), rigid.predict(arm.new), atol=0.02 * arm.y.std())
 
 
 def test_one_joint_and_a_sliding_one():

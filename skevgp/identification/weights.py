@@ -100,6 +100,18 @@ class Weights:
         """The mean (n, o) of rows of features (n, o, p)."""
         return _forward(features, self.mean, self.prior)
 
+    def given(self, first: np.ndarray) -> Weights:
+        """The same with the first weights elsewhere, and the others where they then most probably are."""
+        n = len(first)
+        scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
+        unit = np.where(scale > 0.0, scale, 1.0)
+        correlation = self.covariance / np.outer(unit, unit)
+        move = (first - self.mean[:n]) / unit[:n]
+        mean = self.mean.copy()
+        mean[:n] = first
+        mean[n:] += unit[n:] * (correlation[n:, :n] @ np.linalg.lstsq(correlation[:n, :n], move, rcond=1e-10)[0])
+        return replace(self, mean=mean)
+
     def variance(self, features: np.ndarray) -> np.ndarray:
         """What the weights' uncertainty adds to it, (n, o), to first order in the gains."""
         slopes, _ = _linearised(features, np.zeros(features.shape[:2]), self.mean, self.prior)
@@ -143,12 +155,9 @@ def identify(rows: Rows, prior: Prior) -> Weights:
         mean = prior.mean + root @ z
         left = y - _forward(rows.features, mean, prior)
         coulomb = np.zeros(n_outputs) if prior.coulomb is None else np.abs(mean[prior.coulomb])
-        found = [
-            likeliest_noise(*one, prior.velocity, last)
-            for *one, last in zip(left.T, rows.speed.T, coulomb, noise, strict=True)
-        ]
         noise = [
-            one._replace(variance=max(one.variance, _LEAST * whole)) for one, whole in zip(found, size, strict=True)
+            _noise_of(left[:, o], rows.speed[:, o], float(coulomb[o]), last, _LEAST * float(size[o]))
+            for o, last in enumerate(noise)
         ]
         spread = np.sqrt(_variances(noise, rows.speed))
         times = np.array([correlation_time(errors, rows.runs) for errors in (left / spread).T])
@@ -208,6 +217,11 @@ def _linearised(
     scaled = features[:, :, prior.scaled] @ mean[:p][prior.scaled]
     slopes[:, range(n_outputs), range(p, len(mean))] = scaled
     return slopes, targets + c * scaled
+
+
+def _noise_of(errors: np.ndarray, speed: np.ndarray, coulomb: float, last: JointNoise, least: float) -> JointNoise:
+    found = likeliest_noise(errors, speed, coulomb, last.velocity, last)
+    return found._replace(variance=max(found.variance, least))
 
 
 def _variances(noise: list[JointNoise], speed: np.ndarray) -> np.ndarray:

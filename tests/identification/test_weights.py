@@ -98,6 +98,15 @@ def test_variance_is_that_of_drawn_weights():
     assert_allclose(found.variance(rows.features[:5]), values.var(axis=0), rtol=0.1)
 
 
+def test_weights_given_others_are_those_of_the_joint_normal():
+    rows, prior, _ = problem(n=20)
+    found = identify(rows, prior)
+    cov = found.covariance
+    first = found.mean[:2] + np.array([0.01, -0.02])
+    expected = found.mean[2:] + cov[2:, :2] @ np.linalg.solve(cov[:2, :2], [0.01, -0.02])
+    assert_allclose(found.given(first).mean, [*first, *expected], rtol=1e-9)
+
+
 def test_rows_left_out_are_predicted_from_the_others():
     rows, prior, beta = problem()
     targets = rows.targets.copy()
