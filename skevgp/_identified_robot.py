@@ -14,17 +14,20 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._joint_residual import JointResidual
 from ._payload import find_payload, payload_prior
-from ._validation import check_real, checked_groups
-from .identification.rows_of_logs import blocks_of
-from .identification.weights import Rows, Weights
+from ._validation import check_integer, check_magnitude, check_real, checked_groups
+from .identification.rows_of_logs import blocks_of, groups_of
+from .identification.weights import Known, Rows, Weights
 from .robots import (
     body_parameters,
-    load_robot,
+    layout_of,
     nearest_consistent,
     physical_consistency,
     with_parameters,
     write_urdf,
 )
+
+# Of a payload's mass, kg, and size, m, a priori.
+_LARGEST_SCALE = 1e6
 
 
 def _knows_a_robot(model: IdentifiedRobot) -> bool:
@@ -38,6 +41,7 @@ class IdentifiedRobot(BaseEstimator):
 
     feature_map_: Any
     _weights: Weights
+    _known: Known
     _joints: list[JointResidual]
     _outputs: list[str]
     coef_: np.ndarray
@@ -49,10 +53,16 @@ class IdentifiedRobot(BaseEstimator):
     def _has_robot(self) -> bool:
         return bool(getattr(self.feature_map_, "share_coef", False))
 
-    def _as_rows(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray | None) -> Rows:
+    def _as_rows(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
         n, n_outputs = y.shape
-        runs = np.zeros(n, dtype=int) if groups is None else groups
-        return Rows(self._features(X, n_outputs), y, self._speed(X, n_outputs), runs, blocks_of(groups, n))
+        labels = checked_groups(groups, n)
+        runs = checked_groups(pieces, n, "pieces")
+        if runs is None:
+            runs = np.zeros(n, dtype=int) if labels is None else labels
+        features = self._features(X, n_outputs)
+        check_magnitude(features, "What feature_map_ returns")
+        blocks = blocks_of(labels, n)
+        return Rows(features, y, self._speed(X, n_outputs), runs, groups_of(labels, blocks), blocks)
 
     def _speed(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
         """q̇ of each joint, (n, o)."""
@@ -136,7 +146,7 @@ class IdentifiedRobot(BaseEstimator):
             If Pinocchio is not installed; the message gives the pip command.
         """
         check_is_fitted(self)
-        model = load_robot(self.feature_map_.robot)
+        model = self.feature_map_.model_
         friction = {name: np.maximum(values, 0.0) for name, values in self._friction(self.coef_).items()}
         return with_parameters(
             model,
@@ -160,9 +170,12 @@ class IdentifiedRobot(BaseEstimator):
         Raises
         ------
         ValueError
-            If the robot has no file, or is not one that can be rewritten.
+            If the robot has no file, or is not one that can be rewritten, or has other joints since `fit`.
         """
         check_is_fitted(self)
+        joints = layout_of(self.feature_map_.robot).position_names
+        if list(joints) != self._outputs:
+            raise ValueError(f"The robot's file has other joints than when it was fitted: {list(joints)}.")
         parameters, covariance = self._inertial()
         friction, std = self._friction(self.coef_), self._friction(self.coef_std_)
         write_urdf(
@@ -185,7 +198,7 @@ class IdentifiedRobot(BaseEstimator):
     def _friction(self, values: np.ndarray) -> dict[str, np.ndarray]:
         """Of weights, or their standard deviations, those of friction by name, in the model's units."""
         n_joints = len(self._outputs)
-        rest = values[10 * n_joints :].reshape(-1, n_joints) / self.gains_
+        rest = values[10 * n_joints :].reshape(-1, n_joints) / np.abs(self.gains_)
         return dict(zip(self.feature_map_.friction, rest, strict=True))
 
     @available_if(_knows_a_robot)
@@ -195,14 +208,16 @@ class IdentifiedRobot(BaseEstimator):
         y: ArrayLike,
         *,
         groups: ArrayLike | None = None,
+        pieces: ArrayLike | None = None,
         link: int = -1,
         mass_scale: float = 5.0,
         size: float = 0.2,
     ) -> Bunch:
         """Find what the robot carries in other logs than those of `fit`.
 
-        Torques with the load, less those of the model, are linear in the ten parameters of the load; what is still
-        uncertain of the robot, its friction and its gains is carried along.
+        Torques with the load are those of the robot and of the ten parameters of the load. All of them, friction and
+        gains are found anew from what both logs say, so what is uncertain of the robot widens the load's interval. (Of
+        what physics missed the mean is subtracted, as if it were known.)
 
         Parameters
         ----------
@@ -210,7 +225,7 @@ class IdentifiedRobot(BaseEstimator):
             With the load, in the order of time.
         y : array-like of shape (n_samples, n_joints)
             Torques with the load, in the units of `fit`.
-        groups : array-like of shape (n_samples,), default=None
+        groups, pieces : array-like of shape (n_samples,), default=None
             As in `fit`.
         link : int, default=-1
             Which joint's link it is fixed to: the last.
@@ -257,14 +272,17 @@ class IdentifiedRobot(BaseEstimator):
         targets = np.asarray(targets, dtype=np.float64).reshape(len(rows_x), -1)
         if targets.shape[1] != n_outputs:
             raise ValueError(f"y has {targets.shape[1]} columns; the robot has {n_outputs} joints.")
-        if not -n_outputs <= link < n_outputs:
+        check_magnitude(rows_x, "X")
+        check_magnitude(targets, "y")
+        if check_integer(link, "link", minimum=-n_outputs) >= n_outputs:
             raise ValueError(f"link={link} must be the index of one of the {n_outputs} links.")
-        check_real(mass_scale, "mass_scale", minimum=0.0, strict=True)
-        check_real(size, "size", minimum=0.0, strict=True)
-        labels = checked_groups(groups, len(rows_x))
-        rows = self._as_rows(rows_x, targets, labels)
+        for name, value in (("mass_scale", mass_scale), ("size", size)):
+            if check_real(value, name, minimum=0.0, strict=True) > _LARGEST_SCALE:
+                raise ValueError(f"{name} must be no more than {_LARGEST_SCALE:g}; got {value!r}.")
+        rows = self._as_rows(rows_x, targets, groups, pieces)
 
         def missed(torque: np.ndarray) -> np.ndarray:
             return np.column_stack([f.mean(self._own(rows_x, torque, j)) for j, f in enumerate(self._joints)])
 
-        return find_payload(rows, link % n_outputs, payload_prior(self._weights, mass_scale, size), missed)
+        prior = payload_prior(self._weights.prior, mass_scale, size)
+        return find_payload(rows, link % n_outputs, prior, self._known, missed)

@@ -19,6 +19,10 @@ _LARGEST_SIGNAL, _SMALLEST_SIGNAL = 1.0, 1e-3
 _SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 100.0
 
 
+# Of the noise without f, the share that it leaves at least.
+_LEAST = 1e-6
+
+
 class QuietRegressor(EVGPRegressor):
     """Its limits are not the user's, who is not told that fits end at them."""
 
@@ -107,12 +111,13 @@ def fit_joint_residual(
         shortest[speed_column] = _SHORTEST_OF_SPEED
     signal = ConstantKernel(0.25 * size, (_SMALLEST_SIGNAL**2 * size, _LARGEST_SIGNAL**2 * size))
     kernel = signal * RBF(_START * spread, np.column_stack([shortest * spread, _LONGEST * spread]))
-    sharp = noise_at(residual, speed, noise.coulomb, velocity)
+    least = _LEAST * noise.variance
+    sharp = noise_at(residual, speed, noise.coulomb, velocity, least)
     relative = sharp.of(speed) / sharp.variance
     model = QuietRegressor(kernel=kernel, **options)
     model.fit(x[rows], residual[rows], groups=groups[rows], relative_variance=relative[rows])
     left = residual - model.predict(x)
-    found = likeliest_noise(left, speed, noise.coulomb, noise.velocity)
+    found = likeliest_noise(left, speed, noise.coulomb, noise.velocity, least)
     # Groups that were left out show how much larger noise is than where f was fitted.
     growth = max(1.0, float(model.noise_variance_ / max(np.mean(left**2 / relative), 1e-300)))
     return JointResidual(model, found._replace(variance=growth * found.variance), model._held_for_no_group)

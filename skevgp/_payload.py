@@ -8,21 +8,21 @@ from dataclasses import replace
 import numpy as np
 from sklearn.utils import Bunch
 
-from .identification.weights import Prior, Rows, Weights, identify
+from .identification.weights import Known, Prior, Rows, identify
 
 # Half of the width of an interval that holds 95 % of a normal distribution, in standard deviations.
 _95 = 1.959963984540054
 
 
-def payload_prior(weights: Weights, mass_scale: float, size: float) -> Prior:
-    """The posterior of the robot alone, and a body of ten parameters of which hardly anything is known.
+def payload_prior(prior: Prior, mass_scale: float, size: float) -> Prior:
+    """The prior of the robot alone, and a body of ten parameters of which hardly anything is known.
 
     Parameters
     ----------
-    weights : Weights
-        Without the payload.
+    prior : Prior
+        Of the robot.
     mass_scale : float
-        Standard deviation of its mass, kg; the prior mean is 0.
+        Standard deviation of the body's mass, kg; the prior mean is 0.
     size : float
         m: first moments have that times mass_scale, moments of inertia once more.
 
@@ -31,20 +31,18 @@ def payload_prior(weights: Weights, mass_scale: float, size: float) -> Prior:
     prior : Prior
         The body's parameters follow the weights; gains are last.
     """
-    p, total = weights.n_weights, len(weights.mean)
-    order = np.concatenate([np.arange(p), np.full(10, -1), np.arange(p, total)])
-    old = order >= 0
-    mean, covariance = np.zeros(len(order)), np.zeros((len(order), len(order)))
-    mean[old] = weights.mean
-    covariance[np.ix_(old, old)] = weights.covariance
+    p, total = len(prior.scaled), len(prior.mean)
+    robot = np.concatenate([np.arange(p), np.arange(p + 10, total + 10)])
+    mean, covariance = np.zeros(total + 10), np.zeros((total + 10, total + 10))
+    mean[robot] = prior.mean
+    covariance[np.ix_(robot, robot)] = prior.covariance
     body = mass_scale * np.concatenate([[1.0], np.full(3, size), np.full(6, size**2)])
     covariance[range(p, p + 10), range(p, p + 10)] = body**2
-    scaled = np.concatenate([weights.prior.scaled, np.ones(10, dtype=bool)])
-    return replace(weights.prior, mean=mean, covariance=covariance, scaled=scaled)
+    return replace(prior, mean=mean, covariance=covariance, scaled=np.append(prior.scaled, np.ones(10, dtype=bool)))
 
 
 def find_payload(
-    rows: Rows, link: int, prior: Prior, residual: Callable[[np.ndarray], np.ndarray], rounds: int = 2
+    rows: Rows, link: int, prior: Prior, known: Known, residual: Callable[[np.ndarray], np.ndarray], rounds: int = 2
 ) -> Bunch:
     """The body that explains what a robot's torques have more than its model.
 
@@ -56,6 +54,9 @@ def find_payload(
         From 0, that it is fixed to.
     prior : Prior
         `payload_prior`.
+    known : Known
+        What rows without the payload said: weights and gains are found anew from both, for their product is what
+        either knows.
     residual : callable
         Torques (n, o) of the model -> what its Gaussian processes add.
     rounds : int
@@ -67,11 +68,12 @@ def find_payload(
     """
     body = rows.features[:, :, 10 * link : 10 * link + 10]
     carried = replace(rows, features=np.concatenate([rows.features, body], axis=2))
-    missed = np.zeros_like(rows.targets)
+    nothing = np.zeros((*known.targets.shape, 10))
+    known = known._replace(features=np.concatenate([known.features, nothing], axis=2))
+    weights = identify(carried, prior, known=known)
     for _ in range(rounds):
-        weights = identify(replace(carried, targets=rows.targets - missed), prior)
         missed = residual(weights.predict(carried.features))
-    weights = identify(replace(carried, targets=rows.targets - missed), prior)
+        weights = identify(replace(carried, targets=rows.targets - missed), prior, start=weights, known=known)
     p = weights.n_weights
     of = slice(p - 10, p)
     return _described(weights.mean[of], weights.covariance[of, of])

@@ -111,16 +111,16 @@ def as_floats(values: Any, name: str) -> np.ndarray:
     raise ValueError(f"{name} must be real numbers; got the type {array.dtype}.")
 
 
-def checked_groups(groups: Any, n_samples: int) -> np.ndarray | None:
+def checked_groups(groups: Any, n_samples: int, name: str = "groups") -> np.ndarray | None:
     """Numbers 0, 1, ... (n_samples,) in place of the labels of groups; None for None."""
     if groups is None:
         return None
     try:
         labels = np.asarray(groups.compute() if hasattr(groups, "__dask_graph__") else groups)
     except ValueError as error:
-        raise ValueError(f"groups must be one label for each row: {error}") from error
+        raise ValueError(f"{name} must be one label for each row: {error}") from error
     if labels.shape != (n_samples,):
-        raise ValueError(f"groups must have the shape (n_samples,) = ({n_samples},); got {labels.shape}.")
+        raise ValueError(f"{name} must have the shape (n_samples,) = ({n_samples},); got {labels.shape}.")
     try:
         numbers: np.ndarray = np.unique(labels, return_inverse=True)[1]
     except TypeError:

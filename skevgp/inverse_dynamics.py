@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
-from sklearn.base import RegressorMixin, TransformerMixin, clone
+from sklearn.base import RegressorMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -18,13 +18,18 @@ from ._identified_robot import IdentifiedRobot
 from ._joint_residual import JointResidual, fit_joint_residual
 from ._shapes import like_y
 from ._sklearn import Interval, fit_context
-from ._validation import check_magnitude, checked_groups, unchanged_if_it_fails
+from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails
 from .exceptions import warn_user
 from .features import RigidBodyRegressor
 from .identification.stiction import likeliest_noise
-from .identification.weights import Prior, Rows, identify, left_out, with_gains
+from .identification.weights import Prior, Rows, condensed, identify, left_out, with_gains
 from .robots import nearest_consistent
 from .robots.loading import Robot
+
+# So many prior standard deviations make the prior doubtful.
+_FAR = 4.0
+# Physics that leaves this share of a torque's variance explains hardly anything.
+_LITTLE = 0.5
 
 
 class InverseDynamics(RegressorMixin, IdentifiedRobot):
@@ -51,14 +56,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         gains of a catalogue. 0: y are torques. Predictions hardly depend on it, masses and their intervals do.
     consistent : bool, default=False
         Whether the weights are the most probable ones that bodies can have (masses above 0, pseudo-inertias positive
-        definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well.
+        definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well. Means
+        move, covariances and noise stay.
     n_inducing : int, default=40
         Inducing points of each f_j; 0 leaves f_j out.
     max_rows : int, default=3000
         Rows that each f_j is fitted to, evenly spread: those of a log at 100 Hz hardly differ. Weights see all.
-    max_iter : int, default=None
+    max_iter : int or None, default=None
         As in `EVGPRegressor`.
-    n_jobs : int, default=None
+    n_jobs : int or None, default=None
         Joints that are fitted at the same time, in threads; None means 1, -1 all cores.
     random_state : int, RandomState instance or None, default=None
         Places inducing points.
@@ -84,6 +90,11 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         The f_j.
     correlation_time_ : ndarray of shape (n_outputs,)
         How many rows say as much about the weights as an independent one.
+    inflation_ : float
+        By how much more than that groups differ from each other, at least 1: all that rows say of the weights counts
+        so much less.
+    stiction_velocity_ : ndarray of shape (n_outputs,)
+        Up to which speed friction's sign is open in the log, rad/s or m/s.
     n_iter_ : int
         The most iterations that an f_j took.
     feature_map_ : transformer
@@ -172,7 +183,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return tags
 
     @fit_context(prefer_skip_nested_validation=False)
-    def fit(self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None) -> Self:
+    def fit(
+        self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None, pieces: ArrayLike | None = None
+    ) -> Self:
         """Find weights, noise, and what physics missed.
 
         Parameters
@@ -182,8 +195,10 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
             Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents.
         groups : array-like of shape (n_samples,), default=None
-            Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least two;
-            of one, blocks of rows stand in for groups.
+            Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least
+            three of them, none with half of the rows; of fewer, blocks of rows stand in.
+        pieces : array-like of shape (n_samples,), default=None
+            Which rows follow each other without a gap, such as ``load_log(...).pieces``; None: all rows of a group.
 
         Returns
         -------
@@ -200,10 +215,19 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Warns
         -----
         ConvergenceWarning
-            If f_j of some joints holds for no group that was left out: its signal is then nearly 0.
+            If weights end far from the robot's model, as with placeholders for its masses or y in other units; if f_j
+            of some joints holds for no group that was left out: its signal is then nearly 0.
         """
         with unchanged_if_it_fails(self):
-            self._fit(X, y, groups)
+            self._fit(X, y, groups, pieces)
+        if self._has_robot and (self._weights.surprise > _FAR or self._unexplained):
+            warn_user(
+                "The robot's model is far from what torques say: its masses may be placeholders, or y in other units. "
+                "Give RigidBodyRegressor wider scales, or y in N m. "
+                f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations; of {self._unexplained} "
+                "hardly anything is explained.)",
+                ConvergenceWarning,
+            )
         lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
         if lost:
             warn_user(
@@ -213,7 +237,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             )
         return self
 
-    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None) -> None:
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> None:
         rows_x: np.ndarray
         rows_x, targets = validate_data(
             self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
@@ -223,28 +247,34 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         targets = targets.reshape(len(targets), -1)
         check_magnitude(rows_x, "X")
         check_magnitude(targets, "y")
-        labels = checked_groups(groups, len(rows_x))
+        check_not_vanishing(np.abs(targets).max(axis=0), "y")
         self._map().fit(X)  # a frame's columns must be in the robot's order
         self.feature_map_ = self._map().fit(rows_x)
-        rows, prior = self._rows(rows_x, targets, labels)
+        rows, prior = self._rows(rows_x, targets, groups, pieces)
         self._weights = identify(rows, prior)
+        self._known = condensed(rows, self._weights)
         if self.consistent and self._has_robot:
             size = 10 * targets.shape[1]
             start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
             self._weights = self._weights.given(nearest_consistent(start.reshape(-1, 10), covariance).ravel())
         self._outputs = self._output_names(targets.shape[1])
+        missed = np.array([noise.variance for noise in self._weights.noise]) > _LITTLE * targets.var(axis=0)
+        varies = targets.var(axis=0) > 0.0
+        self._unexplained = [name for name, bad in zip(self._outputs, missed & varies, strict=True) if bad]
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
 
-    def _map(self) -> TransformerMixin:
-        if isinstance(self.robot, TransformerMixin):
+    def _map(self) -> RigidBodyRegressor:
+        if isinstance(self.robot, RigidBodyRegressor):
             return clone(self.robot)
         return RigidBodyRegressor(self.robot)
 
-    def _rows(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray | None) -> tuple[Rows, Prior]:
+    def _rows(
+        self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None
+    ) -> tuple[Rows, Prior]:
         """What the regression sees, and its prior."""
         n_outputs = y.shape[1]
-        rows = self._as_rows(X, y, groups)
+        rows = self._as_rows(X, y, groups, pieces)
         features = rows.features
         names = [str(name) for name in self._names(n_outputs)]
         if hasattr(self.feature_map_, "coef_prior"):
@@ -274,12 +304,13 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
         weights, y = self._weights, rows.targets
-        guessed = left_out(rows, weights.prior)
+        guessed = left_out(rows, weights)
         if self.n_inducing == 0:
-            coulomb = [noise.coulomb for noise in weights.noise]
-            left = (y - guessed).T
-            every = zip(left, rows.speed.T, coulomb, strict=True)
-            return [JointResidual(None, likeliest_noise(*one, self._velocity)) for one in every]
+            every = zip((y - guessed).T, rows.speed.T, weights.noise, strict=True)
+            return [
+                JointResidual(None, likeliest_noise(left, speed, last.coulomb, last.velocity, last.variance))
+                for left, speed, last in every
+            ]
         residual = y - weights.predict(rows.features)
         some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
@@ -317,6 +348,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.residual_models_ = [joint.model for joint in self._joints]
         self.n_iter_ = max([1, *(model.n_iter_ for model in self.residual_models_ if model is not None)])
         self.correlation_time_ = weights.correlation_time
+        self.inflation_ = weights.inflation
+        self.stiction_velocity_ = np.array([one.velocity for one in noise])
 
     def predict(
         self, X: ArrayLike, return_std: bool = False, include_noise: bool = True

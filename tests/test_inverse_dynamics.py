@@ -6,9 +6,11 @@ import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from sklearn import config_context
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupKFold, cross_val_score
+from sklearn.preprocessing import StandardScaler
 
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
@@ -72,7 +74,6 @@ def rigid(arm):
 
 def identifiable(model, truth):
     """Distances, in standard deviations, of the combinations of which torques know more than the prior did."""
-    to_unit = np.linalg.pinv(_root(np.diag(model.coef_prior_scale_**2)), rcond=1e-12)
     root = _root(model._weights.prior.covariance)
     to_unit = np.linalg.pinv(root, rcond=1e-9)
     variance, directions = np.linalg.eigh(to_unit @ model.coef_cov_ @ to_unit.T)
@@ -175,20 +176,38 @@ def test_gains_widen_masses_and_leave_torques(arm, rigid):
     assert (arm_of_catalogue.gains_std_ > 0.0).all()
 
 
-def test_a_payload_lies_in_its_interval():
-    arm = Arm()
-    model = arm.fit(n_inducing=0)
-    body = pinocchio.Inertia(2.0, np.array([0.02, -0.03, 0.1]), 0.01 * np.eye(3))
-    arm.model.inertias[arm.model.njoints - 1] += body
-    rng, X = np.random.default_rng(1), trajectory(6, 77)
-    clean = arm.torque(X)
-    payload = model.estimate_payload(X, clean + 0.02 * clean.std(axis=0) * rng.normal(size=clean.shape))
+def carrying(arm, model, seed, gains=1.0, mass=2.0):
+    """What a model of the arm says that it carries, and what it does carry."""
+    loaded = Arm(seed=seed)
+    body = pinocchio.Inertia(mass, np.array([0.02, -0.03, 0.1]), 0.01 * np.eye(3))
+    loaded.model.inertias[loaded.model.njoints - 1] += body
+    rng, X = np.random.default_rng(seed), trajectory(6, 1000 + seed)
+    clean = gains * loaded.torque(X)
+    return model.estimate_payload(X, clean + 0.02 * clean.std(axis=0) * rng.normal(size=clean.shape)), body
+
+
+def test_a_payload_lies_in_its_interval(arm, rigid):
+    payload, body = carrying(arm, rigid, 0)
     assert payload.mass_interval[0] < 2.0 < payload.mass_interval[1]
     assert payload.mass_std < 0.2
     assert (np.abs(payload.com - body.lever) < 3.0 * payload.com_std).all()
-    nothing = model.estimate_payload(arm.X, arm.y, groups=arm.groups)
+    nothing = rigid.estimate_payload(arm.X, arm.y, groups=arm.groups)
     assert nothing.mass_interval[0] < 0.0 < nothing.mass_interval[1]
     assert abs(nothing.mass) < 0.1
+
+
+@pytest.mark.slow
+def test_unknown_gains_widen_a_payloads_interval_until_it_holds():
+    distances, widths = [], []
+    for seed in range(8):
+        gains = 1.0 + 0.1 * np.random.default_rng(100 + seed).normal(size=6)
+        arm = Arm(seed=seed)
+        arm.y = gains * arm.y
+        payload, _ = carrying(arm, arm.fit(n_inducing=0, gain_scale=0.1), seed, gains)
+        distances.append(abs(payload.mass - 2.0) / payload.mass_std)
+        widths.append(payload.mass_std)
+    assert np.mean(np.array(distances) < 1.96) >= 0.75  # 6 of 8; fewer is one chance in 200
+    assert 0.01 < np.median(widths) < 0.3
 
 
 def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
@@ -262,13 +281,50 @@ def test_frames_must_be_in_the_robots_order():
 
 @pytest.mark.parametrize("scale", [0.0, 1e-6, 1e6])
 def test_torques_of_any_size(scale):
+    """Without a prior that knows their units."""
     arm = Arm("acrobot")
+    wide = RigidBodyRegressor(arm.nominal, mass_scale=1e8, com_scale=1.0, inertia_scale=1e8, friction_scale=1e8)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
-        model = InverseDynamics(arm.nominal, n_inducing=5, max_iter=5).fit(arm.X, scale * arm.y)
+        model = InverseDynamics(wide, n_inducing=5, max_iter=5).fit(arm.X, scale * arm.y)
     mean, std = model.predict(arm.new, return_std=True)
-    assert np.isfinite(mean).all()
     assert np.isfinite(std).all()
+    assert (std >= 0.0).all()
+    assert_allclose(mean, scale * arm.torque(arm.new), atol=0.05 * scale * arm.y.std() + 1e-12)
+
+
+def with_masses(arm, factor):
+    model = arm.nominal.copy()
+    for link in range(1, model.njoints):
+        body = model.inertias[link]
+        model.inertias[link] = pinocchio.Inertia(factor * body.mass, body.lever, factor * body.inertia)
+    return model
+
+
+@pytest.mark.parametrize("factor", [0.01, 0.1])
+def test_masses_that_are_placeholders_are_told(factor):
+    arm = Arm()
+    with pytest.warns(ConvergenceWarning, match="far from what torques say"):
+        InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
+
+
+@pytest.mark.parametrize("factor", [0.3, 5.0])
+def test_masses_that_are_far_off_are_found(factor):
+    arm = Arm()
+    found = InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
+    truth = arm.torque(arm.new)
+    error = np.sqrt(np.mean((found.predict(arm.new) - truth) ** 2, axis=0)) / truth.std(axis=0)
+    assert error.max() < 0.01
+
+
+def test_limits_of_effort_that_are_placeholders_lose_no_digits():
+    arm = Arm(noise=1e-3)
+    model = arm.nominal.copy()
+    model.upperEffortLimit, model.lowerEffortLimit = np.full(6, 1e8), np.full(6, -1e8)
+    found = InverseDynamics(RigidBodyRegressor(model), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
+    truth = arm.torque(arm.new)
+    error = np.sqrt(np.mean((found.predict(arm.new) - truth) ** 2, axis=0)) / truth.std(axis=0)
+    assert error.max() < 0.005
 
 
 def test_torques_without_noise_and_joints_that_do_not_move():
@@ -278,6 +334,21 @@ def test_torques_without_noise_and_joints_that_do_not_move():
     model = InverseDynamics(arm.nominal, n_inducing=0).fit(arm.X, y)
     assert_allclose(model.predict(arm.X), y, atol=1e-3 * y.std())
     assert np.isfinite(model.predict(arm.X, return_std=True)[1]).all()
+
+
+@pytest.mark.parametrize("n_inducing", [0, 5])
+@pytest.mark.parametrize("scale", [0.0, 1e-100, 1.0])
+def test_torques_that_are_the_models_own(scale, n_inducing):
+    arm = Arm("cartpole")
+    body = RigidBodyRegressor("cartpole")
+    y = scale * (body.fit_transform(arm.X) @ body.coef_prior(2)[0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model = InverseDynamics("cartpole", n_inducing=n_inducing, max_iter=10).fit(arm.X, y)
+    mean, std = model.predict(arm.X, return_std=True)
+    assert_allclose(mean, y, atol=1e-4 * y.std() + 1e-6)
+    assert np.isfinite(std).all()
+    assert np.isfinite(model.coef_).all()
 
 
 def test_bad_input_is_named(arm):
@@ -297,11 +368,49 @@ def test_bad_input_is_named(arm):
     assert not hasattr(model, "coef_")
 
 
+def test_the_robot_that_was_fitted_is_kept():
+    arm = Arm("acrobot")
+    model = arm.nominal.copy()
+    fitted = InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y)
+    model.gravity.linear = np.zeros(3)
+    assert fitted.robot_model().gravity.linear[2] < -9.0
+
+
+def test_frames_of_output_are_no_matter():
+    arm = Arm("acrobot")
+    with config_context(transform_output="pandas"):
+        model = InverseDynamics(arm.nominal, n_inducing=0).fit(arm.X, arm.y)
+        assert model.predict(arm.new).shape == arm.new[:, :2].shape
+
+
+def test_other_transformers_are_no_robots():
+    with pytest.raises(TypeError, match="robot must be a name"):
+        InverseDynamics(StandardScaler()).fit(np.zeros((5, 3)), np.zeros(5))
+
+
+def test_two_trajectories_that_differ_widen_what_is_known(arm):
+    rows = arm.groups < 2
+    X, y, groups = arm.X[rows], arm.y[rows].copy(), arm.groups[rows]
+    same = InverseDynamics("ur5", n_inducing=0).fit(X, y, groups=groups)
+    y += np.where(groups == 0, 3.0, -3.0)[:, np.newaxis] * np.sin(X[:, :6])
+    other = InverseDynamics("ur5", n_inducing=0).fit(X, y, groups=groups)
+    seen = same.coef_std_ < 0.5 * same.coef_prior_scale_
+    assert np.median(other.coef_std_[seen] / same.coef_std_[seen]) > 2.0
+
+
 def test_bad_payloads_are_named(arm, rigid):
     with pytest.raises(ValueError, match="y has 2 columns"):
         rigid.estimate_payload(arm.X, arm.y[:, :2])
     with pytest.raises(ValueError, match="link=6"):
         rigid.estimate_payload(arm.X, arm.y, link=6)
+    with pytest.raises(ValueError, match="link"):
+        rigid.estimate_payload(arm.X, arm.y, link=-7)
+    with pytest.raises(TypeError, match="link"):
+        rigid.estimate_payload(arm.X, arm.y, link=1.5)
+    with pytest.raises(ValueError, match="mass_scale"):
+        rigid.estimate_payload(arm.X, arm.y, mass_scale=1e300)
+    with pytest.raises(ValueError, match="pieces"):
+        rigid.estimate_payload(arm.X, arm.y, pieces=[0, 1])
     for name in ("mass_scale", "size"):
         with pytest.raises(ValueError, match=name):
             rigid.estimate_payload(arm.X, arm.y, **{name: 0.0})

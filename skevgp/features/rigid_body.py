@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
+from numpy.typing import ArrayLike
 from sklearn.utils.metaestimators import available_if
 
 from .._sklearn import Interval
@@ -24,7 +25,8 @@ _SPEED, _ACCELERATION = 1.0, 10.0
 _STEP = 1e-3
 
 
-class RigidBodyRegressor(RobotTransformer):
+# Its rows have a matrix each, which no frame can hold.
+class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type: ignore[call-arg]
     r"""Features of inverse dynamics: the torques of all joints are linear in one set of weights.
 
     A robot's equation of motion with friction is
@@ -60,6 +62,8 @@ class RigidBodyRegressor(RobotTransformer):
     ----------
     share_coef : bool
         Whether all outputs have the same weights: with a robot.
+    model_ : pinocchio.Model
+        The robot; only with one.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -71,9 +75,10 @@ class RigidBodyRegressor(RobotTransformer):
 
     Notes
     -----
-    A link's size is its distance to the next joint or its radius of gyration, whichever is larger. An error of its mass
-    changes first moments and inertias too, so the prior is a covariance (`coef_prior`). Where the model knows no limits
-    of effort, weights of all links, times their greatest reach, stand for the motor's largest torque.
+    A link's size is the largest of three lengths: from its joint to the next one, from its joint to its centre of mass,
+    and the radius of gyration about that. An error of its mass changes first moments and inertias too, so the prior is
+    a covariance (`coef_prior`). Where the model knows no limits of effort, the weight of all links, times the sum of
+    their sizes, stands for the motor's largest torque.
 
     Rows need accelerations: `skevgp.datasets.load_log` makes them from a robot's log. Do not scale the columns of x
     before this map.
@@ -132,6 +137,60 @@ class RigidBodyRegressor(RobotTransformer):
     def share_coef(self) -> bool:
         return self.robot is not None
 
+    def fit(self, X: ArrayLike, y: object = None) -> Self:
+        """Load the robot and check the columns.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈]; any width without a robot.
+        y : None
+            Ignored.
+
+        Returns
+        -------
+        self : RigidBodyRegressor
+            Fitted.
+
+        Raises
+        ------
+        ImportError
+            If Pinocchio is not installed; the message gives the pip command.
+        ValueError, TypeError
+            If the robot is unknown, an argument out of its range, or X does not have its columns.
+        """
+        return super().fit(X, y)
+
+    def transform(self, X: ArrayLike) -> np.ndarray:
+        """Evaluate the features.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈].
+
+        Returns
+        -------
+        H : ndarray of shape (n_samples, n_joints, n_features_out)
+            [Y F] of each row; without a robot X.
+        """
+        return super().transform(X)
+
+    def jacobian(self, X: ArrayLike) -> np.ndarray:
+        """Differentiate the features by the columns of X.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈].
+
+        Returns
+        -------
+        J : ndarray of shape (n_samples, n_joints, n_features_out, 3 * n_joints)
+            Of Y by central differences of fourth order, whose error is that of rounding; of friction exact.
+        """
+        return super().jacobian(X)
+
     def _column_names(self) -> list[str]:
         names = self._layout.position_names
         return [*self._layout.state_names, *(f"d2{name}/dt2" for name in names)]
@@ -139,11 +198,16 @@ class RigidBodyRegressor(RobotTransformer):
     def _prepare(self, robot: Robot | None) -> None:
         self._terms = self._checked_friction()
         if robot is not None:
-            self._body = RigidBody(load_robot(robot))
+            self.model_ = load_robot(robot).copy()
+            self._body = RigidBody(self.model_)
 
     def _checked_friction(self) -> tuple[str, ...]:
         terms = [term for term in self.friction if isinstance(term, str) and term in FRICTION]
-        if len(terms) < len(self.friction) or len(set(terms)) < len(terms):
+        if (
+            isinstance(self.friction, (str, set, frozenset))
+            or len(terms) < len(self.friction)
+            or len(set(terms)) < len(terms)
+        ):
             raise ValueError(f"friction={self.friction!r} must be some of {list(FRICTION)}, each once, or empty.")
         return tuple(terms)
 
@@ -248,7 +312,7 @@ class RigidBodyRegressor(RobotTransformer):
 
 
 def _sizes(model: Any) -> np.ndarray:
-    """Of each link: the distance to the farthest joint on it, or its radius of gyration about its own joint."""
+    """Of each link: the distance to the farthest joint on it, or to its centre of mass, or its radius of gyration."""
     sizes = np.zeros(model.nv)
     for joint in range(1, model.njoints):
         link = model.inertias[joint]

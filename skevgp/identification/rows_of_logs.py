@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-# Groups of which one has this share of the rows say nothing of others: they are cut into so many blocks.
+# Groups of which one has this share of the rows are too few to say what others would: they are cut into so many blocks.
 _LARGEST_SHARE, _BLOCKS = 0.5, 5
 
 
@@ -43,12 +43,33 @@ def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
 
 
 def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
-    """Labels (n,) from 0 of what is left out together: the groups, or blocks of rows that follow each other.
+    """Labels (n,) from 0 of what is left out together: whole groups, or blocks of rows that follow each other in one.
 
-    Blocks stand in where there is one group, or one has half of the rows or more; more groups than blocks are joined.
+    Blocks stand in where there are fewer than three groups, or one has half of the rows or more. More groups than
+    blocks are joined, the largest with the smallest.
     """
-    if groups is not None:
-        _, labels, sizes = np.unique(groups, return_inverse=True, return_counts=True)
-        if len(sizes) > 1 and sizes.max() < _LARGEST_SHARE * n_rows:
-            return labels % _BLOCKS if len(sizes) > _BLOCKS else labels
-    return np.arange(n_rows) * min(_BLOCKS, n_rows) // n_rows
+    labels = np.zeros(n_rows, dtype=int) if groups is None else np.unique(groups, return_inverse=True)[1].ravel()
+    sizes = np.bincount(labels)
+    if len(sizes) > 2 and sizes.max() < _LARGEST_SHARE * n_rows:
+        return _joined(sizes)[labels] if len(sizes) > _BLOCKS else labels
+    blocks = np.zeros(n_rows, dtype=int)
+    for group, size in enumerate(sizes):
+        parts = max(1, min(size, round(_BLOCKS * size / n_rows)))
+        blocks[labels == group] = blocks.max() + (group > 0) + np.arange(size) * parts // size
+    return blocks
+
+
+def groups_of(groups: np.ndarray | None, blocks: np.ndarray) -> np.ndarray:
+    """Labels (n,) of what may differ as a whole: the groups if there are some, else blocks."""
+    if groups is None or len(np.unique(groups)) < 2:
+        return blocks
+    return np.unique(groups, return_inverse=True)[1].ravel()
+
+
+def _joined(sizes: np.ndarray) -> np.ndarray:
+    """The block of each group: one after the other, from the largest on, to the block that has the fewest rows."""
+    blocks, rows = np.zeros(len(sizes), dtype=int), np.zeros(_BLOCKS)
+    for group in np.argsort(-sizes, kind="stable"):
+        blocks[group] = np.argmin(rows)
+        rows[blocks[group]] += sizes[group]
+    return blocks

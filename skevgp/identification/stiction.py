@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
-# Noise is at least this share of the variance of a torque.
-_FLOOR = 1e-10
+# A row moves if friction leaves less than this share of its variance open.
+_MOVING = 0.1
 # rad/s or m/s: between which the speed is found at which friction has a sign.
 _SLOWEST, _FASTEST = 1e-3, 0.3
 
@@ -47,21 +47,26 @@ class JointNoise(NamedTuple):
         return self.coulomb**2 / 3.0 * undecided(speed, self.velocity)
 
 
-def noise_at(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float) -> JointNoise:
-    """The most likely σ² of Gaussian errors (n,) whose other noise is known."""
+def noise_at(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, least: float) -> JointNoise:
+    """The most likely σ² of Gaussian errors (n,) whose other noise is known, no less than some."""
     standing = coulomb**2 / 3.0 * undecided(speed, velocity)
-    size = _size(errors, coulomb)
+    most = _most(errors, least)
 
     def loss(log_variance: float) -> float:
         variance = np.exp(log_variance) + standing
         return float(np.mean(np.log(variance) + errors**2 / variance))
 
-    found = minimize_scalar(loss, bounds=(np.log(_FLOOR * size), np.log(2.0 * size)), method="bounded")
+    found = minimize_scalar(loss, bounds=(np.log(least), np.log(most)), method="bounded")
     return JointNoise(float(np.exp(found.x)), coulomb, velocity)
 
 
 def likeliest_noise(
-    errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, start: JointNoise | None = None
+    errors: np.ndarray,
+    speed: np.ndarray,
+    coulomb: float,
+    velocity: float,
+    least: float,
+    start: JointNoise | None = None,
 ) -> JointNoise:
     """The same with the most likely v_s, which depends on how signals were filtered.
 
@@ -71,6 +76,8 @@ def likeliest_noise(
     coulomb : float
     velocity : float
         Where v_s starts.
+    least : float
+        Which σ² is not below, above 0.
     start : JointNoise, optional
         Of errors that were nearly the same: it starts there alone.
 
@@ -79,8 +86,8 @@ def likeliest_noise(
     noise : JointNoise
     """
     if coulomb == 0.0:
-        return noise_at(errors, speed, coulomb, velocity)
-    size, largest, squares = _size(errors, coulomb), coulomb**2 / 3.0, errors**2
+        return noise_at(errors, speed, coulomb, velocity, least)
+    squares, largest, most = errors**2, coulomb**2 / 3.0, _most(errors, least)
 
     def loss(logs: np.ndarray) -> tuple[float, np.ndarray]:
         ratio = speed / np.exp(logs[1])
@@ -92,18 +99,21 @@ def likeliest_noise(
         return float(np.mean(np.log(variance) + squares / variance)), np.array(by_logs)
 
     slowest, fastest = min(_SLOWEST, velocity), max(_FASTEST, velocity)
-    limits = np.log([[_FLOOR * size, 2.0 * size], [slowest, fastest]])
+    limits = np.log([[least, most], [slowest, fastest]])
     if start is not None and start.coulomb > 0.0:
         starts = [np.log([start.variance, start.velocity])]
     else:
+        moving = squares[undecided(speed, velocity) < _MOVING]
+        size = float(np.mean(squares))
+        variances = np.maximum([size, 0.1 * size, np.mean(moving) if len(moving) else size], least)
         starts = [
-            np.log([share * size, first]) for share in (1.0, 0.1) for first in (velocity, np.sqrt(velocity * fastest))
+            np.log([variance, first]) for variance in variances for first in (velocity, np.sqrt(velocity * fastest))
         ]
     fits = [minimize(loss, np.clip(first, *limits.T), jac=True, method="L-BFGS-B", bounds=limits) for first in starts]
     best = np.exp(min(fits, key=lambda fit: fit.fun).x)
     return JointNoise(float(best[0]), coulomb, float(best[1]))
 
 
-def _size(errors: np.ndarray, coulomb: float) -> float:
+def _most(errors: np.ndarray, least: float) -> float:
     """A variance that noise does not exceed."""
-    return float(np.mean(errors**2)) or coulomb**2 * _FLOOR or 1e-300
+    return max(2.0 * float(np.max(errors**2)), 10.0 * least)

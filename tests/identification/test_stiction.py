@@ -20,13 +20,13 @@ def test_at_rest_friction_is_uniform_and_at_speed_it_is_known():
 
 def test_noise_is_found_where_the_rest_is_known():
     errors, speed = drawn()
-    assert noise_at(errors, speed, 2.0, 0.02).variance == pytest.approx(0.01, rel=0.05)
-    assert noise_at(errors, speed, 0.0, 0.02).variance == pytest.approx(np.mean(errors**2), rel=1e-3)
+    assert noise_at(errors, speed, 2.0, 0.02, 1e-9).variance == pytest.approx(0.01, rel=0.05)
+    assert noise_at(errors, speed, 0.0, 0.02, 1e-9).variance == pytest.approx(np.mean(errors**2), rel=1e-3)
 
 
 @pytest.mark.parametrize("velocity", [0.005, 0.02, 0.1])
 def test_the_velocity_is_found_too(velocity):
-    found = likeliest_noise(*drawn(velocity=velocity), coulomb=2.0, velocity=0.01)
+    found = likeliest_noise(*drawn(velocity=velocity), coulomb=2.0, velocity=0.01, least=1e-9)
     assert found.velocity == pytest.approx(velocity, rel=0.1)
     assert found.variance == pytest.approx(0.01, rel=0.2)
 
@@ -34,18 +34,31 @@ def test_the_velocity_is_found_too(velocity):
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 def test_units_do_not_matter(scale):
     errors, speed = drawn(2000)
-    one, other = (likeliest_noise(s * errors, speed, s * 2.0, 0.01) for s in (1.0, scale))
+    one, other = (likeliest_noise(s * errors, speed, s * 2.0, 0.01, 1e-9 * s**2) for s in (1.0, scale))
     assert_allclose([other.variance, other.velocity], [scale**2 * one.variance, one.velocity], rtol=1e-2)
 
 
 def test_without_errors_there_is_hardly_any_noise():
-    noise = likeliest_noise(np.zeros(10), np.zeros(10), 1.0, 0.01)
-    assert 0.0 < noise.variance < 1e-6
-    assert noise_at(np.zeros(10), np.zeros(10), 0.0, 0.01).variance > 0.0
+    for least in (1e-12, 1e-250):
+        noise = likeliest_noise(np.zeros(10), np.zeros(10), 1.0, 0.01, least)
+        assert least * 0.999 <= noise.variance <= 11.0 * least
+        assert noise_at(np.zeros(10), np.zeros(10), 0.0, 0.01, least).variance >= least * 0.999
 
 
 def test_a_start_nearby_ends_at_the_same_noise():
     errors, speed = drawn()
-    cold = likeliest_noise(errors, speed, 2.0, 0.01)
-    warm = likeliest_noise(errors, speed, 2.0, 0.01, JointNoise(0.02, 2.0, 0.03))
+    cold = likeliest_noise(errors, speed, 2.0, 0.01, 1e-9)
+    warm = likeliest_noise(errors, speed, 2.0, 0.01, 1e-9, JointNoise(0.02, 2.0, 0.03))
     assert_allclose(warm, cold, rtol=1e-2)
+
+
+@pytest.mark.parametrize("coulomb", [0.5, 2.0])
+def test_noise_of_few_rows_that_move_is_larger_than_the_mean_square_of_all(coulomb):
+    rng = np.random.default_rng(0)
+    speed = np.where(np.arange(20_000) % 100 == 0, 1.0, 1e-3)
+    true = JointNoise(1.0, coulomb, 0.01)
+    quiet = np.where(speed > 0.5, 1.0, 0.1)  # at rest hardly any of it is seen
+    errors = quiet * np.sqrt(true.variance) * rng.normal(size=20_000)
+    found = noise_at(errors[speed > 0.5], speed[speed > 0.5], coulomb, 0.01, 1e-9)
+    assert found.variance == pytest.approx(1.0, rel=0.3)
+    assert noise_at(errors, speed, coulomb, 0.01, 1e-9).variance > np.mean(errors**2)

@@ -6,7 +6,7 @@ from numpy.testing import assert_allclose
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import DotProduct
 
-from skevgp.identification.weights import Prior, Rows, identify, left_out, with_gains
+from skevgp.identification.weights import Prior, Rows, condensed, identify, left_out, with_gains
 
 
 def problem(n=400, n_outputs=2, p=4, noise=0.1, seed=0, gains=None, scaled=4):
@@ -16,7 +16,7 @@ def problem(n=400, n_outputs=2, p=4, noise=0.1, seed=0, gains=None, scaled=4):
     rigid = features[:, :, :scaled] @ beta[:scaled]
     targets = rigid * (1.0 if gains is None else gains) + features[:, :, scaled:] @ beta[scaled:]
     targets = targets + noise * rng.normal(size=(n, n_outputs))
-    rows = Rows(features, targets, np.ones((n, n_outputs)), np.zeros(n, dtype=int), np.arange(n) * 5 // n)
+    rows = Rows(features, targets, np.ones((n, n_outputs)), np.zeros(n, dtype=int), *2 * [np.arange(n) * 5 // n])
     prior = Prior(np.zeros(p), np.eye(p), np.arange(p) < scaled, None, 0.01)
     return rows, prior, beta
 
@@ -107,15 +107,34 @@ def test_weights_given_others_are_those_of_the_joint_normal():
     assert_allclose(found.given(first).mean, [*first, *expected], rtol=1e-9)
 
 
+@pytest.mark.parametrize("gains", [None, np.array([1.1, 0.9])])
+def test_condensed_rows_say_what_all_rows_said(gains):
+    rows, prior, beta = problem(n=600, p=5, gains=gains, scaled=3)
+    prior = with_gains(replace(prior, mean=beta, covariance=0.04 * np.eye(5)), 2, 0.0 if gains is None else 0.2)
+    first, second = rows[rows.blocks < 3], rows[rows.blocks >= 3]
+    alone = identify(first, prior)
+    both = identify(second, prior, known=condensed(first, alone))
+    all_rows = identify(rows, prior)
+    # Noise and what rows are worth are estimated apart, so they agree up to their errors.
+    assert_allclose(both.mean, all_rows.mean, atol=0.5 * np.sqrt(np.diag(all_rows.covariance).max()))
+    assert_allclose(np.sqrt(np.diag(both.covariance)), np.sqrt(np.diag(all_rows.covariance)), rtol=0.3)
+    # The squared errors of any weights are the same.
+    known, some = condensed(first, alone), beta + 0.3
+    scale = alone.inflation * alone.correlation_time * np.array([noise.variance for noise in alone.noise])
+    expected = np.sum((first.targets - first.features @ some) ** 2 / scale)
+    assert np.sum((known.targets - known.features @ some) ** 2) == pytest.approx(expected, rel=1e-8)
+
+
 def test_rows_left_out_are_predicted_from_the_others():
     rows, prior, beta = problem()
     targets = rows.targets.copy()
     targets[rows.blocks == 2] += 100.0
-    found = left_out(replace(rows, targets=targets), prior)
+    rows = replace(rows, targets=targets)
+    found = left_out(rows, identify(rows, prior))
     truth = rows.features @ beta
     assert np.abs(found - truth)[rows.blocks == 2].max() < 0.5  # its own targets are not used
     alone = replace(rows, blocks=np.zeros(len(targets), dtype=int))
-    assert np.isfinite(left_out(alone, prior)).all()
+    assert np.isfinite(left_out(alone, identify(alone, prior))).all()
 
 
 @pytest.mark.parametrize("noise", [0.0, 1e-12])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from numbers import Integral
 from pathlib import Path
 from typing import Any, Literal, overload
 
@@ -198,9 +199,14 @@ def load_log(
     True
     """
     how = Processing(dt, cutoff, max_gap, rest_velocity, rest_time)
-    if time_unit not in SECONDS:
+    if not isinstance(time_unit, str) or time_unit not in SECONDS:
         raise ValueError(f"time_unit must be one of {list(SECONDS)}; got {time_unit!r}.")
-    if isinstance(joints, str) or (joints is not None and len(set(joints)) != len(joints)):
+    names_of_joints = [] if joints is None else joints
+    if (
+        not isinstance(names_of_joints, (list, tuple, np.ndarray))
+        or not all(isinstance(name, str) for name in names_of_joints)
+        or len(set(names_of_joints)) != len(names_of_joints)
+    ):
         raise ValueError(f"joints must be a list of different names; got {joints!r}.")
     asked = None if columns is None else check_columns(columns)
     files, limits = _files(path, keep)
@@ -219,6 +225,8 @@ def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
     """The files, and what is kept of each."""
     if isinstance(path, (str, os.PathLike)):
         return [Path(path)], [_check_keep(keep)]
+    if not isinstance(path, (list, tuple)) or not all(isinstance(one, (str, os.PathLike)) for one in path):
+        raise TypeError(f"path must be a path or a list of paths; got {path!r}.")
     files = [Path(one) for one in path]
     if not files:
         raise ValueError("path must be a file or several; got none.")
@@ -228,7 +236,11 @@ def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
 
 
 def _check_keep(keep: Any) -> Keep | None:
-    if keep is None or isinstance(keep, slice):
+    if keep is None:
+        return keep
+    if isinstance(keep, slice):
+        if not all(part is None or isinstance(part, Integral) for part in (keep.start, keep.stop, keep.step)):
+            raise ValueError(f"keep must be slice(first row, stop row) of whole numbers; got {keep!r}.")
         return keep
     if not isinstance(keep, tuple) or len(keep) != 2:
         raise ValueError(f"keep must be slice(first row, stop row) or (first second, last second); got {keep!r}.")

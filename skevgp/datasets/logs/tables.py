@@ -27,13 +27,14 @@ def check_columns(columns: Any) -> dict[str, list[int | str]]:
     """Which columns hold which signal, as lists; or an error."""
     if not isinstance(columns, Mapping):
         raise TypeError(f"columns must be a dict that says which columns hold {', '.join(_NAMES)}; got {columns!r}.")
+    columns = {name: value for name, value in columns.items() if value is not None}
     unknown, missing = set(columns) - set(_NAMES), set(_REQUIRED) - set(columns)
     if unknown or missing or len(set(_EFFORT) & set(columns)) != 1:
         raise ValueError(
             f"columns must name 'time', 'position', one of 'effort' and 'current', and perhaps 'velocity' and "
             f"'acceleration'; got {list(columns)}."
         )
-    asked = {name: _as_list(value, name) for name, value in columns.items() if value is not None}
+    asked = {name: _as_list(value, name) for name, value in columns.items()}
     if len(asked["time"]) != 1:
         raise ValueError(f"columns['time'] must be one column; got {columns['time']!r}.")
     return asked
@@ -60,7 +61,7 @@ def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: st
     """
     try:
         # The signature of UTF-8, which spreadsheets write, is none of the first column's name.
-        with (gzip.open if path.suffix == ".gz" else open)(path, "rt", encoding="utf-8-sig") as lines:
+        with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rt", encoding="utf-8-sig") as lines:
             found, values = _read(lines, columns)
     except (gzip.BadGzipFile, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise ValueError(f"it is no text, or its compression is broken ({error}).") from error
