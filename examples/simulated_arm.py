@@ -10,7 +10,8 @@ and what a robot's controller would write down goes into a file: irregular times
 import numpy as np
 import pinocchio
 
-GAINS = np.array([14.0, 14.0, 12.0, 10.0, 10.0, 10.0])  # torque per current, N m/A
+CATALOGUE_GAINS = np.array([14.0, 14.0, 12.0, 10.0, 10.0, 10.0])  # torque per current, N m/A
+GAINS = CATALOGUE_GAINS * [0.95, 0.94, 0.96, 0.93, 0.97, 0.95]  # what the motors really have
 HOME = np.array([0.0, -1.6, 0.4, -1.6, 0.3, 0.0])  # an arm that stands upright with a bent elbow, rad
 VISCOUS = np.array([12.0, 12.0, 8.0, 3.0, 3.0, 2.0])  # N m s/rad
 COULOMB = np.array([8.0, 8.0, 5.0, 2.0, 2.0, 1.5])  # N m
@@ -18,11 +19,11 @@ BY_LOAD = 0.05  # Coulomb's friction per torque
 STICTION_VELOCITY = 0.02  # rad/s
 
 
-def sums_of_sines(times, rng, speed=0.35):
-    """Positions, velocities and accelerations of six joints along harmonics of 0.05 Hz up to 0.6 Hz."""
-    omega = 2.0 * np.pi * 0.05 * np.arange(1, 13)
-    amplitude = speed * rng.standard_normal((6, 12)) / omega / np.sqrt(6.0)
-    phase = omega * times[:, np.newaxis, np.newaxis] + rng.uniform(0.0, 2.0 * np.pi, (6, 12))
+def sums_of_sines(times, rng, speed=0.2):
+    """Positions, velocities and accelerations of six joints along harmonics of 0.1 Hz up to 0.8 Hz."""
+    omega = 2.0 * np.pi * 0.1 * np.arange(1, 9)
+    amplitude = speed * rng.standard_normal((6, 8)) / omega
+    phase = omega * times[:, np.newaxis, np.newaxis] + rng.uniform(0.0, 2.0 * np.pi, (6, 8))
     position = HOME + np.sum(amplitude * np.sin(phase), axis=2)
     velocity = np.sum(amplitude * omega * np.cos(phase), axis=2)
     return position, velocity, -np.sum(amplitude * omega**2 * np.sin(phase), axis=2)
@@ -37,16 +38,22 @@ def torques(robot, position, velocity, acceleration):
     return body + VISCOUS * velocity + (COULOMB + BY_LOAD * np.abs(body)) * sign
 
 
-def write_log(file, robot, seconds, random_state, noise=0.02):
-    """Write a log in the columns time, 6 positions, 6 velocities, 6 currents, about every 8 ms."""
+def write_log(file, robot, seconds, random_state, noise=0.02, loaded=None, change=np.inf):
+    """Write a log in the columns time, 6 positions, 6 velocities, 6 currents, about every 8 ms.
+
+    From the second ``change`` on the arm is ``loaded``.
+    """
     rng = np.random.RandomState(random_state)
     times = np.arange(0.0, seconds, 0.008)
     times += rng.uniform(0.0, 0.004, len(times))
-    position, velocity, acceleration = sums_of_sines(times, rng)
-    current = torques(robot, position, velocity, acceleration) / GAINS
+    motion = sums_of_sines(times, rng)
+    current = torques(robot, *motion) / GAINS
+    if loaded is not None:
+        after = times >= change
+        current[after] = torques(loaded, *(part[after] for part in motion)) / GAINS
     current += noise * current.std(axis=0) * rng.standard_normal(current.shape)
-    velocity = velocity + 1e-3 * rng.standard_normal(velocity.shape)
-    np.savetxt(file, np.column_stack([times, position, velocity, current]), delimiter=",", fmt="%.6f")
+    velocity = motion[1] + 1e-3 * rng.standard_normal(current.shape)
+    np.savetxt(file, np.column_stack([times, motion[0], velocity, current]), delimiter=",", fmt="%.6f")
 
 
 def with_payload(robot, mass, com):
