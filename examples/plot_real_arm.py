@@ -5,8 +5,8 @@ Torques of a real arm from its logs
 A robot on a table gives a log of positions, velocities and motor currents, and its maker a URDF file whose masses are
 rough and whose gears have no friction. From both, ``InverseDynamics`` learns the torques with bands, and finds masses
 and friction with intervals. Here they are compared with those of the URDF and of least squares, on a trajectory that
-none of them has seen. Give the folder of a real arm's logs, ``python examples/plot_real_arm.py DATA_DIR``, or none: then
-an arm is simulated. Run ``python examples/plot_real_arm.py --help`` for options.
+none of them has seen. Give the folder of a real arm's logs, ``python examples/plot_real_arm.py DATA_DIR``, or none:
+then an arm is simulated. Run ``python examples/plot_real_arm.py --help`` for options.
 """
 
 # %%
@@ -51,12 +51,13 @@ scratch = tempfile.TemporaryDirectory()
 # %%
 # The robot as its maker describes it, and the logs
 # -------------------------------------------------
-# The simulated arm is a UR10 whose masses, centres of mass and inertias the model has wrong by up to 20 %. Its gears have
-# Coulomb's and viscous friction; its currents have noise of 2 %, and its motors give some 5 % less than the catalogue
-# says. Only its log reaches what follows.
+# The simulated arm is a UR10 whose masses, centres of mass and inertias the model has wrong by up to 20 %. Its gears
+# have Coulomb's and viscous friction; its currents have noise of 2 %, and its motors give some 5 % less than the
+# catalogue says. Only its log reaches what follows.
 
 try:
     import matplotlib.pyplot as plt
+
     from simulated_arm import CATALOGUE_GAINS, write_log
 
     if options.data is None:
@@ -84,8 +85,8 @@ print(f"{robot.name}, {'simulated' if truth else 'its logs'}: {len(train.data)} 
 # %%
 # What was done to the signals
 # ----------------------------
-# They are interpolated to a grid of 10 ms and filtered at 5 Hz, forth and back so that nothing is late, and accelerations
-# are differences of the filtered velocities.
+# They are interpolated to a grid of 10 ms and filtered at 5 Hz, forth and back so that nothing is late, and
+# accelerations are differences of the filtered velocities.
 
 options.output.mkdir(parents=True, exist_ok=True)
 stem = "real_arm" if options.data is None else "real_arm_measured"
@@ -120,11 +121,11 @@ print(f"{'within 2 std':16s}", *(f"{value:13.3f}" for value in inside))
 # %%
 # What the arm is made of
 # -----------------------
-# Torques do not show everything: the mass of a link that turns about the vertical, or how a mass is shared by two links.
-# There the interval stays as wide as that of the prior, around the URDF's value. What they do show, a robot's user can ask
-# for: any linear function of the weights has its own interval, such as the torque that holds the arm stretched out.
-# (The simulated gears' friction grows with the load, so that it has no true values; and where gains are unknown, friction
-# is in units of the catalogue's.)
+# Torques do not show everything: not the mass of a link that turns about the vertical, nor how a mass is shared by two
+# links. There the interval stays as wide as that of the prior, around the URDF's value. What they do show, a user can
+# ask for: any linear function of the weights has its own interval, such as the torque that holds the arm stretched
+# out. (The simulated gears' friction grows with the load, so that it has no true values; and it is found in the units
+# of what was measured, with the catalogue's gains.)
 
 n_inertial = 10 * len(joints)
 holding = body.transform(np.zeros((1, 3 * len(joints))))[0]
@@ -152,7 +153,8 @@ for name, row in asked.items():
 # %%
 # Torques, errors and parameters
 # ------------------------------
-# The URDF alone knows gravity, but nothing of friction. The band is two standard deviations.
+# The URDF alone knows gravity, but nothing of friction. The band is that of InverseDynamics, two standard deviations to
+# each side of its mean.
 
 figure, axes = plt.subplots(3, 2, figsize=(10, 7.5), layout="constrained", width_ratios=(1.6, 1))
 colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}
@@ -162,7 +164,7 @@ for ax, joint in zip(axes[:, 0], shown, strict=True):
     ax.plot(seconds, predictions["URDF"][window, joint], color=colours["URDF"], linewidth=1, label="URDF")
     ax.plot(seconds, new.target[window, joint], "k", linewidth=1, label="measured")
     band = mean[window, joint] + 2.0 * np.array([[-1.0], [1.0]]) * std[window, joint]
-    ax.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0, label="InverseDynamics")
+    ax.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0)
     ax.set_title(joints[joint].removesuffix("_joint").replace("_", " "), fontsize=10)
     ax.set_ylabel("torque (N m)")
 axes[2, 0].set_xlabel("time (s)")
@@ -172,6 +174,7 @@ places = np.arange(len(joints))
 for (name, error), marker in zip(errors.items(), "s^o", strict=True):
     axes[0, 1].plot(places, error, marker, color=colours[name], label=name)
 axes[0, 1].set_yscale("log")
+axes[0, 1].grid(axis="y", color="0.9")
 axes[0, 1].set_title("Mean squared error / variance", fontsize=10)
 for ax, start, title in (
     (axes[1, 1], "m(", "Mass of the link (kg)"),
@@ -182,17 +185,25 @@ for ax, start, title in (
         np.array([interval(row, *of) for row in rows]).T for of in ((cad, prior_cov), (model.coef_, model.coef_cov_))
     )
     if start == "m(":
-        ax.errorbar(places - 0.12, *before, fmt="s", color=colours["URDF"], capsize=3, label="URDF, prior")
-    ax.errorbar(places + 0.12, *after, fmt="o", color=colours["InverseDynamics"], capsize=3, label="found, 95 %")
+        ax.errorbar(places - 0.22, *before, fmt="s", color=colours["URDF"], capsize=3, label="URDF, prior")
+    ax.errorbar(
+        places + 0.22 * (start == "m("),
+        *after,
+        fmt="o",
+        color=colours["InverseDynamics"],
+        capsize=3,
+        label="found, 95 %",
+    )
     if truth and start == "m(":
         ax.plot(places, [row @ true_weights for row in rows], "kx", label="truth")
     ax.set_title(title, fontsize=10)
     ax.set_ylim(bottom=0.0)
 for ax in axes[:, 1]:
-    ax.set_xticks(places, short, fontsize=7)
-for ax in (axes[0, 1], axes[1, 1]):
-    ax.legend(fontsize=8)
-figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower left", ncols=3, fontsize=8)
+    ax.set_xticks(places, short, fontsize=8)
+    ax.set_xlim(-0.5, len(joints) - 0.5)
+axes[1, 1].legend(fontsize=8)
+handles = [*axes[0, 0].get_lines()[1:], *axes[0, 1].get_lines()]
+figure.legend(handles, [line.get_label() for line in handles], loc="outside lower center", ncols=4, fontsize=9)
 
 picture = options.output / f"{stem}.png"
 figure.savefig(picture, dpi=100)
