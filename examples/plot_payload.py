@@ -48,7 +48,7 @@ parser.add_argument(
 )
 options = parser.parse_args()
 quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
-duration = 12.0 if quick else 30.0
+duration = 8.0 if quick else 30.0
 scratch = tempfile.TemporaryDirectory()
 
 # %%
@@ -91,7 +91,7 @@ scratch.cleanup()
 # gain is unknown up to some 10 %, and the interval says what that leaves of the mass. (Only weights are asked for,
 # which need no Gaussian process: ``n_inducing=0``.)
 
-lengths = np.linspace(2.0, loaded.time[-1] - loaded.time[0], 3 if quick else 9)
+lengths = np.linspace(2.0, loaded.time[-1] - loaded.time[0], 2 if quick else 9)
 models, found = {}, {}
 print(f"{'':24s}{'seconds':>8s}{'mass (kg)':>17s}   centre of mass (mm, in the last joint's frame)")
 for gain_scale in (0.0, 0.1):
