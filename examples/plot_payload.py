@@ -56,6 +56,9 @@ scratch = tempfile.TemporaryDirectory()
 # ------------------------------
 # The simulated arm is a UR10 of which the model has masses, centres of mass and inertias wrong by up to 20 %; its
 # motors give some 5 % less torque than the catalogue says. A third log is of an arm that picks the body up half-way.
+# The gears' friction grows with the load, as in harmonic drives, which no weight stands for: where gains are right,
+# intervals of 95 % held the mass and the centre of mass 12 times of 16 in four such pairs of 20 s (``gain_scale=0``),
+# and 24 times of 24 in six pairs whose friction did not grow.
 
 try:
     import matplotlib.pyplot as plt
@@ -168,7 +171,7 @@ for (gain_scale, loads), colour, shift in zip(found.items(), colours, (-0.15, 0.
     axes[0].errorbar(lengths + shift, masses, 1.96 * deviations, fmt="o", color=colour, capsize=3, label=label)
 axes[0].axhline(mass, color="k", linewidth=1, label="truth")
 axes[0].set_ylabel("mass (kg)")
-axes[0].set_title("The load, with intervals that hold 95 %", fontsize=10)
+axes[0].set_title("The load, with 95 % intervals of the model", fontsize=10)
 for axis, colour in enumerate(colours):
     middle, half = 1e3 * np.array([(load.com[axis], 1.96 * load.com_std[axis]) for load in found[0.1]]).T
     axes[1].errorbar(

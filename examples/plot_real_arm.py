@@ -52,8 +52,8 @@ scratch = tempfile.TemporaryDirectory()
 # The robot as its maker describes it, and the logs
 # -------------------------------------------------
 # The simulated arm is a UR10 whose masses, centres of mass and inertias the model has wrong by up to 20 %. Its gears
-# have Coulomb's and viscous friction; its currents have noise of 2 %, and its motors give some 5 % less than the
-# catalogue says. Only its log reaches what follows.
+# have viscous friction, and Coulomb's, which grows with the load; its currents have noise of 2 %, and its motors give
+# some 5 % less than the catalogue says. Only its log reaches what follows.
 
 try:
     import matplotlib.pyplot as plt
