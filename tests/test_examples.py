@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from skevgp.metrics import prediction_error
+from skevgp.robots import load_robot
+from skevgp.robots.loading import urdf_path
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LEARN = EXAMPLES / "plot_learn_dynamics.py"
@@ -131,6 +133,42 @@ def test_without_crocoddyl():
     assert "Traceback" not in result.stderr
 
 
+def test_real_arm(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_real_arm.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    errors = {name: error.mean() for name, error in names["errors"].items()}
+    assert errors["InverseDynamics"] < errors["least squares"] < 0.1 * errors["URDF"]
+    assert (names["inside"] > 0.7).all()
+    assert "coulomb(wrist_3_joint)" in capsys.readouterr().out
+    for picture in ("real_arm.png", "real_arm_signals.png"):
+        assert (tmp_path / picture).stat().st_size > 10_000
+
+
+def test_payload(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_payload.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    least, largest = names["found"][0.1][-1].mass_interval
+    assert least < names["mass"] < largest
+    remembers, forgets = (names["followed"][factor][0, -1] for factor in (1.0, 0.8))
+    assert abs(forgets - names["mass"]) < abs(remembers - names["mass"])
+    assert "online, forgetting factor 0.8" in capsys.readouterr().out
+    assert (tmp_path / "payload.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("script", ["plot_real_arm.py", "plot_payload.py"])
+def test_a_folder_with_a_urdf_and_logs_takes_the_place_of_the_simulation(monkeypatch, tmp_path, script):
+    write_log = runpy.run_path(str(EXAMPLES / "simulated_arm.py"))["write_log"]
+    robot = load_robot("ur10")
+    names = ["20sec_8harm", "30sec_12harm", "40sec_12harm", "50sec_12harm"]
+    if script == "plot_payload.py":
+        names = ["14harm50sec", "14harm50secLoad"]
+    folder = tmp_path / "data"
+    folder.mkdir()
+    for seed, name in enumerate(names):
+        write_log(folder / f"arm_{name}.csv.gz", robot, 5.0, seed)
+    (folder / "arm.urdf").write_bytes(urdf_path("ur10").read_bytes())
+    found = run(EXAMPLES / script, folder, "--output", tmp_path, monkeypatch=monkeypatch)
+    assert found["com" if "payload" in script else "truth"] is None
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -163,6 +201,15 @@ def test_an_unknown_robot_is_a_line_not_a_traceback():
     assert "Traceback" not in result.stderr
 
 
+@pytest.mark.parametrize("script", ["plot_real_arm.py", "plot_payload.py"])
+def test_a_folder_without_a_urdf_is_a_line_not_a_traceback(tmp_path, script):
+    result = command_line(str(tmp_path), script=EXAMPLES / script)
+    assert result.returncode == 1
+    assert result.stderr.startswith("error: ")
+    assert "robot.urdf" in result.stderr
+    assert "Traceback" not in result.stderr
+
+
 def test_a_wrong_size_is_a_line_not_a_traceback():
     result = command_line("--trajectories", "0")
     assert result.returncode == 1
@@ -189,6 +236,8 @@ def test_without_an_optional_package(package, pip):
         "plot_swing_up.py",
         "plot_crocoddyl.py",
         "plot_online.py",
+        "plot_real_arm.py",
+        "plot_payload.py",
     ],
 )
 def test_the_stories_of_robots_without_pinocchio(script):

@@ -1,0 +1,212 @@
+"""
+Torques of a real arm from its logs
+===================================
+
+A robot on a table gives a log of positions, velocities and motor currents, and its maker a URDF file whose masses are
+rough and whose gears have no friction. From both, ``InverseDynamics`` learns the torques with bands, and finds masses
+and friction with intervals. Here they are compared with those of the URDF and of least squares, on a trajectory that
+none of them has seen. Give the folder of a real arm's logs, ``python examples/plot_real_arm.py DATA_DIR``, or none:
+then an arm is simulated. Run ``python examples/plot_real_arm.py --help`` for options.
+"""
+
+# %%
+# Options
+# -------
+# A real arm's folder holds a URDF file and tables, by the names below and without a header: time, six positions, six
+# velocities, six currents (further columns are passed over).
+
+import argparse
+import os
+import sys
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from skevgp import InverseDynamics
+from skevgp.datasets import load_log, load_robot, perturb_robot
+from skevgp.features import RigidBodyRegressor
+from skevgp.plotting import SignalsDisplay
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+
+TRAINING = {"20sec_8harm": 20.0, "30sec_12harm": 30.0, "40sec_12harm": 40.0}  # and how long to simulate, s
+NEW = {"50sec_12harm": 40.0}
+UR10E_GAINS = [14.87, 13.26, 11.13, 10.62, 11.03, 11.47]  # of its catalogue: torque per current, N m/A
+
+parser = argparse.ArgumentParser(description="Torques, masses and friction of an arm from its own logs.")
+parser.add_argument("data", type=Path, nargs="?", help="folder of a real arm's logs; default: simulate an arm")
+parser.add_argument("--seed", type=int, default=0, help="of the simulated arm and the model; default: %(default)s")
+parser.add_argument(
+    "--output",
+    type=Path,
+    default=Path(__file__).resolve().parent / "output",
+    help="folder for the pictures; default: examples/output",
+)
+options = parser.parse_args()
+quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
+settings = {"n_inducing": 10, "max_rows": 300, "max_iter": 15} if quick else {}
+scratch = tempfile.TemporaryDirectory()
+
+# %%
+# The robot as its maker describes it, and the logs
+# -------------------------------------------------
+# The simulated arm is a UR10 whose masses, centres of mass and inertias the model has wrong by up to 20 %. Its gears
+# have viscous friction, and Coulomb's, which grows with the load; its currents have noise of 2 %, and its motors give
+# some 5 % less than the catalogue says. Only its log reaches what follows.
+
+try:
+    import matplotlib.pyplot as plt
+
+    from simulated_arm import CATALOGUE_GAINS, write_log
+
+    if options.data is None:
+        truth, folder, gains = load_robot("ur10"), Path(scratch.name), CATALOGUE_GAINS
+        robot = perturb_robot(truth, 0.2, random_state=options.seed)
+        for seed, (name, seconds) in enumerate((TRAINING | NEW).items(), start=100 * options.seed):
+            write_log(folder / f"{name}.csv.gz", truth, min(seconds, 8.0) if quick else seconds, seed)
+    else:
+        truth, folder, gains = None, options.data, UR10E_GAINS
+        robot = load_robot(next(folder.glob("*.urdf"), folder / "robot.urdf"))
+    joints = list(robot.names)[1:]
+    columns = {"time": 0, "position": range(1, 7), "velocity": range(7, 13), "current": range(13, 19)}
+    files = {name: next(folder.glob(f"*{name}.csv*"), folder / f"{name}.csv") for name in TRAINING | NEW}
+    train, new = (
+        load_log([files[name] for name in names], columns=columns, joints=joints, gains=gains)
+        for names in (TRAINING, NEW)
+    )
+except ImportError as error:
+    sys.exit(f"error: {error}\nThis example needs: pip install pin example-robot-data matplotlib")
+except (ValueError, OSError) as error:
+    sys.exit(f"error: {error}")
+scratch.cleanup()
+print(f"{robot.name}, {'simulated' if truth else 'its logs'}: {len(train.data)} rows of {len(TRAINING)} trajectories")
+
+# %%
+# What was done to the signals
+# ----------------------------
+# They are interpolated to a grid of 10 ms and filtered at 5 Hz, forth and back so that nothing is late, and
+# accelerations are differences of the filtered velocities.
+
+options.output.mkdir(parents=True, exist_ok=True)
+stem = "real_arm" if options.data is None else "real_arm_measured"
+shown = [1, 2, 4]
+SignalsDisplay.from_log(train, joints=shown).figure_.savefig(options.output / f"{stem}_signals.png", dpi=100)
+
+# %%
+# Three ways to predict torques
+# -----------------------------
+# The first two need the same features: the torque is linear in masses, first moments, inertias and friction.
+# ``gain_scale`` says that the gains of a catalogue may be off by some 10 %. Rows of a log depend on each other:
+# ``groups``, the files, tell what holds for another trajectory.
+
+body = RigidBodyRegressor(robot)
+features, features_new = body.fit_transform(train.data), body.transform(new.data)
+cad, _ = body.coef_prior(len(joints))
+least_squares = np.linalg.lstsq(features.reshape(-1, len(cad)), train.target.ravel(), rcond=None)[0]
+model = InverseDynamics(robot, gain_scale=0.1, random_state=options.seed, **settings)
+model.fit(train.data, train.target, groups=train.groups)
+mean, std = model.predict(new.data, return_std=True)
+predictions = {"URDF": features_new @ cad, "least squares": features_new @ least_squares, "InverseDynamics": mean}
+errors = {
+    name: np.mean((new.target - torque) ** 2, axis=0) / new.target.var(axis=0) for name, torque in predictions.items()
+}
+print("mean squared error over the torque's variance, on a new trajectory:")
+print(f"{'':16s}", *(f"{joint.removesuffix('_joint'):>13s}" for joint in joints))
+for name, error in errors.items():
+    print(f"{name:16s}", *(f"{value:13.4f}" for value in error))
+inside = (np.abs(new.target - mean) < 2.0 * std).mean(axis=0)
+print(f"{'within 2 std':16s}", *(f"{value:13.3f}" for value in inside))
+
+# %%
+# What the arm is made of
+# -----------------------
+# Torques do not show everything: not the mass of a link that turns about the vertical, nor how a mass is shared by two
+# links. There the interval stays as wide as that of the prior, around the URDF's value. What they do show, a user can
+# ask for: any linear function of the weights has its own interval, such as the torque that holds the arm stretched
+# out. (The simulated gears' friction grows with the load, so that it has no true values; and it is found in the units
+# of what was measured, with the catalogue's gains.)
+
+n_inertial = 10 * len(joints)
+holding = body.transform(np.zeros((1, 3 * len(joints))))[0]
+holding[:, n_inertial:] = 0.0
+asked = {name: row for name, row in zip(model.coef_names_, np.eye(len(cad)), strict=True) if name.startswith("m(")}
+asked |= {f"holds the stretched arm({joints[joint]})": holding[joint] for joint in (1, 2)}
+friction = [name for name in model.coef_names_ if name.startswith(("coulomb(", "viscous("))]
+asked |= {name: (model.coef_names_ == name).astype(float) for name in friction}
+units = {"m": "kg", "v": "N m s", "c": "N m", "h": "N m"}
+true_weights = RigidBodyRegressor(truth).coef_prior(len(joints))[0] if truth else None
+prior_cov = body.coef_prior(len(joints))[1]
+
+
+def interval(row, mean, covariance):
+    """Mean, and half of the width of the interval that holds 95 %, of row @ weights."""
+    return np.array([row @ mean, 1.96 * np.sqrt(row @ covariance @ row)])
+
+
+print(f"\n{'':46s}{'unit':7s}{'URDF, prior':>17s}{'found':>19s}{'truth' if truth else '':>10s}")
+for name, row in asked.items():
+    before, after = interval(row, cad, prior_cov), interval(row, model.coef_, model.coef_cov_)
+    known = f"{row @ true_weights:10.3f}" if truth and name not in friction else ""
+    print(f"{name:46s}{units[name[0]]:7s}{before[0]:8.2f} ± {before[1]:6.2f}{after[0]:10.3f} ± {after[1]:6.3f}{known}")
+
+# %%
+# Torques, errors and parameters
+# ------------------------------
+# The URDF alone knows gravity, but nothing of friction. The band is that of InverseDynamics, two standard deviations to
+# each side of its mean.
+
+figure, axes = plt.subplots(3, 2, figsize=(10, 7.5), layout="constrained", width_ratios=(1.6, 1))
+colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}
+window = slice(0, 1000)
+# No line reaches across a gap or rest: one row less there.
+seconds = np.where(np.diff(new.pieces, prepend=new.pieces[0]) == 0, new.time, np.nan)[window]
+for ax, joint in zip(axes[:, 0], shown, strict=True):
+    ax.plot(seconds, predictions["URDF"][window, joint], color=colours["URDF"], linewidth=1, label="URDF")
+    ax.plot(seconds, new.target[window, joint], "k", linewidth=1, label="measured")
+    band = mean[window, joint] + 2.0 * np.array([[-1.0], [1.0]]) * std[window, joint]
+    ax.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0)
+    ax.set_title(joints[joint].removesuffix("_joint").replace("_", " "), fontsize=10)
+    ax.set_ylabel("torque (N m)")
+axes[2, 0].set_xlabel("time (s)")
+
+short = [joint.removesuffix("_joint").replace("_", "\n") for joint in joints]
+places = np.arange(len(joints))
+for (name, error), marker in zip(errors.items(), "s^o", strict=True):
+    axes[0, 1].plot(places, error, marker, color=colours[name], label=name)
+axes[0, 1].set_yscale("log")
+axes[0, 1].grid(axis="y", color="0.9")
+axes[0, 1].set_title("Mean squared error / variance", fontsize=10)
+for ax, start, title in (
+    (axes[1, 1], "m(", "Mass of the link (kg)"),
+    (axes[2, 1], "coulomb(", "Coulomb's friction (N m)"),
+):
+    rows = [row for name, row in asked.items() if name.startswith(start)]
+    before, after = (
+        np.array([interval(row, *of) for row in rows]).T for of in ((cad, prior_cov), (model.coef_, model.coef_cov_))
+    )
+    if start == "m(":
+        ax.errorbar(places - 0.22, *before, fmt="s", color=colours["URDF"], capsize=3, label="URDF, prior")
+    ax.errorbar(
+        places + 0.22 * (start == "m("),
+        *after,
+        fmt="o",
+        color=colours["InverseDynamics"],
+        capsize=3,
+        label="found, 95 %",
+    )
+    if truth and start == "m(":
+        ax.plot(places, [row @ true_weights for row in rows], "kx", label="truth")
+    ax.set_title(title, fontsize=10)
+    ax.set_ylim(bottom=0.0)
+for ax in axes[:, 1]:
+    ax.set_xticks(places, short, fontsize=8)
+    ax.set_xlim(-0.5, len(joints) - 0.5)
+axes[1, 1].legend(fontsize=8)
+handles = [*axes[0, 0].get_lines()[1:], *axes[0, 1].get_lines()]
+figure.legend(handles, [line.get_label() for line in handles], loc="outside lower center", ncols=4, fontsize=9)
+
+picture = options.output / f"{stem}.png"
+figure.savefig(picture, dpi=100)
+print(f"picture: {picture}")
+plt.show()
