@@ -108,6 +108,15 @@ def test_swing_up(monkeypatch, capsys, tmp_path, system):
     assert (tmp_path / f"swing_up_{system}.png").stat().st_size > 10_000
 
 
+def test_tracking(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_tracking.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["errors"]["with what was learned"] < 0.2 * names["errors"]["nominal model"]
+    broken = [np.mean(peak > 1.0) for *_, peak in names["tried"].values()]
+    assert broken[1] < broken[0]  # with and without what the std adds
+    assert "break a limit" in capsys.readouterr().out
+    assert (tmp_path / "tracking.png").stat().st_size > 10_000
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -164,6 +173,7 @@ def test_without_an_optional_package(package, pip):
         "plot_any_robot.py",
         "plot_rollout.py",
         "plot_swing_up.py",
+        "plot_tracking.py",
         "plot_online.py",
     ],
 )
