@@ -182,9 +182,12 @@ def _one_row(body: RigidBody, model: Any) -> Callable[[np.ndarray], np.ndarray]:
 
 
 def broken_limits(
-    arm: arms.Arm, body: RigidBody, model: Any, n_moves: int, share: float, seed: int
+    arm: arms.Arm, body: RigidBody, model: Any, X: np.ndarray, n_moves: int, share: float, seed: int
 ) -> Iterator[tuple[str, str, str, float]]:
-    """Shares of moves that break a limit: at any joint and step, and where the plan comes closest to it."""
+    """How many moves break a limit: at any joint and step, and where the plan comes closest to it.
+
+    The latter also of those only in which the joint accelerates there no more than it did in the log, of rows X.
+    """
     limits = share * arm.effort
     widths = {"mean": 0.0, "mean + 2 std": 2.0, "Boole": arms.cautious(CHANCE, len(limits), n_steps=400)}
     starts, ends = arms.positions(n_moves, seed)
@@ -204,10 +207,13 @@ def broken_limits(
         )
         over = (np.abs(run.torque) > limits) & moving[:, :, np.newaxis]
         room = np.where(moving[:, :, np.newaxis], limits - np.abs(mean) - k * std, np.inf)
-        tightest = room.swapaxes(0, 1).reshape(len(starts), -1).argmin(axis=1)
-        there = over.swapaxes(0, 1).reshape(len(starts), -1)[np.arange(len(starts)), tightest]
+        tightest = np.arange(len(starts)), room.swapaxes(0, 1).reshape(len(starts), -1).argmin(axis=1)
+        seen = np.abs(path[:, :, 14:]) <= np.abs(X[:, 14:]).max(axis=0)
+        there, seen = (each.swapaxes(0, 1).reshape(len(starts), -1)[tightest] for each in (over, seen))
         yield "broken", BOTH, name, float(over.any(axis=(0, 2)).sum())
         yield "broken where tightest", BOTH, name, float(there.sum())
+        yield "moves as logged", BOTH, name, float(seen.sum())
+        yield "broken as logged", BOTH, name, float((there & seen).sum())
         yield "duration", BOTH, name, float(durations.mean())
         yield "within 2 std", BOTH, name, float(np.mean(np.abs(run.torque - mean)[moving] < 2.0 * std[moving]))
 
@@ -220,12 +226,13 @@ def run(cell: Cell) -> list[dict[str, Any]]:
             warnings.simplefilter("ignore", expected)
         arm = arms.make_arm(cell.payload, seed)
         log = arms.track(arm, ComputedTorque(body, arms.waves(size.n_runs, size.seconds, seed + 100)), seed=0)
-        models, cases = learn(arms.log_of(log), body, size, seed), references(size.n_references, seed + 200)
+        rows = arms.log_of(log)
+        models, cases = learn(rows, body, size, seed), references(size.n_references, seed + 200)
         share = 0.35 if cell.payload <= 3.0 else 0.45  # with less they can hardly be held
         found = [
             *tracking_errors(arm, body, models, cases),
             *step_costs(body, models, cases["waves"], size.calls),
-            *broken_limits(arm, body, models[BOTH], size.n_moves, share, seed + 300),
+            *broken_limits(arm, body, models[BOTH], rows[0], size.n_moves, share, seed + 300),
         ]
     own = {name: getattr(cell, name) for name in Cell.__dataclass_fields__}
     return [
@@ -303,10 +310,13 @@ def limit_lines(rows: Sequence[Row]) -> list[list[str]]:
     found = []
     for case, said in promised.items():
         n = values(rows, "moves", BOTH, case).sum()
-        shares = [
-            f"{values(rows, name, BOTH, case).sum() / n:.1%}" if n else ""
-            for name in ("broken", "broken where tightest")
-        ]
+        counts = {
+            name: values(rows, name, BOTH, case).sum()
+            for name in ("broken", "broken where tightest", "broken as logged", "moves as logged")
+        }
+        shares = [f"{counts[name] / n:.1%}" if n else "" for name in ("broken", "broken where tightest")]
+        logged = counts["moves as logged"]
+        shares.append(f"{counts['broken as logged'] / logged:.1%} of {logged:.0f}" if logged else "")
         means = [values(rows, name, BOTH, case) for name in ("duration", "within 2 std")]
         weights = values(rows, "moves", BOTH, case)
         duration, within = (np.average(each, weights=weights[weights > 0.0]) if n else np.nan for each in means)
@@ -339,10 +349,14 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
         "## Limits",
         "Moves as fast as limits of torque allow for the mean, or the mean and k std, by weights and GP; those that "
         "torques decide. Boole: k = 4.1 promises all of a move's joints and steps. Shares of moves that break a limit "
-        "anywhere, and at the joint and instant where the plan has the least room, for which k std is promised; how "
-        "long moves are, s; and how many of the measured torques are within 2 std, predicted before the move.",
+        "anywhere, and at the joint and instant where the plan has the least room, for which k std is promised; "
+        "the same of moves in which the joint accelerates there no more than it did in the log; how long moves are, s; "
+        "and how many of the measured torques are within 2 std, predicted before the move.",
         harness.table(
-            ["planned with", "moves", "break a limit", "where tightest", "promised", "duration", "within 2 std"],
+            [
+                *("planned with", "moves", "break a limit", "where tightest", "there as logged", "promised"),
+                *("duration", "within 2 std"),
+            ],
             limit_lines(rows),
         ),
         harness.provenance_text(rows),

@@ -80,7 +80,8 @@ for name, error in errors.items():
 # %%
 # As fast as limits allow
 # -----------------------
-# By Boole's inequality the chance that a move breaks a limit is no more than the sum over joints and steps.
+# By Boole's inequality the chance that a move breaks a limit is no more than the sum over joints and steps. That is
+# cautious, and leaves room for accelerations that were not in the log, where models are less sure than they say.
 
 limits = options.limit * arm.effort
 n_joints = len(limits)

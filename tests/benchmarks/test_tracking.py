@@ -61,9 +61,19 @@ def test_moves_of_all_arms_count_together(tracking):
     for payload, n, broken in (("2.0", 10, 4), ("5.0", 30, 6), ("1.0", 0, None)):
         rows.append(a_row("moves", tracking.BOTH, "mean", n, payload))
         if n:
-            found = {"broken": broken, "broken where tightest": 2, "duration": n / 10.0, "within 2 std": 0.95}
+            found = {"broken": broken, "broken where tightest": 2, "broken as logged": 1, "moves as logged": 5}
+            found |= {"duration": n / 10.0, "within 2 std": 0.95}
             rows += [a_row(measure, tracking.BOTH, "mean", value, payload) for measure, value in found.items()]
-    assert tracking.limit_lines(rows)[0] == ["mean", "40", "25.0%", "10.0%", "50 % where tightest", "2.50", "0.950"]
+    assert tracking.limit_lines(rows)[0] == [
+        "mean",
+        "40",
+        "25.0%",
+        "10.0%",
+        "20.0% of 10",
+        "50 % where tightest",
+        "2.50",
+        "0.950",
+    ]
     assert tracking.limit_lines(rows)[2][:2] == ["Boole", "0"]
 
 
