@@ -169,6 +169,15 @@ def test_a_folder_with_a_urdf_and_logs_takes_the_place_of_the_simulation(monkeyp
     assert found["com" if "payload" in script else "truth"] is None
 
 
+def test_tracking(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_tracking.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    assert names["errors"]["with what was learned"] < 0.2 * names["errors"]["nominal model"]
+    broken = [np.mean(peak > 1.0) for *_, peak in names["tried"].values()]
+    assert broken[1] < broken[0]  # with and without what the std adds
+    assert "break a limit" in capsys.readouterr().out
+    assert (tmp_path / "tracking.png").stat().st_size > 10_000
+
+
 def command_line(*arguments, script=LEARN, code=""):
     program = [
         "-c",
@@ -234,7 +243,11 @@ def test_without_an_optional_package(package, pip):
         "plot_any_robot.py",
         "plot_rollout.py",
         "plot_swing_up.py",
+<<<<<<< HEAD
         "plot_crocoddyl.py",
+=======
+        "plot_tracking.py",
+>>>>>>> tracking
         "plot_online.py",
         "plot_real_arm.py",
         "plot_payload.py",

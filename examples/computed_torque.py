@@ -1,0 +1,242 @@
+"""A simulated arm with a payload and friction that its model does not know, and a computed-torque controller.
+
+What `plot_tracking.py` and `benchmarks/tracking.py` share. Trajectories are arrays of shape (n_steps, n_runs,
+3 * n_joints) with rows [q, q̇, q̈]; all runs are simulated at once.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.stats import norm
+
+from skevgp import InverseDynamics
+from skevgp.datasets import load_robot, perturb_robot, quintic_reference
+from skevgp.features import RigidBodyRegressor
+from skevgp.robots import RigidBody
+
+# Of the controller, s. The simulator takes five steps of Runge and Kutta's method in it, for friction is stiff.
+DT, SUBSTEPS = 0.005, 5
+KP, KD = 100.0, 20.0
+HOME = np.array([0.0, 0.8, 0.0, -1.2, 0.0, 0.8, 0.0])
+# Of what is logged, every so many steps: 50 Hz.
+EVERY = 4
+# Of moves, rad/s, and s: no faster and no slower.
+FASTEST, SLOWEST = 2.2, 5.0
+# Where a move's torques are looked at before it runs.
+INSTANTS = np.linspace(0.0, 1.0, 51)
+
+
+@dataclass(frozen=True)
+class Arm:
+    """An iiwa14 as it is.
+
+    Joints have Coulomb's and viscous friction, which the learner's physics know, and what gears have beside it: more
+    friction at low speeds (Stribeck) and under load.
+
+    Attributes
+    ----------
+    body : RigidBody
+        With its payload, and masses that are a little off.
+    effort : ndarray of shape (n_joints,)
+        What motors can give, N m.
+    coulomb, viscous, stribeck, load : ndarray of shape (n_joints,)
+        N m, N m s, N m, and a share of the motor's torque.
+    ripple, noise : ndarray of shape (n_joints,)
+        Standard deviations of what motors give beside what is asked, and of the torque sensors, N m.
+    """
+
+    body: RigidBody
+    effort: np.ndarray
+    coulomb: np.ndarray
+    viscous: np.ndarray
+    stribeck: np.ndarray
+    load: np.ndarray
+    ripple: np.ndarray
+    noise: np.ndarray
+
+    def friction(self, v: np.ndarray, u: np.ndarray) -> np.ndarray:
+        dry = self.coulomb + self.stribeck * np.exp(-((v / 0.2) ** 2)) + self.load * np.abs(u)
+        return dry * np.tanh(v / 0.02) + self.viscous * v
+
+    def step(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The state after DT of held torques."""
+        h = DT / SUBSTEPS
+
+        def rate(q: np.ndarray, v: np.ndarray) -> np.ndarray:
+            return np.array([v, self.body.accelerations(q, v, u - self.friction(v, u))])
+
+        z = np.array([q, v])
+        for _ in range(SUBSTEPS):
+            first = rate(*z)
+            second = rate(*z + h / 2.0 * first)
+            third = rate(*z + h / 2.0 * second)
+            z = z + h / 6.0 * (first + 2.0 * second + 2.0 * third + rate(*z + h * third))
+        return z[0], z[1]
+
+
+def make_arm(payload: float, seed: int) -> Arm:
+    """With a payload of so many kg, at a place in the hand that the seed draws, as it does friction."""
+    rng = np.random.RandomState(seed)
+    model = perturb_robot("iiwa14", 0.05, random_state=rng)
+    model.armature = load_robot("iiwa14").armature  # a catalogue has it
+    place = np.array([0.0, 0.0, 0.1]) + rng.uniform(-0.05, 0.05, 3)
+    _carry(model, payload, place)
+    effort = np.array(model.effortLimit)
+    sizes = [share * effort * rng.uniform(0.5, 1.5, len(effort)) for share in (0.02, 0.01, 0.01)]
+    gears = 0.1 * rng.uniform(0.5, 1.5, len(effort))
+    return Arm(RigidBody(model), effort, *sizes, gears, ripple=0.001 * effort, noise=0.002 * effort)
+
+
+def _carry(model: Any, payload: float, place: np.ndarray) -> None:
+    link = model.inertias[model.njoints - 1]
+    model.inertias[model.njoints - 1] = link + type(link)(payload, place, payload * 0.05**2 * np.eye(3))
+
+
+def learner(payload: float = 2.5, **options: Any) -> InverseDynamics:
+    """Of the arm's torques; its prior is the nominal model with some load or other, a few kg more or less."""
+    model = load_robot("iiwa14").copy()
+    _carry(model, payload, np.array([0.0, 0.0, 0.1]))
+    return InverseDynamics(RigidBodyRegressor(model, mass_scale=1.0, com_scale=0.5), **options)
+
+
+class ComputedTorque:
+    """τ = M(q) (q̈_d + k_p e + k_d ė + k_i ∫e) + C(q, q̇) q̇ + g(q) of a model, e = q_d - q, and what it misses.
+
+    Parameters
+    ----------
+    body : RigidBody
+        The approximate model.
+    reference : ndarray of shape (n_steps, n_runs, 3 * n_joints)
+    missed : ndarray of shape (n_steps, n_runs, n_joints) or callable, default=None
+        Torques that are added, known ahead as the reference is; or what gives them of rows [q_d, q̇_d, q̈_d].
+    ki : float, default=0.0
+        In 1/s³.
+    """
+
+    def __init__(self, body: RigidBody, reference: np.ndarray, missed: Any = None, ki: float = 0.0):
+        self.body, self.reference, self.missed, self.ki = body, reference, missed, ki
+        self._integral = np.zeros((reference.shape[1], reference.shape[2] // 3))
+
+    def __call__(self, step: int, q: np.ndarray, v: np.ndarray) -> np.ndarray:
+        wanted = self.reference[step]
+        n = q.shape[1]
+        off = wanted[:, :n] - q
+        a = wanted[:, 2 * n :] + KP * off + KD * (wanted[:, n : 2 * n] - v)
+        if self.ki:
+            self._integral += DT * off
+            a += self.ki * self._integral
+        torque = self.body.forces(q, v, a)
+        if self.missed is None:
+            return torque
+        return torque + (self.missed(wanted) if callable(self.missed) else self.missed[step])
+
+
+@dataclass(frozen=True)
+class Run:
+    """What happened.
+
+    Attributes
+    ----------
+    motion : ndarray of shape (n_steps, n_runs, 3 * n_joints)
+        Means of q and q̇ over each step, and q̈ as the change of q̇.
+    torque : ndarray of shape (n_steps, n_runs, n_joints)
+        As sensors at the joints measure it.
+    error : ndarray of shape (n_steps, n_runs, n_joints)
+        Position minus reference, at the start of each step.
+    """
+
+    motion: np.ndarray
+    torque: np.ndarray
+    error: np.ndarray
+
+
+def track(arm: Arm, controller: ComputedTorque, seed: int) -> Run:
+    """Follow the reference from its first state on; motors are as strong as they need to be."""
+    rng, reference = np.random.RandomState(seed), controller.reference
+    n = reference.shape[2] // 3
+    q, v = reference[0, :, :n].copy(), reference[0, :, n : 2 * n].copy()
+    motion, torque, error = np.empty_like(reference), *np.empty((2, *reference.shape[:2], n))
+    for step in range(len(reference)):
+        u = controller(step, q, v) + arm.ripple * rng.standard_normal(q.shape)
+        before = q, v
+        q, v = arm.step(q, v, u)
+        motion[step] = np.hstack([(before[0] + q) / 2.0, (before[1] + v) / 2.0, (v - before[1]) / DT])
+        torque[step] = u + arm.noise * rng.standard_normal(q.shape)
+        error[step] = before[0] - reference[step, :, :n]
+    return Run(motion, torque, error)
+
+
+def log_of(run: Run) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Rows to learn from, X, y and which run they are of."""
+    X, y = (part[::EVERY].swapaxes(0, 1) for part in (run.motion, run.torque))
+    return np.concatenate(X), np.concatenate(y), np.repeat(np.arange(len(X)), X.shape[1])
+
+
+def waves(n_runs: int, seconds: float, seed: int, slower: float = 1.0) -> np.ndarray:
+    """Sums of three waves of each joint about HOME, of up to half a turn per second or so."""
+    rng, t = np.random.RandomState(seed), DT * np.arange(round(seconds / DT))[:, np.newaxis, np.newaxis, np.newaxis]
+    omega = 2.0 * np.pi * rng.uniform(0.05, 0.7, (n_runs, len(HOME), 3)) / slower
+    phase, size = rng.uniform(0.0, 2.0 * np.pi, omega.shape), rng.uniform(0.1, 0.35, omega.shape)
+    q = size * np.sin(omega * t + phase)
+    parts = q, size * omega * np.cos(omega * t + phase), -(omega**2) * q
+    q, v, a = (part.sum(axis=3) for part in parts)
+    return np.concatenate([HOME + q, v, a], axis=2)
+
+
+def moves(starts: np.ndarray, ends: np.ndarray, durations: np.ndarray, seconds: float) -> np.ndarray:
+    """A minimum-jerk motion of each run between two positions, which is then held."""
+    t = DT * np.arange(round(seconds / DT))
+    each = [
+        np.concatenate(quintic_reference(*ends_, duration, t), axis=1)
+        for *ends_, duration in zip(starts, ends, durations, strict=True)
+    ]
+    return np.stack(each, axis=1)
+
+
+def missed_by(body: RigidBody, model: Any, reference: np.ndarray) -> np.ndarray:
+    """Torques along a reference that a learned model of torques adds to those of the nominal one, in one batch."""
+    rows = reference.reshape(-1, reference.shape[-1])
+    missed = model.predict(rows) - body.forces(*np.split(rows, 3, axis=1))
+    return missed.reshape(*reference.shape[:-1], -1)
+
+
+def cautious(chance: float, n_joints: int, n_steps: int) -> float:
+    """How many standard deviations keep all torques of a move within limits with this probability, by Boole's bound."""
+    return float(norm.isf((1.0 - chance) / (n_joints * n_steps)))
+
+
+def fastest(
+    model: Any, starts: np.ndarray, ends: np.ndarray, limits: np.ndarray, k: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The shortest durations of moves in which |mean| + k std of all torques stay within limits, by bisection.
+
+    Returns
+    -------
+    durations : ndarray of shape (n_moves,)
+    decided : ndarray of bool of shape (n_moves,)
+        Whether torques decide: neither the limit of speeds, nor that the arm cannot hold its load there at all.
+    """
+    q, v, a = quintic_reference(starts, ends, 1.0, INSTANTS)
+
+    def holds(durations: np.ndarray) -> np.ndarray:
+        T = durations[:, np.newaxis, np.newaxis]
+        rows = np.concatenate([q, v / T, a / T**2], axis=2)
+        mean, std = model.predict(rows.reshape(-1, rows.shape[2]), return_std=True)
+        return (np.abs(mean) + k * std < limits).reshape(len(q), -1).all(axis=1)
+
+    short, long = 1.875 * np.abs(ends - starts).max(axis=1) / FASTEST, np.full(len(q), SLOWEST)
+    decided = ~holds(short) & holds(long)
+    for _ in range(9):
+        middle = np.sqrt(short * long)
+        held = holds(middle)
+        short, long = np.where(held, short, middle), np.where(held, middle, long)
+    return long, decided
+
+
+def positions(n_moves: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
+    """Where moves start and end."""
+    starts, ends = HOME + np.random.RandomState(seed).uniform(-0.7, 0.7, (2, n_moves, len(HOME)))
+    return starts, ends

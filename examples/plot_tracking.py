@@ -1,0 +1,192 @@
+"""
+An arm that carries what nobody told it
+=======================================
+
+An iiwa14 tracks references by computed torque. Its model knows nothing of the load in its hand, nor of the friction in
+its joints, and it is off by what these cost. ``InverseDynamics`` learns the torques from a minute of the arm's own log:
+masses and friction that all joints share, with the model as prior, and a Gaussian process of what gears do beside it.
+The reference is known ahead, so that its torques are predicted in one batch, and the controller adds them.
+
+Predictions know how good they are. Moves are made as fast as torque limits allow: if only the mean stays within them,
+about every move breaks them; if the mean plus k standard deviations does, the limits hold, for a little time. The plant
+is simulated, with Pinocchio's dynamics, in ``computed_torque.py`` beside this file. Run
+``python examples/plot_tracking.py --help`` for options.
+"""
+
+# %%
+# Options
+# -------
+
+import argparse
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+
+sys.path.insert(0, str(Path(__file__).resolve().parent))
+import computed_torque as arms
+from computed_torque import DT, ComputedTorque
+
+parser = argparse.ArgumentParser(description="Track references with a load that the model does not know.")
+parser.add_argument("--payload", type=float, default=3.0, help="in the hand, kg; default: %(default)s")
+parser.add_argument("--limit", type=float, default=0.35, help="share of the motors' torques; default: %(default)s")
+parser.add_argument("--chance", type=float, default=0.95, help="that a move keeps the limits; default: %(default)s")
+parser.add_argument("--seed", type=int, default=0, help="of arm, references and models; default: %(default)s")
+parser.add_argument(
+    "--output",
+    type=Path,
+    default=Path(__file__).resolve().parent / "output",
+    help="folder for the picture; default: examples/output",
+)
+options = parser.parse_args()
+quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
+n_runs, seconds, n_inducing, n_moves = (3, 4.0, 10, 20) if quick else (6, 10.0, 40, 150)
+
+# %%
+# Learn from the log
+# ------------------
+# The arm moves along some waves, badly, and joints measure torques. The prior is the nominal model with a load that may
+# weigh a few kg.
+
+try:
+    import matplotlib.pyplot as plt
+    import pinocchio as pin
+
+    from skevgp.datasets import load_robot
+    from skevgp.robots import RigidBody
+
+    arm, nominal = arms.make_arm(options.payload, options.seed), RigidBody(load_robot("iiwa14"))
+except ImportError as error:
+    sys.exit(f"error: {error}\nThis example needs Pinocchio and matplotlib: pip install pin matplotlib")
+log = arms.track(arm, ComputedTorque(nominal, arms.waves(n_runs, seconds, options.seed + 1)), options.seed)
+X, y, groups = arms.log_of(log)
+model = arms.learner(n_inducing=n_inducing, max_rows=1500, random_state=options.seed).fit(X, y, groups=groups)
+
+# %%
+# Track what was not in the log
+# -----------------------------
+
+reference = arms.waves(1, 4.0 if quick else 8.0, options.seed + 2)
+feedforward = arms.missed_by(nominal, model, reference)
+runs = {
+    "nominal model": arms.track(arm, ComputedTorque(nominal, reference), options.seed),
+    "with what was learned": arms.track(arm, ComputedTorque(nominal, reference, feedforward), options.seed),
+}
+errors = {name: 1e3 * np.sqrt(np.mean(run.error**2)) for name, run in runs.items()}
+for name, error in errors.items():
+    print(f"{name:22s} rms error of joints {error:6.2f} mrad")
+
+# %%
+# As fast as limits allow
+# -----------------------
+# By Boole's inequality the chance that a move breaks a limit is no more than the sum over joints and steps. That is
+# cautious, and leaves room for accelerations that were not in the log, where models are less sure than they say.
+
+limits = options.limit * arm.effort
+n_joints = len(limits)
+k = arms.cautious(options.chance, n_joints, n_steps=400)
+starts, ends = arms.positions(n_moves, options.seed + 3)
+planned = {width: arms.fastest(model, starts, ends, limits, width) for width in (0.0, k)}
+decided = np.logical_and(*(chosen for _, chosen in planned.values()))  # by torques
+if not decided.any():
+    sys.exit("error: no move is decided by the limits of torques; another --limit, please.")
+starts, ends, tried = starts[decided], ends[decided], {}
+for width, (durations, _) in planned.items():
+    durations = durations[decided]
+    path = arms.moves(starts, ends, durations, durations.max() + DT)
+    run = arms.track(arm, ComputedTorque(nominal, path, arms.missed_by(nominal, model, path)), options.seed)
+    moving = (DT * np.arange(len(path))[:, np.newaxis] < durations)[:, :, np.newaxis]
+    tried[width] = durations, path, run.torque, np.where(moving, np.abs(run.torque) / limits, 0.0).max(axis=(0, 2))
+    broken = np.mean(tried[width][3] > 1.0)
+    print(f"mean + {width:3.1f} std: {broken:4.0%} of {len(starts)} moves break a limit, {durations.mean():.2f} s each")
+
+# %%
+# What happened
+# -------------
+# Bands are wide where joints stand still: friction may then be anything up to Coulomb's.
+
+blue, orange, grey = "#0072B2", "#D55E00", "0.35"
+colours = dict(zip(runs, (orange, blue), strict=True))
+figure, axes = plt.subplots(2, 3, figsize=(13, 7.5), layout="constrained")
+data = nominal.model.createData()
+
+
+def tip(q):
+    """Where the last joint is, m."""
+    places = []
+    for row in q:
+        pin.forwardKinematics(nominal.model, data, row)
+        places.append(data.oMi[n_joints].translation.copy())
+    return np.array(places)
+
+
+times, wanted = DT * np.arange(len(reference)), reference[:, 0]
+desired = tip(wanted[:, :n_joints])
+part = times < 4.0
+axes[0, 0].plot(*desired[part, 1:].T, color=grey, linewidth=5, alpha=0.35, label="reference")
+for name, run in runs.items():
+    place = tip(wanted[:, :n_joints] + run.error[:, 0])
+    axes[0, 0].plot(*place[part, 1:].T, color=colours[name], linewidth=1.3, label=name)
+    off = 1e3 * np.linalg.norm(place - desired, axis=1)
+    axes[0, 1].plot(times, off, color=colours[name], label=f"{name}: {np.sqrt(np.mean(off**2)):.2g} mm rms")
+axes[0, 0].set(title="The hand, seen from the front", xlabel="y (m)", ylabel="z (m)", aspect="equal")
+axes[0, 1].set(title="How far the hand is off", xlabel="time (s)", ylabel="mm", yscale="log", ylim=(0.02, 200.0))
+
+joint = 3
+run = runs["with what was learned"]
+mean, std = (part[:, joint] for part in model.predict(run.motion[:, 0], return_std=True))
+believed = nominal.forces(*np.split(run.motion[:, 0], 3, axis=1))[:, joint]
+ax = axes[0, 2]
+ax.plot(times, run.torque[:, 0, joint], ".", color="0.6", markersize=2, label="measured")
+ax.plot(times, believed, color=orange, linewidth=1, label="nominal model")
+ax.plot(times, mean, color=blue, linewidth=1, label="learned, ± 2 std")
+ax.fill_between(times, mean - 2 * std, mean + 2 * std, color=blue, alpha=0.3, linewidth=0, zorder=3)
+ax.set_xlim(0.5, 3.5)
+ax.set(title=f"Torque of joint {joint + 1} on the way", xlabel="time (s)", ylabel="N m")
+
+# Without caution, of the moves that break a limit one in the middle; at the joint, step and side where it does.
+by_peak = np.argsort(tried[0.0][3])
+move = by_peak[(np.searchsorted(tried[0.0][3][by_peak], 1.0) + len(by_peak)) // 2]
+over = np.abs(tried[0.0][2][:, move]) / limits
+over[round(tried[0.0][0][move] / DT) :] = 0.0
+step, joint = np.unravel_index(over.argmax(), over.shape)
+side, shown = np.sign(tried[0.0][2][step, move, joint]), []
+for ax, (width, (durations, path, torque, _)) in zip(axes[1], tried.items(), strict=False):
+    until = round(durations[move] / DT)
+    t, measured = DT * np.arange(until), side * torque[:until, move, joint]
+    mean, std = (part[:, joint] for part in model.predict(path[:until, move], return_std=True))
+    ax.plot(t, side * mean, color=blue, label="predicted mean")
+    ax.fill_between(
+        t, side * mean - k * std, side * mean + k * std, color=blue, alpha=0.25, linewidth=0, label=f"± {k:.1f} std"
+    )
+    ax.plot(t, measured, ".", color=grey, markersize=2, label="measured")
+    beyond = measured > limits[joint]
+    ax.plot(
+        t[beyond], measured[beyond], "o", color=orange, markersize=4, label="over the limit" if beyond.any() else None
+    )
+    ax.axhline(limits[joint], color="k", linestyle="--", linewidth=1)
+    what = f"mean + {width:.1f} std" if width else "the mean"
+    ax.set(title=f"One move: {what} within the limit", xlabel=f"time (s), {durations[move]:.2f} s in all")
+    ax.set(ylabel=f"torque of joint {joint + 1} (N m)")
+    shown.append(side * mean - k * std)
+low = min(values.min() for values in shown)
+for ax in axes[1, :2]:
+    ax.set_ylim(low, limits[joint] + 0.12 * (limits[joint] - low))
+
+bins = np.linspace(*np.percentile(np.concatenate([each[3] for each in tried.values()]), (0, 100)), 25)
+for (width, (*_, peak)), colour in zip(tried.items(), (orange, blue), strict=True):
+    what = f"mean + {width:.1f} std" if width else "mean"
+    label = f"{what}: {np.mean(peak > 1.0):.0%} break a limit"
+    axes[1, 2].hist(peak, bins, color=colour, alpha=0.6, label=label)
+axes[1, 2].axvline(1.0, color="k", linestyle="--", linewidth=1)
+axes[1, 2].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="moves")
+axes[1, 2].yaxis.get_major_locator().set_params(integer=True)
+for ax in axes.ravel():
+    ax.legend(fontsize=8)
+
+options.output.mkdir(parents=True, exist_ok=True)
+picture = options.output / "tracking.png"
+figure.savefig(picture, dpi=100)
+print(f"picture: {picture}")
+plt.show()
