@@ -243,11 +243,8 @@ def test_without_an_optional_package(package, pip):
         "plot_any_robot.py",
         "plot_rollout.py",
         "plot_swing_up.py",
-<<<<<<< HEAD
         "plot_crocoddyl.py",
-=======
         "plot_tracking.py",
->>>>>>> tracking
         "plot_online.py",
         "plot_real_arm.py",
         "plot_payload.py",
