@@ -285,12 +285,12 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
             mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
         inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
-        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocity)
+        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocities(n_outputs))
         return rows, with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
 
-    @property
-    def _velocity(self) -> float:
-        return float(getattr(self.feature_map_, "stiction_velocity", 0.01))
+    def _velocities(self, n_outputs: int) -> np.ndarray:
+        """v_s of each joint's Coulomb friction, (o,)."""
+        return np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)
 
     def _names(self, n_outputs: int) -> np.ndarray:
         names = self.feature_map_.get_feature_names_out()
@@ -321,13 +321,13 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 residual[:, j],
                 rows.speed[:, j],
                 weights.noise[j],
-                self._velocity,
+                float(velocity),
                 rows.blocks,
                 some,
                 1 if self._has_robot else None,
                 **options,
             )
-            for j in range(y.shape[1])
+            for j, velocity in enumerate(weights.prior.velocity)
         )
         return Parallel(n_jobs=self.n_jobs, prefer="threads")(fits)
 

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils.metaestimators import available_if
 
 from .._sklearn import Interval
+from .._validation import as_floats
 from ..robots import RigidBody, load_robot
 from ..robots.loading import Robot, effort_limits
 from .robot_map import RobotTransformer, has_robot, same_for_all
@@ -46,8 +47,8 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
     friction : sequence of str, default=("viscous", "coulomb", "offset", "armature")
         What each joint has beside its links: a torque :math:`\dot q`, :math:`\tanh(\dot q / v_s)`, 1 and
         :math:`\ddot q` times a weight.
-    stiction_velocity : float, default=0.01
-        v_s, rad/s or m/s: below it Coulomb's friction has no sign yet. Above 0.
+    stiction_velocity : float or array-like of shape (n_joints,), default=0.01
+        v_s, rad/s or m/s, of all joints or of each: below it Coulomb's friction has no sign yet. Above 0.
     mass_scale : float, default=0.2
         Prior standard deviation of each link's mass, as a share of it.
     com_scale : float, default=0.2
@@ -109,7 +110,7 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
         robot: Robot | None = None,
         *,
         friction: Sequence[str] = FRICTION,
-        stiction_velocity: float = 0.01,
+        stiction_velocity: float | ArrayLike = 0.01,
         mass_scale: float = 0.2,
         com_scale: float = 0.2,
         inertia_scale: float = 0.3,
@@ -126,7 +127,7 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotTransformer._parameter_constraints,
         "friction": ["array-like"],
-        "stiction_velocity": [Interval(Real, 0, None, closed="neither")],
+        "stiction_velocity": [Interval(Real, 0, None, closed="neither"), "array-like"],
         "mass_scale": [Interval(Real, 0, None, closed="left")],
         "com_scale": [Interval(Real, 0, None, closed="left")],
         "inertia_scale": [Interval(Real, 0, None, closed="left")],
@@ -197,9 +198,20 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
 
     def _prepare(self, robot: Robot | None) -> None:
         self._terms = self._checked_friction()
+        self._velocity = self._checked_velocity()
         if robot is not None:
             self.model_ = load_robot(robot).copy()
             self._body = RigidBody(self.model_)
+
+    def _checked_velocity(self) -> np.ndarray:
+        velocity = as_floats(self.stiction_velocity, "stiction_velocity")
+        n_joints = 1 if self.robot is None else self._layout.n_joints
+        if velocity.shape not in ((), (n_joints,)) or not (np.isfinite(velocity) & (velocity > 0.0)).all():
+            raise ValueError(
+                f"stiction_velocity={self.stiction_velocity!r} must be a number above 0, or one for each of the "
+                f"{n_joints} joints."
+            )
+        return velocity
 
     def _checked_friction(self) -> tuple[str, ...]:
         terms = [term for term in self.friction if isinstance(term, str) and term in FRICTION]
@@ -222,7 +234,7 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
         n, n_joints = v.shape
         values = {
             "viscous": v,
-            "coulomb": np.tanh(v / self.stiction_velocity),
+            "coulomb": np.tanh(v / self._velocity),
             "offset": np.ones_like(v),
             "armature": a,
         }
@@ -246,8 +258,8 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
                 jacobian[:, :, :width, column] += weight * self._body.torque_regressor(*np.split(moved, 3, axis=1))
         jacobian /= 12.0 * _STEP
         zero, one = np.zeros_like(v), np.ones_like(v)
-        tanh = np.tanh(v / self.stiction_velocity)
-        by_v = {"viscous": one, "coulomb": (1.0 - tanh**2) / self.stiction_velocity, "offset": zero, "armature": zero}
+        tanh = np.tanh(v / self._velocity)
+        by_v = {"viscous": one, "coulomb": (1.0 - tanh**2) / self._velocity, "offset": zero, "armature": zero}
         for number, term in enumerate(self._terms):
             for joint in range(n_joints):
                 feature = width + number * n_joints + joint

@@ -60,7 +60,7 @@ class Prior:
         The weights that gains multiply: not friction, which is found in the units of what was measured.
     coulomb : ndarray of int of shape (o,), optional
         Which weight is Coulomb's friction of each output. None: nothing stands still.
-    velocity : float
+    velocity : ndarray of shape (o,)
         Up to which friction has no sign.
     """
 
@@ -68,7 +68,7 @@ class Prior:
     covariance: np.ndarray
     scaled: np.ndarray
     coulomb: np.ndarray | None
-    velocity: float
+    velocity: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -238,7 +238,10 @@ class _Problem:
 
     def first(self, share: float) -> _State:
         """Noise of so much of each output's variance."""
-        noise = [JointNoise(float(share * size), 0.0, self.prior.velocity) for size in self.size]
+        noise = [
+            JointNoise(float(share * size), 0.0, float(velocity))
+            for size, velocity in zip(self.size, self.prior.velocity, strict=True)
+        ]
         return _State(self.prior.mean, noise, np.ones(len(noise)))
 
     def settled(self, state: _State, rounds: int) -> _State:

@@ -17,7 +17,7 @@ def problem(n=400, n_outputs=2, p=4, noise=0.1, seed=0, gains=None, scaled=4):
     targets = rigid * (1.0 if gains is None else gains) + features[:, :, scaled:] @ beta[scaled:]
     targets = targets + noise * rng.normal(size=(n, n_outputs))
     rows = Rows(features, targets, np.ones((n, n_outputs)), np.zeros(n, dtype=int), *2 * [np.arange(n) * 5 // n])
-    prior = Prior(np.zeros(p), np.eye(p), np.arange(p) < scaled, None, 0.01)
+    prior = Prior(np.zeros(p), np.eye(p), np.arange(p) < scaled, None, np.full(n_outputs, 0.01))
     return rows, prior, beta
 
 
