@@ -161,6 +161,7 @@ def test_the_summary_is_of_all_joints_and_files(real_arms):
     ]
     assert lines[1][7] == "0.675"
     assert list(real_arms.error_lines(rows))[1] == ["a", "EVGP", "**0.0250**", "0.400"]
+    assert list(real_arms.lost_lines(rows)) == [["a", "2", "least squares", "0.100", "0.400", "4.00"]]
 
 
 def test_a_model_without_bands_has_none_in_the_tables(real_arms):
