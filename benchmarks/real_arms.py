@@ -533,7 +533,8 @@ def paragraphs(rows: Sequence[Row], found: Sequence[Row], picture: str) -> list[
         "of them is in this project: this page has results only) and of a real UR10 (github.com/unisa-acg/"
         "inverse-dynamics-solver, BSD-3-Clause). Signals: `load_log` on a grid of 10 ms with a zero-phase filter of "
         "5 Hz; the UR10e's torques are currents times a catalogue's gains, the UR10's are those of its messages. "
-        "Splits are by trajectory: no test file is of a training one.",
+        "Splits are by trajectory: no test file is of a training one, but that of the UR10's one recording, cut in "
+        "thirds, the last is a test where the others are trained on. Its validation trajectory is another one.",
         "Errors are mean squares: nMSE is relative to the torque's variance, ratio to plain least squares on the same "
         "training rows (`RigidBodyRegressor`'s features, numpy's lstsq), a geometric mean over joints and test files; "
         "of a joint the mean over test files. CAD is the URDF without friction; least squares, prior is "
