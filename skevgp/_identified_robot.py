@@ -7,16 +7,15 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator
 from sklearn.utils import Bunch
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._joint_residual import JointResidual
 from ._payload import find_payload, payload_prior
-from ._validation import check_integer, check_magnitude, check_real, checked_groups
-from .identification.rows_of_logs import blocks_of, groups_of
-from .identification.weights import Known, Rows, Weights
+from ._torque_regression import TorqueRegression
+from ._validation import check_integer, check_magnitude, check_real
+from .identification.weights import Known
 from .robots import (
     body_parameters,
     layout_of,
@@ -36,11 +35,9 @@ def _knows_a_robot(model: IdentifiedRobot) -> bool:
     raise AttributeError("It needs a robot: give InverseDynamics one.")
 
 
-class IdentifiedRobot(BaseEstimator):
-    """What `InverseDynamics` knows of the robot after `fit`, and how its rows become those of a regression."""
+class IdentifiedRobot(TorqueRegression):
+    """What `InverseDynamics` knows of the robot after `fit`."""
 
-    feature_map_: Any
-    _weights: Weights
     _known: Known
     _joints: list[JointResidual]
     _outputs: list[str]
@@ -48,41 +45,6 @@ class IdentifiedRobot(BaseEstimator):
     coef_std_: np.ndarray
     coef_cov_: np.ndarray
     gains_: np.ndarray
-
-    @property
-    def _has_robot(self) -> bool:
-        return bool(getattr(self.feature_map_, "share_coef", False))
-
-    def _as_rows(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
-        n, n_outputs = y.shape
-        labels = checked_groups(groups, n)
-        runs = checked_groups(pieces, n, "pieces")
-        if runs is None:
-            runs = np.zeros(n, dtype=int) if labels is None else labels
-        features = self._features(X, n_outputs)
-        check_magnitude(features, "What feature_map_ returns")
-        blocks = blocks_of(labels, n)
-        return Rows(features, y, self._speed(X, n_outputs), runs, groups_of(labels, blocks), blocks)
-
-    def _speed(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
-        """q̇ of each joint, (n, o)."""
-        return X[:, n_outputs : 2 * n_outputs] if self._has_robot else np.zeros((len(X), n_outputs))
-
-    def _features(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
-        """H (n, o, p); of a map without a row for each output, weights of each output side by side, with a constant."""
-        H = self.feature_map_.transform(X)
-        if H.ndim == 3:
-            return H
-        own = np.column_stack([H, np.ones(len(H))])
-        features = np.zeros((len(H), n_outputs, n_outputs, own.shape[1]))
-        features[:, range(n_outputs), range(n_outputs)] = own[:, np.newaxis]
-        return features.reshape(len(H), n_outputs, -1)
-
-    def _own(self, X: np.ndarray, torque: np.ndarray, joint: int) -> np.ndarray:
-        """x_j, the columns that f_j sees."""
-        if not self._has_robot:
-            return X
-        return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
 
     @available_if(_knows_a_robot)
     def links(self) -> list[Bunch]:

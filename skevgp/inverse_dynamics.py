@@ -3,26 +3,25 @@
 from __future__ import annotations
 
 from numbers import Integral, Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from joblib import Parallel, delayed
 from numpy.typing import ArrayLike
-from sklearn.base import RegressorMixin, clone
+from sklearn.base import RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ._coef_prior import wide_scale
 from ._identified_robot import IdentifiedRobot
 from ._joint_residual import JointResidual, fit_joint_residual
 from ._shapes import like_y
-from ._sklearn import Interval, fit_context
+from ._sklearn import Interval, StrOptions, fit_context
 from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails
 from .exceptions import warn_user
 from .features import RigidBodyRegressor
 from .identification.stiction import likeliest_noise
-from .identification.weights import Prior, Rows, condensed, identify, left_out, with_gains
+from .identification.weights import Rows, condensed, left_out
 from .robots import nearest_consistent
 from .robots.loading import Robot
 
@@ -30,6 +29,8 @@ from .robots.loading import Robot
 _FAR = 4.0
 # Physics that leaves this share of a torque's variance explains hardly anything.
 _LITTLE = 0.5
+# The largest speed below which rows count less for f_j: filters blur friction's sign, but f_j learns its average there.
+_SHARP = 0.01
 
 
 class InverseDynamics(RegressorMixin, IdentifiedRobot):
@@ -58,6 +59,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Whether the weights are the most probable ones that bodies can have (masses above 0, pseudo-inertias positive
         definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well. Means
         move, covariances and noise stay.
+    stiction_velocity : "auto" or None, default="auto"
+        ``"auto"`` finds the speed at which friction of each joint has a sign (filters blur it), if there are three
+        ``groups`` or more to tell; None leaves it as `RigidBodyRegressor` has it.
     n_inducing : int, default=40
         Inducing points of each f_j; 0 leaves f_j out.
     max_rows : int, default=3000
@@ -149,6 +153,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         "robot": "no_validation",
         "gain_scale": [Interval(Real, 0, None, closed="left")],
         "consistent": ["boolean"],
+        "stiction_velocity": [StrOptions({"auto"}), None],
         "n_inducing": [Interval(Integral, 0, None, closed="left")],
         "max_rows": [Interval(Integral, 10, None, closed="left")],
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
@@ -162,6 +167,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         *,
         gain_scale: float = 0.0,
         consistent: bool = False,
+        stiction_velocity: Literal["auto"] | None = "auto",
         n_inducing: int = 40,
         max_rows: int = 3000,
         max_iter: int | None = None,
@@ -171,6 +177,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self.robot = robot
         self.gain_scale = gain_scale
         self.consistent = consistent
+        self.stiction_velocity = stiction_velocity
         self.n_inducing = n_inducing
         self.max_rows = max_rows
         self.max_iter = max_iter
@@ -250,8 +257,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_not_vanishing(np.abs(targets).max(axis=0), "y")
         self._map().fit(X)  # a frame's columns must be in the robot's order
         self.feature_map_ = self._map().fit(rows_x)
-        rows, prior = self._rows(rows_x, targets, groups, pieces)
-        self._weights = identify(rows, prior)
+        rows = self._find_weights(rows_x, targets, groups, pieces)
         self._known = condensed(rows, self._weights)
         if self.consistent and self._has_robot:
             size = 10 * targets.shape[1]
@@ -263,44 +269,6 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         self._unexplained = [name for name, bad in zip(self._outputs, missed & varies, strict=True) if bad]
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
-
-    def _map(self) -> RigidBodyRegressor:
-        if isinstance(self.robot, RigidBodyRegressor):
-            return clone(self.robot)
-        return RigidBodyRegressor(self.robot)
-
-    def _rows(
-        self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None
-    ) -> tuple[Rows, Prior]:
-        """What the regression sees, and its prior."""
-        n_outputs = y.shape[1]
-        rows = self._as_rows(X, y, groups, pieces)
-        features = rows.features
-        names = [str(name) for name in self._names(n_outputs)]
-        if hasattr(self.feature_map_, "coef_prior"):
-            mean, covariance = self.feature_map_.coef_prior(n_outputs)
-        else:
-            size = np.sqrt(np.mean(features**2, axis=0))
-            scale = wide_scale(size, y.std(axis=0), np.abs(y).max(axis=0), shared=True)[0]
-            mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
-        coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
-        inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
-        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocities(n_outputs))
-        return rows, with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
-
-    def _velocities(self, n_outputs: int) -> np.ndarray:
-        """v_s of each joint's Coulomb friction, (o,)."""
-        return np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)
-
-    def _names(self, n_outputs: int) -> np.ndarray:
-        names = self.feature_map_.get_feature_names_out()
-        if self._has_robot:
-            return names
-        return np.array([f"{name}({o})" for o in range(n_outputs) for name in [*names, "1"]], dtype=object)
-
-    def _output_names(self, n_outputs: int) -> list[str]:
-        layout = getattr(self.feature_map_, "_layout", None)
-        return [f"output {o}" for o in range(n_outputs)] if layout is None else list(layout.position_names)
 
     def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
         weights, y = self._weights, rows.targets
@@ -321,7 +289,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 residual[:, j],
                 rows.speed[:, j],
                 weights.noise[j],
-                float(velocity),
+                min(float(velocity), _SHARP),
                 rows.blocks,
                 some,
                 1 if self._has_robot else None,

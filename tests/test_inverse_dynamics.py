@@ -368,6 +368,19 @@ def test_bad_input_is_named(arm):
     assert not hasattr(model, "coef_")
 
 
+def test_the_speed_at_which_friction_has_a_sign_is_found_from_several_trajectories():
+    arm = Arm("acrobot", noise=0.01)
+    blurred = np.tanh(arm.X[:, 2:4] / 0.1) - np.tanh(arm.X[:, 2:4] / 0.01)
+    y = arm.y + arm.coulomb * blurred
+
+    def velocity(groups, **options):
+        return InverseDynamics(arm.nominal, n_inducing=0, **options).fit(arm.X, y, groups=groups).feature_map_
+
+    assert (np.array(velocity(arm.groups).stiction_velocity) > 0.04).all()
+    assert velocity(None).stiction_velocity == 0.01
+    assert velocity(arm.groups, stiction_velocity=None).stiction_velocity == 0.01
+
+
 def test_the_robot_that_was_fitted_is_kept():
     arm = Arm("acrobot")
     model = arm.nominal.copy()

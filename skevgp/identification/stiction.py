@@ -11,6 +11,9 @@ from scipy.optimize import minimize, minimize_scalar
 _MOVING = 0.1
 # rad/s or m/s: between which the speed is found at which friction has a sign.
 _SLOWEST, _FASTEST = 1e-3, 0.3
+# What is tried for that of mean friction, and its prior: the usual one and the standard deviation of its logarithm.
+_VELOCITIES = np.array([0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2])
+_USUAL, _USUAL_SPREAD = 0.015, 0.7
 
 
 def undecided(speed: np.ndarray, velocity: np.ndarray | float) -> np.ndarray:
@@ -117,3 +120,38 @@ def likeliest_noise(
 def _most(errors: np.ndarray, least: float) -> float:
     """A variance that noise does not exceed."""
     return max(2.0 * float(np.max(errors**2)), 10.0 * least)
+
+
+def likeliest_velocity(
+    left: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, worth: float, least: float
+) -> float:
+    """The speed v_s at which a joint's mean friction F tanh(q̇ / v_s) has a sign, by what it leaves.
+
+    Parameters
+    ----------
+    left : ndarray of shape (n,)
+        What all weights leave of the joint's torque.
+    speed : ndarray of shape (n,)
+    coulomb : float
+        F, with its sign.
+    velocity : float
+        The v_s with which F was found.
+    worth : float
+        The rows that say as much as an independent one.
+    least : float
+        Which the variance of errors is not below, above 0.
+
+    Returns
+    -------
+    velocity : float
+        Of a grid; F, viscous friction and an offset are fitted anew to each, and a log-normal prior keeps it from ends
+        of which the log says little. All rows count the same, for it is slow ones that tell.
+    """
+    target = left + coulomb * np.tanh(speed / velocity)
+    scale = worth * max(float(np.mean(left**2)), least)
+    losses = []
+    for candidate in _VELOCITIES:
+        terms = np.column_stack([np.tanh(speed / candidate), speed, np.ones_like(speed)])
+        error = target - terms @ np.linalg.lstsq(terms, target, rcond=None)[0]
+        losses.append(error @ error / scale + (np.log(candidate / _USUAL) / _USUAL_SPREAD) ** 2)
+    return float(_VELOCITIES[int(np.argmin(losses))])

@@ -119,6 +119,17 @@ def test_friction_that_there_is_not(friction):
         RigidBodyRegressor("pendulum", friction=friction).fit([[0.0, 0.0, 0.0]])
 
 
+def test_each_joint_may_have_its_own_stiction_velocity():
+    X = rows_of(load_robot("acrobot"))
+    each = RigidBodyRegressor("acrobot", stiction_velocity=[0.1, 0.5]).fit_transform(X)
+    for joint, velocity in enumerate([0.1, 0.5]):
+        one = RigidBodyRegressor("acrobot", stiction_velocity=velocity).fit_transform(X)
+        assert_allclose(each[:, joint], one[:, joint])
+    for bad in ([0.1], [0.1, -0.5], [0.1, np.nan]):
+        with pytest.raises(ValueError, match="stiction_velocity"):
+            RigidBodyRegressor("acrobot", stiction_velocity=bad).fit(X)
+
+
 def test_bad_arguments_are_named():
     with pytest.raises(ValueError, match="y has 3 columns.*torques of its 1 joints"):
         RigidBodyRegressor("pendulum").coef_prior(3)
