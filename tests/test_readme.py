@@ -1,11 +1,17 @@
 """What the README says works as it stands."""
 
 import re
+import shutil
 from pathlib import Path
 
 import dask.array as dask_array
 import numpy as np
 import pytest
+
+from skevgp.features import RigidBodyRegressor
+from skevgp.robots.loading import urdf_path
+
+from .test_inverse_dynamics import trajectory
 
 README = (Path(__file__).parents[1] / "README.md").read_text()
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
@@ -30,9 +36,31 @@ def test_any_robot_runs():
 
 
 @pytest.mark.slow
-def test_control_runs():
+def test_a_real_arm_runs(tmp_path, monkeypatch, capsys):
+    """On logs of a simulated one."""
+    monkeypatch.chdir(tmp_path)
+    shutil.copy(urdf_path("ur10"), "arm.urdf")
+    body = RigidBodyRegressor("ur10", friction=["coulomb"])
+    gains = np.array([14.87, 13.26, 11.13, 10.62, 11.03, 11.47])
+    for seed, name in enumerate(["first.csv", "second.csv", "third.csv"]):
+        X = trajectory(6, seed, dt=0.01)
+        weights = body.fit(X).coef_prior(6)[0]
+        weights[60:] = 3.0
+        torque = body.transform(X) @ weights
+        torque += 0.02 * torque.std(axis=0) * np.random.default_rng(seed).normal(size=torque.shape)
+        time = 0.01 * np.arange(len(X))
+        np.savetxt(name, np.column_stack([time, X[:, :12], torque / gains]), delimiter=",")
     names = {}
     exec(SNIPPETS[3], names)
+    assert names["model"].score(names["log"].data, names["log"].target) > 0.98
+    assert "wrist_3_joint" in capsys.readouterr().out
+    assert (tmp_path / "identified.urdf").stat().st_size > 1000
+
+
+@pytest.mark.slow
+def test_control_runs():
+    names = {}
+    exec(SNIPPETS[4], names)
     assert names["ahead"].mean.shape == (50, 4)
     assert names["A_B"].shape == (50, 4, 5)
     assert names["mean"].shape == names["std"].shape == (4,)
@@ -41,7 +69,7 @@ def test_control_runs():
 @pytest.mark.slow
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
-    files, chunks = SNIPPETS[4:]
+    files, chunks = SNIPPETS[5:]
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (500, 2))
     np.save(tmp_path / "X.npy", X)
