@@ -47,6 +47,8 @@ parser.add_argument(
     help="folder for the picture; default: examples/output",
 )
 options = parser.parse_args()
+if not options.mass > 0.0:
+    parser.error("--mass must be above 0")
 quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 duration = 8.0 if quick else 30.0
 scratch = tempfile.TemporaryDirectory()
@@ -98,12 +100,14 @@ lengths = np.linspace(2.0, loaded.time[-1] - loaded.time[0], 2 if quick else 9)
 models, found = {}, {}
 print(f"{'':24s}{'seconds':>8s}{'mass (kg)':>17s}   centre of mass (mm, in the last joint's frame)")
 for gain_scale in (0.0, 0.1):
-    model = InverseDynamics(robot, gain_scale=gain_scale, n_inducing=0).fit(unloaded.data, unloaded.target)
+    model = InverseDynamics(robot, gain_scale=gain_scale, n_inducing=0).fit(
+        unloaded.data, unloaded.target, pieces=unloaded.pieces
+    )
     models[gain_scale] = model
     found[gain_scale] = []
     for seconds in lengths:
         rows = loaded.time <= loaded.time[0] + seconds
-        load = model.estimate_payload(loaded.data[rows], loaded.target[rows])
+        load = model.estimate_payload(loaded.data[rows], loaded.target[rows], pieces=loaded.pieces[rows])
         found[gain_scale].append(load)
         places = "  ".join(f"{1e3 * c:6.1f} ± {1.96e3 * s:5.1f}" for c, s in zip(load.com, load.com_std, strict=True))
         print(f"gain_scale={gain_scale:<13g}{seconds:8.1f}{load.mass:9.3f} ± {1.96 * load.mass_std:5.3f}   {places}")

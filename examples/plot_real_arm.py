@@ -105,7 +105,7 @@ features, features_new = body.fit_transform(train.data), body.transform(new.data
 cad, _ = body.coef_prior(len(joints))
 least_squares = np.linalg.lstsq(features.reshape(-1, len(cad)), train.target.ravel(), rcond=None)[0]
 model = InverseDynamics(robot, gain_scale=0.1, random_state=options.seed, **settings)
-model.fit(train.data, train.target, groups=train.groups)
+model.fit(train.data, train.target, groups=train.groups, pieces=train.pieces)
 mean, std = model.predict(new.data, return_std=True)
 predictions = {"URDF": features_new @ cad, "least squares": features_new @ least_squares, "InverseDynamics": mean}
 errors = {

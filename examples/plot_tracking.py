@@ -8,8 +8,8 @@ masses and friction that all joints share, with the model as prior, and a Gaussi
 The reference is known ahead, so that its torques are predicted in one batch, and the controller adds them.
 
 Predictions know how good they are. Moves are made as fast as torque limits allow: if only the mean stays within them,
-about every move breaks them; if the mean plus k standard deviations does, the limits hold, for a little time. The plant
-is simulated, with Pinocchio's dynamics, in ``computed_torque.py`` beside this file. Run
+most moves break them; if the mean plus k standard deviations does, the limits hold, and moves take a little longer. The
+plant is simulated, with Pinocchio's dynamics, in ``computed_torque.py`` beside this file. Run
 ``python examples/plot_tracking.py --help`` for options.
 """
 
@@ -85,7 +85,7 @@ for name, error in errors.items():
 
 limits = options.limit * arm.effort
 n_joints = len(limits)
-k = arms.cautious(options.chance, n_joints, n_steps=400)
+k = arms.cautious(options.chance, n_joints, n_steps=400)  # of moves that take 2 s or less
 starts, ends = arms.positions(n_moves, options.seed + 3)
 planned = {width: arms.fastest(model, starts, ends, limits, width) for width in (0.0, k)}
 decided = np.logical_and(*(chosen for _, chosen in planned.values()))  # by torques
