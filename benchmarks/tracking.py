@@ -348,9 +348,10 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
         harness.table(["", "step", "ratio", "batch, per row", "in the loop", "ratio"], cost_lines(rows)),
         "## Limits",
         "Moves as fast as limits of torque allow for the mean, or the mean and k std, by weights and GP; those that "
-        "torques decide. Boole: k = 4.1 promises all joints and steps of a move of up to 2 s. Shares of moves that break a limit "
-        "anywhere, and at the joint and instant where the plan has the least room, for which k std is promised; "
-        "the same of moves in which the joint accelerates there no more than it did in the log; how long moves are, s; "
+        "torques decide. Boole: k = 4.1 promises all joints and steps of a move of up to 2 s. Shares of moves that "
+        "break a limit anywhere, and at the joint and instant where the plan has the least room, for which k std is "
+        "promised; the same of moves in which the joint accelerates there no more than it did in the log; how long "
+        "moves are, s; "
         "and how many of the measured torques are within 2 std, predicted before the move.",
         harness.table(
             [

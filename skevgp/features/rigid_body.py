@@ -26,8 +26,7 @@ _SPEED, _ACCELERATION = 1.0, 10.0
 _STEP = 1e-3
 
 
-# Its rows have a matrix each, which no frame can hold.
-class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type: ignore[call-arg]
+class RigidBodyRegressor(RobotTransformer):
     r"""Features of inverse dynamics: the torques of all joints are linear in one set of weights.
 
     A robot's equation of motion with friction is
@@ -199,6 +198,8 @@ class RigidBodyRegressor(RobotTransformer, auto_wrap_output_keys=None):  # type:
     def _prepare(self, robot: Robot | None) -> None:
         self._terms = self._checked_friction()
         self._velocity = self._checked_velocity()
+        # Rows have a matrix each with a robot, which no frame can hold, whatever `set_output` says.
+        self._sklearn_auto_wrap_output_keys = {"transform"} if robot is None else set()
         if robot is not None:
             self.model_ = load_robot(robot).copy()
             self._body = RigidBody(self.model_)

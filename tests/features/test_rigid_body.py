@@ -5,6 +5,7 @@ import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose
+from sklearn import config_context
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import load_robot
@@ -101,6 +102,15 @@ def test_without_a_robot_it_passes_rows_through():
     assert not body.share_coef
     assert not hasattr(body, "coef_prior")
     assert_allclose(body.jacobian(X), np.broadcast_to(np.eye(5), (4, 5, 5)))
+
+
+def test_a_frame_as_output_is_for_rows_without_a_robot():
+    X = rows_of(load_robot("acrobot"))
+    with config_context(transform_output="pandas"):
+        assert RigidBodyRegressor("acrobot").fit_transform(X).shape == (20, 2, 28)
+        assert isinstance(RigidBodyRegressor().fit_transform(X), pd.DataFrame)
+    body = RigidBodyRegressor("acrobot").set_output(transform="pandas")
+    assert body.fit(X).transform(X).shape == (20, 2, 28)
 
 
 def test_names_and_order_of_columns():
