@@ -182,8 +182,9 @@ for (width, (*_, peak)), colour in zip(tried.items(), (orange, blue), strict=Tru
 axes[1, 2].axvline(1.0, color="k", linestyle="--", linewidth=1)
 axes[1, 2].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="moves")
 axes[1, 2].yaxis.get_major_locator().set_params(integer=True)
+axes[1, 2].margins(y=0.25)  # above which the legend is
 for ax in axes.ravel():
-    ax.legend(fontsize=8)
+    ax.legend(fontsize=8, loc="lower center" if ax in axes[1, :2] else "best")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "tracking.png"

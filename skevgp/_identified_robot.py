@@ -68,6 +68,16 @@ class IdentifiedRobot(TorqueRegression):
         ----------
         - P. M. Wensing, S. Kim, J.-J. E. Slotine (2017): Linear Matrix Inequalities for Physically-Consistent Inertial
           Parameter Identification.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> X = np.random.default_rng(0).normal(size=(300, 3))
+        >>> y = 1.2 * (X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]))  # 1.2 kg in place of the model's 1
+        >>> (link,) = InverseDynamics("pendulum", n_inducing=0).fit(X, y).links()
+        >>> link.joint, float(round(link.mass * -link.com[2], 2))  # what gravity's torque tells: m c
+        ('q', 0.6)
         """
         check_is_fitted(self)
         parameters, covariance = self._inertial()
@@ -106,12 +116,20 @@ class IdentifiedRobot(TorqueRegression):
         ------
         ImportError
             If Pinocchio is not installed; the message gives the pip command.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> X = np.random.default_rng(0).normal(size=(300, 3))
+        >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.7 * X[:, 1]
+        >>> InverseDynamics("pendulum", n_inducing=0).fit(X, y).robot_model().damping.round(2)
+        array([0.7])
         """
         check_is_fitted(self)
-        model = self.feature_map_.model_
         friction = {name: np.maximum(values, 0.0) for name, values in self._friction(self.coef_).items()}
         return with_parameters(
-            model,
+            self.feature_map_.model_,
             nearest_consistent(*self._inertial()),
             armature=friction.get("armature"),
             damping=friction.get("viscous"),
@@ -133,6 +151,21 @@ class IdentifiedRobot(TorqueRegression):
         ------
         ValueError
             If the robot has no file, or is not one that can be rewritten, or has other joints since `fit`.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> from skevgp.features import RigidBodyRegressor
+        >>> X, body = np.random.default_rng(0).normal(size=(300, 18)), RigidBodyRegressor("ur5")
+        >>> y = body.fit_transform(X) @ body.coef_prior(6)[0]
+        >>> model = InverseDynamics("ur5", n_inducing=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     model.fit(X, y).write_urdf(Path(folder) / "found.urdf")
+        ...     "standard deviations: mass=" in (Path(folder) / "found.urdf").read_text(encoding="utf-8")
+        True
         """
         check_is_fitted(self)
         joints = layout_of(self.feature_map_.robot).position_names

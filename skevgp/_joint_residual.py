@@ -17,8 +17,6 @@ from .regressor import EVGPRegressor
 # friction does change within a fraction of the speeds.
 _LARGEST_SIGNAL, _SMALLEST_SIGNAL = 1.0, 1e-3
 _SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 100.0
-
-
 # Of the noise without f, the share that it leaves at least.
 _LEAST = 1e-6
 
@@ -58,11 +56,12 @@ class JointResidual:
     def mean(self, x: np.ndarray) -> np.ndarray:
         return np.zeros(len(x)) if self.model is None else self.model.predict(x)
 
-    def variance(self, x: np.ndarray) -> np.ndarray:
-        """Of f, (n,)."""
+    def moments(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Mean and variance of f, (n,)."""
         if self.model is None:
-            return np.zeros(len(x))
-        return self.model.predict(x, return_std=True, include_noise=False)[1] ** 2
+            return np.zeros(len(x)), np.zeros(len(x))
+        mean, std = self.model.predict(x, return_std=True, include_noise=False)
+        return mean, std**2
 
 
 def fit_joint_residual(
@@ -73,7 +72,7 @@ def fit_joint_residual(
     velocity: float,
     groups: np.ndarray,
     rows: np.ndarray,
-    speed_column: int | None,
+    smooth: np.ndarray,
     **options: Any,
 ) -> JointResidual:
     """Fit the Gaussian process of a joint, and the noise that it leaves.
@@ -92,8 +91,8 @@ def fit_joint_residual(
         What is left out together when signal and noise are calibrated.
     rows : ndarray of int
         Those that the model is fitted to.
-    speed_column : int or None
-        Which column of x may have a short lengthscale; None: all may.
+    smooth : ndarray of bool of shape (d,)
+        Of which columns of x the lengthscale may not be short.
     **options
         Of `EVGPRegressor`.
 
@@ -106,9 +105,7 @@ def fit_joint_residual(
         return JointResidual(None, noise)
     spread = x[rows].std(axis=0)
     spread = np.where(spread > 1e-9 * np.abs(x[rows]).max(axis=0), spread, 1.0)
-    shortest = np.full(x.shape[1], _SHORTEST if speed_column is not None else _SHORTEST_OF_SPEED)
-    if speed_column is not None:
-        shortest[speed_column] = _SHORTEST_OF_SPEED
+    shortest = np.where(smooth, _SHORTEST, _SHORTEST_OF_SPEED)
     signal = ConstantKernel(0.25 * size, (_SMALLEST_SIGNAL**2 * size, _LARGEST_SIGNAL**2 * size))
     kernel = signal * RBF(_START * spread, np.column_stack([shortest * spread, _LONGEST * spread]))
     least = _LEAST * noise.variance

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Literal
 
 import numpy as np
@@ -74,7 +75,9 @@ class TorqueRegression(BaseEstimator):
         return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
 
     def _find_weights(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
-        rows, prior = self._rows(X, y, groups, pieces)
+        """Set the weights, and the map's speeds at which friction has a sign; the rows that they are of."""
+        rows = self._as_rows(X, y, groups, pieces)
+        prior = self._prior(rows)
         self._weights = identify(rows, prior)
         # One trajectory says little of the speeds at which friction has a sign in others.
         labels = checked_groups(groups, len(X))
@@ -86,7 +89,7 @@ class TorqueRegression(BaseEstimator):
             if (velocity == prior.velocity).all():
                 break
             self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
-            rows, prior = self._rows(X, y, groups, pieces)
+            rows, prior = replace(rows, features=self._features(X, y.shape[1])), replace(prior, velocity=velocity)
             self._weights = identify(rows, prior, start=self._weights)
         return rows
 
@@ -112,13 +115,10 @@ class TorqueRegression(BaseEstimator):
             return clone(self.robot)
         return RigidBodyRegressor(self.robot)
 
-    def _rows(
-        self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None
-    ) -> tuple[Rows, Prior]:
-        """What the regression sees, and its prior."""
+    def _prior(self, rows: Rows) -> Prior:
+        """Of the weights: the map's, or a wide one; and of gains."""
+        features, y = rows.features, rows.targets
         n_outputs = y.shape[1]
-        rows = self._as_rows(X, y, groups, pieces)
-        features = rows.features
         names = [str(name) for name in self._names(n_outputs)]
         if hasattr(self.feature_map_, "coef_prior"):
             mean, covariance = self.feature_map_.coef_prior(n_outputs)
@@ -129,7 +129,7 @@ class TorqueRegression(BaseEstimator):
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
         inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
         prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocities(n_outputs))
-        return rows, with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
+        return with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
 
     def _velocities(self, n_outputs: int) -> np.ndarray:
         """v_s of each joint's Coulomb friction, (o,)."""

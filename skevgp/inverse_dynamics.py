@@ -283,6 +283,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
         seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
         options = {"n_inducing": self.n_inducing, "max_iter": self.max_iter, "random_state": seed}
+        smooth = np.array([True, False, True, True]) if self._has_robot else np.zeros(X.shape[1], dtype=bool)
         fits = (
             delayed(fit_joint_residual)(
                 self._own(X, guessed, j),
@@ -292,7 +293,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
                 min(float(velocity), _SHARP),
                 rows.blocks,
                 some,
-                1 if self._has_robot else None,
+                smooth,
                 **options,
             )
             for j, velocity in enumerate(weights.prior.velocity)
@@ -346,14 +347,15 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         n_outputs = len(self._joints)
         features = self._features(rows, n_outputs)
         physics = self._weights.predict(features)
-        mean = physics + np.column_stack([f.mean(self._own(rows, physics, j)) for j, f in enumerate(self._joints)])
+        own = [self._own(rows, physics, j) for j in range(n_outputs)]
         if not return_std:
-            return self._like_y(mean)
-        variance = self._weights.variance(features)
-        for j, joint in enumerate(self._joints):
-            variance[:, j] += joint.variance(self._own(rows, physics, j))
-            if include_noise:
-                variance[:, j] += joint.noise.of(self._speed(rows, n_outputs)[:, j])
+            return self._like_y(physics + np.column_stack([f.mean(x) for f, x in zip(self._joints, own, strict=True)]))
+        found = [f.moments(x) for f, x in zip(self._joints, own, strict=True)]
+        mean = physics + np.column_stack([missed for missed, _ in found])
+        variance = self._weights.variance(features) + np.column_stack([uncertain for _, uncertain in found])
+        if include_noise:
+            speed = self._speed(rows, n_outputs)
+            variance += np.column_stack([f.noise.of(v) for f, v in zip(self._joints, speed.T, strict=True)])
         return self._like_y(mean), self._like_y(np.sqrt(variance))
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -137,60 +137,6 @@ class RigidBodyRegressor(RobotTransformer):
     def share_coef(self) -> bool:
         return self.robot is not None
 
-    def fit(self, X: ArrayLike, y: object = None) -> Self:
-        """Load the robot and check the columns.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, 3 * n_joints)
-            Rows [q, q̇, q̈]; any width without a robot.
-        y : None
-            Ignored.
-
-        Returns
-        -------
-        self : RigidBodyRegressor
-            Fitted.
-
-        Raises
-        ------
-        ImportError
-            If Pinocchio is not installed; the message gives the pip command.
-        ValueError, TypeError
-            If the robot is unknown, an argument out of its range, or X does not have its columns.
-        """
-        return super().fit(X, y)
-
-    def transform(self, X: ArrayLike) -> np.ndarray:
-        """Evaluate the features.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, 3 * n_joints)
-            Rows [q, q̇, q̈].
-
-        Returns
-        -------
-        H : ndarray of shape (n_samples, n_joints, n_features_out)
-            [Y F] of each row; without a robot X.
-        """
-        return super().transform(X)
-
-    def jacobian(self, X: ArrayLike) -> np.ndarray:
-        """Differentiate the features by the columns of X.
-
-        Parameters
-        ----------
-        X : array-like of shape (n_samples, 3 * n_joints)
-            Rows [q, q̇, q̈].
-
-        Returns
-        -------
-        J : ndarray of shape (n_samples, n_joints, n_features_out, 3 * n_joints)
-            Of Y by central differences of fourth order, whose error is that of rounding; of friction exact.
-        """
-        return super().jacobian(X)
-
     def _column_names(self) -> list[str]:
         names = self._layout.position_names
         return [*self._layout.state_names, *(f"d2{name}/dt2" for name in names)]
@@ -297,7 +243,7 @@ class RigidBodyRegressor(RobotTransformer):
             If ``n_outputs`` is not the number of joints, or a parameter is out of its range.
         """
         self._validate_params()
-        terms, model = self._checked_friction(), load_robot(self.robot)
+        terms, model = self._checked_friction(), getattr(self, "model_", None) or load_robot(self.robot)
         if n_outputs != model.nv:
             raise ValueError(
                 f"y has {n_outputs} columns, but {type(self).__name__} of the robot {model.name!r} predicts the "

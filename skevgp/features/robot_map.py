@@ -51,7 +51,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``; any width without a robot.
+            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``; of `RigidBodyRegressor` [q, q̇, q̈]; any width
+            without a robot.
         y : None
             Ignored.
 
@@ -65,8 +66,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
         ImportError
             If the robot needs Pinocchio and it is not installed; the message gives the pip command.
         ValueError, TypeError
-            If the robot is unknown, X does not have its 2 * n_joints + n_inputs columns (and one for the time step), or
-            a time step is not positive.
+            If the robot is unknown, X does not have its columns (and one for the time step), or a time step is not
+            positive.
         """
         self._timed = self._takes_steps()
         rows: np.ndarray = validate_data(self, X, dtype=np.float64, ensure_all_finite=not self._timed)
@@ -117,8 +118,8 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
         Returns
         -------
-        H : ndarray of shape (n_samples, n_features_out)
-            The features h(x) of each row.
+        H : ndarray of shape (n_samples, n_features_out) or (n_samples, n_joints, n_features_out)
+            The features h(x) of each row; of `RigidBodyRegressor` with a robot a row for each joint.
         """
         return self._values(self._checked(X))
 
@@ -132,8 +133,9 @@ class RobotTransformer(TransformerMixin, BaseEstimator):
 
         Returns
         -------
-        J : ndarray of shape (n_samples, n_features_out, n_features)
-            The analytic derivatives dh(x)/dx of each row.
+        J : ndarray of the shape of H, and (n_features,)
+            The derivatives dh(x)/dx of each row: analytic, but for Y of `RigidBodyRegressor`, which are central
+            differences of fourth order with errors of rounding.
 
         Notes
         -----
