@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from sklearn.base import BaseEstimator
@@ -174,7 +174,7 @@ class Adam(BaseEstimator):
     batch_size : int, default=512
         Rows per step.
     learning_rate : float, default=0.1
-        The first step size; it falls to zero along half a cosine: over ``max_iter`` steps, or over the last steps.
+        The first step size.
     natural_gradient : bool, default=False
         Only with ``posterior="full"``: whether q moves by natural gradients (Hensman et al. 2013), the last one on all
         rows, so that Adam is left with kernel, noise and inducing points. For a million rows this is the fastest way to
@@ -183,6 +183,9 @@ class Adam(BaseEstimator):
         As of `LBFGS`.
     callback : callable, default=None
         callback(step, lower_bound, outputs), once per step, with a mini-batch's estimate; as of `LBFGS`.
+    schedule : {"cosine", "constant"}, default="cosine"
+        Whether steps fall to zero along half a cosine, over ``max_iter`` steps or over the last ones, or stay as they
+        are until the bound does, and only the last ones fall.
 
     Attributes
     ----------
@@ -218,12 +221,14 @@ class Adam(BaseEstimator):
         natural_gradient: bool = False,
         n_restarts: int = 0,
         callback: Callback | None = None,
+        schedule: Literal["cosine", "constant"] = "cosine",
     ):
         self.batch_size = batch_size
         self.learning_rate = learning_rate
         self.natural_gradient = natural_gradient
         self.n_restarts = n_restarts
         self.callback = callback
+        self.schedule = schedule
 
     def check(self, posterior: str) -> None:
         """Refuse options out of their range, or that do not go with the posterior.
@@ -236,6 +241,8 @@ class Adam(BaseEstimator):
         _check_common(self)
         check_integer(self.batch_size, "batch_size of Adam", minimum=1)
         check_real(self.learning_rate, "learning_rate of Adam", minimum=0.0, strict=True)
+        if self.schedule not in ("cosine", "constant"):
+            raise ValueError(f'schedule of Adam must be "cosine" or "constant"; got {self.schedule!r}.')
         if not isinstance(self.natural_gradient, (bool, np.bool_)):
             raise TypeError(f"natural_gradient of Adam must be True or False; got {self.natural_gradient!r}.")
         if self.natural_gradient and posterior != "full":
@@ -269,6 +276,7 @@ class Adam(BaseEstimator):
             tol / n_rows,
             task.monitor.seen_as(factor=n_rows, is_last=self.n_restarts == 0),
             elbo.pace,
+            constant=self.schedule == "constant",
         )
         # A mini-batch's loss does not tell which point is best: the bound on all rows does.
         x, (bound, predictor) = start, elbo.solution(start)

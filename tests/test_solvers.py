@@ -101,6 +101,7 @@ def test_what_is_no_solver_is_named_with_what_is(solver):
         (Adam(batch_size="all"), TypeError, "batch_size of Adam must be an integer; got 'all'"),
         (Adam(learning_rate=0.0), ValueError, "learning_rate of Adam must be finite and above 0.0; got 0.0"),
         (Adam(learning_rate=np.nan), ValueError, "learning_rate of Adam must be finite and above 0.0; got nan"),
+        (Adam(schedule="linear"), ValueError, 'schedule of Adam must be "cosine" or "constant"; got \'linear\''),
         (Adam(learning_rate="fast"), TypeError, "learning_rate of Adam must be a number; got 'fast'"),
         (Adam(natural_gradient=1), TypeError, "natural_gradient of Adam must be True or False; got 1"),
     ],

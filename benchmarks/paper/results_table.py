@@ -8,8 +8,13 @@ Markdown table and a picture beside it. Models of seed s learn from data of rand
     python benchmarks/paper/results_table.py --systems iiwa14 --settings paper --max-iter 1000  # half an hour per fit
     python benchmarks/paper/results_table.py --systems pendulum --settings skevgp --seeds 10
     python benchmarks/paper/results_table.py --noise 0.01  # on training and test targets; in another file
+    python benchmarks/paper/results_table.py --angles wrapped --systems pendulum cartpole acrobot --settings paper
 
-Settings: "paper" (Adam, diagonal posterior, inducing points per output), "skevgp" (its defaults), "skevgp-angles" (the
+Of the cartpole there are two: with damping of both joints, which Drake's had in Python when the paper was written, and
+without. Angles are as they come, or wrapped: in [-pi, pi) in the data, the target of a row moved with them.
+
+Settings: "paper" (Adam, diagonal posterior, inducing points per output), "author" (the same from where the author's
+library starts, with its solver), "skevgp" (its defaults), "skevgp-angles" (the
 kernel sees sines and cosines of angles) and, for iiwa14's EVGP, "skevgp-nominal" (a model of the arm whose masses,
 centres of mass and inertias are wrong by up to 20 % as further features). RES-DBNN has a standard normal prior on its
 weights in the paper's setting, and one that shrinks with the width of a layer in the others.
@@ -38,6 +43,8 @@ from paper import results_table_report
 from paper.models import MODELS, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, fitted_row, has
 from skevgp.datasets import make_dynamics
 
+ANGLES = ("raw", "wrapped")
+
 
 @dataclass(frozen=True)
 class Cell:
@@ -47,6 +54,8 @@ class Cell:
     ----------
     system, model, setting : str
     seed : int
+    angles : {"raw", "wrapped"}
+        As they come, or in [-pi, pi).
     noise : float
         Of both data sets, as a share of each training target's standard deviation.
     size : {"full", "quick"}
@@ -58,17 +67,19 @@ class Cell:
     model: str
     setting: str
     seed: int
+    angles: str
     noise: float
     size: str
     max_iter: int | None = field(compare=False)
 
 
 @lru_cache(maxsize=1)
-def data(system: str, seed: int, noise: float, size: str) -> tuple[Bunch, Bunch]:
+def data(system: str, seed: int, noise: float, size: str, angles: str = "raw") -> tuple[Bunch, Bunch]:
     """A training and a test set, measured with the same noise; the models that learn from it come one after another."""
     n_trajectories = QUICK_TRAJECTORIES if size == "quick" else None
-    train = make_dynamics(system, n_trajectories, noise=noise, random_state=seed)
-    test = make_dynamics(system, n_trajectories, random_state=1000 + seed)
+    wrap = angles == "wrapped"
+    train = make_dynamics(system, n_trajectories, noise=noise, wrap_angles=wrap, random_state=seed)
+    test = make_dynamics(system, n_trajectories, wrap_angles=wrap, random_state=1000 + seed)
     states = train.trajectories[:, 1:].reshape(train.target.shape)
     test.target += noise * states.std(axis=0) * np.random.RandomState(2000 + seed).standard_normal(test.target.shape)
     return train, test
@@ -76,9 +87,9 @@ def data(system: str, seed: int, noise: float, size: str) -> tuple[Bunch, Bunch]
 
 def run(cell: Cell) -> dict[str, Any]:
     """Fit one model on one training set, and look at it on one test set."""
-    train, test = data(cell.system, cell.seed, cell.noise, cell.size)
+    train, test = data(cell.system, cell.seed, cell.noise, cell.size, cell.angles)
     fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
-    return fitted_row(fit, train, test, noise=cell.noise)
+    return fitted_row(fit, train, test, angles=cell.angles, noise=cell.noise)
 
 
 def say(row: dict[str, Any]) -> str:
@@ -95,6 +106,7 @@ def main() -> None:
     )
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=SETTINGS, help="default: all")
+    parser.add_argument("--angles", nargs="+", choices=ANGLES, default=["raw"], help="default: raw")
     parser.add_argument("--noise", type=float, default=0.0, help="as a share of each training target's std; default: 0")
     parser.add_argument(
         "--max-iter",
@@ -107,11 +119,11 @@ def main() -> None:
     output = harness.output_path(options, f"results_table{f'_noise{noise:g}' if noise else ''}")
     n_seeds = (1 if options.quick else 4) if options.seeds is None else options.seeds
     cells = [
-        Cell(system, model, setting, seed, noise, size, options.max_iter)
-        for system, seed, model, setting in itertools.product(
-            options.systems, range(n_seeds), options.models, options.settings
+        Cell(system, model, setting, seed, angles, noise, size, options.max_iter)
+        for system, seed, angles, model, setting in itertools.product(
+            options.systems, range(n_seeds), options.angles, options.models, options.settings
         )
-        if has(system, model, setting)
+        if has(system, model, setting, angles)
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say)
 

@@ -99,6 +99,7 @@ _PAPER: Mapping[str, RandomInputs | ControlledMoves] = MappingProxyType(
     {
         "pendulum": _random_inputs([np.pi, 0.5], 1.0, 48),
         "cartpole": _random_inputs([1.0, np.pi, 0.5, 0.5], 100.0, 48),
+        "cartpole_damped": _random_inputs([1.0, np.pi, 0.5, 0.5], 100.0, 48),
         "acrobot": _random_inputs([np.pi, 1.0, 0.5, 0.5], 0.5, 93),
         "iiwa14": ControlledMoves(
             center=np.zeros(7),

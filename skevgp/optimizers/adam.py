@@ -27,14 +27,15 @@ def adam(
     monitor: Monitor | None = None,
     pace: Callable[[float], None] | None = None,
     stop: Callable[[np.ndarray], bool] | None = None,
+    constant: bool = False,
 ) -> Minimum:
     """Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine.
 
-    The cosine is meant to take ``max_iter`` steps. When the loss stays flat, a last, shorter one takes over: from the
-    present step size to zero, in as many steps as came before. The loss is flat where its median over the last third
-    of the steps differs from that over the third before by less than ``tol``, or by less than twice its standard error;
-    it stays flat if it was so throughout the last third of the steps. (A loss that rises is no sign of convergence,
-    but of steps that are too large: the cosine goes on.)
+    The cosine is meant to take ``max_iter`` steps (if steps are to be constant, there is none at first). When the loss
+    stays flat, a last, shorter one takes over: from the present step size to zero, in as many steps as came before. The
+    loss is flat where its median over the last third of the steps differs from that over the third before by less than
+    ``tol``, or by less than twice its standard error; it stays flat if it was so throughout the last third of the
+    steps. (A loss that rises is no sign of convergence, but of steps that are too large: the cosine goes on.)
 
     Parameters
     ----------
@@ -54,6 +55,8 @@ def adam(
         pace(share), before each step: its size as a share of the first.
     stop : callable, default=None
         stop(x), after each step: whether it was the last.
+    constant : bool, default=False
+        Whether the step size stays as it is until the loss stays flat.
 
     Returns
     -------
@@ -68,7 +71,9 @@ def adam(
     since, until, highest, flat_from = 0, max_iter, 1.0, 0
     with monitor.keeping_the_best(), suppress(NotPositiveDefiniteError):
         while minimum.n_iter < until:
-            share = 0.5 * highest * (1.0 + np.cos(np.pi * (minimum.n_iter - since) / (until - since)))
+            share = highest
+            if since > 0 or not constant:
+                share *= 0.5 * (1.0 + np.cos(np.pi * (minimum.n_iter - since) / (until - since)))
             if pace is not None:
                 pace(share)
             loss, gradient = objective(x)

@@ -7,7 +7,7 @@ new system is one entry of ``SYSTEMS``. Everything is in SI units, angles in rad
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from types import MappingProxyType
 from typing import Literal
@@ -175,6 +175,19 @@ def _iiwa14_links() -> tuple[Link, ...]:
     )
 
 
+_CARTPOLE = System(
+    "cartpole",
+    links=(
+        Link("x", "prismatic", (1.0, 0.0, 0.0), mass=10.0),
+        Link("theta", "revolute", (0.0, -1.0, 0.0), mass=1.0, com=(0.0, 0.0, -0.5), effort=0.0),
+    ),
+    gravity=(GravityTerm(angle=(1,), acts_on=(1,)),),
+)
+# That of MIT's course Underactuated Robotics until May 2022: Drake's own example, which is the other, has no damping.
+_CARTPOLE_DAMPED = System(
+    "cartpole_damped", tuple(replace(link, damping=0.1) for link in _CARTPOLE.links), _CARTPOLE.gravity
+)
+
 SYSTEMS: Mapping[str, System] = MappingProxyType(
     {
         system.name: system
@@ -184,14 +197,8 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
                 links=(Link("q", "revolute", _Y, mass=1.0, com=(0.0, 0.0, -0.5), damping=0.1),),
                 gravity=(GravityTerm(angle=(0,), acts_on=(0,)),),
             ),
-            System(
-                "cartpole",
-                links=(
-                    Link("x", "prismatic", (1.0, 0.0, 0.0), mass=10.0),
-                    Link("theta", "revolute", (0.0, -1.0, 0.0), mass=1.0, com=(0.0, 0.0, -0.5), effort=0.0),
-                ),
-                gravity=(GravityTerm(angle=(1,), acts_on=(1,)),),
-            ),
+            _CARTPOLE,
+            _CARTPOLE_DAMPED,
             System(
                 "acrobot",
                 links=(

@@ -83,6 +83,27 @@ def test_what_is_less_than_tol_does_not_count():
     assert adam(slope, np.zeros(2), FREE, 6000, 0.1, tol=0.1).n_iter == 3000
 
 
+def test_constant_steps_fall_only_once_the_loss_is_flat():
+    def steps(constant, tol):
+        points = []
+
+        def slope(x):
+            points.append(x[0])
+            return -1e-6 * len(points), np.ones(2)
+
+        minimum = adam(slope, np.zeros(2), FREE, 6000, 0.1, tol=tol, constant=constant)
+        return minimum.n_iter, -np.diff([*points, minimum.x[0]])
+
+    n_iter, falling = steps(constant=True, tol=0.1)
+    assert n_iter == 3000
+    np.testing.assert_allclose(falling[:1500], 0.1)
+    assert falling[-1] < 1e-4
+    n_iter, never = steps(constant=True, tol=0.0)
+    assert n_iter == 6000
+    np.testing.assert_allclose(never, 0.1)
+    assert steps(constant=False, tol=0.0)[1][-1] < 1e-4
+
+
 def test_bounds_are_respected():
     minimum = adam(lambda x: (x.sum(), np.ones(2)), np.zeros(2), (np.full(2, -0.5), np.ones(2)), 100, 0.1)
     np.testing.assert_array_equal(minimum.x, -0.5)
