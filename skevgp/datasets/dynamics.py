@@ -63,7 +63,10 @@ def make_dynamics(
     """Simulate a robot: the data sets of section IV-B of the paper, and the like of any robot.
 
     The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs
-    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 1).
+    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 1). There are two cartpoles, since the
+    paper does not say which it has: ``"cartpole"`` is that of Drake's own example, without friction;
+    ``"cartpole_damped"`` has damping of 0.1 N s/m and 0.1 N m s/rad on its joints, as that of MIT's course
+    Underactuated Robotics had until May 2022.
 
     The arm iiwa14 starts at rest, its joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each, along a
     quintic reference and by computed-torque control (gains 100, 20 and 1, held over each step), with noise of standard
@@ -73,15 +76,15 @@ def make_dynamics(
     of the torques that it takes to hold it and to give each joint 1 rad/s² (less where that would shake a light link by
     more than 2 rad/s²). A robot with a joint without motor starts
     in a random state within its limits and is driven by random inputs of that size, like the acrobot. A robot with the
-    name and the size of one of the four is taken for it. `simulate` says which forces act, and which robots are slow.
+    name and the size of one of these is taken for it. `simulate` says which forces act, and which robots are slow.
 
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        What `load_robot` takes: ``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"iiwa14"``, another name of
-        `list_robots`, the path of a URDF file, or a model.
+        What `load_robot` takes: ``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``, ``"acrobot"``,
+        ``"iiwa14"``, another name of `list_robots`, the path of a URDF file, or a model.
     n_trajectories : int, default=None
-        At least 1; None takes the paper's (48, 48, 93 and 465), and 100 for another robot.
+        At least 1; None takes the paper's (48, of the acrobot 93 and of iiwa14 465), and 100 for another robot.
     n_steps : int, default=None
         Steps per trajectory, at least 1; None takes the paper's (100, and 50 for iiwa14), and 50 for another robot.
     dt : float, default=0.03

@@ -32,9 +32,9 @@ def load_robot(robot: Robot) -> Any:
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        One of `list_robots`: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"acrobot"``, ``"iiwa14"``) or,
-        with the package example-robot-data, one of its robots (``"panda"``, ``"ur5"``, ...); the path of a URDF file;
-        or a model, which is checked.
+        One of `list_robots`: a system of the paper (``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``,
+        ``"acrobot"``, ``"iiwa14"``) or, with the package example-robot-data, one of its robots (``"panda"``,
+        ``"ur5"``, ...); the path of a URDF file; or a model, which is checked.
 
     Returns
     -------
@@ -95,18 +95,18 @@ def list_robots() -> list[str]:
     Returns
     -------
     names : list of str
-        The systems of the paper, then what the installed package example-robot-data brings, sorted: each URDF file
-        with a joint that moves, by its name without ``_robot``; where two have the same, with its folder in front.
-        Legged robots and drones come with the trunk welded to the world. ``"icub"``, ``"romeo"`` and
-        ``"romeo_laas_small"`` have massless links and cannot be simulated (``"icub_reduced"`` and ``"romeo_small"``
-        can).
+        The systems of the paper (of the cartpole two, see `make_dynamics`), then what the installed package
+        example-robot-data brings, sorted: each URDF file with a joint that moves, by its name without ``_robot``; where
+        two have the same, with its folder in front. Legged robots and drones come with the trunk welded to the world.
+        ``"icub"``, ``"romeo"`` and ``"romeo_laas_small"`` have massless links and cannot be simulated
+        (``"icub_reduced"`` and ``"romeo_small"`` can).
 
     Examples
     --------
     >>> from skevgp.datasets import list_robots
     >>> names = list_robots()
-    >>> names[:4]
-    ['acrobot', 'cartpole', 'iiwa14', 'pendulum']
+    >>> names[:5]
+    ['acrobot', 'cartpole', 'cartpole_damped', 'iiwa14', 'pendulum']
     >>> "panda" in names
     True
     """

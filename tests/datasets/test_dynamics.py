@@ -8,11 +8,17 @@ from skevgp.datasets import load_robot, make_dynamics, quintic_reference, simula
 from skevgp.robots import get_system, layout_of
 
 KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "dt", "DESCR"}
-ALPHA = {"pendulum": [np.pi, 0.5], "cartpole": [1.0, np.pi, 0.5, 0.5], "acrobot": [np.pi, 1.0, 0.5, 0.5]}
-ETA = {"pendulum": 1.0, "cartpole": 100.0, "acrobot": 0.5}
+ALPHA = {
+    "pendulum": [np.pi, 0.5],
+    "cartpole": [1.0, np.pi, 0.5, 0.5],
+    "cartpole_damped": [1.0, np.pi, 0.5, 0.5],
+    "acrobot": [np.pi, 1.0, 0.5, 0.5],
+}
+ETA = {"pendulum": 1.0, "cartpole": 100.0, "cartpole_damped": 100.0, "acrobot": 0.5}
 NAMES = {
     "pendulum": ["q", "dq/dt", "u_q"],
     "cartpole": ["x", "theta", "dx/dt", "dtheta/dt", "u_x"],
+    "cartpole_damped": ["x", "theta", "dx/dt", "dtheta/dt", "u_x"],
     "acrobot": ["q1", "q2", "dq1/dt", "dq2/dt", "u_q2"],
 }
 SYSTEMS = sorted(NAMES)
@@ -157,7 +163,7 @@ def test_a_system_works_in_place_of_its_name():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"system": "robot"}, r"Unknown robot 'robot'.*'acrobot', 'cartpole', 'iiwa14', 'pendulum'"),
+        ({"system": "robot"}, r"Unknown robot 'robot'.*'acrobot', 'cartpole', 'cartpole_damped', 'iiwa14', 'pendulum'"),
         ({"system": "acrobat"}, "Did you mean 'acrobot'"),
         (
             {"duration": 1.0},

@@ -115,6 +115,12 @@ def test_mass_and_gravity_of_the_cartpole(theta):
     assert_allclose(gravity("cartpole", [0.7, theta]), [0.0, 9.81 * 0.5 * np.sin(theta)], rtol=1e-12, atol=1e-14)
 
 
+def test_one_of_two_cartpoles_is_damped():
+    free, damped = load_robot("cartpole"), load_robot("cartpole_damped")
+    assert (list(free.damping), list(damped.damping)) == ([0.0, 0.0], [0.1, 0.1])
+    assert_allclose(mass_matrix("cartpole_damped", [0.7, 1.0]), mass_matrix("cartpole", [0.7, 1.0]), rtol=1e-15)
+
+
 @pytest.mark.parametrize("elbow", [0.0, 1.0, -2.5])
 def test_mass_of_the_acrobot(elbow):
     first, second, coupling = 0.083 + 0.25 + 1.0, 0.33 + 1.0, np.cos(elbow)
