@@ -230,15 +230,22 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
     -------
     columns : dict
         ``error_inside`` is their mean error, ``error_outside`` that of the others (NaN without any), ``inside`` the
-        share of the rows; ``outside`` names, for each column, how many rows are out of its range: "2:31 3:4".
+        share of the rows; ``outside`` tells of each column with rows out of its range their number and the largest
+        values to learn from and to be tested on: "1:31:3.02:8.31 3:4:9.7:10.2".
     """
     beyond = (test.data < train.data.min(axis=0)) | (test.data > train.data.max(axis=0))
     inside = ~beyond.any(axis=1)
+    counts = beyond.sum(axis=0)
+    largest = (np.abs(part.data).max(axis=0) for part in (train, test))
     return {
         "error_inside": errors[inside].mean() if inside.any() else np.nan,
         "error_outside": errors[~inside].mean() if not inside.all() else np.nan,
         "inside": inside.mean(),
-        "outside": " ".join(f"{column}:{n}" for column, n in enumerate(beyond.sum(axis=0)) if n),
+        "outside": " ".join(
+            f"{column}:{n}:{learned:.3g}:{tested:.3g}"
+            for column, (n, learned, tested) in enumerate(zip(counts, *largest, strict=True))
+            if n
+        ),
     }
 
 
