@@ -39,7 +39,7 @@ import numpy as np
 from sklearn.utils import Bunch
 
 import harness
-from paper import results_table_report
+from paper import results_table_plots, results_table_report
 from paper.models import MODELS, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, fitted_row, has
 from skevgp.datasets import make_dynamics
 
@@ -130,7 +130,7 @@ def main() -> None:
     # Everything the file has of this size and noise, not only what was asked for now.
     rows = [row for row in harness.read(output) if (row["size"], row["noise"]) == (size, str(noise))]
     if rows:
-        results_table_report.plot(rows, output.with_suffix(".png"))
+        results_table_plots.plot(rows, output.with_suffix(".png"))
     harness.write_report(results_table_report.paragraphs(rows) if rows else [], output, n_failures)
 
 
