@@ -79,7 +79,7 @@ def errors_panel(
         face = "white" if "*" in marks(rows) else colour
         axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
         axes.plot(place, values.mean(), marker, color=colour, markerfacecolor=face, markersize=7, label=label)
-        axes.plot(place, np.nanmean(of(rows, "error_inside")), "_", color=colour, markersize=9)
+        axes.plot(place, of(rows, "error_inside").mean(), "_", color=colour, markersize=9)
     axes.set_xticks(range(len(models)), models, fontsize=9)
     axes.set_xlim(-0.5, len(models) - 0.5)
     axes.tick_params(axis="x", length=0)

@@ -121,8 +121,9 @@ def marks(own: list[Row], n_seeds: int = 4) -> str:
 
 
 def both(own: list[Row]) -> str:
-    """The mean Error of all rows and of those inside the training range, means over seeds."""
-    return f"{figure_of(of(own, 'error_mean').mean())} / {figure_of(np.nanmean(of(own, 'error_inside')))}{marks(own)}"
+    """The mean Error of all rows and, where it was measured, of those inside the training range, means over seeds."""
+    everywhere, inside = of(own, "error_mean").mean(), of(own, "error_inside").mean()
+    return figure_of(everywhere) + (f" / {figure_of(inside)}" if np.isfinite(inside) else "") + marks(own)
 
 
 def paragraphs(rows: list[Row]) -> list[str]:
@@ -254,7 +255,8 @@ def which_cartpole(groups: Groups) -> Iterator[str]:
 
 def spread(own: list[Row]) -> str:
     """The Errors of data sets, and those inside."""
-    inside = f" ({', '.join(map(figure_of, of(own, 'error_inside')))})" if own else ""
+    known = bool(own) and np.isfinite(of(own, "error_inside")).all()
+    inside = f" ({', '.join(map(figure_of, of(own, 'error_inside')))})" if known else ""
     return ", ".join(map(figure_of, of(own, "error_mean"))) + inside
 
 
@@ -275,7 +277,7 @@ def outside(groups: Groups) -> Iterator[str]:
     """Which test rows lie beyond the training rows, and how much of an Error they make."""
     by_case: dict[str, dict[str, Row]] = {}
     for (case, _, _), own in groups.items():
-        for row in own:
+        for row in (row for row in own if np.isfinite(float(row["inside"]))):
             by_case.setdefault(case, {}).setdefault(row["seed"], row)
     lines = []
     for case, by_seed in by_case.items():
@@ -296,7 +298,9 @@ def coverage(groups: Groups) -> str:
     """Shares held by intervals of some promised shares, means over seeds."""
     shown = [share for share in PROMISED if share in (0.5, 0.8, 0.9, 0.95, 0.99)]
     lines = [
-        [" ".join(key), *(f"{of(own, f'within_{share}').mean():.3f}" for share in shown)] for key, own in groups.items()
+        [" ".join(key), *(f"{of(own, f'within_{share}').mean():.3f}" for share in shown)]
+        for key, own in groups.items()
+        if np.isfinite(of(own, "within_0.5")).all()
     ]
     return table(["promised", *map(str, shown)], lines)
 
@@ -338,12 +342,12 @@ def details(groups: Groups, setting: str) -> str:
             continue
         paper, errors = published(case, model), of(own, "error_mean")
         counts = sorted({row["n_parameters"] for row in own}, key=int)
-        beyond = of(own, "error_outside")
+        beyond, inside = of(own, "error_outside"), of(own, "error_inside").mean()
         lines.append(
             [
                 *(case, model, str(len(own)), f"{figure_of(errors.mean())} / {paper.error:.3f}"),
                 *(figure_of(value) for value in (np.median(errors), errors.max())),
-                f"{figure_of(np.nanmean(of(own, 'error_inside')))} ({of(own, 'inside').mean():.1%})",
+                f"{figure_of(inside)} ({of(own, 'inside').mean():.1%})" if np.isfinite(inside) else "",
                 figure_of(np.nanmean(beyond)) if np.isfinite(beyond).any() else "",
                 *(figure_of(of(own, column).mean()) for column in ("error_median", "error_p99")),
                 f"{figure_of(of(own, 'std_norm').mean())} / {paper.std_norm:.3f}",
