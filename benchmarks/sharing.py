@@ -184,7 +184,7 @@ def main() -> None:
         for system, seed, model in itertools.product(options.systems, range(n_seeds), options.models)
         for sharing in ("auto", "kernel", *map(name_of, partitions(range(N_OUTPUTS[system]))))
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

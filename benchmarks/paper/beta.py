@@ -128,7 +128,7 @@ def main() -> None:
             options.systems, range(n_seeds), options.settings, options.models
         )
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 
     rows = [row for row in harness.read(output) if row["size"] == size]
     for system in dict.fromkeys(row["system"] for row in rows):

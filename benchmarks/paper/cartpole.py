@@ -208,7 +208,7 @@ def main() -> None:
         Cell(variant, model, seed, size)
         for seed, model, variant in itertools.product(range(n_seeds), options.models, options.variants)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 
     rows = [row for row in harness.read(output) if row["size"] == size]
     if rows:

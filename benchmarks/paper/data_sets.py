@@ -104,7 +104,7 @@ def main() -> None:
     n_seeds = (1 if options.quick else 4) if options.seeds is None else options.seeds
     states = [offset + seed for offset, seed in itertools.product((0, 1000), range(n_seeds))]
     cells = [Cell(system, state, size) for system, state in itertools.product(options.systems, states)]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     rows = [row for row in harness.read(output) if row["size"] == size]
     harness.write_report(paragraphs(rows) if rows else [], output, n_failures)
 

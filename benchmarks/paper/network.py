@@ -199,7 +199,7 @@ def main() -> None:
         for system, seed, variant, n in itertools.product(systems, range(n_seeds), options.variants, epochs)
         if not variant or n == (epochs[-1] if options.quick else VARIED)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     rows = [row for row in harness.read(output) if row["size"] == size]
     harness.write_report(paragraphs(rows) if rows else [], output, n_failures)
 

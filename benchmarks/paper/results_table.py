@@ -125,7 +125,7 @@ def main() -> None:
         )
         if has(system, model, setting, angles)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 
     # Everything the file has of this size and noise, not only what was asked for now.
     rows = [row for row in harness.read(output) if (row["size"], row["noise"]) == (size, str(noise))]
