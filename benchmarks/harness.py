@@ -97,7 +97,7 @@ def argument_parser(
         said = "processes, each on one core; default: %(default)s"
         parser.add_argument("--jobs", type=positive, default=joblib.cpu_count(), help=said)
         said = "a day, 2026-11-23: what was measured before is measured again; default: what is there stays"
-        parser.add_argument("--since", type=day, default="", help=said)
+        parser.add_argument("--since", type=day, help=said)
     parser.add_argument(
         "--output", type=csv_path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
     )
@@ -201,7 +201,7 @@ def run_missing(
     jobs: int,
     say: Callable[[Any], str],
     fresh: bool = False,
-    since: str = "",
+    since: str | None = None,
 ) -> int:
     """Run the cells of which the CSV has no row, in processes, and write what each gives as it comes.
 
@@ -219,7 +219,7 @@ def run_missing(
         What ``run`` returned -> what to print of it.
     fresh : bool, default=False
         Whether each cell has a process of its own, where memory is measured.
-    since : str, default=""
+    since : str, default=None
         A day: rows that were measured before are as if they were not there, until a new one replaces them. (What they
         do not know, because the benchmark measured less then, is "nan".)
 
@@ -242,7 +242,7 @@ def run_missing(
     rows = read(output)
     if rows and not set(names) <= rows[0].keys():
         raise SystemExit(f"{output} has no columns {sorted(set(names) - rows[0].keys())}: give another --output.")
-    done = {tuple(row[name] for name in names) for row in rows if row.get("date", "") >= since}
+    done = {tuple(row[name] for name in names) for row in rows if not since or row["date"] >= since}
     missing = [cell for cell in cells if key(cell) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:

@@ -11,7 +11,12 @@ import numpy as np
 
 from harness import Row, column, figure_of, provenance_text, pyplot, save_picture, table
 
-SETTINGS = {"paper": "paper's setting", "skevgp": "skevgp's setting"}
+SETTINGS = {
+    "paper": "paper's setting",
+    "author": "author's starts",
+    "author-100": "author's starts, prior scale 100",
+    "skevgp": "skevgp's setting",
+}
 # Blue, white and vermilion of Okabe & Ito's palette; white to black for standard deviations.
 DIVERGING = ("#0072B2", "#8cc1e0", "#ffffff", "#edb48c", "#D55E00")
 # Weights smaller than this are coloured in proportion, larger ones by their logarithm: 1 and Δt are not all one sees.

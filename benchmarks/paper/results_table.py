@@ -13,11 +13,11 @@ Markdown table and a picture beside it. Models of seed s learn from data of rand
 Of the cartpole there are two: with damping of both joints, which Drake's had in Python when the paper was written, and
 without. Angles are as they come, or wrapped: in [-pi, pi) in the data, the target of a row moved with them.
 
-Settings: "paper" (Adam, diagonal posterior, inducing points per output), "author" (the same from where the author's
-library starts, with its solver), "skevgp" (its defaults), "skevgp-angles" (the
-kernel sees sines and cosines of angles) and, for iiwa14's EVGP, "skevgp-nominal" (a model of the arm whose masses,
-centres of mass and inertias are wrong by up to 20 % as further features). RES-DBNN has a standard normal prior on its
-weights in the paper's setting, and one that shrinks with the width of a layer in the others.
+Settings: "paper" (Adam, diagonal posterior, inducing points per output), "author" and "author-100" (the same from
+where the author's library starts, with its solver and a prior scale of 1 or 100), "skevgp" (its defaults),
+"skevgp-angles" (the kernel sees sines and cosines of angles) and, for iiwa14's EVGP, "skevgp-nominal" (a model of the
+arm whose masses, centres of mass and inertias are wrong by up to 20 % as further features). RES-DBNN has a standard
+normal prior on its weights in the paper's setting, and one that shrinks with the width of a layer in the others.
 
 In the paper's setting a fit of a GP takes 1 to 5 minutes of one core for the pendulum and the cartpole, 10 to 30 for
 the acrobot, and 3 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.

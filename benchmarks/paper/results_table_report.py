@@ -68,6 +68,7 @@ ORDER = (("EVGP-IFG", "EVGP-IF"), ("EVGP-IF", "VGP"), ("EVGP-IF", "RES-VGP"))
 STYLES = {
     "paper": ("#E69F00", "s"),
     "author": ("#D55E00", "v"),
+    "author-100": ("#56B4E9", "P"),
     "skevgp": ("#0072B2", "o"),
     "skevgp-angles": ("#009E73", "^"),
     "skevgp-nominal": ("#CC79A7", "D"),
