@@ -61,7 +61,7 @@ def test_it_runs_and_resumes_and_has_a_row_for_each_weight(run, tmp_path):
     assert (tmp_path / "b_pendulum.png").stat().st_size > 10_000
     page = (tmp_path / "b.md").read_text()
     assert "**A quick run**" in page
-    assert page.count("(dq/dt, sin(q))") == 2
+    assert page.count("(dq/dt, sin(q))") == 4
     assert "(dq/dt, q): " not in page  # the paper's observation is of the acrobot
 
 
