@@ -129,6 +129,15 @@ def paper(results: Results, system: str, model: str) -> str:
     return f"{results_table_report.PAPER[system][model].error:.3f}"
 
 
+def held(results: Results, system: str, model: str, setting: str, which: str) -> str:
+    """With noise: a containing ratio (cr1, cr2, cr3) or the Error, mean over data sets."""
+    own = results.noisy.get((system, model, setting))
+    if not own:
+        return MISSING
+    value = float(of(own, which).mean())
+    return figure_of(value) if which == "error_mean" else f"{value:.3f}"
+
+
 def n_parameters(results: Results, system: str, model: str, setting: str) -> str:
     """The largest number that a cell's fits learned."""
     own = results.table.get((system, model, setting))
@@ -145,7 +154,7 @@ FILLERS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(errors, which_cartpole, outside, claims_table, tried, calibration),
-        *(error, spread, paper, n_parameters, variant),
+        *(error, spread, paper, held, n_parameters, variant),
     )
 }
 
