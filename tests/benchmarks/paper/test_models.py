@@ -34,7 +34,7 @@ def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():
 
 
 def test_settings_are_what_they_say():
-    from paper.models import EPOCHS, Fit, build
+    from paper.models import UNTIL_FLAT, Fit, build
 
     def built(system, model, setting, seed=0, size="full", max_iter=None):
         return build(Fit(system, model, setting, seed, size, max_iter))
@@ -65,8 +65,7 @@ def test_settings_are_what_they_say():
 
     standard, narrow = (built("iiwa14", "RES-DBNN", setting).regressor for setting in ("paper", "skevgp"))
     assert (standard.hidden_layer_sizes, standard.prior_scale) == ((250, 250), 1.0)
-    epochs = EPOCHS["iiwa14"]
-    assert narrow.get_params() == BayesianMLPRegressor((250, 250), max_iter=epochs, random_state=0).get_params()
+    assert narrow.get_params() == BayesianMLPRegressor((250, 250), random_state=0, **UNTIL_FLAT).get_params()
     encoder, network = built("pendulum", "RES-DBNN", "skevgp-angles", size="quick").regressor
     assert isinstance(encoder, AngleEncoder)
     assert network.max_iter == 400

@@ -8,10 +8,10 @@ from ..conftest import read
 @pytest.mark.slow
 def test_it_runs_in_short_mode(run_script, tmp_path):
     said = run_script("paper/network.py", "--quick", "--jobs", 1, "--output", tmp_path / "network.csv")
-    assert "[6/6] pendulum" in said
+    assert "[7/7] pendulum" in said
     rows = read(tmp_path / "network.csv")
     assert {row["variant"] for row in rows} == {
-        *("", "prior of 1", "first step 0.003", "batches of 50", "twice as wide")
+        *("", "prior of 1", "first step 0.003", "batches of 50", "twice as wide", "early stopping")
     }
     assert all(0 < float(row["error_learned"]) < 1 for row in rows)
     assert "| twice as wide | 10 |" in (tmp_path / "network.md").read_text()
