@@ -1,4 +1,4 @@
-"""Data for other packages' ways with a regressor. These tests run where they are asked for, with the extra `clients`."""
+"""Data for other packages' ways with a regressor. (These tests run where they are named, with the extra `clients`.)"""
 
 import numpy as np
 import pytest
