@@ -1,4 +1,4 @@
-"""The paper's metrics of a probabilistic prediction (its section IV-B), proper scores, and calibration."""
+"""The paper's metrics of a probabilistic prediction (its section IV-B), proper scores, calibration, and scorers."""
 
 from __future__ import annotations
 
@@ -9,10 +9,17 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 from sklearn.utils import check_array, check_consistent_length
 
+from ._scorers import make_std_scorer
+
 __all__ = [
     "calibration_error",
     "containing_ratios",
     "crps",
+    "interval_levels",
+    "make_std_scorer",
+    "neg_calibration_error",
+    "neg_crps",
+    "neg_nlpd",
     "negative_log_predictive_density",
     "prediction_error",
     "std_norm",
@@ -293,3 +300,9 @@ def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.
     unreached = np.where(error > 0, np.inf, 0.0)
     with np.errstate(over="ignore"):
         return 2.0 * ndtr(np.divide(error, std, out=unreached, where=std > 0)) - 1.0
+
+
+# For ``scoring=``; higher is better.
+neg_nlpd = make_std_scorer(negative_log_predictive_density, greater_is_better=False)
+neg_crps = make_std_scorer(crps, greater_is_better=False)
+neg_calibration_error = make_std_scorer(calibration_error, greater_is_better=False)
