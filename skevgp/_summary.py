@@ -22,7 +22,8 @@ _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
 # Lines of weights that are printed, and columns of text.
 _LINES, _WIDTH = 40, 100
 _CELL = 'style="text-align: left; padding: 0 1em 0 0"'
-_SCROLLED = 'style="max-height: 30em; overflow: auto"'
+_TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
+_SCROLLED = 'style="max-height: 30em; max-width: fit-content; overflow: auto"'
 
 
 class Parameter(NamedTuple):
@@ -320,4 +321,4 @@ def _plus_minus(value: float, std: float) -> str:
 def _html_table(lines: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
     head = "".join(f"<th {_CELL}>{escape(cell)}</th>" for cell in header)
     rows = "".join(f"<tr>{''.join(f'<td {_CELL}>{escape(cell)}</td>' for cell in line)}</tr>" for line in lines)
-    return f"<table>{f'<thead><tr>{head}</tr></thead>' if header else ''}<tbody>{rows}</tbody></table>"
+    return f"<table {_TABLE}>{f'<thead><tr>{head}</tr></thead>' if header else ''}<tbody>{rows}</tbody></table>"
