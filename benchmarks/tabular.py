@@ -1,12 +1,12 @@
 """Tables: EVGPRegressor beside scikit-learn's exact Gaussian process, gradient boosting and Bayesian ridge regression.
 
 RMSE, NLPD, CRPS, coverage of 90 % intervals and time on scikit-learn's own sets and on made ones, of which two are as
-trees like them: steps, and a set like California's houses (districts, skewed columns, values cut off at the top; the
+trees like them: boxes, and a set like California's houses (districts, skewed columns, values cut off at the top; the
 real one would have to be downloaded). All models have their defaults, and see columns and targets of variance one. Does
 ``EVGPRegressor(n_inducing="auto")`` cost accuracy against `GaussianProcessRegressor` (a lengthscale per column,
 optimised), and how much of its time does it take? Models of a set and seed are fitted one after the other in one
-process with one thread, so that ratios of times are of the same run. Writes a row per fit to a CSV (what is there is not
-run again), and from it a Markdown page.
+process with one thread, so that ratios of times are of the same run. Writes a row per fit to a CSV (what is there is
+not run again), and from it a Markdown page.
 
     python benchmarks/tabular.py            # some hours of one core
     python benchmarks/tabular.py --quick    # two small sets, one seed
@@ -244,7 +244,8 @@ def against_exact(rows: Sequence[harness.Row]) -> Iterator[list[str]]:
             times = [harness.figure_of(of("seconds")) for of in (exact, auto)]
             ratios = [f"{auto(time) / exact(time):.2f}" for time in ("seconds", "wall_seconds")]
             points = f"{auto('m'):.0f}"
-            yield [name, f"{exact('nlpd'):.3f}", f"{lost:+.3f}", "yes" if lost <= ENOUGH else "no", points, *times] + ratios
+            near = "yes" if lost <= ENOUGH else "no"
+            yield [name, f"{exact('nlpd'):.3f}", f"{lost:+.3f}", near, points, *times, *ratios]
 
 
 def report(rows: Sequence[harness.Row]) -> Iterator[str]:

@@ -138,11 +138,10 @@ def _scaled_back(model: TransformedTargetRegressor, mean: np.ndarray, std: np.nd
     if not (identity or isinstance(transformer, _SCALERS)) or given.get("clip"):
         names = ", ".join(scaler.__name__ for scaler in _SCALERS)
         raise TypeError(
-            f"Of a TransformedTargetRegressor with {transformer!r} there is no standard deviation of y: it is known where "
-            f"y is scaled ({names}). EVGPRegressor scales y itself, and normalize_y=True centres it."
+            f"Of a TransformedTargetRegressor with {transformer!r} there is no standard deviation of y: it is known "
+            f"where y is scaled ({names}). EVGPRegressor scales y itself, and normalize_y=True centres it."
         )
     shape, columns = mean.shape, mean.reshape(len(mean), -1)
     unit = transformer.inverse_transform(np.ones((1, columns.shape[1])))
     unit = np.abs(unit - transformer.inverse_transform(np.zeros((1, columns.shape[1]))))
     return transformer.inverse_transform(columns).reshape(shape), std * unit.reshape(shape[1:])
-

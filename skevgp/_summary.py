@@ -133,7 +133,8 @@ class ModelSummary:
             shown = table[: _LINES + 1]
             widths = [max(len(line[column]) for line in shown) for column in range(len(table[0]))]
             lines = [
-                "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip() for line in shown
+                "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+                for line in shown
             ]
             if len(table) > len(shown):
                 lines.append(f"... and {len(table) - len(shown)} more: to_frame() has all")

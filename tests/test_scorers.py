@@ -236,7 +236,9 @@ def test_groups_are_routed_to_the_fit_and_to_the_split(wrapped, inner):
         *(X, targets),
         params={"groups": GROUPS},
         cv=GroupKFold(3),
-        scoring={"nlpd": make_std_scorer(negative_log_predictive_density)} if wrapped is not ResidualRegressor else None,
+        scoring={"nlpd": make_std_scorer(negative_log_predictive_density)}
+        if wrapped is not ResidualRegressor
+        else None,
         return_estimator=True,
         error_score="raise",
     )
@@ -255,6 +257,13 @@ def test_groups_are_routed_in_a_search():
 
 def test_without_routing_groups_split_and_a_parameter_tells_the_fit():
     found = cross_validate(
-        WITNESS, X, y, groups=GROUPS, params={"groups": GROUPS}, cv=GroupKFold(3), scoring=neg_nlpd, return_estimator=True
+        WITNESS,
+        X,
+        y,
+        groups=GROUPS,
+        params={"groups": GROUPS},
+        cv=GroupKFold(3),
+        scoring=neg_nlpd,
+        return_estimator=True,
     )
     assert all(len(np.unique(fitted.told_)) == 8 for fitted in found["estimator"])

@@ -129,9 +129,16 @@ def test_columns_are_called_as_the_kernel_sees_them():
     assert scales().index.tolist() == ["angle", "speed"]
     assert scales(kernel_map=StandardScaler()).index.tolist() == ["angle", "speed"]
     assert scales(kernel_map=AngleEncoder(angles=[0])).index.tolist() == ["sin(angle)", "cos(angle)", "speed"]
-    assert scales(kernel_map=FunctionTransformer(lambda x: np.hstack([x, x]))).index.tolist() == ["k0", "k1", "k2", "k3"]
+    assert scales(kernel_map=FunctionTransformer(lambda x: np.hstack([x, x]))).index.tolist() == [
+        "k0",
+        "k1",
+        "k2",
+        "k3",
+    ]
     assert scales(kernel=RBF(1.0)).index.tolist() == [""]
-    assert scales(kernel=RBF(1.0), kernel_map=FunctionTransformer(lambda x: x.to_numpy()[:, :1])).index.tolist() == ["k0"]
+    assert scales(kernel=RBF(1.0), kernel_map=FunctionTransformer(lambda x: x.to_numpy()[:, :1])).index.tolist() == [
+        "k0"
+    ]
 
 
 def test_hyperparameters_of_the_same_name_are_told_apart():

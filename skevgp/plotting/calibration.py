@@ -202,7 +202,9 @@ class CalibrationDisplay:
         observed = np.array([np.searchsorted(np.sort(each), nominal, side="right") / len(each) for each in own])
         y_true, y_pred, std = (np.asarray(part, dtype=float).reshape(levels.shape) for part in (y_true, y_pred, std))
         columns = zip(y_true.T, y_pred.T, std.T, strict=True)
-        errors = [calibration_error(*one) for one in columns] if per_output else [calibration_error(y_true, y_pred, std)]
+        errors = (
+            [calibration_error(*one) for one in columns] if per_output else [calibration_error(y_true, y_pred, std)]
+        )
         return cls(nominal, observed, np.array(errors), len(own[0]), names).plot(ax, label=label, color=color)
 
     def plot(self, ax: Any = None, *, label: str | None = None, color: str | None = None) -> Self:

@@ -80,7 +80,9 @@ class LossDisplay:
         check_is_fitted(estimator)
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
         if len(bound) == 0:
-            raise ValueError(f"{type(estimator).__name__} has no iterations to show: it has no loss_curve_, or an empty one.")
+            raise ValueError(
+                f"{type(estimator).__name__} has no iterations to show: it has no loss_curve_, or an empty one."
+            )
         exact = hasattr(estimator, "log_marginal_likelihood_value_")
         name = "log marginal likelihood (nats)" if exact else "lower bound (nats)"
         return cls(bound, name).plot(ax, gap=gap, label=label, color=color)
