@@ -306,7 +306,7 @@ def _of_kernel(kernel: Any, output: int | str | None, columns: Sequence[str]) ->
             yield Parameter(output, part, str(name), float(value))
 
 
-def _certificate(lower: float, upper: float) -> str:
+def _certificate(lower: Any, upper: Any) -> str:
     if lower == upper:
         return f"log marginal likelihood: {lower:.2f} nats"
     if np.isinf(upper):
