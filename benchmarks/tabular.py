@@ -1,12 +1,12 @@
 """Tables: EVGPRegressor beside scikit-learn's exact Gaussian process, gradient boosting and Bayesian ridge regression.
 
 RMSE, NLPD, CRPS, coverage of 90 % intervals and time on scikit-learn's own sets and on made ones, of which two are as
-trees like them: boxes, and a set like California's houses (districts, skewed columns, values cut off at the top; the
-real one would have to be downloaded). All models have their defaults, and see columns and targets of variance one. Does
+trees like them: boxes, and a set like California's houses (prices that jump between districts, skewed columns; the real
+one would have to be downloaded). All models have their defaults, and see columns and targets of variance one. Does
 ``EVGPRegressor(n_inducing="auto")`` cost accuracy against `GaussianProcessRegressor` (a lengthscale per column,
 optimised), and how much of its time does it take? Models of a set and seed are fitted one after the other in one
 process with one thread, so that ratios of times are of the same run. Writes a row per fit to a CSV (what is there is
-not run again), and from it a Markdown page.
+not run again), from it a Markdown page, and the tables of docs/guide/boosting.md.
 
     python benchmarks/tabular.py            # some hours of one core
     python benchmarks/tabular.py --quick    # two small sets, one seed
@@ -15,11 +15,13 @@ not run again), and from it a Markdown page.
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -48,7 +50,7 @@ SMALLEST_STD = 1e-3
 
 
 def houses(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    """Like California's: where a district begins the price jumps, people and rooms are skewed, prices are cut at 5."""
+    """Like California's: prices jump between districts, people and rooms are skewed; few are cut off at 5."""
     place, age = rng.uniform(0.0, 6.0, (n, 2)), rng.randint(1, 53, n)
     income, people = np.exp(1.2 + 0.45 * rng.randn(n)), np.exp(7.0 + 0.7 * rng.randn(n))
     rooms = np.exp(1.6 + 0.1 * income / 3 + 0.3 * rng.randn(n))
@@ -210,6 +212,15 @@ def say(rows: list[dict[str, Any]]) -> str:
     return "; ".join(f"{row['model']} NLPD {row['nlpd']:.3f} in {row['seconds']:.1f} s" for row in rows)
 
 
+SCORES = ("set", "model", "RMSE", "NLPD", "CRPS", "coverage", "width", "seconds")
+AGAINST_EXACT = (
+    *("set", "NLPD of GPR", "auto's, more", f"within {ENOUGH}"),
+    *("points", "s, GPR", "s, auto", "ratio", "ratio on the wall"),
+)
+# Its tables are these.
+PAGE = Path(__file__).parents[1] / "docs" / "guide" / "boosting.md"
+
+
 def mean_of(rows: Sequence[harness.Row], name: str, model: str, value: str) -> float:
     """Over seeds; not a number where there is none."""
     own = [row for row in rows if (row["name"], row["model"]) == (name, model)]
@@ -220,9 +231,9 @@ def names_in(rows: Sequence[harness.Row]) -> list[str]:
     return [name for name in SETS if any(row["name"] == name for row in rows)]
 
 
-def scores(rows: Sequence[harness.Row]) -> Iterator[list[str]]:
-    """Lines of all models of all sets."""
-    for name in names_in(rows):
+def scores(rows: Sequence[harness.Row], names: Sequence[str]) -> Iterator[list[str]]:
+    """Lines of all models of some sets."""
+    for name in names:
         models = [model for model in MODELS if np.isfinite(mean_of(rows, name, model, "nlpd"))]
         for model in models:
             of = partial(mean_of, rows, name, model)
@@ -260,15 +271,29 @@ def report(rows: Sequence[harness.Row]) -> Iterator[str]:
         "interval, whose width is the standard deviation's; *boosting, folds*: one standard deviation, of the errors "
         "of five folds. Seconds: of the processor, one thread."
     )
-    yield harness.table(["set", "model", "RMSE", "NLPD", "CRPS", "coverage", "width", "seconds"], scores(rows))
+    fewer = [name for name in names_in(rows) if len({row["seed"] for row in rows if row["name"] == name}) < len(seeds)]
+    if fewer:
+        yield f"Of the first of these seeds only: {', '.join(fewer)}."
+    yield harness.table(SCORES, scores(rows, names_in(rows)))
     lines = list(against_exact(rows))
     if lines:
         near = sum(line[3] == "yes" for line in lines)
         yield '## `n_inducing="auto"` against the exact model'
-        header = ["set", "NLPD of GPR", "auto's, more", f"within {ENOUGH}", "points", "s, GPR", "s, auto", "ratio"]
-        yield harness.table([*header, "ratio on the wall"], lines)
+        yield harness.table(AGAINST_EXACT, lines)
         yield f"Within {ENOUGH} nats per row of GPR: {near} of {len(lines)}."
     yield harness.provenance_text(rows)
+
+
+def with_tables(page: str, rows: Sequence[harness.Row]) -> str:
+    """A page with, below each line ``<!-- table: SETS -->``, the table of these sets or, of "auto", against GPR."""
+
+    def filled(match: re.Match[str]) -> str:
+        names = match[1].split()
+        if names == ["auto"]:
+            return match[0].partition("\n")[0] + "\n" + harness.table(AGAINST_EXACT, against_exact(rows))
+        return match[0].partition("\n")[0] + "\n" + harness.table(SCORES, scores(rows, names))
+
+    return re.sub(r"<!-- table: (.*) -->\n(?:\|.*\n)*", filled, page)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -280,7 +305,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     seeds = range(options.seeds or (1 if options.quick else 3))
     cells = [Cell(name, seed) for seed in seeds for name in names]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say)
-    harness.write_report(report(harness.read(output)), output, n_failures)
+    rows = harness.read(output)
+    if rows and options.output is None and not options.quick:
+        PAGE.write_text(with_tables(PAGE.read_text(), rows))
+    harness.write_report(report(rows), output, n_failures)
 
 
 if __name__ == "__main__":

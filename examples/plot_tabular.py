@@ -54,7 +54,7 @@ n_rows, n_test = (80, 200) if quick else (options.rows, 1000)
 # Data
 # ----
 # The noise of Friedman's functions is what he gave them (1991). Houses are like California's, which would have to be
-# downloaded: the price jumps where a district begins, columns are skewed, and prices are cut off at the top.
+# downloaded: the price jumps where a district begins, and columns are skewed.
 
 
 def make_houses(n_samples, random_state):
@@ -128,7 +128,9 @@ def models(n_columns):
 results, fitted, tests = {}, {}, {}
 print(f"{'':12s} {'':26s} {'RMSE':>7s} {'NLPD':>7s} {'within 90 %':>12s} {'seconds':>8s}")
 for name, (X, y) in sets.items():
-    X, X_test, y, y_test = train_test_split(X, y / y.std(), test_size=min(n_test, len(y) // 3), random_state=options.seed)
+    X, X_test, y, y_test = train_test_split(
+        X, y / y.std(), test_size=min(n_test, len(y) // 3), random_state=options.seed
+    )
     tests[name] = X_test, y_test
     for label, model in models(X.shape[1]).items():
         model = make_pipeline(StandardScaler(), model)
@@ -157,7 +159,8 @@ print(fitted["friedman1", "EVGPRegressor"][-1].summary())
 # %%
 # Who promises what
 # -----------------
-# Left: how often values of the houses lie inside of intervals. Right: error and density relative to the best.
+# Left: how often values of the houses lie inside of intervals. Beside it error and density, and how far they are from
+# the best of each set.
 
 figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
 labels = list(models(1))
@@ -173,10 +176,11 @@ for ax, column, title in ((axes[1], 0, "RMSE / the best"), (axes[2], 1, "NLPD, a
         values = np.divide(values, best) if column == 0 else np.subtract(values, best)
         ax.plot(values, np.arange(len(sets)) + 0.15 * (place - 1.5), "o", color=colors[label], label=label)
     ax.set_yticks(range(len(sets)), sets)
+    ax.invert_yaxis()
     ax.set_title(title, fontsize=10)
     ax.grid(axis="y", color="0.92")
 axes[2].set_xscale("symlog", linthresh=0.1)
-axes[2].set_xlim(left=-0.01)
+axes[2].set_xlim(-0.02, 2.0 * axes[2].get_xlim()[1])
 axes[1].legend(fontsize=7)
 options.output.mkdir(parents=True, exist_ok=True)
 figure.savefig(options.output / "tabular.png", dpi=100)
