@@ -271,9 +271,10 @@ def report(rows: Sequence[harness.Row]) -> Iterator[str]:
         "interval, whose width is the standard deviation's; *boosting, folds*: one standard deviation, of the errors "
         "of five folds. Seconds: of the processor, one thread."
     )
-    fewer = [name for name in names_in(rows) if len({row["seed"] for row in rows if row["name"] == name}) < len(seeds)]
+    counts = {name: len({row["seed"] for row in rows if row["name"] == name}) for name in names_in(rows)}
+    fewer = [f"{name} ({count})" for name, count in counts.items() if count < len(seeds)]
     if fewer:
-        yield f"Of the first of these seeds only: {', '.join(fewer)}."
+        yield f"Fewer seeds, the first ones: {', '.join(fewer)}."
     yield harness.table(SCORES, scores(rows, names_in(rows)))
     lines = list(against_exact(rows))
     if lines:
