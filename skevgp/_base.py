@@ -15,6 +15,7 @@ from ._coef_prior import coef_names
 from ._control import ForControl
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
+from ._summary import ModelSummary, Summarised, of_gaussian_process
 from ._validation import check_fitted, check_integer, is_plain
 from .exceptions import warn_user
 from .export.exportable import Exportable
@@ -56,7 +57,7 @@ class _OfWeights:
         )
 
 
-class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForControl):
+class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Exportable, ForControl):
     """A Gaussian process with explicit features, however it is fitted."""
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
@@ -227,6 +228,9 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
+
+    def _described(self) -> ModelSummary:
+        return of_gaussian_process(self)
 
     def _set_posterior(self) -> None:
         """What is known of weights, if there are any, and noise."""
