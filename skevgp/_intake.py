@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils.validation import validate_data
 
@@ -24,6 +24,7 @@ from ._validation import (
     validate_frame,
     words_of,
 )
+from ._versioned import VersionedEstimator
 from .fitting.units import Units
 from .inference.posterior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
@@ -69,7 +70,7 @@ class Problem:
     groups: np.ndarray | None
 
 
-class Intake(BaseEstimator):
+class Intake(VersionedEstimator):
     """An estimator with explicit features, as far as it takes in rows."""
 
     feature_map: TransformerMixin | None

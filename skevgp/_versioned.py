@@ -1,0 +1,37 @@
+"""Estimators that know, in pickles and files of skops, which version of skevgp they are of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sklearn.base import BaseEstimator
+
+from . import __version__
+from .exceptions import InconsistentVersionWarning, warn_user
+
+_KEY = "_skevgp_version"
+
+
+class VersionedEstimator(BaseEstimator):
+    """As scikit-learn's own estimators: the version is in the state, and another one is warned of."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = dict(super().__getstate__())
+        # Of a user's class it says nothing; scikit-learn does the same.
+        return {**state, _KEY: __version__} if _is_ours(self) else state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = dict(state)
+        version = state.pop(_KEY, "before 0.2")
+        if _is_ours(self) and version != __version__:
+            warn_user(
+                f"{type(self).__name__} is a pickle of skevgp {version}, and this is {__version__}: it may fail, or "
+                "predict something else. Load it with that version and save it with skevgp.io.save, whose files are "
+                "checked when they are read; or fit it again.",
+                InconsistentVersionWarning,
+            )
+        super().__setstate__(state)
+
+
+def _is_ours(estimator: object) -> bool:
+    return type(estimator).__module__.startswith("skevgp.")

@@ -1,0 +1,1 @@
+TRUSTED_TYPES: list[str] = []
