@@ -15,6 +15,7 @@ from sklearn.utils.validation import validate_data
 
 from ._coef_prior import resolve_coef_prior, says_shared, wide_scale
 from ._row_weights import chosen_rows
+from ._state import StatefulEstimator
 from ._validation import (
     FLOATS,
     check_magnitude,
@@ -24,7 +25,6 @@ from ._validation import (
     validate_frame,
     words_of,
 )
-from ._versioned import VersionedEstimator
 from .fitting.units import Units
 from .inference.posterior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
@@ -70,7 +70,7 @@ class Problem:
     groups: np.ndarray | None
 
 
-class Intake(VersionedEstimator):
+class Intake(StatefulEstimator):
     """An estimator with explicit features, as far as it takes in rows."""
 
     feature_map: TransformerMixin | None

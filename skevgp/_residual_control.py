@@ -14,8 +14,8 @@ from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from ._sklearn import safe_indexing
+from ._state import StatefulEstimator
 from ._validation import as_floats, is_frame
-from ._versioned import VersionedEstimator
 from .export.c_code import write_c
 from .export.casadi import with_base
 from .prediction.compiled import CompiledPredictor
@@ -46,7 +46,7 @@ def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
     return columns
 
 
-class ResidualForControl(VersionedEstimator):
+class ResidualForControl(StatefulEstimator):
     """A meta-estimator of changes that control loops can use, as far as its regressor can."""
 
     regressor_: Any

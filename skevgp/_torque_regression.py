@@ -10,8 +10,8 @@ from numpy.typing import ArrayLike
 from sklearn.base import clone
 
 from ._coef_prior import wide_scale
+from ._state import StatefulEstimator
 from ._validation import check_magnitude, checked_groups
-from ._versioned import VersionedEstimator
 from .features import RigidBodyRegressor
 from .identification.rows_of_logs import blocks_of, groups_of
 from .identification.stiction import likeliest_velocity
@@ -21,7 +21,7 @@ from .identification.weights import Prior, Rows, Weights, identify, with_gains
 _STICTION_ROUNDS = 3
 
 
-class TorqueRegression(VersionedEstimator):
+class TorqueRegression(StatefulEstimator):
     """How rows of `InverseDynamics` become those of a regression, and the weights that it finds."""
 
     robot: Any

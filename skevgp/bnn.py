@@ -17,8 +17,8 @@ from ._progress import monitor_of
 from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
+from ._state import StatefulEstimator
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
-from ._versioned import VersionedEstimator
 from .exceptions import warn_user
 from .network.model import VariationalNetwork
 from .network.training import Scaling, train
@@ -32,7 +32,7 @@ _BATCH_SIZE = 200  # "auto"
 _NUMBERS_AT_ONCE = 2**21
 
 
-class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, VersionedEstimator):
+class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     r"""Neural network with normal variational weights (a deep Bayesian neural network, the paper's DBNN).
 
     Layers of LeakyReLU units; each weight is normal, :math:`q(w) = N(\mu, s^2)`, independent of the others, its prior

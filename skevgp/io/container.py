@@ -130,10 +130,11 @@ def _array_in(file: IO[bytes], info: ZipInfo) -> np.ndarray:
         raise MalformedError(f"its member {info.filename!r} says the shape {shape}, which are not the bytes it has")
     values = np.empty(shape, dtype, order="F" if header[2] == b"True" else "C")
     # A transposed view has the bytes in their order.
-    target = memoryview((values.T if header[2] == b"True" else values).reshape(-1)).cast("B") if n_bytes else b""
+    flat: Any = (values.T if header[2] == b"True" else values).reshape(-1)
+    target = memoryview(flat).cast("B") if n_bytes else memoryview(bytearray())
     place = 0
     while piece := file.read(_PIECE):
-        target[place : place + len(piece)] = piece  # type: ignore[index]
+        target[place : place + len(piece)] = piece
         place += len(piece)
     if place != n_bytes:
         raise MalformedError(f"its member {info.filename!r} ends too early")

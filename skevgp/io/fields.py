@@ -100,7 +100,7 @@ def integer(least: int = -(2**62)) -> Field:
     """An integer; NumPy's too."""
 
     def holds(value: Any, sizes: Sizes) -> bool:
-        return isinstance(value, Integral) and not isinstance(value, bool) and least <= int(value) < 2**62
+        return type(value) is not bool and isinstance(value, Integral) and least <= int(value) < 2**62
 
     return Field("an integer" + (f" of at least {least}" if least > -(2**62) else ""), holds)
 
@@ -115,7 +115,7 @@ def made(*kinds: type) -> Field:
     return Field(f"a {' or '.join(kind.__name__ for kind in kinds)}", lambda value, sizes: isinstance(value, kinds))
 
 
-def several(item: Field, kind: type = list) -> Field:
+def several(item: Field, kind: Any = list) -> Field:
     """A list (or tuple) whose items hold."""
     return Field(
         f"a {kind.__name__} of which each is {item.words}",

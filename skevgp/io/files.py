@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import platform
 import warnings
+from collections.abc import Iterator
+from importlib.util import find_spec
 from typing import IO, Any
 from zipfile import BadZipFile
 
@@ -14,23 +16,24 @@ import sklearn
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
-from .. import __version__
+from .._frames import FrameColumns
+from .._version import __version__
 from ..exceptions import InconsistentVersionWarning, warn_user
 from ..rows.maps import take_rows
-from . import of_maps, of_models, of_robots
+from . import of_maps, of_models
 from .container import Container, replacing, write
 from .fields import MalformedError
 from .records import Record, by_name
 from .values import Reader, Writer, refusal
 
 FORMAT, VERSION = "skevgp", 1
-_TRIAL_ROWS = 4
+_ROWS = 4
 # What a prediction may differ by where other libraries compute it: shares of its standard deviation, and of itself.
 _OF_STD, _OF_MEAN = 1e-2, 1e-6
 
 
 def _records() -> dict[str, Record]:
-    return by_name([*of_models.RECORDS, *of_maps.RECORDS, of_robots.record()])
+    return by_name([*of_models.RECORDS, *of_maps.RECORDS])
 
 
 def save(model: BaseEstimator, path: str | os.PathLike[str]) -> None:
@@ -99,7 +102,10 @@ def save(model: BaseEstimator, path: str | os.PathLike[str]) -> None:
     content["trial"] = writer.value(_trial(model), "trial")
     with replacing(path) as file:
         write(file, content, writer.arrays)
-        _loaded(file, os.fspath(path))
+        try:
+            _loaded(file, os.fspath(path))
+        except ValueError as error:
+            raise ValueError(f"The model cannot be saved, for its file could not be read: {error}") from error
 
 
 def load(path: str | os.PathLike[str]) -> Any:
@@ -201,22 +207,46 @@ def _read(file: IO[bytes]) -> tuple[Any, dict[str, str], bool]:
 
 
 def _trial(model: Any) -> dict[str, Any] | None:
-    """A few rows, and what is predicted of them; None for a model that takes no such rows."""
-    rows = getattr(model, "_example", None)
-    if rows is None:
-        width = getattr(model, "n_features_in_", 1)
-        rows = np.random.RandomState(0).uniform(0.1, 1.0, (_TRIAL_ROWS, width))
-    rows = take_rows(rows, slice(0, _TRIAL_ROWS))
+    """A few rows, and what is predicted of them; None for a model of which nobody knows what rows it takes."""
+    rows = _rows_for(model)
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             mean, std = _predicted(model, rows)
     except Exception:
-        # Rows of words, say, that only the user knows.
         return None
     if not np.isfinite(mean).all() or not np.isfinite(std).all():
         return None
-    return {"rows": rows, "mean": mean, "std": std}
+    columns = FrameColumns.of(rows)
+    return {"rows": rows if columns is None else columns, "mean": mean, "std": std}
+
+
+def _rows_for(model: Any) -> Any:
+    """A few rows that a fitted model has seen, or that look like them: a data frame if it was fitted to one."""
+    example = getattr(model, "_example", None)
+    if example is not None:
+        return take_rows(example, slice(0, _ROWS))
+    numbers = np.random.RandomState(0).uniform(0.1, 1.0, (_ROWS, getattr(model, "n_features_in_", 1)))
+    names = getattr(model, "feature_names_in_", None)
+    package = next((name for name in ("pandas", "polars") if find_spec(name) is not None), None)
+    if names is None or package is None:
+        return numbers
+    columns: list[np.ndarray] = list(numbers.T)
+    for index, category in _categories(model, range(len(columns))):
+        columns[index] = np.full(_ROWS, category, dtype=object)
+    return FrameColumns(package, list(names), columns).frame()
+
+
+def _categories(transformer: Any, columns: Any) -> Iterator[tuple[int, Any]]:
+    """Columns that an encoder takes, by index, and one of the values it knows of each."""
+    if hasattr(transformer, "steps"):
+        yield from _categories(transformer.steps[0][1], columns)
+    elif hasattr(transformer, "transformers_"):
+        for name, own, _ in transformer.transformers_:
+            own_columns = transformer._transformer_to_input_indices.get(name, [])
+            yield from _categories(own, [columns[index] for index in own_columns])
+    elif hasattr(transformer, "categories_"):
+        yield from ((column, known[0]) for column, known in zip(columns, transformer.categories_, strict=True))
 
 
 def _predicted(model: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -238,7 +268,8 @@ def _compare(model: Any, trial: Any, made_with: dict[str, str]) -> None:
         raise MalformedError("its trial is not rows, their mean and their standard deviation")
     if not all(isinstance(each, np.ndarray) and each.dtype == np.float64 for each in arrays):
         raise MalformedError("its trial has predictions that are no numbers")
-    mean, std = _predicted(model, trial["rows"])
+    rows = trial["rows"].frame() if isinstance(trial["rows"], FrameColumns) else trial["rows"]
+    mean, std = _predicted(model, rows)
     if mean.shape != trial["mean"].shape or std.shape != trial["std"].shape:
         raise MalformedError(f"its model predicts the shape {mean.shape}, and {trial['mean'].shape} when it was saved")
     allowed = _OF_STD * trial["std"] + _OF_MEAN * np.abs(trial["mean"])

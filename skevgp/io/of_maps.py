@@ -8,11 +8,13 @@ import numpy as np
 from scipy.interpolate import BSpline
 from sklearn import compose, decomposition, impute, kernel_approximation, pipeline, preprocessing
 
+from .._frames import FrameColumns
 from ..features.angles import AngleEncoder
 from ..features.gravity import GravityMap, Lever, LinkGravity, Links, SineGravity
 from ..features.newton import InertiaForce, InertiaForceGravity
 from ..features.nominal import NominalDynamics
 from ..features.rigid_body import RigidBodyRegressor
+from ..robots.numbers import JOINTS, RobotNumbers
 from ..robots.rigid_body import RigidBody
 from ..robots.systems import GravityTerm, Layout, Link, System
 from .fields import (
@@ -21,6 +23,7 @@ from .fields import (
     flag,
     integer,
     made,
+    mapping,
     nothing,
     one_of,
     real,
@@ -29,7 +32,7 @@ from .fields import (
     text,
     words,
 )
-from .records import Record, bare, estimator, plain
+from .records import Record, bare, estimator, plain, state_of
 
 _INPUTS = {"n_features_in_": integer(1), "feature_names_in_": words}
 _INDICES = several(integer(0), tuple)
@@ -52,7 +55,7 @@ def _rigid_body_regressor() -> Record:
     name = "_sklearn_auto_wrap_output_keys"
 
     def take(thing: Any) -> dict[str, Any]:
-        return {key: value for key, value in record.take(thing).items() if key != name}
+        return {key: value for key, value in state_of(thing).items() if key != name}
 
     def make(found: dict[str, Any]) -> Any:
         thing = record.make(found)
@@ -91,11 +94,30 @@ _OURS = [
     Record(
         "RigidBody",
         RigidBody,
-        {"model": anything},
+        {"model": made(RobotNumbers)},
         frozenset(),
-        lambda body: {"model": body.model},
-        lambda found: RigidBody(found["model"]),
+        lambda body: body.__getstate__(),
+        lambda found: RigidBody(found["model"].model()),
     ),
+    plain(
+        RobotNumbers,
+        name=text,
+        names=several(text),
+        joints=several(one_of(*JOINTS)),
+        parents=array("j", "i", least=0),
+        axes=array("j 6"),
+        placements=array("j 3 4"),
+        inertias=array("l 13"),
+        n_bodies=integer(1),
+        gravity=array("6"),
+        limits=mapping(array("...", finite=False)),
+        frames=several(text),
+        frame_numbers=array("f 3", "i", least=0),
+        frame_placements=array("f 3 4"),
+        frame_inertias=array("f 13"),
+        configurations=mapping(array("...")),
+    ),
+    plain(FrameColumns, package=text, names=several(text), columns=several(array("n", "bifuOU", finite=False))),
     plain(Lever, link=integer(0), name=text, acts_on=_INDICES),
     bare(
         Links,

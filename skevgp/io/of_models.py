@@ -6,7 +6,6 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from sklearn.gaussian_process import kernels as sk
 
 from .._joint_residual import JointResidual, QuietRegressor
 from .._linalg import Jitter
@@ -26,8 +25,7 @@ from ..inference.model import SparseModel
 from ..inference.posterior import CoefficientPrior, Predictor, PredictorGroup
 from ..inference.statistics import SufficientStatistics, Whitening
 from ..inverse_dynamics import InverseDynamics
-from ..kernels import constant, cosine, covariances, dot_product, profiles, stationary
-from ..kernels.parse import KernelSpec, Start, Starts
+from ..kernels.parse import KernelSpec
 from ..network.model import VariationalNetwork
 from ..network.training import Scaling
 from ..optimizers.parameters import Parameter, ParameterTable
@@ -36,6 +34,7 @@ from ..regressor import EVGPRegressor
 from ..residual import ResidualRegressor
 from ..rows.source import RawRows
 from ..solvers import LBFGS, Adam
+from . import of_kernels
 from .fields import (
     MalformedError,
     anything,
@@ -53,84 +52,8 @@ from .fields import (
     text,
     words,
 )
-from .records import Record, bare, estimator, plain
-
-# --- kernels -----------------------------------------------------------------------------------------------------
-
-_LENGTH = real(above=0.0) | array("d", above=0.0) | several(real(above=0.0)) | row(real(above=0.0))
-_BOUNDS = (
-    one_of("fixed")
-    | row(real(least=0.0), real(least=0.0, finite=False))
-    | several(anything)
-    | several(anything, tuple)
-    | array("...", least=0.0, finite=False)
-)
-_TREE, _COVARIANCE = made(sk.Kernel), made(covariances.Covariance)
-_ROWS = made(covariances.CentredSquares)
-_PROFILES = (
-    profiles.Exponential,
-    profiles.Matern12,
-    profiles.Matern32,
-    profiles.Matern52,
-    profiles.RationalQuadratic,
-    profiles.ExpSineSquared,
-)
-
-_SK_KERNELS = [
-    bare(sk.ConstantKernel, "sklearn.ConstantKernel", constant_value=_LENGTH, constant_value_bounds=_BOUNDS),
-    bare(sk.WhiteKernel, "sklearn.WhiteKernel", noise_level=_LENGTH, noise_level_bounds=_BOUNDS),
-    bare(sk.RBF, "sklearn.RBF", length_scale=_LENGTH, length_scale_bounds=_BOUNDS),
-    bare(
-        sk.Matern, "sklearn.Matern", length_scale=_LENGTH, length_scale_bounds=_BOUNDS, nu=real(above=0.0, finite=False)
-    ),
-    bare(
-        sk.RationalQuadratic,
-        "sklearn.RationalQuadratic",
-        length_scale=_LENGTH,
-        alpha=_LENGTH,
-        length_scale_bounds=_BOUNDS,
-        alpha_bounds=_BOUNDS,
-    ),
-    bare(
-        sk.ExpSineSquared,
-        "sklearn.ExpSineSquared",
-        length_scale=_LENGTH,
-        periodicity=_LENGTH,
-        length_scale_bounds=_BOUNDS,
-        periodicity_bounds=_BOUNDS,
-    ),
-    bare(sk.DotProduct, "sklearn.DotProduct", sigma_0=_LENGTH, sigma_0_bounds=_BOUNDS),
-    bare(sk.Sum, "sklearn.Sum", k1=_TREE, k2=_TREE),
-    bare(sk.Product, "sklearn.Product", k1=_TREE, k2=_TREE),
-    bare(cosine.Cosine, length_scale=_LENGTH, length_scale_bounds=_BOUNDS),
-]
-
-_COVARIANCES = [
-    plain(covariances.CentredSquares, centre=several(real(), tuple)),
-    plain(covariances.Sum, parts=several(_COVARIANCE, tuple)),
-    plain(covariances.Product, parts=several(_COVARIANCE, tuple)),
-    plain(constant.Constant, "Constant"),
-    plain(dot_product.DotProduct, "DotProduct"),
-    plain(cosine.Wave, n_columns=integer(1), isotropic=flag, rows=_ROWS),
-    *(plain(profile, f"profiles.{profile.__name__}") for profile in _PROFILES),
-    plain(profiles.Matern, "profiles.Matern", nu=real(above=0.0, finite=False)),
-    plain(
-        stationary.Stationary,
-        profile=made(*_PROFILES, profiles.Matern),
-        n_columns=integer(1),
-        isotropic=flag,
-        rows=_ROWS,
-    ),
-    plain(stationary.SquaredExponential, n_columns=integer(1), isotropic=flag, rows=_ROWS),
-    plain(
-        Start,
-        value=array("n", above=0.0) | nothing,
-        bounds=array("n 2", least=0.0, finite=False) | nothing,
-        fixed=flag | array("n", "b"),
-    ),
-    plain(Starts, hyperparameters=made(Start), signal=made(Start), noise=made(Start)),
-    plain(KernelSpec, covariance=_COVARIANCE, starts=made(Starts), tree=_TREE, signal=_TREE, given=_TREE | nothing),
-]
+from .of_kernels import COVARIANCE, TREE
+from .records import Record, estimator, plain
 
 # --- what is kept of fits ----------------------------------------------------------------------------------------
 
@@ -156,7 +79,7 @@ _GROUP = Record(
     PredictorGroup,
     {
         "outputs": columns,
-        "kernel": _COVARIANCE,
+        "kernel": COVARIANCE,
         "hyperparameters": array("h", above=0.0),
         "points": array("m d"),
         "L": array("m m"),
@@ -213,13 +136,13 @@ _FITS = [
     plain(Jitter, size=real(least=0.0), well_conditioned=real(least=0.0)),
     plain(
         SparseModel,
-        kernel=_COVARIANCE,
+        kernel=COVARIANCE,
         prior=_PRIOR,
         family=one_of("full", "diagonal"),
         groups=several(made(slice), tuple),
         jitter=made(Jitter),
         complete=flag,
-        kernels=several(_COVARIANCE, tuple) | nothing,
+        kernels=several(COVARIANCE, tuple) | nothing,
     ),
     plain(
         SufficientStatistics,
@@ -277,11 +200,11 @@ _FITS = [
     ),
     plain(
         ExactModel,
-        kernel=_COVARIANCE,
+        kernel=COVARIANCE,
         prior=_PRIOR,
         vague=array("o p", "b"),
         rows=made(RawRows),
-        kernels=several(_COVARIANCE, tuple) | nothing,
+        kernels=several(COVARIANCE, tuple) | nothing,
     ),
     plain(
         Fit,
@@ -361,7 +284,7 @@ _OF_BOTH = {
     "_predictor": made(Predictor),
     "_columns_changed": array("c", "i", least=0),
     "noise_variance_": _NOISE,
-    "kernel_": _TREE | several(_TREE),
+    "kernel_": TREE | several(TREE),
     "loss_curve_": array("t", finite=False),
     "n_iter_": integer(0),
     "coef_": array("p") | array("o p"),
@@ -433,4 +356,4 @@ _ESTIMATORS = [
     estimator(Adam),
 ]
 
-RECORDS: list[Record] = [*_SK_KERNELS, *_COVARIANCES, *_FITS, *_NETWORK, *_ESTIMATORS]
+RECORDS: list[Record] = [*of_kernels.RECORDS, *_FITS, *_NETWORK, *_ESTIMATORS]

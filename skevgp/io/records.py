@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from sklearn import __version__ as sklearn_version
+
+from .._version import __version__
 from .fields import Field, MalformedError, Sizes, anything
 
 
@@ -95,13 +98,18 @@ def estimator(kind: type, name: str | None = None, /, **attributes: Field) -> Re
         kind,
         fields,
         frozenset(fields.keys() - {each for each, default in parameters.items() if default is inspect.Parameter.empty}),
-        lambda thing: {key: value for key, value in thing.__getstate__().items() if key not in _VERSIONS},
+        state_of,
         _validated(kind, parameters),
     )
 
 
 _VERSIONS = ("_sklearn_version", "_skevgp_version")
 _OF_ALL = {"_sklearn_output_config": anything}
+
+
+def state_of(thing: Any) -> dict[str, Any]:
+    """The state of an estimator, but for versions, which a file has once."""
+    return {name: value for name, value in thing.__getstate__().items() if name not in _VERSIONS}
 
 
 def parameters_of(kind: Any) -> dict[str, Any]:
@@ -119,7 +127,7 @@ def dict_of(thing: Any) -> dict[str, Any]:
     return dict(vars(thing))
 
 
-def _filled(kind: type) -> Callable[[dict[str, Any]], Any]:
+def _filled(kind: Any) -> Callable[[dict[str, Any]], Any]:
     def make(found: dict[str, Any]) -> Any:
         thing = kind.__new__(kind)
         vars(thing).update(found)
@@ -128,12 +136,18 @@ def _filled(kind: type) -> Callable[[dict[str, Any]], Any]:
     return make
 
 
-def _validated(kind: type, parameters: Mapping[str, Any]) -> Callable[[dict[str, Any]], Any]:
-    filled = _filled(kind)
+def _validated(kind: Any, parameters: Mapping[str, Any]) -> Callable[[dict[str, Any]], Any]:
+    # Whether it still predicts the same is seen when it is tried.
+    version = (
+        {"_skevgp_version": __version__} if kind.__module__.startswith("skevgp.") else {_VERSIONS[0]: sklearn_version}
+    )
 
     def make(found: dict[str, Any]) -> Any:
-        # What a later version of scikit-learn has more is as it was.
-        thing = filled({**{name: value for name, value in parameters.items() if name not in found}, **found})
+        thing = kind.__new__(kind)
+        # Parameters that a later version of scikit-learn has more are as they were.
+        thing.__setstate__(
+            {**{name: value for name, value in parameters.items() if name not in found}, **found, **version}
+        )
         # Kernels and solvers check theirs elsewhere.
         if getattr(thing, "_parameter_constraints", None):
             thing._validate_params()

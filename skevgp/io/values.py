@@ -3,7 +3,7 @@
 Numbers, strings, lists, True, False and None are themselves. All else is an object of JSON with one name:
 ``{"array": 3}`` an array, ``{"object": 5}`` an object, ``{"tuple": [...]}``, ``{"dict": [[key, value], ...]}``,
 ``{"slice": [...]}``, ``{"float": "nan"}``, ``{"number": ["int64", 3]}`` a number of NumPy's, ``{"words": [...]}`` an
-array of strings, ``{"type": "float64"}``, ``{"dtype": "<f8"}``, ``{"frame": [...]}``. Since objects refer backwards,
+array of strings, ``{"type": "float64"}``, ``{"dtype": "<f8"}``. Since objects refer backwards,
 there are no cycles.
 """
 
@@ -11,14 +11,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
-from importlib import import_module
+from collections.abc import Callable, Mapping
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
 
-from .._validation import is_frame
 from .container import Container
 from .fields import MalformedError
 from .records import Record
@@ -36,7 +34,6 @@ TYPES: dict[str, Any] = {
 }
 _NAMES = {kind: name for name, kind in TYPES.items()}
 _NUMBERS = {name: getattr(np, name) for name in ("bool", "int64", "int32", "intp", "uint64", "float64", "float32")}
-_FRAMES = ("pandas", "polars", "pyarrow")
 
 
 class Writer:
@@ -89,8 +86,6 @@ class Writer:
             return {"type": _NAMES[value]}
         if kind in self._records:
             return self._object(value, where)
-        if is_frame(value) and kind.__module__.partition(".")[0] in _FRAMES:
-            return self._frame(value, where)
         raise ValueError(refusal(value, where))
 
     def _items(self, items: Any, where: str) -> list[Any]:
@@ -118,13 +113,6 @@ class Writer:
             self._seen[id(thing)] = thing, len(self.objects)
             self.objects.append({"class": record.name, "fields": written})
         return {"object": self._seen[id(thing)][1]}
-
-    def _frame(self, frame: Any, where: str) -> Any:
-        package = type(frame).__module__.partition(".")[0]
-        names = [str(name) for name in (frame.column_names if package == "pyarrow" else frame.columns)]
-        return {
-            "frame": [package, [[name, self._array(np.asarray(frame[name]), f"{where}[{name!r}]")] for name in names]]
-        }
 
 
 def refusal(value: Any, where: str) -> str:
@@ -159,6 +147,16 @@ class Reader:
         self._objects: list[Any] = []
         self._parts: list[int] = []
         self._met = 0
+        self._readers: dict[str, tuple[type, Callable[[Any, int], Any]]] = {
+            "tuple": (list, self._tuple),
+            "dict": (list, self._dict),
+            "slice": (list, self._slice),
+            "float": (str, self._float),
+            "number": (list, self._number),
+            "words": (list, self._words),
+            "type": (str, self._type),
+            "dtype": (str, self._dtype),
+        }
 
     def objects(self, written: Any) -> list[Any]:
         """All objects, in their order.
@@ -201,14 +199,15 @@ class Reader:
             ((name, content),) = written.items()
             if name in ("array", "object"):
                 return self._known(name, content)
-            if name in _OTHERS and type(content) is _OTHERS[name]:
-                return getattr(self, f"_{name}")(content, depth + 1)
+            kind, read = self._readers.get(name, (None, None))
+            if read is not None and type(content) is kind:
+                return read(content, depth + 1)
         raise MalformedError(f"it has a value that no such file has: {written!r:.80}")
 
     def _known(self, kind: str, number: Any) -> Any:
         there = self._container.n_arrays if kind == "array" else len(self._objects)
         if type(number) is not int or not 0 <= number < there:
-            raise MalformedError(f"it refers to the {kind} {number!r:.80}, but there are {there} so far")
+            raise MalformedError(f"it refers to the {kind} {number!r:.80}, of {there} that there are so far")
         if kind == "array":
             return self._container.array(number)
         self._met += self._parts[number]
@@ -273,43 +272,7 @@ class Reader:
             raise MalformedError(f"it names the type {content!r:.80}")
         return np.dtype(content)
 
-    def _frame(self, content: list[Any], depth: int) -> Any:
-        package, columns = self._of_length(content, 2)
-        if package not in _FRAMES or type(columns) is not list:
-            raise MalformedError("it has a data frame of no known package")
-        found = {}
-        for pair in columns:
-            name, values = self._of_length(pair, 2)
-            found[name] = self.value(values, depth)
-            if type(name) is not str or not isinstance(found[name], np.ndarray) or found[name].ndim != 1:
-                raise MalformedError("it has a data frame whose columns are no arrays with names")
-        if len({len(own) for own in found.values()}) > 1:
-            raise MalformedError("it has a data frame whose columns differ in length")
-        return _framed(package, found)
-
     def _of_length(self, content: Any, length: int) -> list[Any]:
         if type(content) is not list or len(content) != length:
             raise MalformedError(f"it has a value of other than {length} parts: {content!r:.80}")
         return content
-
-
-_OTHERS = {
-    "tuple": list,
-    "dict": list,
-    "slice": list,
-    "float": str,
-    "number": list,
-    "words": list,
-    "type": str,
-    "dtype": str,
-    "frame": list,
-}
-
-
-def _framed(package: str, found: dict[str, np.ndarray]) -> Any:
-    try:
-        module = import_module(package)
-    except ImportError as error:
-        raise ImportError(f"The model was fitted to a data frame: pip install {package} (here: {error})") from error
-    kind = module.table if package == "pyarrow" else module.DataFrame
-    return kind(found)
