@@ -96,13 +96,13 @@ def real(*, least: float = -np.inf, above: float = -np.inf, finite: bool = True)
     return Field(f"a {'finite ' if finite else ''}number{limits}", holds)
 
 
-def integer(least: int = -(2**62)) -> Field:
+def integer(least: int, most: int = 2**62) -> Field:
     """An integer; NumPy's too."""
 
     def holds(value: Any, sizes: Sizes) -> bool:
-        return type(value) is not bool and isinstance(value, Integral) and least <= int(value) < 2**62
+        return type(value) is not bool and isinstance(value, Integral) and least <= int(value) <= most
 
-    return Field("an integer" + (f" of at least {least}" if least > -(2**62) else ""), holds)
+    return Field(f"an integer from {least} to {most}" if most < 2**62 else f"an integer of at least {least}", holds)
 
 
 def one_of(*choices: str) -> Field:
@@ -153,5 +153,12 @@ words = Field(
     "an array of strings",
     lambda value, sizes: isinstance(value, np.ndarray) and all(type(each) is str for each in value.ravel().tolist()),
 )
-# Outputs: all or some that follow each other, or their numbers.
-columns = Field("a slice", lambda value, sizes: type(value) is slice) | several(integer(0))
+# Outputs that follow each other; outputs as slices, or by their numbers.
+span = Field(
+    "a slice of integers from 0",
+    lambda value, sizes: (
+        type(value) is slice
+        and all(part is None or (type(part) is int and part >= 0) for part in (value.start, value.stop, value.step))
+    ),
+)
+columns = span | several(integer(0))

@@ -13,6 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 import scipy
 import sklearn
+from joblib import parallel_config
 from sklearn.base import BaseEstimator
 from sklearn.utils.validation import check_is_fitted
 
@@ -147,11 +148,15 @@ def load(path: str | os.PathLike[str]) -> Any:
 
     Examples
     --------
+    >>> import tempfile
+    >>> from pathlib import Path
     >>> from skevgp.io import load
-    >>> load("pyproject.toml")
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = Path(folder) / "notes.skevgp"
+    ...     _ = path.write_text("no model")
+    ...     load(path)  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):
-    ...
-    ValueError: 'pyproject.toml' is not a file of skevgp.io.save, or damaged: File is not a zip file.
+    ValueError: '.../notes.skevgp' is not a file of skevgp.io.save, or damaged: File is not a zip file.
     """
     with open(path, "rb") as file:
         return _loaded(file, os.fspath(path))
@@ -159,10 +164,10 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 def _loaded(file: IO[bytes], path: str) -> Any:
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
+        with warnings.catch_warnings(), np.errstate(all="ignore"), parallel_config("sequential"):
             warnings.simplefilter("ignore")
             model, made_with, tried = _read(file)
-    except (ImportError, MemoryError):
+    except ImportError:
         raise
     except (MalformedError, BadZipFile) as error:
         raise ValueError(f"{path!r} is not a file of skevgp.io.save, or damaged: {error}.") from error

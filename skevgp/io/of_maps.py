@@ -162,6 +162,8 @@ _OURS = [
 # --- scikit-learn's ----------------------------------------------------------------------------------------------
 
 _COLUMN, _OPTIONAL = array("d"), array("d") | nothing
+# What a map makes of a row takes memory.
+_WIDTH = integer(0, 10**6)
 _COUNT = real(least=0.0) | array("d", "if", least=0.0)
 _POSITIVE = array("d", above=0.0) | nothing
 _LISTS = several(array("...", "OUbif", finite=False))
@@ -258,12 +260,12 @@ _SCIKIT_LEARN = [
     _sk(preprocessing.PowerTransformer, lambdas_=array("d"), _scaler=made(preprocessing.StandardScaler)),
     _sk(
         preprocessing.PolynomialFeatures,
-        _min_degree=integer(0),
-        _max_degree=integer(0),
-        n_output_features_=integer(0),
-        _n_out_full=integer(0),
+        _min_degree=_WIDTH,
+        _max_degree=_WIDTH,
+        n_output_features_=_WIDTH,
+        _n_out_full=_WIDTH,
     ),
-    _sk(preprocessing.SplineTransformer, bsplines_=several(made(BSpline)), n_features_out_=integer(1)),
+    _sk(preprocessing.SplineTransformer, bsplines_=several(made(BSpline)), n_features_out_=_WIDTH),
     _sk(preprocessing.FunctionTransformer),
     _sk(
         preprocessing.OneHotEncoder,
@@ -297,7 +299,7 @@ _SCIKIT_LEARN = [
         random_weights_=array("d k"),
         random_offset_=array("k"),
         _gamma=real(least=0.0),
-        _n_features_out=integer(1),
+        _n_features_out=_WIDTH,
     ),
 ]
 

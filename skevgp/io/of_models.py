@@ -49,6 +49,7 @@ from .fields import (
     real,
     row,
     several,
+    span,
     text,
     words,
 )
@@ -139,7 +140,7 @@ _FITS = [
         kernel=COVARIANCE,
         prior=_PRIOR,
         family=one_of("full", "diagonal"),
-        groups=several(made(slice), tuple),
+        groups=several(span, tuple),
         jitter=made(Jitter),
         complete=flag,
         kernels=several(COVARIANCE, tuple) | nothing,

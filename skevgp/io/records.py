@@ -10,7 +10,7 @@ from typing import Any
 from sklearn import __version__ as sklearn_version
 
 from .._version import __version__
-from .fields import Field, MalformedError, Sizes, anything
+from .fields import Field, MalformedError, Sizes, anything, integer, nothing
 
 
 @dataclass(frozen=True)
@@ -104,7 +104,8 @@ def estimator(kind: type, name: str | None = None, /, **attributes: Field) -> Re
 
 
 _VERSIONS = ("_sklearn_version", "_skevgp_version")
-_OF_ALL = {"_sklearn_output_config": anything}
+# A stranger's file does not start a million processes.
+_OF_ALL = {"_sklearn_output_config": anything, "n_jobs": integer(-1024, 1024) | nothing}
 
 
 def state_of(thing: Any) -> dict[str, Any]:
