@@ -18,11 +18,12 @@ _MADE_ANEW = (
     "skevgp.kernels.stationary.SquaredExponentialAt",
     "skevgp.kernels.stationary.StationaryAt",
 )
-# Of scikit-learn's maps: columns by their type, and inside SplineTransformer and SimpleImputer.
+# Of scikit-learn's maps, in some of its versions: inside ColumnTransformer, SplineTransformer and SimpleImputer.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",
     "numpy.number",
     "scipy._lib.array_api_compat.numpy._aliases.asarray",
+    "sklearn.compose._column_transformer._RemainderColsList",
 )
 
 TRUSTED_TYPES: list[str] = sorted(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections import UserList
 from collections.abc import Callable, Mapping
 from pathlib import PurePath
 from typing import Any
@@ -65,8 +66,8 @@ class Writer:
             return value
         if kind is float:
             return value if math.isfinite(value) else {"float": repr(value)}
-        if kind is list:
-            return self._items(value, where)
+        if kind is list or isinstance(value, UserList):  # which ColumnTransformer had in scikit-learn 1.6
+            return self._items(value if kind is list else value.data, where)
         if kind is tuple:
             return {"tuple": self._items(value, where)}
         if kind is dict:

@@ -62,7 +62,7 @@ def frame(rows):
 
 
 def polars(rows):
-    return pl.DataFrame(frame(rows).to_dict("list"))
+    return pl.DataFrame({"a": rows[:, 0], "b": rows[:, 1]})
 
 
 def encoded(*words):
@@ -142,7 +142,7 @@ CASES = {
         X_NEW,
     ),
     "words": (evgp(kernel_map=encoded()), frame(X), Y[:, 0], frame(X_NEW)),
-    "words-of-polars": (evgp(kernel_map=encoded()), polars(X), Y[:, 0], polars(X_NEW)),
+    "polars": (evgp(InertiaForce(), kernel_map=StandardScaler()), polars(X), Y[:, 0], polars(X_NEW)),
     "words-in-a-pipeline": (make_pipeline(encoded(), evgp()), frame(X), Y[:, 0], frame(X_NEW)),
     "selected": (
         evgp(

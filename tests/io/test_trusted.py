@@ -23,7 +23,14 @@ def test_skops_needs_to_trust_no_others(name):
         np.testing.assert_array_equal(found, expected)
 
 
-@pytest.mark.parametrize("name", TRUSTED_TYPES)
+# Which some versions of their packages do not have.
+OF_VERSIONS = {
+    "scipy._lib.array_api_compat.numpy._aliases.asarray",
+    "sklearn.compose._column_transformer._RemainderColsList",
+}
+
+
+@pytest.mark.parametrize("name", sorted(set(TRUSTED_TYPES) - OF_VERSIONS))
 def test_each_type_is_there(name):
     module, _, own = name.rpartition(".")
     assert getattr(import_module(module), own) is not None
