@@ -237,13 +237,13 @@ def _rows_for(model: Any) -> Any:
     if names is None or package is None:
         return numbers
     columns: list[np.ndarray] = list(numbers.T)
-    for index, category in _categories(model, range(len(columns))):
-        columns[index] = np.full(_ROWS, category, dtype=object)
+    for index, known in _categories(model, range(len(columns))):
+        columns[index] = np.array([known[row % len(known)] for row in range(_ROWS)], dtype=object)
     return FrameColumns(package, list(names), columns).frame()
 
 
 def _categories(transformer: Any, columns: Any) -> Iterator[tuple[int, Any]]:
-    """Columns that an encoder takes, by index, and one of the values it knows of each."""
+    """Columns that an encoder takes, by index, and the values it knows of each."""
     if hasattr(transformer, "steps"):
         yield from _categories(transformer.steps[0][1], columns)
     elif hasattr(transformer, "transformers_"):
@@ -251,7 +251,7 @@ def _categories(transformer: Any, columns: Any) -> Iterator[tuple[int, Any]]:
             own_columns = transformer._transformer_to_input_indices.get(name, [])
             yield from _categories(own, [columns[index] for index in own_columns])
     elif hasattr(transformer, "categories_"):
-        yield from ((column, known[0]) for column, known in zip(columns, transformer.categories_, strict=True))
+        yield from zip(columns, transformer.categories_, strict=True)
 
 
 def _predicted(model: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
