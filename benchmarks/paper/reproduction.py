@@ -8,6 +8,7 @@ does not have is a dash. No number that a CSV holds is written by hand; a test f
 
 from __future__ import annotations
 
+import argparse
 import re
 import shlex
 import sys
@@ -176,10 +177,13 @@ def filled(text: str, results: Results) -> str:
 
 
 def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--page", type=Path, default=PAGE, help="what is written; default: %(default)s")
+    options = parser.parse_args()
     results = Results(harness.RESULTS)
     harness.write_report(claims.paragraphs(results.verdicts), harness.RESULTS / "claims.csv")
-    PAGE.write_text(filled(TEMPLATE.read_text(), results))
-    print(f"{PAGE} is written.")
+    options.page.write_text(filled(TEMPLATE.read_text(), results))
+    print(f"{options.page} is written.")
 
 
 if __name__ == "__main__":
