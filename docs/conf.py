@@ -1,0 +1,107 @@
+"""The site: ``python -m sphinx -W -n docs docs/_build/html``, with the extra ``docs``."""
+
+import builtins
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+# Before anything is imported that reads them. Pictures are drawn into files, and examples take minutes, not hours.
+os.environ.setdefault("MPLBACKEND", "Agg")
+os.environ.setdefault("SKEVGP_EXAMPLES_QUICK", "1")
+
+DOCS = Path(__file__).resolve().parent
+sys.path.insert(0, str(DOCS / "_ext"))
+
+import skevgp  # noqa: E402
+
+project = "skevgp"
+author = "The skevgp developers"
+copyright = author
+version = release = skevgp.__version__
+
+extensions = [
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "sphinx.ext.mathjax",
+    "sphinx.ext.viewcode",
+    "myst_parser",
+    "numpydoc",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "mathjax",
+    "pages",
+]
+exclude_patterns = ["_build", "tests", "generated/parts"]
+templates_path = ["_templates"]
+# Names in docstrings link to what they name if the site has a page of it.
+default_role = "py:obj"
+
+# Docstrings name private helpers, other packages' classes and each other's attributes, which have no page here. All
+# other references must lead somewhere.
+nitpick_ignore_regex = [("py:(obj|class|attr|meth|func|mod)", ".*")]
+
+autosummary_generate = True
+autodoc_typehints = "none"  # docstrings have the types, with shapes and units
+numpydoc_show_class_members = False
+# The gallery is configured with functions, which no cache can keep.
+suppress_warnings = ["config.cache"]
+
+myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+myst_dmath_double_inline = True
+
+copybutton_exclude = ".linenos, .gp, .go"
+
+
+def example_arguments(_: dict[str, Any], script: dict[str, str]) -> list[str]:
+    """Keep what an example writes out of its folder. (The one without options takes a picture's path, or none.)"""
+    if Path(script["src_file"]).name == "plot_sparse_gp.py":
+        return []
+    return ["--output", str(DOCS / "_build" / "examples")]
+
+
+def as_a_script(_: dict[str, Any], name: str) -> None:
+    """Let examples know where they are, as scripts do: sphinx-gallery gives them no ``__file__``."""
+    builtins.__file__ = str(DOCS.parent / "examples" / name)
+
+
+sphinx_gallery_conf = {
+    "examples_dirs": str(DOCS.parent / "examples"),
+    "gallery_dirs": "auto_examples",
+    "filename_pattern": r"/plot_",
+    "ignore_pattern": r"^(?!plot_)",  # helpers beside them
+    "within_subsection_order": "ExampleTitleSortKey",
+    "reset_argv": example_arguments,
+    "reset_modules": ("matplotlib", as_a_script),
+    "abort_on_example_error": True,
+    "only_warn_on_example_error": False,
+    "show_memory": False,
+    "show_signature": False,
+    "min_reported_time": 0,
+    "download_all_examples": False,
+    "image_srcset": [],
+    "doc_module": ("skevgp",),
+    "backreferences_dir": "generated/backreferences",
+    "inspect_global_variables": False,
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = "skevgp"
+html_static_path = ["_static"]
+html_css_files = ["site.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_theme_options = {
+    "logo": {"text": "skevgp"},
+    "header_links_before_dropdown": 6,
+    "navigation_with_keys": False,
+    "show_prev_next": True,
+    "secondary_sidebar_items": ["page-toc"],
+    "footer_start": ["copyright"],
+    "footer_end": ["theme-version"],
+    "pygments_light_style": "a11y-high-contrast-light",
+    "pygments_dark_style": "a11y-high-contrast-dark",
+}
+html_sidebars = {"index": [], "start": [], "which_model": [], "comparison": [], "changelog": [], "tests": []}
