@@ -1,10 +1,8 @@
 """The site: ``python -m sphinx -W -n docs docs/_build/html``, with the extra ``docs``."""
 
-import builtins
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 # Before anything is imported that reads them. Pictures are drawn into files, and examples take minutes, not hours.
 os.environ.setdefault("MPLBACKEND", "Agg")
@@ -33,7 +31,7 @@ extensions = [
     "mathjax",
     "pages",
 ]
-exclude_patterns = ["_build", "tests", "generated/parts"]
+exclude_patterns = ["_build", "tests", "generated/parts", "**sg_execution_times.rst"]
 templates_path = ["_templates"]
 # Names in docstrings link to what they name if the site has a page of it.
 default_role = "py:obj"
@@ -42,11 +40,10 @@ default_role = "py:obj"
 # other references must lead somewhere.
 nitpick_ignore_regex = [("py:(obj|class|attr|meth|func|mod)", ".*")]
 
-autosummary_generate = True
+autosummary_generate = ["generated/api.rst"]
+toc_object_entries_show_parents = "hide"
 autodoc_typehints = "none"  # docstrings have the types, with shapes and units
 numpydoc_show_class_members = False
-# The gallery is configured with functions, which no cache can keep.
-suppress_warnings = ["config.cache"]
 
 myst_enable_extensions = ["amsmath", "attrs_inline", "colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
@@ -55,26 +52,14 @@ myst_dmath_double_inline = True
 copybutton_exclude = ".linenos, .gp, .go"
 
 
-def example_arguments(_: dict[str, Any], script: dict[str, str]) -> list[str]:
-    """Keep what an example writes out of its folder. (The one without options takes a picture's path, or none.)"""
-    if Path(script["src_file"]).name == "plot_sparse_gp.py":
-        return []
-    return ["--output", str(DOCS / "_build" / "examples")]
-
-
-def as_a_script(_: dict[str, Any], name: str) -> None:
-    """Let examples know where they are, as scripts do: sphinx-gallery gives them no ``__file__``."""
-    builtins.__file__ = str(DOCS.parent / "examples" / name)
-
-
 sphinx_gallery_conf = {
     "examples_dirs": str(DOCS.parent / "examples"),
     "gallery_dirs": "auto_examples",
     "filename_pattern": r"/plot_",
     "ignore_pattern": r"^(?!plot_)",  # helpers beside them
-    "within_subsection_order": "ExampleTitleSortKey",
-    "reset_argv": example_arguments,
-    "reset_modules": ("matplotlib", as_a_script),
+    "within_subsection_order": "stories.Order",
+    "reset_argv": "stories.arguments",
+    "reset_modules": ("matplotlib", "stories.as_a_script"),
     "abort_on_example_error": True,
     "only_warn_on_example_error": False,
     "show_memory": False,
@@ -91,10 +76,12 @@ html_theme = "pydata_sphinx_theme"
 html_title = "skevgp"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
+html_favicon = "_static/favicon.svg"
+html_context = {"default_mode": "auto"}
 html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {
-    "logo": {"text": "skevgp"},
+    "logo": {"text": "skevgp", "image_light": "_static/favicon.svg", "image_dark": "_static/favicon.svg"},
     "header_links_before_dropdown": 6,
     "navigation_with_keys": False,
     "show_prev_next": True,

@@ -37,26 +37,31 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 def short(value: float) -> str:
     """Write a number with three digits."""
-    return f"{value:.3g}" if abs(value) < 1000.0 else f"{value:,.0f}"
+    return f"{value:#.3g}".rstrip(".") if abs(value) < 1000.0 else f"{value:,.0f}"
 
 
-def best(values: Sequence[float]) -> list[str]:
-    """Write numbers of which less is better, the best in bold."""
-    return [f"**{short(value)}**" if value == min(values) else short(value) for value in values]
+def best(values: Sequence[float], among: Sequence[bool] | None = None) -> list[str]:
+    """Write numbers of which less is better, in bold the best of all, or of some that can be compared."""
+    least = min(value for value, counts in zip(values, among or [True] * len(values), strict=True) if counts)
+    return [f"**{short(value)}**" if value == least else short(value) for value in values]
 
 
 def peers() -> str:
-    """Write seconds, error and NLPD of each library on each data set, means over data sets; the best in bold."""
+    """Write seconds, error and NLPD of each library on each data set, means over data sets; in bold the best of those with all."""
     found: dict[str, dict[tuple[str, str], list[dict[str, str]]]] = {}
     for row in rows_of(RESULTS / "against_peers.csv"):
         found.setdefault(row["dataset"], {}).setdefault((row["peer"], row["sharing"]), []).append(row)
     lines = []
     for data, fits in found.items():
+        most = max(len(rows) for rows in fits.values())
+        full = [len(rows) == most for rows in fits.values()]
         columns = [
             [fmean(float(row[name]) for row in rows) for rows in fits.values()] for name in ("seconds", "rmse", "nlpd")
         ]
         several = "outputs" in DATA[data]
-        for (peer, sharing), rows, *numbers in zip(fits, fits.values(), *map(best, columns), strict=True):
+        for (peer, sharing), rows, *numbers in zip(
+            fits, fits.values(), *(best(column, full) for column in columns), strict=True
+        ):
             size = f"{int(rows[0]['n_train']):,}"
             how = f", {SHARING[sharing]}" if several else ""
             lines.append([DATA[data], size, rows[0]["m"], f"{peer}{how}", str(len(rows)), *numbers])

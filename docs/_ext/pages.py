@@ -111,21 +111,24 @@ def public_modules() -> list[tuple[str, ModuleType]]:
 def tables(module: str, names: Iterable[str]) -> str:
     """List a module's names in tables that link to their pages."""
     entries = "\n".join(f"   {name}" for name in names)
-    return f".. currentmodule:: {module}\n\n.. autosummary::\n   :toctree: ../generated/api\n\n{entries}\n"
+    return f".. currentmodule:: {module}\n\n.. autosummary::\n   :toctree: api\n   :nosignatures:\n\n{entries}\n"
 
 
 def write_api() -> None:
     """Write the overview of all public names; autosummary writes a page for each."""
-    parts = []
+    title, listed = "API reference", set()
+    parts = [f"{title}\n{'=' * len(title)}\n\nEvery public name, made of the docstrings, whose examples are tests.\n"]
     for name, module in public_modules():
         members = [each for each in module.__all__ if not each.startswith("_")]
         members = [each for each in members if not inspect.ismodule(getattr(module, each))]
-        callables = [each for each in members if callable(getattr(module, each))]
+        # What two modules have is listed with the first.
+        callables = [each for each in members if callable(thing := getattr(module, each)) and thing not in listed]
+        listed |= {getattr(module, each) for each in callables}
         summary = inspect.getdoc(module).splitlines()[0].rstrip(".")
         parts.append(f"{name}\n{'-' * len(name)}\n\n{summary}.\n\n{tables(name, callables)}")
     parts.append("What methods return\n-------------------\n")
     parts += [tables(module, names) for module, names in RETURNED.items()]
-    write(GENERATED / "parts" / "api.rst", "\n".join(parts))
+    write(GENERATED / "api.rst", "\n".join(parts))
 
 
 def write_pictures(page: Path) -> None:
@@ -146,7 +149,7 @@ def write_pictures(page: Path) -> None:
 
 def generate(app: Sphinx, _: Config) -> None:
     """Write all generated pages."""
-    for folder in ("results", "source", "parts"):
+    for folder in ("api", "results", "source", "parts"):
         shutil.rmtree(GENERATED / folder, ignore_errors=True)
     for name in ("REPRODUCTION.md", "CHANGELOG.md"):
         write_included(name)
