@@ -11,7 +11,7 @@ os.environ.setdefault("SKEVGP_EXAMPLES_QUICK", "1")
 DOCS = Path(__file__).resolve().parent
 sys.path.insert(0, str(DOCS / "_ext"))
 
-import skevgp  # noqa: E402
+import skevgp
 
 project = "skevgp"
 author = "The skevgp developers"

@@ -37,11 +37,7 @@ LAYOUT.add(tokenize.ENDMARKER)
 
 
 def lines_of_code(source: str) -> int:
-    """Count lines that hold code.
-
-    >>> lines_of_code('\"\"\"Of a module.\"\"\"\\n\\n# A comment.\\nx = (\\n    1\\n)  # three lines\\n')
-    3
-    """
+    """Count lines that hold code."""
     held: set[int] = set()
     for token in tokenize.generate_tokens(io.StringIO(source).readline):
         if token.type not in LAYOUT:
@@ -83,7 +79,7 @@ def measured(name: str) -> dict[str, str]:
         installed = Path(found.stdout.strip())
         return {
             "package": name,
-            "version": versions[Path(distribution).name.lower() if name != "skevgp" else "skevgp"],
+            "version": versions["skevgp" if name == "skevgp" else distribution],
             "distributions": str(len(versions)),
             "megabytes": f"{megabytes(installed):.1f}",
             "lines_of_code": str(code_in(installed / module)),

@@ -1,7 +1,6 @@
 """The code in the pages: found, run in the order of its page, and compared with the output that stands below it.
 
-In a page's Markdown a fence ``python`` is code; a fence ``text`` right behind it is what it prints. A fence ``bash`` or
-``c`` with a caption, or code that starts with one, is told apart by `Block.language`.
+In a page's Markdown a fence ``python`` is code; a fence ``text`` right behind it is what it prints.
 """
 
 import re
@@ -40,10 +39,12 @@ def blocks_of(text: str) -> Iterator[Block]:
     found = list(_FENCE.finditer(text))
     for fence, following in zip(found, [*found[1:], None], strict=True):
         info = fence["info"].strip()
-        output = None
-        if following is not None and following["info"].strip() == "text":
-            if not text[fence.end() : following.start()].strip():
-                output = following["body"]
+        has_output = (
+            following is not None
+            and following["info"].strip() == "text"
+            and not text[fence.end() : following.start()].strip()
+        )
+        output = following["body"] if has_output else None
         yield Block(info, fence["body"], text.count("\n", 0, fence.start()) + 1, output)
 
 

@@ -47,7 +47,7 @@ def best(values: Sequence[float], among: Sequence[bool] | None = None) -> list[s
 
 
 def peers() -> str:
-    """Write seconds, error and NLPD of each library on each data set, means over data sets; in bold the best of those with all."""
+    """Write seconds, error and NLPD of each library on each data set; in bold the best of those with all seeds."""
     found: dict[str, dict[tuple[str, str], list[dict[str, str]]]] = {}
     for row in rows_of(RESULTS / "against_peers.csv"):
         found.setdefault(row["dataset"], {}).setdefault((row["peer"], row["sharing"]), []).append(row)
@@ -69,7 +69,7 @@ def peers() -> str:
 
 
 def splits() -> str:
-    """Write RMSE, NLPD and seconds on tables of data, means over random splits with standard errors; the best in bold."""
+    """Write RMSE, NLPD and seconds on tables of data, means over random splits with standard errors."""
     rows, lines = rows_of(RESULTS / "splits.csv"), []
     for data in dict.fromkeys(row["dataset"] for row in rows):
         fits: dict[str, list[dict[str, str]]] = {}

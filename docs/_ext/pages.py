@@ -1,7 +1,7 @@
 """Pages made of what the repository has: results, the reproduction, the changelog, source files, the API.
 
-They are written to ``generated`` before Sphinx looks for pages, so that there is one copy of each in the repository. The
-role ``src`` links to a source file's page: ``{src}`skevgp/metrics.py```.
+They are written to ``generated`` before Sphinx looks for pages, so that there is one copy of each in the repository.
+The role ``src`` links to a source file's page: ``{src}`skevgp/metrics.py```.
 """
 
 import inspect
@@ -14,13 +14,13 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
-import blocks
-import comparison
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
 from sphinx.config import Config
 
+import blocks
+import comparison
 import skevgp
 
 DOCS = Path(__file__).resolve().parents[1]
@@ -65,7 +65,7 @@ def rewritten(text: str, folder: Path) -> str:
     """Let the links of a Markdown file of the repository lead to pages of the site."""
 
     def link(found: re.Match[str]) -> str:
-        picture, words, target, anchor = found.groups()
+        picture, words, target, _ = found.groups()
         path = (folder / target).resolve().relative_to(ROOT).as_posix()
         if picture:
             return f"![{words}](/../{path})"

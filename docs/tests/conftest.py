@@ -12,7 +12,8 @@ import pytest
 SITE = Path(os.environ.get("SKEVGP_SITE", Path(__file__).parents[1] / "_build" / "html"))
 # Flags without which Chromium looks for a screen, a sandbox or the network.
 FLAGS = """--headless --no-sandbox --disable-gpu --disable-quic --no-first-run --disable-background-networking
---disable-component-update --disable-sync --hide-scrollbars --host-resolver-rules=MAP\t*\t~NOTFOUND,EXCLUDE\t127.0.0.1"""
+--disable-component-update --disable-sync --hide-scrollbars"""
+OFFLINE = "--host-resolver-rules=MAP * ~NOTFOUND, EXCLUDE 127.0.0.1"
 SIZES = {"desktop": (1280, 900), "phone": (390, 844)}
 
 
@@ -53,8 +54,8 @@ def browser(request, tmp_path_factory):
 
     options = webdriver.ChromeOptions()
     options.binary_location = chromium()
-    for flag in FLAGS.replace("\n", " ").split(" "):
-        options.add_argument(flag.replace("\t", " "))
+    for flag in (*FLAGS.split(), OFFLINE):
+        options.add_argument(flag)
     options.add_argument(f"--user-data-dir={tmp_path_factory.mktemp('chromium')}")
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(shutil.which("chromedriver")))

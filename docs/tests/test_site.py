@@ -2,6 +2,7 @@
 
 from functools import cache
 from html.parser import HTMLParser
+from itertools import pairwise
 from urllib.parse import unquote, urlsplit
 
 import pytest
@@ -87,7 +88,7 @@ def test_headings_follow_each_other(site, page):
     levels = parsed(page).headings
     assert levels[:1] == [1]
     assert levels.count(1) == 1
-    assert all(after <= before + 1 for before, after in zip(levels, levels[1:], strict=False))
+    assert all(after <= before + 1 for before, after in pairwise(levels))
 
 
 @pytest.mark.parametrize("page", WRITTEN)
