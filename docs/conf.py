@@ -91,4 +91,6 @@ html_theme_options = {
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
-html_sidebars = {"index": [], "start": [], "which_model": [], "comparison": [], "changelog": [], "tests": []}
+# Pages on their own have nothing to list beside them.
+ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
+html_sidebars = {page: [] for page in ALONE}

@@ -52,7 +52,7 @@ def cut_off(browser):
              for (; e && e.tagName != 'ARTICLE'; e = e.parentElement)
                if (/auto|scroll/.test(getComputedStyle(e).overflowX)) return true;
              return false };
-           return [...document.querySelectorAll('article :is(p, h1, h2, li, dt, img)')]
+           return [...document.querySelectorAll('article :is(p, h1, h2, li, dt, img, code, a)')]
              .filter(e => e.getClientRects().length && e.getBoundingClientRect().right > limit && !scrolls(e))
              .map(e => e.tagName + ' ' + e.textContent.slice(0, 60))"""
     )

@@ -1,7 +1,6 @@
 """The code of the site's pages runs as it stands, and prints what they say."""
 
 import re
-import shutil
 import subprocess
 import sys
 import warnings
@@ -59,10 +58,6 @@ def test_all_code_is_run():
         for block in blocks.blocks_of(page.read_text()):
             assert block.language in known or directives.match(block.language), f"{page.name}:{block.line}"
     assert len(WITH_CODE) > 15
-
-
-def test_a_compiler_is_there():
-    assert shutil.which("cc")
 
 
 def test_each_source_file_that_a_page_names_is_there():
