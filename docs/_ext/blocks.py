@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import chdir, redirect_stdout
 from dataclasses import dataclass
 from io import StringIO
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +38,7 @@ class Block:
 def blocks_of(text: str) -> Iterator[Block]:
     """Find the code of a page, each with its output."""
     found = list(_FENCE.finditer(text))
-    for fence, following in zip(found, [*found[1:], None], strict=True):
+    for fence, following in zip_longest(found, found[1:]):
         info = fence["info"].strip()
         has_output = (
             following is not None

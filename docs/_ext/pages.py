@@ -158,7 +158,7 @@ def generate(app: Sphinx, _: Config) -> None:
     for name, text in comparison.parts().items():
         write(GENERATED / "parts" / f"{name}.md", text)
     for page in DOCS.rglob("*.md"):
-        if not {"_build", "generated"} & set(page.relative_to(DOCS).parts):
+        if not {"_build", "generated", "tests"} & set(page.relative_to(DOCS).parts):
             write_pictures(page)
     pages = [page for page in DOCS.rglob("*.md") if "_build" not in page.parts]
     pages.append(ROOT / "examples" / "GALLERY_HEADER.rst")

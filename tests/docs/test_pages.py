@@ -15,7 +15,7 @@ sys.path.insert(0, str(DOCS / "_ext"))
 import blocks  # noqa: E402
 import comparison  # noqa: E402
 
-PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not {"_build", "generated"} & set(page.relative_to(DOCS).parts)]
+PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not {"_build", "generated", "tests"} & set(page.relative_to(DOCS).parts)]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text()]
 # Commands that install packages or run for long; those of the README are run by CI.
 INSTALLS = ("pip ", "python3 -m venv ", "pytest ", "bash .ci/run", "python -m ")
@@ -125,6 +125,10 @@ def test_blocks_are_found_with_their_output():
     assert (first.language, first.output, first.line) == ("python", "2 0.50\n", 3)
     assert (output.language, other.language, last.language) == ("text", "text", "python")
     assert last.output is None
+
+
+def test_a_page_without_code_has_no_blocks():
+    assert not list(blocks.blocks_of("# Words"))
 
 
 def test_an_error_in_a_page_names_its_line(tmp_path):
