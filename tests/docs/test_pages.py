@@ -15,7 +15,8 @@ sys.path.insert(0, str(DOCS / "_ext"))
 import blocks  # noqa: E402
 import comparison  # noqa: E402
 
-PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not {"_build", "generated", "tests"} & set(page.relative_to(DOCS).parts)]
+NOT_WRITTEN = {"_build", "generated", "tests"}
+PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not NOT_WRITTEN & set(page.relative_to(DOCS).parts)]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text()]
 # Commands that install packages or run for long; those of the README are run by CI.
 INSTALLS = ("pip ", "python3 -m venv ", "pytest ", "bash .ci/run", "python -m ")
