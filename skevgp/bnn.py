@@ -84,9 +84,9 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         What is subtracted from the inputs.
     noise_variance_ : float or ndarray of shape (n_outputs,)
         σ², in squared units of y.
-    loss_curve_ : ndarray of shape (n_iter_,)
+    loss_curve_ : ndarray of shape (n_iter,)
         Minus the evidence lower bound per row, in nats: its mean over the mini-batches of each epoch.
-    validation_scores_ : ndarray of shape (n_iter_,) or None
+    validation_scores_ : ndarray of shape (n_iter,) or None
         Expected log likelihood per row held back, in nats, after each epoch; None without ``early_stopping``.
     n_iter_ : int
         Epochs, the last one perhaps in part.

@@ -121,7 +121,7 @@ class EGPRegressor(ExplicitGaussianProcess):
         σ², in squared units of y.
     log_marginal_likelihood_value_ : float
         In nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts (eq. 2.45 there).
-    loss_curve_ : ndarray of shape (n_iter_,)
+    loss_curve_ : ndarray of shape (n_iter,)
         Minus the log marginal likelihood per iteration.
     n_iter_ : int
         Iterations of the start that was kept; of a callable ``optimizer`` its evaluations.

@@ -187,7 +187,7 @@ class EVGPRegressor(SparseGaussianProcess):
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs. Where they agree, inducing
         points cost nothing. The upper one (Titsias 2014) holds for either posterior, and becomes loose with many rows.
         With ``noise_cv`` the lower one is below that of the last iteration: noise and signal have moved since.
-    loss_curve_ : ndarray of shape (n_iter_,)
+    loss_curve_ : ndarray of shape (n_iter,)
         Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
         sample of the rows: the sample's, times the number of rows over its size).
     n_iter_ : int

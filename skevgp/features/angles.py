@@ -80,7 +80,7 @@ class AngleEncoder(RobotTransformer):
 
         Returns
         -------
-        X_original : ndarray of shape (n_samples, n_features_in_)
+        X_original : ndarray of shape (n_samples, n_features)
             The angles lie in (-π, π].
 
         Raises

@@ -23,15 +23,15 @@ class FunctionKernel(sk.Kernel):
     Parameters
     ----------
     function : callable
-        function(X, Z, **hyperparameters) -> array of shape (len(X), len(Z)), in autograd.numpy: symmetric and positive
-        semi-definite. Its parameters with a float as default are the hyperparameters; all are positive, and start
-        there. Other defaults (integers, strings) stay as they are.
+        ``function(X, Z, **hyperparameters)`` -> array of shape (len(X), len(Z)), in autograd.numpy: symmetric and
+        positive semi-definite. Its parameters with a float as default are the hyperparameters; all are positive, and
+        start there. Other defaults (integers, strings) stay as they are.
     values : dict of str to float, default=None
         Where hyperparameters start, if not at their defaults.
     values_bounds : pair of floats, "fixed", or dict of str to either, default=(1e-5, 1e5)
         Bounds of all hyperparameters, or of those named (the others then have the default).
     diagonal : callable, default=None
-        diagonal(X, **hyperparameters) -> k(x, x) of each row, (len(X),), in autograd.numpy. None takes it from
+        ``diagonal(X, **hyperparameters)`` -> k(x, x) of each row, (len(X),), in autograd.numpy. None takes it from
         ``function`` in chunks of rows, which takes longer.
 
     Attributes

@@ -79,8 +79,8 @@ def physical_consistency(parameters: np.ndarray) -> np.ndarray:
     """How far each link is from one that no body can be: a body can be it if this is above 0.
 
     The smallest eigenvalue of the pseudo-inertia at the centre of mass, which is diag(Σ_c, m), in units of the link's
-    own: of mass, |m|, and of Σ_c, the mean absolute value of its three eigenvalues. So it does not depend on units, nor
-    on the joint's frame. It is 1 for a ball or a cube, some hundredths for a slender link, 0 for a plate without
+    own: of mass, ``|m|``, and of Σ_c, the mean absolute value of its three eigenvalues. So it does not depend on units,
+    nor on the joint's frame. It is 1 for a ball or a cube, some hundredths for a slender link, 0 for a plate without
     thickness, a rod, a point and for no body at all (ten zeros), and below 0 (-3 at the least) where moments of inertia
     violate the triangle inequality or the mass is negative.
 

@@ -1,0 +1,112 @@
+"""What a Gaussian process package brings along: what pip installs, how large that is, and how much code it is itself.
+
+Each package is installed by pip, alone, in an empty environment; the CSV has one row per package. Code is counted in
+lines of the package's own Python files that hold code (tests left out): no comments, no docstrings, no blank lines.
+On Linux pip takes the torch of the default index, which brings CUDA.
+
+    python benchmarks/peers/packages.py
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import csv
+import io
+import json
+import os
+import platform
+import subprocess
+import sys
+import tempfile
+import tokenize
+from datetime import UTC, datetime
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+# The distribution to install, and the module that it brings.
+PACKAGES = {
+    "skevgp": (str(ROOT), "skevgp"),
+    "scikit-learn": ("scikit-learn", "sklearn/gaussian_process"),
+    "GPflow": ("gpflow", "gpflow"),
+    "GPyTorch": ("gpytorch", "gpytorch"),
+    "GPJax": ("gpjax", "gpjax"),
+}
+LAYOUT = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENCODING}
+LAYOUT.add(tokenize.ENDMARKER)
+
+
+def lines_of_code(source: str) -> int:
+    """Count lines that hold code."""
+    held: set[int] = set()
+    for token in tokenize.generate_tokens(io.StringIO(source).readline):
+        if token.type not in LAYOUT:
+            held.update(range(token.start[0], token.end[0] + 1))
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant) and isinstance(node.value.value, str):
+            held.difference_update(range(node.lineno, node.end_lineno + 1))
+    return len(held)
+
+
+def code_in(folder: Path) -> int:
+    """Count the code of a package without its tests."""
+    files = [file for file in folder.rglob("*.py") if not {"tests", "testing"} & set(file.relative_to(folder).parts)]
+    return sum(lines_of_code(file.read_text(encoding="utf-8")) for file in files)
+
+
+def megabytes(folder: Path) -> float:
+    """Measure what files hold, without what Python compiled of them."""
+    files = (file for file in folder.rglob("*") if file.is_file() and not file.is_symlink())
+    return sum(file.stat().st_size for file in files if "__pycache__" not in file.parts) / 1e6
+
+
+def measured(name: str) -> dict[str, str]:
+    """Install a package in an empty environment, and measure it."""
+    distribution, module = PACKAGES[name]
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
+        python = Path(folder, "Scripts" if os.name == "nt" else "bin", "python")
+        pip = [sys.executable, "-m", "pip", "--python", str(python)]
+        subprocess.run([*pip, "install", "--quiet", "--no-compile", distribution], check=True)
+        listed = json.loads(subprocess.run([*pip, "list", "--format=json"], check=True, capture_output=True).stdout)
+        versions = {each["name"].lower(): each["version"] for each in listed}
+        found = subprocess.run(
+            [python, "-c", "import sysconfig; print(sysconfig.get_path('platlib'))"],
+            check=True,
+            capture_output=True,
+            text=True,
+        )
+        installed = Path(found.stdout.strip())
+        return {
+            "package": name,
+            "version": versions["skevgp" if name == "skevgp" else distribution],
+            "distributions": str(len(versions)),
+            "megabytes": f"{megabytes(installed):.1f}",
+            "lines_of_code": str(code_in(installed / module)),
+            "counted": module,
+            "date": datetime.now(UTC).date().isoformat(),
+            "machine": f"Python {platform.python_version()}, {platform.system()} {platform.machine()}",
+        }
+
+
+def main() -> None:
+    """Measure the packages, or some of them; rows of others stay."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=list(PACKAGES))
+    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".csv"))
+    options = parser.parse_args()
+    rows = {}
+    if options.output.exists():
+        with options.output.open(encoding="utf-8") as file:
+            rows = {row["package"]: row for row in csv.DictReader(file)}
+    for name in options.packages:
+        rows[name] = measured(name)
+        print(rows[name], flush=True)
+        with options.output.open("w", encoding="utf-8", newline="") as file:
+            writer = csv.DictWriter(file, list(rows[name]))
+            writer.writeheader()
+            writer.writerows(rows[each] for each in PACKAGES if each in rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,121 @@
+"""The pages as they are seen: one of each type, at the width of a desk and of a phone."""
+
+import pytest
+
+selenium = pytest.importorskip("selenium", reason="the extra 'docs-test' is not installed")
+
+from selenium.webdriver.common.by import By  # noqa: E402
+from selenium.webdriver.support.ui import WebDriverWait  # noqa: E402
+
+# Page, its title, whether it has formulas, and whether it has pictures.
+TYPES = {
+    "index.html": ("skevgp", True, False),
+    "start.html": ("Start in five minutes", False, True),
+    "guide/index.html": ("User guide", True, False),
+    "guide/model.html": ("The model and its bound", True, False),
+    "howto/logs.html": ("Read a log", False, True),
+    "which_model.html": ("Which model when", True, False),
+    "comparison.html": ("Comparison", False, False),
+    "auto_examples/index.html": ("Gallery", False, True),
+    "auto_examples/plot_sparse_gp.html": ("A sparse Gaussian process in scikit-learn", False, True),
+    "generated/api.html": ("API reference", True, False),
+    "generated/api/skevgp.EVGPRegressor.html": ("EVGPRegressor", True, True),
+    "benchmarks.html": ("Benchmarks", False, False),
+    "generated/results/results_table.html": ("The results: Table 4 of the paper, and ours", False, True),
+    "generated/source/skevgp-metrics.py.html": ("skevgp/metrics.py", False, False),
+    "reproduction.html": ("The paper, reproduced", False, True),
+    "tests.html": ("How it is tested", True, False),
+    "changelog.html": ("Changelog", False, False),
+}
+each_page = pytest.mark.parametrize("page", TYPES)
+SEEN = """return [...document.querySelectorAll('article img')].filter(i => i.getClientRects().length)
+    .map(i => { i.loading = 'eager'; return [i.src, i.complete && i.naturalWidth > 0] })"""
+
+
+def opened(browser, address, page, theme="light"):
+    browser.get(f"{address}/{page}")
+    browser.execute_script(f"localStorage.setItem('mode', '{theme}'); localStorage.setItem('theme', '{theme}')")
+    browser.get_log("browser")
+    browser.get(f"{address}/{page}")
+    return WebDriverWait(browser, 30)
+
+
+def complaints(browser):
+    """Warnings and errors of the console; the theme also tells there what it does."""
+    return [entry["message"] for entry in browser.get_log("browser") if entry["level"] in ("WARNING", "SEVERE")]
+
+
+def cut_off(browser):
+    """What reaches beyond the page to the right, and cannot be scrolled."""
+    return browser.execute_script(
+        """const limit = document.documentElement.clientWidth + 1, scrolls = e => {
+             for (; e && e.tagName != 'ARTICLE'; e = e.parentElement)
+               if (/auto|scroll/.test(getComputedStyle(e).overflowX)) return true;
+             return false };
+           return [...document.querySelectorAll('article :is(p, h1, h2, li, dt, img, code, a)')]
+             .filter(e => e.getClientRects().length && e.getBoundingClientRect().right > limit && !scrolls(e))
+             .map(e => e.tagName + ' ' + e.textContent.slice(0, 60))"""
+    )
+
+
+def check_formulas(browser, wait):
+    wait.until(lambda d: d.find_elements(By.CSS_SELECTOR, "article mjx-container mjx-math"))
+    first = browser.find_element(By.CSS_SELECTOR, "article mjx-container")
+    assert min(first.size["width"], first.size["height"]) > 5
+    loaded = "return [...document.fonts].some(font => /MJX/.test(font.family) && font.status == 'loaded')"
+    wait.until(lambda d: d.execute_script(loaded))
+    assert not browser.find_elements(By.CSS_SELECTOR, "mjx-merror")
+    assert "\\(" not in browser.find_element(By.TAG_NAME, "article").text
+
+
+@pytest.mark.parametrize("theme", ["light", "dark"])
+@each_page
+def test_a_page_is_seen_as_it_should_be(browser, address, page, theme):
+    title, formulas, pictures = TYPES[page]
+    wait = opened(browser, address, page, theme)
+    wait.until(lambda d: d.execute_script("return document.readyState") == "complete")
+    heading = browser.find_element(By.CSS_SELECTOR, "article h1")
+    assert heading.is_displayed()
+    assert heading.text.strip("#¶ \n") == title
+    assert "skevgp" in browser.title
+    assert bool(browser.execute_script("return document.querySelectorAll('article .math').length")) == formulas
+    if formulas:
+        check_formulas(browser, wait)
+    shown = browser.execute_script(SEEN)
+    assert bool(shown) == pictures
+    wait.until(lambda d: all(loaded for _, loaded in d.execute_script(SEEN)), str(shown))
+    assert browser.execute_script("return document.documentElement.dataset.theme") == theme
+    needed, given = browser.execute_script(
+        "const page = document.documentElement; return [page.scrollWidth, page.clientWidth]"
+    )
+    assert needed <= given
+    assert not cut_off(browser)
+    assert not complaints(browser)
+
+
+def test_text_and_its_ground_differ_in_the_dark(browser, address):
+    opened(browser, address, "guide/model.html", "dark")
+    colour = "const s = getComputedStyle(document.querySelector(arguments[0])); return [s.color, s.backgroundColor]"
+    text, _ = browser.execute_script(colour, "article p")
+    _, ground = browser.execute_script(colour, "body")
+    light = [sum(map(float, each.split("(")[1].rstrip(")").split(",")[:3])) for each in (text, ground)]
+    assert light[0] - light[1] > 300.0
+
+
+def test_both_tabs_of_the_start_open(browser, address):
+    opened(browser, address, "start.html")
+    robot = browser.find_element(By.XPATH, "//label[contains(., 'A robot')]")
+    browser.execute_script("arguments[0].scrollIntoView({block: 'center'})", robot)
+    robot.click()
+    shown = [code.text for code in browser.find_elements(By.CSS_SELECTOR, ".sd-tab-content pre") if code.is_displayed()]
+    assert any("InertiaForceGravity" in code for code in shown)
+    assert not any("PolynomialFeatures" in code for code in shown)
+
+
+def test_search_finds_the_regressor(browser, address):
+    wait = opened(browser, address, "search.html?q=EVGPRegressor")
+    found = "#search-results li a"
+    wait.until(lambda d: any(link.text == "skevgp.EVGPRegressor" for link in d.find_elements(By.CSS_SELECTOR, found)))
+    link = next(link for link in browser.find_elements(By.CSS_SELECTOR, found) if link.text == "skevgp.EVGPRegressor")
+    assert "generated/api/skevgp.EVGPRegressor.html" in link.get_attribute("href")
+    assert not complaints(browser)

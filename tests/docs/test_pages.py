@@ -1,0 +1,191 @@
+"""The code of the site's pages runs as it stands, and prints what they say."""
+
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import matplotlib.pyplot as plt
+import pytest
+
+DOCS = Path(__file__).parents[2] / "docs"
+sys.path.insert(0, str(DOCS / "_ext"))
+
+import blocks  # noqa: E402
+import comparison  # noqa: E402
+
+NOT_WRITTEN = {"_build", "generated", "tests"}
+PAGES = [page for page in sorted(DOCS.rglob("*.md")) if not NOT_WRITTEN & set(page.relative_to(DOCS).parts)]
+# Of packages that only tests/clients has, which runs them.
+OF_CLIENTS = {"bayesian_optimisation.md", "mapie.md"}
+WITH_CODE = [page for page in PAGES if "```python" in page.read_text() and page.name not in OF_CLIENTS]
+# Commands that install packages or run for long; those of the README are run by CI.
+INSTALLS = ("pip ", "python3 -m venv ", "pytest ", "bash .ci/run", "python -m ")
+
+
+def name_of(page):
+    return page.relative_to(DOCS).as_posix()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
+def test_a_page_runs_and_prints_what_it_says(page, tmp_path):
+    with warnings.catch_warnings():  # a page may silence one
+        for block, printed in blocks.run(page, tmp_path):
+            assert not blocks.differences(printed, block.output or ""), f"{page.name}:{block.line}"
+    plt.close("all")
+    text = page.read_text()
+    for picture in re.findall(r"generated/pictures/([\w.]+)", text):
+        assert (tmp_path / picture).stat().st_size > 5_000
+    run_commands(text, tmp_path)
+
+
+def run_commands(text, folder):
+    """Of a shell, with the C programs that the page shows, in the folder where its Python has run."""
+    for name, source in re.findall(r"```\{code-block\} c\n:caption: (\S+)\n\n(.*?)```", text, flags=re.DOTALL):
+        (folder / name).write_text(source)
+    for block in blocks.blocks_of(text):
+        if block.language != "bash" or all(line.startswith(INSTALLS) for line in block.body.splitlines()):
+            continue
+        result = subprocess.run(["bash", "-euc", block.body], cwd=folder, capture_output=True, text=True, check=False)
+        assert result.returncode == 0, result.stderr
+        assert not blocks.differences(result.stdout, block.output or "")
+
+
+def test_all_code_is_run():
+    """No fence has a language that nobody runs."""
+    known = {"python", "bash", "text", "{code-block} c"}
+    directives = re.compile(r"\{(toctree|include|list-table)\}")
+    for page in PAGES:
+        for block in blocks.blocks_of(page.read_text()):
+            assert block.language in known or directives.match(block.language), f"{page.name}:{block.line}"
+    assert len(WITH_CODE) > 15
+
+
+def test_each_source_file_that_a_page_names_is_there():
+    named = [path for page in PAGES for path in re.findall(r"\{src\}`([^`]+)`", page.read_text())]
+    assert len(named) > 30
+    assert not [path for path in named if not (DOCS.parent / path).is_file()]
+
+
+# What the prose says was measured, and the line of the results that it is from.
+FIGURES = [
+    ("guide/control.md", "take 23 µs by `compile()`", "latency", r"compiled: row, mean and std \| 23 "),
+    ("guide/control.md", "49 µs by `predict`", "latency", r"predict: row, mean and std \| 49 "),
+    ("guide/solvers.md", "they had 99.0 %", "many_rows", r"adam 40 .* 98 \| .* 99\.02 %"),
+    ("guide/solvers.md", "L-BFGS had 98.6 %", "many_rows", r"default .* 404 \| .* 98\.63 %"),
+    ("guide/solvers.md", "On 18 of 20 sets", "auto_inducing", r"18 of 20"),
+    ("guide/noise.md", "0.55 of", "calibration", r"iiwa14 noise 0\.0 \| 4 \| 0\.549 → 0\.950"),
+    ("guide/torques.md", "half of the mean square error", "real_arms", r"ur10e \| three \| 0\.49"),
+    ("guide/torques.md", "does worse", "real_arms", r"ur10 \| whole \| 1\.2"),
+    ("which_model.md", "eight times", "real_arms", r"gradient boosting \| 7\.[5-9]|gradient boosting \| 7\.49"),
+    ("which_model.md", "four times", "real_arms", r"\| GP \| 3\.9"),
+    ("which_model.md", "need 385 points for 800 rows", "auto_inducing", r"sines-8 \| 800 .* 385 "),
+    ("which_model.md", "a point for each of 800 rows", "auto_inducing", r"acrobot \| 800 .* 800 \| 800 "),
+    (
+        "howto/inducing_points.md",
+        "a fiftieth of the error",
+        "results_table",
+        r"cartpole \| EVGP-IFG .* 0\.0300 .* 0\.00055",
+    ),
+]
+
+
+@pytest.mark.parametrize(("page", "words", "report", "line"), FIGURES)
+def test_figures_of_the_prose_are_those_of_the_results(page, words, report, line):
+    assert words in re.sub(r"\s+", " ", (DOCS / page).read_text())
+    assert re.search(line, (comparison.RESULTS / f"{report}.md").read_text())
+
+
+# --- the tools themselves -----------------------------------------------------------------------------------------
+
+SMALL = """# Page
+
+```python
+x = 2
+print(x, 0.5)
+```
+
+```text
+2 0.50
+```
+
+Words between, so that this is no output:
+
+```text
+else
+```
+
+```python
+print(1 / 0)
+```
+"""
+
+
+def test_blocks_are_found_with_their_output():
+    first, output, other, last = blocks.blocks_of(SMALL)
+    assert (first.language, first.output, first.line) == ("python", "2 0.50\n", 3)
+    assert (output.language, other.language, last.language) == ("text", "text", "python")
+    assert last.output is None
+
+
+def test_a_page_without_code_has_no_blocks():
+    assert not list(blocks.blocks_of("# Words"))
+
+
+def test_an_error_in_a_page_names_its_line(tmp_path):
+    page = tmp_path / "page.md"
+    page.write_text(SMALL)
+    found = blocks.run(page, tmp_path)
+    assert next(found)[1] == "2 0.5\n"
+    with pytest.raises(ZeroDivisionError) as caught:
+        next(found)
+    assert caught.traceback[-1].lineno + 1 == 19
+
+
+@pytest.mark.parametrize(
+    ("printed", "said", "same"),
+    [
+        ("a 1.00\n", "a  1.01", True),
+        ("a 1.00", "a 1.2", False),
+        ("b 1.00", "a 1.00", False),
+        ("1", "1 2", False),
+        ("[0.1 0.2]", "[0.2 0.2]", True),  # of one digit, up to that digit
+        ("[0.1 0.4]", "[0.1 0.2]", False),
+        ("-824 nats", "-828 nats", True),
+        ("True", "False", False),
+        ("", "something", False),
+        ("1e-09", "2e-09", False),
+    ],
+)
+def test_numbers_are_compared_up_to_their_digits(printed, said, same):
+    assert (blocks.differences(printed, said) == []) == same
+
+
+def test_tables_have_the_csvs_numbers():
+    parts = comparison.parts()
+    for row in comparison.rows_of(comparison.RESULTS / "against_peers.csv"):
+        assert row["peer"] in parts["peers"]
+    gpr = [row for row in comparison.rows_of(comparison.RESULTS / "against_gpr.csv") if row["model"] == "GPR"]
+    assert comparison.short(max(float(row["memory_mb"]) for row in gpr)) in parts["exact"].replace("*", "")
+    assert "scikit-learn" in parts["packages"]
+
+
+def test_the_best_are_bold_also_where_they_are_not_ours():
+    assert comparison.best([2.0, 1.0, 1.5]) == ["2.00", "**1.00**", "1.50"]
+    assert comparison.best([2.0, 1.0, 1.5], [True, False, True]) == ["2.00", "1.00", "**1.50**"]
+    bold = [line for line in comparison.peers().splitlines() if "GPflow" in line and "**" in line]
+    assert bold
+
+
+def test_the_gallery_is_in_an_order_that_knows_all_examples():
+    from stories import ORDER, Order
+
+    files = sorted((DOCS.parent / "examples").glob("plot_*.py"), key=lambda path: Order("")(path.name))
+    assert [path.stem.removeprefix("plot_") for path in files] == ORDER
+
+
+def test_what_is_generated_is_not_kept():
+    ignored = (DOCS.parent / ".gitignore").read_text().split()
+    assert {"/docs/_build/", "/docs/generated/", "/docs/auto_examples/"} <= {*ignored}
