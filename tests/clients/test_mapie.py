@@ -1,4 +1,9 @@
-"""MAPIE makes intervals with a guarantee from our mean, and from our std."""
+"""MAPIE makes intervals with a guarantee from our mean, and from our std, as docs/howto/mapie.md has it."""
+
+import contextlib
+import io
+import re
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -6,6 +11,18 @@ import pytest
 from skevgp import EVGPRegressor
 
 pytest.importorskip("mapie")
+
+
+def test_the_page_prints_what_it_says():
+    page = Path(__file__).parents[2] / "docs" / "howto" / "mapie.md"
+    ((code, expected),) = re.findall(r"```python\n(.*?)```\n\n```text\n(.*?)```", page.read_text(), flags=re.DOTALL)
+    said = io.StringIO()
+    with contextlib.redirect_stdout(said):
+        exec(code, {})
+    ours, theirs = (np.array(re.findall(r": ([\d.]+)|and ([\d.]+)", text)) for text in (said.getvalue(), expected))
+    ours, theirs = (np.array(["".join(pair) for pair in pairs], dtype=float) for pairs in (ours, theirs))
+    np.testing.assert_allclose(ours, theirs, rtol=0.05)
+    assert len(theirs) == 4
 
 
 def test_conformal_intervals_hold(data):
