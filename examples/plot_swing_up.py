@@ -57,6 +57,7 @@ try:
     import matplotlib.pyplot as plt
     from matplotlib.patches import Rectangle
 
+    plt.style.use("skevgp.plotting.page")
     learned, runs = {}, {}
     for name, physics in (("EVGP-IFG", True), ("without physics", False)):
         start = time.perf_counter()
@@ -111,12 +112,12 @@ times = DT * np.arange(task.n_steps + 1)
 until = np.flatnonzero(shown.distance >= NEAR)[-1] if shown.success else task.n_steps - 1
 frames = np.linspace(0, min(until + 10, task.n_steps - 1), 12).astype(int)
 
-figure = plt.figure(figsize=(12, 8), layout="constrained")
+figure = plt.figure(figsize=(8, 6.4))
 strip, middle, bottom = figure.subfigures(3, 1, height_ratios=(0.6, 1.2, 1.0))
 ax = strip.subplots()
 for place, frame in enumerate(frames):
     draw(ax, shown.states[frame], shown.inputs[frame, 0], 1.5 * place)
-    ax.text(1.5 * place, -0.82, f"{times[frame]:.2f} s", ha="center", fontsize=9)
+    ax.text(1.5 * place, -0.82, f"{times[frame]:.2f} s", ha="center")
 ax.set(aspect="equal", xlim=(-0.9, 1.5 * len(frames) - 0.6), ylim=(-0.9, 0.65))
 ax.axis("off")
 ax.set_title(f"EVGP-IFG, learned from {seconds:g} s of data" + (", with the force that acts" if has_cart else ""))
@@ -131,7 +132,7 @@ for ax, (name, run) in zip(middle.subplots(1, 2, sharey=True), runs.items(), str
     ax.axhline(np.pi * (1.0 + 2.0 * turns), color="0.3", linestyle=":", label="upright")
     ax.set(title=f"{name}: {'upright' if run.success else 'not upright'} in the last second", xlabel="time (s)")
     ax.set(xlim=(0.0, times[-1]), ylabel="pole's angle from hanging (rad)")
-    ax.legend(fontsize=8)
+    ax.legend()
 
 left, right = bottom.subplots(1, 2)
 for name, run in runs.items():
@@ -144,10 +145,10 @@ left.set(title="What the controller did", xlabel="time (s)", ylabel=push, xlim=(
 right.set(title="One step ahead: the pole's angular velocity", xlabel="time (s)", ylabel="rad/s", yscale="log")
 right.set(xlim=(0.0, times[-1]))
 for ax in (left, right):
-    ax.legend(fontsize=8)
+    ax.legend()
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"swing_up_{task.system}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

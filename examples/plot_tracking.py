@@ -53,6 +53,7 @@ try:
     import matplotlib.pyplot as plt
     import pinocchio as pin
 
+    plt.style.use("skevgp.plotting.page")
     from skevgp.datasets import load_robot
     from skevgp.robots import RigidBody
 
@@ -108,7 +109,7 @@ for width, (durations, _) in planned.items():
 
 blue, orange, grey = "#0072B2", "#D55E00", "0.35"
 colours = dict(zip(runs, (orange, blue), strict=True))
-figure, axes = plt.subplots(2, 3, figsize=(13, 7.5), layout="constrained")
+figure, axes = plt.subplots(2, 3, figsize=(8, 5.6))
 data = nominal.model.createData()
 
 
@@ -184,10 +185,10 @@ axes[1, 2].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of 
 axes[1, 2].yaxis.get_major_locator().set_params(integer=True)
 axes[1, 2].margins(y=0.25)  # above which the legend is
 for ax in axes.ravel():
-    ax.legend(fontsize=8, loc="lower center" if ax in axes[1, :2] else "best")
+    ax.legend(loc="lower center" if ax in axes[1, :2] else "best")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "tracking.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()
