@@ -157,7 +157,7 @@ for name, row in asked.items():
 # The URDF alone knows gravity, but nothing of friction. The band is that of InverseDynamics, two standard deviations to
 # each side of its mean.
 
-figure, axes = plt.subplots(3, 2, figsize=(8, 6.8), width_ratios=(1.6, 1))
+figure, axes = plt.subplots(3, 2, figsize=(8, 6.8), width_ratios=(1.3, 1))
 colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}
 window = slice(0, 1000)
 # No line reaches across a gap or rest: one row less there.
@@ -201,7 +201,7 @@ for ax, start, title in (
     ax.set_title(title)
     ax.set_ylim(bottom=0.0)
 for ax in axes[:, 1]:
-    ax.set_xticks(places, short)
+    ax.set_xticks(places, short, fontsize=7)
     ax.set_xlim(-0.5, len(joints) - 0.5)
 axes[1, 1].legend()
 handles = [*axes[0, 0].get_lines()[1:], *axes[0, 1].get_lines()]

@@ -261,12 +261,10 @@ def plot(rows: list[Row], path: Path) -> None:
             bar.set_ticks([*ticks, 0.0], labels=[f"{tick:g}" for tick in (*ticks, 0.0)])
             bar.ax.minorticks_off()
     n_seeds = len({row["seed"] for row in rows})
-    figure.suptitle(
-        f"{rows[0]['system']}: "
-        + (f"means over {n_seeds} seeds, ± standard deviation between seeds" if n_seeds > 1 else "one seed")
-        + ("; framed: what would imitate gravity" if is_written(rows) else "")
-        + f"\niterations: {iterations(rows)}"
-    )
+    said = f"means over {n_seeds} seeds" if n_seeds > 1 else "one seed"
+    if is_written(rows):
+        said += ", ± standard deviation between seeds" * (n_seeds > 1) + "; framed: what would imitate gravity"
+    figure.suptitle(f"{rows[0]['system']}: {said}\niterations: {iterations(rows)}")
     save_picture(figure, path)
 
 
@@ -282,8 +280,8 @@ def heat_map(axes: Any, rows: list[Row], value: str, colours: Any, norm: Any) ->
     values, outputs, features = matrix(rows, value), names(rows, "output"), names(rows, "feature")
     mean, is_wide = values.mean(axis=0), not is_written(rows)
     picture = axes.imshow(mean, cmap=colours, norm=norm, aspect="auto")
-    axes.set_xticks(range(len(features)), map(pretty, features), fontsize=5 if is_wide else 8.5, rotation=90 * is_wide)
-    axes.set_yticks(range(len(outputs)), map(pretty, outputs), fontsize=5 if is_wide else 8.5)
+    axes.set_xticks(range(len(features)), map(pretty, features), fontsize=6 if is_wide else 8.5, rotation=90 * is_wide)
+    axes.set_yticks(range(len(outputs)), map(pretty, outputs), fontsize=6 if is_wide else 8.5)
     axes.tick_params(length=0)
     axes.grid(False)
     axes.spines[:].set_visible(False)
