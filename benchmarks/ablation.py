@@ -304,7 +304,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     output, sets = harness.output_path(options, "ablation"), list(cases(options.quick))
 
     def missing(cells: list[Cell]) -> int:
-        return harness.run_missing(cells, run, output, options.jobs, said)
+        return harness.run_missing(cells, run, output, options.jobs, said, since=options.since)
 
     failures = missing([Cell(DEFAULT.rule, DEFAULT.variant, *own, options.quick) for own in sets])
     default = {(row["case"], int(row["seed"])): row for row in harness.read(output) if row["rule"] == DEFAULT.rule}

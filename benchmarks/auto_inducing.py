@@ -264,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     names = options.sets or (QUICK_SETS if options.quick else SETS)
     seeds = range(options.seeds or (1 if options.quick else 3))
     cells = [Cell(name, seed, model) for seed in seeds for model in options.models for name in names]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(report(harness.read(output)), output, n_failures)
 
 

@@ -238,7 +238,7 @@ def main() -> None:
         for data, variant, noise in settings
         for noise_cv in ("None", "5")
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

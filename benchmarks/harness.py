@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from datetime import UTC, datetime
+from datetime import UTC, date, datetime
 from multiprocessing import active_children, get_context
 from pathlib import Path
 from typing import Any
@@ -39,6 +39,14 @@ def positive(text: str) -> int:
     if not text.isdecimal() or int(text) < 1:
         raise argparse.ArgumentTypeError(f"{text!r} must be a positive integer")
     return int(text)
+
+
+def day(text: str) -> str:
+    """Of an option, as `provenance` writes it."""
+    try:
+        return date.fromisoformat(text).isoformat()
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} must be a day like 2026-11-23") from None
 
 
 def csv_path(text: str) -> Path:
@@ -90,6 +98,8 @@ def argument_parser(
     if in_processes:
         said = "processes, each on one core; default: %(default)s"
         parser.add_argument("--jobs", type=positive, default=joblib.cpu_count(), help=said)
+        said = "a day, 2026-11-23: what was measured before is measured again; default: what is there stays"
+        parser.add_argument("--since", type=day, help=said)
     parser.add_argument(
         "--output", type=csv_path, help="the CSV; what is drawn from it goes beside it; default: in benchmarks/results"
     )
@@ -173,6 +183,14 @@ def write(rows: Iterable[dict[str, Any]], columns: Sequence[str], path: Path) ->
     new.replace(path)
 
 
+def make_way(cell: tuple[str, ...], names: Sequence[str], columns: Sequence[str], path: Path) -> None:
+    """Take the rows of a cell out of a CSV, and give the others the columns of new ones."""
+    rows = read(path)
+    others = [row for row in rows if tuple(row[name] for name in names) != cell]
+    if len(others) < len(rows) or (rows and set(columns) != rows[0].keys()):
+        write(({name: row.get(name, "nan") for name in columns} for row in others), columns, path)
+
+
 def key(cell: Any) -> tuple[str, ...]:
     """What tells a cell from all others, as a CSV holds it: the fields by which it is compared."""
     return tuple(str(getattr(cell, field.name)) for field in dataclasses.fields(cell) if field.compare)
@@ -185,6 +203,7 @@ def run_missing(
     jobs: int,
     say: Callable[[Any], str],
     fresh: bool = False,
+    since: str | None = None,
 ) -> int:
     """Run the cells of which the CSV has no row, in processes, and write what each gives as it comes.
 
@@ -202,6 +221,9 @@ def run_missing(
         What ``run`` returned -> what to print of it.
     fresh : bool, default=False
         Whether each cell has a process of its own, where memory is measured.
+    since : str, default=None
+        A day: rows that were measured before are as if they were not there, until a new one replaces them. (What they
+        do not know, because the benchmark measured less then, is "nan".)
 
     Returns
     -------
@@ -222,7 +244,7 @@ def run_missing(
     rows = read(output)
     if rows and not set(names) <= rows[0].keys():
         raise SystemExit(f"{output} has no columns {sorted(set(names) - rows[0].keys())}: give another --output.")
-    done = {tuple(row[name] for name in names) for row in rows}
+    done = {tuple(row[name] for name in names) for row in rows if not since or row["date"] >= since}
     missing = [cell for cell in cells if key(cell) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:
@@ -247,7 +269,10 @@ def run_missing(
                     n_failures += 1
                     said += f"failed: {type(problem).__name__}: {problem}"
                 else:
-                    append(result if isinstance(result, list) else [result], output)
+                    new = result if isinstance(result, list) else [result]
+                    if since:
+                        make_way(key(pending[future]), names, list(new[0]), output)
+                    append(new, output)
                     said += say(result)
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:

@@ -223,7 +223,7 @@ def main() -> None:
     output, size = harness.output_path(options, "identification"), "quick" if options.quick else "full"
     n_seeds = options.seeds or (2 if options.quick else 50)
     cells = [Cell(cutoff, seed, size) for seed in range(n_seeds) for cutoff in FILTERS]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

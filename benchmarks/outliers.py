@@ -208,7 +208,7 @@ def main() -> None:
         for dataset in options.datasets or there
         for seed in range(options.seeds or (1 if options.quick else DATASETS[dataset][1]))
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

@@ -621,10 +621,10 @@ def main() -> None:
     ]
     if not cells:
         raise SystemExit(f"{options.data_dir} has no logs of {' or '.join(SPLITS)}: python {sys.argv[0]} --help")
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     second = output.with_name(f"{output.stem}_parameters.csv")
     questions = questions_of(folder, size)
-    n_failures += harness.run_missing(questions, ask, second, options.jobs, say_found)
+    n_failures += harness.run_missing(questions, ask, second, options.jobs, say_found, since=options.since)
     rows, found = (of(harness.read(path), size=size) for path in (output, second))
     picture = output.with_suffix(".png")
     if rows:

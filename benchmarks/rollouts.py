@@ -354,7 +354,7 @@ def main() -> None:
         for m in sizes(system, model)[number : number + 1]
         for noise, share in itertools.product(NOISES, SHARES)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

@@ -230,7 +230,7 @@ def main() -> None:
     parser.add_argument("--models", nargs="+", choices=NAMES, default=list(NAMES), help="default: all")
     options = parser.parse_args()
     output, size = harness.output_path(options, "swing_up"), "quick" if options.quick else "full"
-    n_failures = harness.run_missing(cells_of(options), run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells_of(options), run, output, options.jobs, say, since=options.since)
     harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
 
 

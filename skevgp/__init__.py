@@ -5,16 +5,16 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from ._version import __version__
+
 if TYPE_CHECKING:
-    from . import datasets, exceptions, features, kernels, metrics, plotting, solvers
+    from . import datasets, exceptions, features, io, kernels, metrics, plotting, solvers
     from .bnn import BayesianMLPRegressor
     from .exact import EGPRegressor
     from .inverse_dynamics import InverseDynamics
     from .prediction.rollout import rollout
     from .regressor import EVGPRegressor
     from .residual import ResidualRegressor
-
-__version__ = "0.1.0"
 
 __all__ = [
     "BayesianMLPRegressor",
@@ -26,6 +26,7 @@ __all__ = [
     "datasets",
     "exceptions",
     "features",
+    "io",
     "kernels",
     "metrics",
     "plotting",
@@ -33,7 +34,7 @@ __all__ = [
     "solvers",
 ]
 
-_SUBMODULES = ("datasets", "exceptions", "features", "kernels", "metrics", "plotting", "solvers")
+_SUBMODULES = ("datasets", "exceptions", "features", "io", "kernels", "metrics", "plotting", "solvers")
 _HOME = {
     "BayesianMLPRegressor": "bnn",
     "EGPRegressor": "exact",

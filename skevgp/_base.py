@@ -3,21 +3,20 @@
 from __future__ import annotations
 
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Protocol
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted
 
 from ._coef_prior import coef_names
 from ._control import ForControl
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions
-from ._theta import OfKernel, value_at
-from ._validation import check_integer, is_plain
+from ._summary import ModelSummary, Summarised, of_gaussian_process
+from ._validation import check_fitted, check_integer, is_plain
 from .exceptions import warn_user
 from .export.exportable import Exportable
 from .fitting.units import Units
@@ -58,7 +57,7 @@ class _OfWeights:
         )
 
 
-class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForControl):
+class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Exportable, ForControl):
     """A Gaussian process with explicit features, however it is fitted."""
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
@@ -125,7 +124,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
         if not hasattr(self, "_predictor"):
-            check_is_fitted(self)
+            return self._before_fit(X).predict(X, return_std, return_cov, include_noise)
         if is_dask(X):
             if return_cov:
                 raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
@@ -190,6 +189,8 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
         check_integer(n_samples, "n_samples", minimum=1)
         if is_dask(X):
             raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
+        if not hasattr(self, "_predictor"):
+            return self._before_fit(X).sample_y(X, n_samples, random_state, include_noise)
         rng = check_random_state(random_state)
         mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
         single = mean.ndim == 1
@@ -211,16 +212,25 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Exportable, ForC
         return samples[:, 0] if single else samples
 
     def _check_gradient_of(self, theta: ArrayLike | None, eval_gradient: bool) -> None:
-        check_is_fitted(self)
+        check_fitted(self)
         if theta is None and eval_gradient:
             raise ValueError("Gradient can only be evaluated for theta!=None: give theta=kernel_.theta.")
 
-    def _value_at(self, theta: ArrayLike, eval_gradient: bool, of_kernel: OfKernel) -> Any:
-        """What is the sum of ``of_kernel`` over outputs, and its gradient; see `value_at`."""
-        return value_at(theta, eval_gradient, self._spec.order, self._predictor, of_kernel)
+    def _numbers_of_kernels(self) -> list[np.ndarray]:
+        """Of each output k̃'s hyperparameters and s², as fitted, in the user's units."""
+        signal = self._predictor.signal
+        return [np.append(group.hyperparameters, signal[o]) for o, group in enumerate(self._predictor.by_output)]
+
+    def _before_fit(self, X: Any) -> Self:
+        """What predicts as long as there was no fit: nothing, but for a model with a prior of its own."""
+        check_fitted(self)
+        raise AssertionError
 
     def __sklearn_is_fitted__(self) -> bool:
         return hasattr(self, "_predictor")
+
+    def _described(self) -> ModelSummary:
+        return of_gaussian_process(self)
 
     def _set_posterior(self) -> None:
         """What is known of weights, if there are any, and noise."""

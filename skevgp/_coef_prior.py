@@ -284,8 +284,8 @@ def _weight(union: Any, name: str) -> float:
     return 1.0 if weight is None else float(weight)
 
 
-def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int) -> np.ndarray:
-    """What a fitted feature map calls its features; "h0", "h1", ... if it does not say.
+def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int, letter: str = "h") -> np.ndarray:
+    """What a fitted map calls its features; "h0", "h1", ... if it does not say.
 
     Parameters
     ----------
@@ -293,6 +293,7 @@ def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int) ->
     columns : ndarray of str, or None
         Names of the columns of X.
     n_features : int
+    letter : str, default="h"
     """
     try:
         names = np.asarray([str(name) for name in feature_map.get_feature_names_out(columns)], dtype=object)
@@ -300,4 +301,4 @@ def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int) ->
         names = np.empty(0, dtype=object)
     if len(names) == n_features:
         return names
-    return np.array([f"h{index}" for index in range(n_features)], dtype=object)
+    return np.array([f"{letter}{index}" for index in range(n_features)], dtype=object)

@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted
 
 from ._intake import Intake
 from ._shapes import like_y
-from ._validation import check_integer, is_plain
+from ._validation import check_fitted, check_integer, is_plain
 from .inference.posterior import Predictor
 from .prediction.compiled import CompiledPredictor
 from .prediction.derivatives import gradient_covariance, mapped
@@ -181,7 +180,7 @@ class ForControl(Intake):
         >>> model.novelty([[3.0], [60.0]]).round(3)
         array([0., 1.])
         """
-        check_is_fitted(self)
+        check_fitted(self)
         if is_dask(X):
             raise ValueError("novelty needs rows in memory: not for Dask arrays. Give it X.compute().")
         given: Any = X
@@ -224,7 +223,7 @@ class ForControl(Intake):
         >>> slope.round(2)
         array([1.])
         """
-        check_is_fitted(self)
+        check_fitted(self)
         return CompiledPredictor(self, include_noise)
 
     def sample_functions(
@@ -274,7 +273,7 @@ class ForControl(Intake):
         ((5, 60), ())
         >>> value, slope = functions[0].value_and_jacobian(X)
         """
-        check_is_fitted(self)
+        check_fitted(self)
         check_integer(n, "n", minimum=1)
         check_integer(n_waves, "n_waves", minimum=1)
         return FunctionSamples(self._functions(), n, n_waves, check_random_state(random_state))
@@ -285,7 +284,7 @@ class ForControl(Intake):
 
     def _in_pieces(self, X: Any) -> Iterator[np.ndarray]:
         """Rows as floats, few enough at once that derivatives fit into memory."""
-        check_is_fitted(self)
+        check_fitted(self)
         if is_dask(X):
             raise ValueError("Derivatives need rows in memory: not for Dask arrays. Give them X.compute().")
         rows = X if is_plain(self, X) else self._numbers(X, reset=False)[0]

@@ -9,12 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils.validation import validate_data
 
 from ._coef_prior import resolve_coef_prior, says_shared, wide_scale
 from ._row_weights import chosen_rows
+from ._state import StatefulEstimator
 from ._validation import (
     FLOATS,
     check_magnitude,
@@ -69,7 +70,7 @@ class Problem:
     groups: np.ndarray | None
 
 
-class Intake(BaseEstimator):
+class Intake(StatefulEstimator):
     """An estimator with explicit features, as far as it takes in rows."""
 
     feature_map: TransformerMixin | None

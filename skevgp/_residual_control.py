@@ -10,11 +10,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted
 
 from ._sklearn import safe_indexing
+from ._state import StatefulEstimator
 from ._validation import as_floats, is_frame
 from .export.c_code import write_c
 from .export.casadi import with_base
@@ -46,7 +46,7 @@ def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
     return columns
 
 
-class ResidualForControl(BaseEstimator):
+class ResidualForControl(StatefulEstimator):
     """A meta-estimator of changes that control loops can use, as far as its regressor can."""
 
     regressor_: Any

@@ -17,6 +17,7 @@ from ._intake import Problem
 from ._progress import Monitor
 from ._row_weights import chosen_rows
 from ._sklearn import fit_context
+from ._theta import value_at
 from ._validation import check_magnitude, unchanged_if_it_fails
 from .calibration.folds import CrossValidation
 from .fitting.inducing import Placement
@@ -152,7 +153,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             )
         with closing(BlockMap(effective_n_jobs(self.n_jobs))) as threads, single_threaded_libraries():
             rows = self._fitted.units.rows(self._source(*self._training_data), threads)
-            return self._value_at(theta, eval_gradient, partial(self._fitted.bound_at, rows))
+            order, kernels = self._spec.order, self._numbers_of_kernels()
+            return value_at(theta, eval_gradient, order, kernels, partial(self._fitted.bound_at, rows))
 
     def set_params(self, **params: Any) -> Self:
         """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.

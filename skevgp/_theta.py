@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -10,14 +10,13 @@ from numpy.typing import ArrayLike
 
 from ._linalg import NotPositiveDefiniteError
 from ._validation import LARGEST, as_floats
-from .inference.posterior import Predictor
 
-# (output, hyperparameters of k̃, s²) -> a value, and its gradient in the logarithms of these.
-OfKernel = Callable[[int, np.ndarray, float], tuple[float, np.ndarray]]
+# (output, numbers) -> a value, and its gradient in the logarithms of these.
+OfKernel = Callable[[int, np.ndarray], tuple[float, np.ndarray]]
 
 
 def value_at(
-    theta: ArrayLike, eval_gradient: bool, order: np.ndarray, predictor: Predictor, of_kernel: OfKernel
+    theta: ArrayLike, eval_gradient: bool, order: np.ndarray, fitted: Sequence[np.ndarray], of_kernel: OfKernel
 ) -> Any:
     """The sum over outputs of what each has at its theta and, if asked for, its gradient, of the shape of theta.
 
@@ -28,9 +27,10 @@ def value_at(
     theta : array-like of shape (n_theta,) or, for several outputs, (o, n_theta)
     eval_gradient : bool
     order : ndarray of shape (n_theta,)
-        `KernelSpec.order`.
-    predictor : Predictor
-        The fitted one, in the user's units: what is fixed stays as it is there.
+        Where in the numbers each entry of theta is: `KernelSpec.order`.
+    fitted : sequence of ndarray
+        Of each output the numbers (k̃'s hyperparameters, s², perhaps σ²), in the user's units: what theta does not have
+        stays as it is there.
     of_kernel : callable
         In the user's units.
 
@@ -39,7 +39,7 @@ def value_at(
     ValueError
         If theta has another shape or is out of range.
     """
-    n_outputs, thetas = len(predictor.noise), as_floats(theta, "theta")
+    n_outputs, thetas = len(fitted), as_floats(theta, "theta")
     shape = (len(order),) if n_outputs == 1 else (n_outputs, len(order))
     if thetas.shape != shape:
         each = "" if n_outputs == 1 else " of each of the kernels"
@@ -47,12 +47,12 @@ def value_at(
     if not (np.abs(thetas) <= np.log(LARGEST)).all():
         raise ValueError(f"theta must be logarithms of numbers from {1 / LARGEST:g} to {LARGEST:g}; got {theta!r}.")
     total, gradient = 0.0, np.zeros((n_outputs, len(order)))
-    for o, group in enumerate(predictor.by_output):
-        kernel = np.append(group.hyperparameters, predictor.signal[o])
-        kernel[order] = np.exp(thetas.reshape(gradient.shape)[o])
+    for o, own in enumerate(fitted):
+        numbers = own.copy()
+        numbers[order] = np.exp(thetas.reshape(gradient.shape)[o])
         try:
             with np.errstate(over="ignore", invalid="ignore"):
-                value, bars = of_kernel(o, kernel[:-1], float(kernel[-1]))
+                value, bars = of_kernel(o, numbers)
         except NotPositiveDefiniteError:
             return (-np.inf, np.zeros(shape)) if eval_gradient else -np.inf
         total += value

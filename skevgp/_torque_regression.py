@@ -7,9 +7,10 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, clone
+from sklearn.base import clone
 
 from ._coef_prior import wide_scale
+from ._state import StatefulEstimator
 from ._validation import check_magnitude, checked_groups
 from .features import RigidBodyRegressor
 from .identification.rows_of_logs import blocks_of, groups_of
@@ -20,7 +21,7 @@ from .identification.weights import Prior, Rows, Weights, identify, with_gains
 _STICTION_ROUNDS = 3
 
 
-class TorqueRegression(BaseEstimator):
+class TorqueRegression(StatefulEstimator):
     """How rows of `InverseDynamics` become those of a regression, and the weights that it finds."""
 
     robot: Any

@@ -8,8 +8,9 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from sklearn.exceptions import NotFittedError
 from sklearn.utils import check_array, check_consistent_length
-from sklearn.utils.validation import validate_data
+from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._sklearn import safe_indexing
 
@@ -52,6 +53,13 @@ def is_plain(estimator: Any, X: Any) -> bool:
         and not hasattr(estimator, "feature_names_in_")
         and bool(np.abs(X).max() <= LARGEST)  # False if there is a NaN
     )
+
+
+def check_fitted(estimator: Any) -> None:
+    """As scikit-learn's `check_is_fitted`, of estimators that predict before a fit too (from their prior)."""
+    if hasattr(estimator, "__sklearn_is_fitted__") and not estimator.__sklearn_is_fitted__():
+        raise NotFittedError(f"This {type(estimator).__name__} instance is not fitted yet: call fit before.")
+    check_is_fitted(estimator)
 
 
 def is_frame(values: Any) -> bool:

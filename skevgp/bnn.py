@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, MultiOutputMixin, RegressorMixin
+from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -17,6 +17,7 @@ from ._progress import monitor_of
 from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
+from ._state import StatefulEstimator
 from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
 from .exceptions import warn_user
 from .network.model import VariationalNetwork
@@ -31,7 +32,7 @@ _BATCH_SIZE = 200  # "auto"
 _NUMBERS_AT_ONCE = 2**21
 
 
-class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, BaseEstimator):
+class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     r"""Neural network with normal variational weights (a deep Bayesian neural network, the paper's DBNN).
 
     Layers of LeakyReLU units; each weight is normal, :math:`q(w) = N(\mu, s^2)`, independent of the others, its prior

@@ -4,26 +4,32 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from numbers import Integral
+from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import TransformerMixin
+from sklearn.base import TransformerMixin, clone
+from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
 from ._base import ExplicitGaussianProcess
+from ._intake import Problem
 from ._progress import monitor_of
-from ._sklearn import Interval, fit_context
+from ._sklearn import Interval, StrOptions, fit_context
+from ._theta import value_at
 from ._validation import unchanged_if_it_fails
 from .fitting.exact import ExactFit, ExactOptions, fit_exact
+from .fitting.prior import prior_predictor
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS
 
 # Without inducing points rounding does not matter before the noise is so low: a smooth function is met to 1e-6.
 _RULES = replace(LBFGS.rules, lowest_noise=1e-12)
+# Of so many, an iteration takes a few milliseconds at most.
+_FEW_ROWS = 100
 
 
 class EGPRegressor(ExplicitGaussianProcess):
@@ -60,8 +66,18 @@ class EGPRegressor(ExplicitGaussianProcess):
         Whether all outputs have the same weights, as of `EVGPRegressor`.
     noise_variance : float, default=None
         Where the noise variance starts; None takes it from the data.
+    alpha : float, default=None
+        A noise variance that is known, in place of one that is learned; ``std`` has it. If each row has its own, give
+        their mean here, and to `fit` what they are in units of it, ``relative_variance``.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y, in place of 0.
+    optimizer : "fmin_l_bfgs_b", callable or None, default="fmin_l_bfgs_b"
+        What finds kernel and noise. None takes the kernel as it is given: a signal variance that is added to one that
+        has none is 1, as all numbers of the default kernel are. A callable is one as `GaussianProcessRegressor` takes,
+        ``optimizer(objective, theta, bounds=bounds) -> (theta, value)``, called from each start: the objective is minus
+        the log marginal likelihood, ``objective(theta, eval_gradient=True) -> (value, gradient)``; theta (n_free,) are
+        the logarithms of k̃'s free hyperparameters, then of each output's signal variance, then of each one's noise
+        variance; bounds (n_free, 2) are those of its entries.
     max_iter : int, default=1000
         The most iterations of L-BFGS from each start. With 0 kernel and noise stay where they start.
     max_time : float, default=None
@@ -69,9 +85,13 @@ class EGPRegressor(ExplicitGaussianProcess):
     n_restarts : int, default=0
         Further fits with kernel and noise drawn log-uniformly around the first start, within their bounds; the
         likeliest is kept.
-    tol : float, default=0.01
+    tol : float or "auto", default="auto"
         In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the log marginal
-        likelihood by less than this, and stops when a fresh start gains no more.
+        likelihood by less than this, and stops when a fresh start gains no more. ``"auto"`` is 0.01, and 1e-9 for 100
+        rows or fewer, where iterations cost next to nothing: a function without noise is then met to rounding.
+    n_targets : int, default=None
+        How many outputs y has. It is needed before a fit only, when `predict` and `sample_y` are of the prior; None is
+        one there.
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0
@@ -104,7 +124,7 @@ class EGPRegressor(ExplicitGaussianProcess):
     loss_curve_ : ndarray of shape (n_iter_,)
         Minus the log marginal likelihood per iteration.
     n_iter_ : int
-        Iterations of the start that was kept.
+        Iterations of the start that was kept; of a callable ``optimizer`` its evaluations.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
@@ -130,11 +150,22 @@ class EGPRegressor(ExplicitGaussianProcess):
     >>> mean, std = model.predict(X, return_std=True)
     >>> round(model.score(X, y), 2)
     0.96
+
+    Before a fit predictions are of the prior, where y counts as of size one:
+
+    >>> prior = EGPRegressor(PolynomialFeatures(1), coef_scale=[0.0, 2.0])
+    >>> mean, std = prior.predict([[0.0], [3.0]], return_std=True)
+    >>> std.round(2)
+    array([1.  , 6.08])
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **ExplicitGaussianProcess._parameter_constraints,
+        "alpha": [Interval(Real, 0, None, closed="neither"), None],
+        "optimizer": [StrOptions({"fmin_l_bfgs_b"}), callable, None],
         "n_restarts": [Interval(Integral, 0, None, closed="left")],
+        "n_targets": [Interval(Integral, 1, None, closed="left"), None],
+        "tol": [Interval(Real, 0, None, closed="left"), StrOptions({"auto"})],
     }
 
     _fitted: ExactFit
@@ -150,11 +181,14 @@ class EGPRegressor(ExplicitGaussianProcess):
         coef_cov: ArrayLike | None = None,
         share_coef: bool | Literal["auto"] = "auto",
         noise_variance: float | None = None,
+        alpha: float | None = None,
         normalize_y: bool = False,
+        optimizer: Callable[..., Any] | Literal["fmin_l_bfgs_b"] | None = "fmin_l_bfgs_b",
         max_iter: int = 1000,
         max_time: float | None = None,
         n_restarts: int = 0,
-        tol: float = 0.01,
+        tol: float | Literal["auto"] = "auto",
+        n_targets: int | None = None,
         random_state: int | np.random.RandomState | None = None,
         verbose: int = 0,
     ):
@@ -166,11 +200,14 @@ class EGPRegressor(ExplicitGaussianProcess):
         self.coef_cov = coef_cov
         self.share_coef = share_coef
         self.noise_variance = noise_variance
+        self.alpha = alpha
         self.normalize_y = normalize_y
+        self.optimizer = optimizer
         self.max_iter = max_iter
         self.max_time = max_time
         self.n_restarts = n_restarts
         self.tol = tol
+        self.n_targets = n_targets
         self.random_state = random_state
         self.verbose = verbose
 
@@ -220,9 +257,15 @@ class EGPRegressor(ExplicitGaussianProcess):
             single_threaded_libraries(),
             monitor_of(self.verbose, max_time=self.max_time) as monitor,
         ):
-            problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
+            problem = self._exact_problem(X, y, sample_weight, relative_variance)
             rows = problem.units.rows(problem.source)
-            options = ExactOptions(_RULES, self.max_iter, self.tol, self.n_restarts)
+            options = ExactOptions(
+                _RULES,
+                0 if self.optimizer is None else self.max_iter,
+                self._tolerance(len(rows)),
+                self.n_restarts,
+                self.optimizer if callable(self.optimizer) else None,
+            )
             self._fitted = fit_exact(
                 problem.units,
                 rows,
@@ -241,6 +284,50 @@ class EGPRegressor(ExplicitGaussianProcess):
         self._warn_of(self._fitted.messages)
         return self
 
+    def _exact_problem(self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None) -> Problem:
+        """What a fit to rows starts from; arguments as of `fit`."""
+        problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
+        n_outputs = len(problem.units.target_unit)
+        if self.n_targets not in (None, n_outputs):
+            raise ValueError(
+                "The number of targets seen in `y` is different from the parameter `n_targets`. "
+                f"Got {n_outputs} != {self.n_targets}."
+            )
+        spec = problem.spec if self.optimizer is not None else problem.spec.as_given()
+        if self.alpha is not None:
+            if spec.starts.noise.value is not None:
+                raise ValueError(
+                    f"alpha={self.alpha!r} is the noise, but a WhiteKernel or noise_variance says that it is to be "
+                    "learned; give one of them."
+                )
+            spec = spec.with_noise(self.alpha, fixed=True)
+        self._spec = spec
+        return replace(problem, spec=spec)
+
+    def _tolerance(self, n_rows: int) -> float:
+        if isinstance(self.tol, str):
+            return 1e-9 if n_rows <= _FEW_ROWS else 0.01
+        return self.tol
+
+    def _before_fit(self, X: Any) -> Self:
+        """A copy that predicts what is known without data. Its maps are fitted to X."""
+        model = clone(self)
+        n_rows = len(X) if isinstance(X, list | tuple) else np.shape(X)[0]
+        problem = model._exact_problem(X, np.zeros((n_rows, self.n_targets or 1)))
+        if problem.vague.any():
+            raise NotFittedError(
+                f"This {type(self).__name__} is not fitted yet, and with coef_scale=inf nothing is known before."
+            )
+        model._predictor = prior_predictor(
+            problem.units.rows(problem.source), problem.spec.as_given(), problem.units.prior
+        )
+        return model
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.requires_fit = False
+        return tags
+
     def log_marginal_likelihood(
         self, theta: ArrayLike | None = None, eval_gradient: bool = False, clone_kernel: bool = True
     ) -> Any:
@@ -252,7 +339,9 @@ class EGPRegressor(ExplicitGaussianProcess):
         ----------
         theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
             Logarithms of the free hyperparameters, in the order of ``kernel_.theta``; for several outputs those of each
-            one's kernel, which need not agree in what the fitted ones share. None means the fitted ones.
+            one's kernel, which need not agree in what the fitted ones share. None means the fitted ones. Where it is of
+            another length, ``kernel.theta`` will do, of the kernel as it was given: a signal variance that it does not
+            have is then 1, and noise that it has is its own.
         eval_gradient : bool, default=False
             Whether to return the gradient too; only with a ``theta``.
         clone_kernel : bool, default=True
@@ -275,8 +364,14 @@ class EGPRegressor(ExplicitGaussianProcess):
             return self.log_marginal_likelihood_value_
         if self._predictor.shared:
             raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: no share_coef.")
+        order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
+        fitted = [np.append(*own) for own in zip(self._numbers_of_kernels(), self._predictor.noise, strict=True)]
+        if clone_kernel and width == (len(given),) != (len(order),):
+            order = given
+            if self._spec.adds_signal:
+                fitted = [np.append(own[:-2], [1.0, own[-1]]) for own in fitted]
         with single_threaded_libraries():
-            found = self._value_at(theta, eval_gradient, self._fitted.log_likelihood_at)
+            found = value_at(theta, eval_gradient, order, fitted, self._fitted.log_likelihood_at)
         if not clone_kernel:
             kernels, thetas = np.atleast_1d(self.kernel_), np.atleast_2d(np.asarray(theta, dtype=np.float64))
             for kernel, own in zip(kernels, thetas, strict=True):

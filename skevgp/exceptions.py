@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import warnings
 
-__all__ = ["DependentRowsWarning"]
+__all__ = ["DependentRowsWarning", "InconsistentVersionWarning"]
 
 
 class DependentRowsWarning(UserWarning):
@@ -26,6 +26,25 @@ class DependentRowsWarning(UserWarning):
     >>> from skevgp.exceptions import DependentRowsWarning
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("ignore", DependentRowsWarning)
+    """
+
+
+class InconsistentVersionWarning(UserWarning):
+    """A model is loaded by another version than it was saved with, and nobody knows whether it predicts the same.
+
+    Given for pickles, and files of skops, of another version of skevgp; and by `skevgp.io.load` for those few models
+    that it cannot try, if they are of another version of scikit-learn. As an error:
+
+    See Also
+    --------
+    skevgp.io.save : Its files are checked when they are read.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from skevgp.exceptions import InconsistentVersionWarning
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("error", InconsistentVersionWarning)
     """
 
 

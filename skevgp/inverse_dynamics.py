@@ -17,6 +17,7 @@ from ._identified_robot import IdentifiedRobot
 from ._joint_residual import JointResidual, fit_joint_residual
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
+from ._summary import ModelSummary, Summarised, of_inverse_dynamics
 from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails
 from .exceptions import warn_user
 from .features import RigidBodyRegressor
@@ -33,7 +34,7 @@ _LITTLE = 0.5
 _SHARP = 0.01
 
 
-class InverseDynamics(RegressorMixin, IdentifiedRobot):
+class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
     r"""Joint torques of a robot with bands, and its masses and friction with their uncertainty, from logs.
 
     .. math::
@@ -360,3 +361,6 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         return like_y(values) if self._one_dimensional else values
+
+    def _described(self) -> ModelSummary:
+        return of_inverse_dynamics(self, self._outputs)

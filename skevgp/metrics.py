@@ -1,4 +1,4 @@
-"""The paper's metrics of a probabilistic prediction (its section IV-B), and a proper score."""
+"""The paper's metrics of a probabilistic prediction (its section IV-B), proper scores, calibration, and scorers."""
 
 from __future__ import annotations
 
@@ -6,9 +6,24 @@ from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.special import ndtr
 from sklearn.utils import check_array, check_consistent_length
 
-__all__ = ["containing_ratios", "negative_log_predictive_density", "prediction_error", "std_norm"]
+from ._scorers import make_std_scorer
+
+__all__ = [
+    "calibration_error",
+    "containing_ratios",
+    "crps",
+    "interval_levels",
+    "make_std_scorer",
+    "neg_calibration_error",
+    "neg_crps",
+    "neg_nlpd",
+    "negative_log_predictive_density",
+    "prediction_error",
+    "std_norm",
+]
 
 
 def _matrix(values: ArrayLike, name: str) -> np.ndarray:
@@ -156,3 +171,138 @@ def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: A
         raise ValueError(f"std must be above 0; its smallest value is {std.min()}.")
     density = 0.5 * np.log(2.0 * np.pi) + np.log(std) + 0.5 * ((y_true - y_pred) / std) ** 2
     return float(density.sum(axis=1).mean())
+
+
+def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
+    r"""Mean over rows of the continuous ranked probability score of N(mean, std²), summed over outputs.
+
+    A proper score as `negative_log_predictive_density` is, lower is better, but in the units of y, and hardly moved by
+    single rows far off. With z = (y - mean) / std it is (Gneiting & Raftery 2007, section 4.2)
+
+    .. math:: \int (F(x) - 1_{x \geq y})^2 dx = \sigma \, [z (2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt{\pi}],
+
+    and the absolute error where the standard deviation is 0.
+
+    Parameters
+    ----------
+    y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Observations, predicted means and predicted standard deviations (with noise).
+
+    Returns
+    -------
+    score : float
+        In the units of y, at least 0.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, a value is not finite or a standard deviation is negative.
+
+    References
+    ----------
+    - T. Gneiting, A. E. Raftery (2007): Strictly Proper Scoring Rules, Prediction, and Estimation.
+
+    Examples
+    --------
+    >>> from skevgp.metrics import crps
+    >>> round(crps([0.0, 1.0], [0.0, 0.0], [1.0, 0.0]), 4)
+    0.6168
+    """
+    y_true, y_pred, std = _matrices(y_true=y_true, y_pred=y_pred, std=std)
+    error, std = np.abs(y_true - y_pred), _positive(std, "std")
+    with np.errstate(over="ignore"):
+        z = np.divide(error, std, out=np.full_like(error, np.inf), where=std > 0)
+        density = np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi)
+    score = error * (2.0 * ndtr(z) - 1.0) + std * (2.0 * density - 1.0 / np.sqrt(np.pi))
+    return float(score.sum(axis=1).mean())
+
+
+def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
+    r"""How far shares of values inside intervals are from what the intervals promise, on average over all of them.
+
+    With :math:`\hat c(p)` the share of all (row, output) pairs inside the central interval of probability p of
+    N(mean, std²), it is the area between the reliability curve and the diagonal,
+
+    .. math:: \int_0^1 |\hat c(p) - p| \, dp,
+
+    in closed form, without bins: the calibration error of Kuleshov et al. (2018, eq. 9) with absolute differences, all
+    levels alike, and central intervals in place of quantiles (the "mean absolute calibration error" of Tran et al.
+    2020). 0 is the best, 0.5 the worst: nothing or everything is inside of any interval. It is no proper score, since
+    wide intervals of what varies little are calibrated too: read it beside `crps`. Of n independent calibrated values
+    it is about 0.3 / sqrt(n).
+
+    Parameters
+    ----------
+    y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Observations, predicted means and predicted standard deviations (with noise).
+
+    Returns
+    -------
+    error : float
+        From 0 to 0.5.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, a value is not finite or a standard deviation is negative.
+
+    See Also
+    --------
+    skevgp.plotting.CalibrationDisplay : The curve.
+
+    References
+    ----------
+    - V. Kuleshov, N. Fenner, S. Ermon (2018): Accurate Uncertainties for Deep Learning Using Calibrated Regression.
+    - K. Tran et al. (2020): Methods for comparing uncertainty quantifications for material property predictions.
+
+    Examples
+    --------
+    Of four values all are inside of the 60 % interval, and none inside the 50 % interval:
+
+    >>> from skevgp.metrics import calibration_error
+    >>> round(calibration_error([0.7, -0.7, 0.8, -0.8], [0.0] * 4, [1.0] * 4), 2)
+    0.23
+    """
+    levels = np.sort(interval_levels(y_true, y_pred, std).ravel())
+    # Between the i-th and the next level the share is i / n; each piece is the area of |share - p|.
+    share = np.arange(len(levels) + 1) / len(levels)
+    ends = np.concatenate([[0.0], levels, [1.0]])
+    area = [0.5 * (end - share) * np.abs(end - share) for end in (ends[1:], ends[:-1])]
+    return float(np.sum(area[0] - area[1]))
+
+
+def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.ndarray:
+    """The probability of the smallest central interval of N(mean, std²) that holds y, of each value.
+
+    Parameters
+    ----------
+    y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
+        Observations, predicted means and predicted standard deviations (with noise).
+
+    Returns
+    -------
+    levels : ndarray of shape (n_samples, n_outputs)
+        From 0 to 1; uniform if predictions are calibrated.
+
+    Raises
+    ------
+    ValueError
+        If shapes differ, a value is not finite or a standard deviation is negative.
+
+    Examples
+    --------
+    >>> from skevgp.metrics import interval_levels
+    >>> interval_levels([0.0, 1.0, -2.0], [0.0, 0.0, 0.0], [1.0, 1.0, 1.0]).round(3).ravel()
+    array([0.   , 0.683, 0.954])
+    """
+    y_true, y_pred, std = _matrices(y_true=y_true, y_pred=y_pred, std=std)
+    error, std = np.abs(y_true - y_pred), _positive(std, "std")
+    unreached = np.where(error > 0, np.inf, 0.0)
+    with np.errstate(over="ignore"):
+        return 2.0 * ndtr(np.divide(error, std, out=unreached, where=std > 0)) - 1.0
+
+
+# For ``scoring=``; higher is better.
+neg_nlpd = make_std_scorer(negative_log_predictive_density, greater_is_better=False)
+neg_crps = make_std_scorer(crps, greater_is_better=False)
+neg_calibration_error = make_std_scorer(calibration_error, greater_is_better=False)

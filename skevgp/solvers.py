@@ -6,9 +6,9 @@ from collections.abc import Callable, Sequence
 from typing import Any, ClassVar, Literal
 
 import numpy as np
-from sklearn.base import BaseEstimator
 
 from ._linalg import NotPositiveDefiniteError
+from ._state import StatefulEstimator
 from ._validation import check_integer, check_real
 from .fitting.advice import how_it_ended
 from .fitting.sparse import SparseTask
@@ -33,7 +33,7 @@ _NATURAL_RATES = 0.3, 0.02
 Callback = Callable[[int, float, Sequence[int]], object]
 
 
-class LBFGS(BaseEstimator):
+class LBFGS(StatefulEstimator):
     """L-BFGS on the bound with q at its optimum: the solver that serves most fits best.
 
     Parameters
@@ -166,7 +166,7 @@ class LBFGS(BaseEstimator):
         return lambda x: curvature_units(objective, x, table.alike(), self.descent.probes)
 
 
-class Adam(BaseEstimator):
+class Adam(StatefulEstimator):
     """The paper's solver: Adam on mini-batches, over all parameters, those of q among them.
 
     Parameters

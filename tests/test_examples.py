@@ -39,6 +39,18 @@ def test_sparse_gp(monkeypatch, capsys, tmp_path):
     assert (tmp_path / "picture.png").stat().st_size > 10_000
 
 
+def test_tabular(monkeypatch, capsys, tmp_path):
+    names = run(EXAMPLES / "plot_tabular.py", "--output", tmp_path, monkeypatch=monkeypatch)
+    results = names["results"]
+    assert len(results) == 5 * 4
+    for name in names["sets"]:
+        ours, theirs, trees, _ = (results[name, label] for label in names["labels"])
+        assert ours[1] < min(theirs[1] + 0.1, trees[1])  # NLPD, of few rows
+        assert 0.8 < ours[2] < 0.98
+    assert "inducing points, for 1 output" in capsys.readouterr().out
+    assert (tmp_path / "tabular.png").stat().st_size > 10_000
+
+
 def test_online(monkeypatch, capsys, tmp_path):
     names = run(EXAMPLES / "plot_online.py", "--output", tmp_path, monkeypatch=monkeypatch)
     assert "forgetting factor" in capsys.readouterr().out
@@ -124,6 +136,13 @@ def test_crocoddyl(monkeypatch, capsys, tmp_path, system):
     np.testing.assert_allclose(names["fast"].predict(np.hstack([Z[:-1], U])), Z[1:], rtol=0, atol=1e-6)
     assert "particles are" in capsys.readouterr().out
     assert (tmp_path / f"crocoddyl_{system}.png").stat().st_size > 10_000
+
+
+def test_tables_without_matplotlib():
+    result = command_line(script=EXAMPLES / "plot_tabular.py", code="sys.modules['matplotlib'] = None")
+    assert result.returncode == 1
+    assert "pip install matplotlib" in result.stderr
+    assert "Traceback" not in result.stderr
 
 
 def test_without_crocoddyl():

@@ -3,14 +3,24 @@ from math import log, pi, sqrt
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
+from scipy.integrate import quad
 from scipy.stats import norm
 
-from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error, std_norm
+from skevgp.metrics import (
+    calibration_error,
+    containing_ratios,
+    crps,
+    interval_levels,
+    negative_log_predictive_density,
+    prediction_error,
+    std_norm,
+)
 
 RNG = np.random.default_rng(0)
 Y, MEAN = RNG.normal(size=(2, 30, 3))
 STD = RNG.uniform(0.1, 2.0, size=(30, 3))
-OF_PREDICTIONS = [prediction_error, containing_ratios, negative_log_predictive_density]
+OF_STD = [containing_ratios, negative_log_predictive_density, crps, calibration_error, interval_levels]
+OF_PREDICTIONS = [prediction_error, *OF_STD]
 
 
 def arguments(metric, y=Y, mean=MEAN, std=STD):
@@ -90,6 +100,65 @@ def test_the_density_of_gaussian_errors_is_their_entropy():
     assert score == pytest.approx(0.5 * log(2 * pi) + log(3.0) + 0.5, abs=0.02)
 
 
+@pytest.mark.parametrize(("y", "mean", "std"), [(0.3, 0.0, 1.0), (-7.0, 1.0, 0.5), (2.0, 2.0, 3.0)])
+def test_the_crps_is_its_integral(y, mean, std):
+    def below(x):
+        return norm.cdf(x, mean, std) ** 2
+
+    def above(x):
+        return norm.sf(x, mean, std) ** 2
+
+    expected = quad(below, -60.0, y, points=[mean])[0] + quad(above, y, 60.0, points=[mean])[0]
+    assert crps([y], [mean], [std]) == pytest.approx(expected, rel=1e-7)
+
+
+def test_the_crps_sums_outputs_and_averages_rows():
+    assert crps(Y, MEAN, STD) == pytest.approx(sum(crps(*column) for column in zip(Y.T, MEAN.T, STD.T, strict=True)))
+
+
+def test_the_crps_without_uncertainty_is_the_error():
+    assert crps([1.0, -2.0, 3.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1e-320]) == pytest.approx(5.0 / 3.0)
+
+
+def test_the_true_standard_deviation_has_the_best_crps():
+    y = 2.0 * RNG.standard_normal(10_000)
+    scores = [crps(y, np.zeros_like(y), np.full_like(y, std)) for std in (1.0, 1.6, 2.0, 2.4, 4.0)]
+    assert np.argmin(scores) == 2
+
+
+def test_the_calibration_error_is_the_area_between_the_curve_and_the_diagonal():
+    levels = np.linspace(0.0, 1.0, 200_001)[1:-1]
+    shares = containing_ratios(Y, MEAN, STD, k=norm.ppf(0.5 + levels / 2))
+    assert calibration_error(Y, MEAN, STD) == pytest.approx(np.abs(shares - levels).mean(), abs=1e-5)
+
+
+def test_the_calibration_error_by_hand():
+    """One value, at the end of the interval of probability p: the area is that of two triangles."""
+    for p in (0.0, 0.3, 0.5, 1.0):
+        expected = 0.5 * p**2 + 0.5 * (1.0 - p) ** 2
+        assert calibration_error([norm.ppf(0.5 + p / 2) if p < 1 else 1.0], [0.0], [float(p < 1)]) == pytest.approx(
+            expected
+        )
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(0.0, 0.5), (1.0, 0.0), (1e9, 0.5)])
+def test_the_calibration_error_of_gaussian_errors(factor, expected):
+    errors = RNG.standard_normal(40_000)
+    assert calibration_error(errors, np.zeros_like(errors), np.full_like(errors, factor)) == pytest.approx(
+        expected, abs=0.005
+    )
+
+
+def test_the_calibration_error_by_chance_is_as_the_docstring_says():
+    found = [calibration_error(*(part(400) for part in (RNG.standard_normal, np.zeros, np.ones))) for _ in range(200)]
+    assert np.mean(found) * 20.0 == pytest.approx(0.313, abs=0.04)  # of a Brownian bridge: sqrt(pi / 32)
+
+
+def test_levels_are_those_of_intervals_that_just_hold_the_value():
+    levels = interval_levels([[0.0, 3.0], [1.0, 2.0]], [[0.0, 0.0], [1.0, 2.5]], [[0.0, 0.0], [1e-320, 1.0]])
+    assert_allclose(levels, [[0.0, 1.0], [0.0, 2 * norm.cdf(0.5) - 1]], rtol=1e-12)
+
+
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
 def test_one_column_equals_one_dimension(metric):
     row = arguments(metric, Y[:, 0], MEAN[:, 0], STD[:, 0])
@@ -102,7 +171,7 @@ def test_lists_work(metric):
     assert_array_equal(metric(*(part.tolist() for part in arguments(metric))), metric(*arguments(metric)))
 
 
-@pytest.mark.parametrize("metric", [prediction_error, negative_log_predictive_density])
+@pytest.mark.parametrize("metric", [prediction_error, negative_log_predictive_density, crps, calibration_error])
 def test_scores_are_plain_floats(metric):
     assert type(metric(*arguments(metric))) is float
 
@@ -128,13 +197,13 @@ def test_a_value_that_is_not_finite_is_named(metric, name, argument, value):
         metric(*arguments(metric, **{argument: np.add(Y, [0.0, 0.0, value])}))
 
 
-@pytest.mark.parametrize("metric", [containing_ratios, negative_log_predictive_density])
+@pytest.mark.parametrize("metric", OF_STD)
 def test_a_standard_deviation_that_is_not_finite_is_named(metric):
     with pytest.raises(ValueError, match="Input std contains NaN"):
         metric(Y, MEAN, np.full_like(STD, np.nan))
 
 
-@pytest.mark.parametrize("metric", [containing_ratios, negative_log_predictive_density])
+@pytest.mark.parametrize("metric", OF_STD)
 def test_a_negative_standard_deviation_is_an_error(metric):
     with pytest.raises(ValueError, match=r"std must .*smallest value is -0\.5"):
         metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,12 @@ import numpy as np
 
 from harness import WIDTH, Row, column, figure_of, provenance_text, pyplot, save_picture, table
 
-SETTINGS = {"paper": "paper's setting", "skevgp": "skevgp's setting"}
+SETTINGS = {
+    "paper": "paper's setting",
+    "author": "author's starts",
+    "author-100": "author's starts, prior scale 100",
+    "skevgp": "skevgp's setting",
+}
 # Blue, white and vermilion of Okabe & Ito's palette, on to dark ones, so that large weights differ too.
 DIVERGING = ("#002a42", "#0066a3", "#6fb1d9", "#cfe4f2", "#ffffff", "#f9dcc4", "#f0a469", "#c65600", "#4f2300")
 # Weights smaller than this are coloured in proportion, larger ones by their logarithm: 1 and Δt are not all one sees.
@@ -205,13 +211,15 @@ def picture_of(output: Path, system: str) -> Path:
 
 def panels_of(rows: list[Row]) -> list[tuple[str, str, str]]:
     """Lines of the picture: title, setting and column of the CSV. The first two are the same in all settings."""
-    settings = sorted({row["setting"] for row in rows})
+    settings = [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
     first = settings[0]
+    # Of many settings, standard deviations are shown for the two that differ most.
+    posteriors = settings if len(settings) < 3 else [settings[0], settings[-1]]
     return [
         ("Prior mean", first, "prior_mean"),
         ("Least squares, features alone", first, "least_squares"),
         *((f"Posterior mean b, {SETTINGS[setting]}", setting, "mean") for setting in settings),
-        *((f"Posterior std, {SETTINGS[setting]}", setting, "std") for setting in settings),
+        *((f"Posterior std, {SETTINGS[setting]}", setting, "std") for setting in posteriors),
     ]
 
 
@@ -264,7 +272,8 @@ def plot(rows: list[Row], path: Path) -> None:
     said = f"means over {n_seeds} seeds" if n_seeds > 1 else "one seed"
     if is_written(rows):
         said += ", ± standard deviation between seeds" * (n_seeds > 1) + "; framed: what would imitate gravity"
-    figure.suptitle(f"{rows[0]['system']}: {said}\niterations: {iterations(rows)}")
+    steps = textwrap.fill(f"iterations: {iterations(rows)}", 120)
+    figure.suptitle(f"{rows[0]['system']}: {said}\n{steps}")
     save_picture(figure, path)
 
 

@@ -168,7 +168,7 @@ def main() -> None:
         if ("network" if "network" in curve.what else "gp") in options.systems
         for sizes in curve.cells()
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 
     # Everything the file has of these sizes, not only what was asked for now.
     rows = harness.read(output)

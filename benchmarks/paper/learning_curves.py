@@ -129,7 +129,7 @@ def main() -> None:
         )
         if wanted(system, model, setting)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 
     # Everything the file has of this size, not only what was asked for now.
     rows = [row for row in harness.read(output) if row["size"] == size]

@@ -327,7 +327,7 @@ def main() -> None:
         for seed in range(n_seeds)
         for name in MODELS
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     if n_failures:
         harness.write_report([], output, n_failures)
 

@@ -265,7 +265,7 @@ def main() -> None:
             for model in options.models
             if has(cell := Cell(system, model, n_rows, seed)) and expected_seconds(rows, cell) <= options.time_limit
         ]
-        n_failures += harness.run_missing(cells, run, output, options.jobs, say, fresh=True)
+        n_failures += harness.run_missing(cells, run, output, options.jobs, say, fresh=True, since=options.since)
 
     rows = harness.read(output)
     if rows:

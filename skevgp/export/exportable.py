@@ -7,8 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
+from .._validation import check_fitted
 from .c_code import write_c
 from .casadi import FittedModel
 
@@ -144,6 +144,6 @@ class Exportable:
         return write_c(function, path, jacobian, columns, include_noise)
 
     def _exported(self) -> FittedModel:
-        check_is_fitted(self)
+        check_fitted(self)
         model: Any = self
         return FittedModel(model._predictor, model.feature_map_, model.kernel_map_, model.n_features_in_)

@@ -222,7 +222,7 @@ class LinkGravity(GravityMap):
         if robot is not None:
             model = load_robot(robot)
             self._levers = self._levers_of(model)
-            self._links = _Links(model)
+            self._links = Links(model)
             components = [_COMPONENTS[lever.name] for lever in self._levers]
             self._columns = np.array(
                 [3 * lever.link + axis for lever, (axis, _) in zip(self._levers, components, strict=True)], dtype=int
@@ -270,7 +270,7 @@ class LinkGravity(GravityMap):
         return [f"gravity({', '.join(filter(None, (columns[lever.link], lever.name)))})" for lever in self._levers]
 
 
-class _Links:
+class Links:
     """Forward kinematics of many rows at once, as far as gravity needs it: rotations alone.
 
     Gravity is passed on from each link to the next, as components along (u_x, u_y, u_z) of its joint. The rotation of

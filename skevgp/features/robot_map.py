@@ -8,12 +8,13 @@ from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import TransformerMixin
 from sklearn.utils import assert_all_finite
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from .._sklearn import check_feature_names_in, fit_context
+from .._state import StatefulEstimator
 from .._validation import is_plain
 from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
@@ -31,7 +32,7 @@ def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str,
     return [int(index) for index in indices]
 
 
-class RobotTransformer(TransformerMixin, BaseEstimator):
+class RobotTransformer(TransformerMixin, StatefulEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
     What a subclass says: `_features`, their `_jacobian` and `_names`, and `_prepare` what it needs of the robot. With

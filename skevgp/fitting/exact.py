@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +15,7 @@ from ..inference.posterior import CoefficientPrior, Predictor
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
 from ..optimizers.lbfgs import lbfgs
+from ..optimizers.minimum import Minimum
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
@@ -21,6 +24,8 @@ from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
 from .units import Units
 
+# (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
+Optimizer = Callable[..., tuple[np.ndarray, float]]
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
 
@@ -36,12 +41,15 @@ class ExactOptions:
     tol : float
         In nats.
     n_restarts : int
+    optimizer : callable, optional
+        The user's, in place of L-BFGS.
     """
 
     rules: Rules
     max_iter: int
     tol: float
     n_restarts: int
+    optimizer: Optimizer | None = None
 
 
 @dataclass(frozen=True)
@@ -58,6 +66,8 @@ class ExactTask:
     rng : RandomState
         Draws the restarts.
     monitor : Monitor
+    units : Units, optional
+        Those in which a user's optimizer is asked.
     """
 
     model: ExactModel
@@ -66,6 +76,7 @@ class ExactTask:
     options: ExactOptions
     rng: np.random.RandomState
     monitor: Monitor
+    units: Units | None = None
 
     @property
     def strategy(self) -> Strategy:
@@ -89,6 +100,8 @@ class ExactTask:
             return -likelihood / n, -table.gradient(gradient) / n
 
         monitor = self.monitor.seen_as(factor=n, is_last=attempt.is_last and self.options.n_restarts == 0)
+        if self.options.optimizer is not None and table.size > 0:
+            return self._minimised_by(self.options.optimizer, table, loss, monitor)
         minimum = lbfgs(loss, table.start(), table.limits(), attempt.until, self.options.tol / n, monitor)
         return Fit(
             table.values(minimum.x),
@@ -97,6 +110,48 @@ class ExactTask:
             minimum.converged,
             how_it_ended(minimum, minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
         )
+
+    def _minimised_by(
+        self,
+        optimizer: Optimizer,
+        table: ParameterTable,
+        loss: Callable[[np.ndarray], tuple[float, np.ndarray]],
+        monitor: Monitor,
+    ) -> Fit:
+        """The user's optimizer on minus the log marginal likelihood, in logarithms of the user's units."""
+        n, (lower, upper) = len(self.model.rows.inputs), table.limits()
+        assert self.units is not None
+        log_variance, shift = 2.0 * np.log(self.units.target_unit), log_units_of_contrasts(self.units, self.model).sum()
+        in_users_units = table.flat(
+            {
+                own.name: log_variance if own.name in ("signal", "noise") else np.zeros(own.start.shape)
+                for own in table.parameters
+            }
+        )
+        best, curve = Minimum(table.start(), np.inf), list[float]()
+
+        def objective(theta: np.ndarray, eval_gradient: bool = True) -> Any:
+            flat = np.asarray(theta, dtype=float) - in_users_units
+            try:
+                value, gradient = loss(flat)
+            except NotPositiveDefiniteError:
+                value, gradient = np.inf, np.zeros(len(flat))
+            if value <= best.loss:
+                best.x, best.loss = flat, value
+            curve.append(n * value)
+            monitor.iteration(len(curve), value)
+            value = n * value + float(shift)
+            return (value, n * gradient) if eval_gradient else value
+
+        with monitor.keeping_the_best():
+            bounds = np.column_stack([lower, upper]) + in_users_units[:, np.newaxis]
+            theta, _ = optimizer(objective, table.start() + in_users_units, bounds=bounds)
+            theta = np.asarray(theta, dtype=float)
+            if theta.shape != lower.shape or not np.isfinite(theta).all():
+                raise ValueError(f"optimizer must return {len(lower)} finite numbers and their value; got {theta!r}.")
+            best.x = np.clip(theta - in_users_units, lower, upper)
+            best.loss = loss(best.x)[0]
+        return Fit(table.values(best.x), -n * best.loss, curve)
 
 
 @dataclass(frozen=True)
@@ -176,35 +231,34 @@ class ExactFit:
         """In nats, summed over outputs."""
         return self.fit.bound - self._shift
 
-    def log_likelihood_at(self, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
-        """Of an output under another kernel, with the fitted noise, and its gradient in the kernel's logarithms.
+    def log_likelihood_at(self, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
+        """Of an output under another kernel and noise, and its gradient in the logarithms of these.
 
         Parameters
         ----------
         output : int
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        signal : float
-            s², in the user's units.
+        numbers : ndarray of shape (n_hyper + 2,)
+            Hyperparameters of k̃, s² and σ², in the user's units.
 
         Returns
         -------
         value : float
             In nats, in the user's units.
-        gradient : ndarray of shape (n_hyper + 1,)
-            That in log s² last.
+        gradient : ndarray of shape (n_hyper + 2,)
         """
         own, model = slice(output, output + 1), self.model
         kernel = model.kernel if model.kernels is None else model.kernels[output]
         model = ExactModel(kernel, model.prior.outputs(own), model.vague[own], model.rows.of(own))
+        *hyperparameters, signal, noise = numbers
+        variance = self.units.target_unit[own] ** 2
         values = {
-            "hyperparameters": hyperparameters,
-            "signal": signal / self.units.target_unit[own] ** 2,
-            "noise": self.fit.values["noise"][own],
+            "hyperparameters": np.array(hyperparameters),
+            "signal": signal / variance,
+            "noise": noise / variance,
         }
         value, gradient = model.log_likelihood(values)
         shift = log_units_of_contrasts(self.units, self.model)[output]
-        return value - float(shift), np.append(gradient["hyperparameters"], gradient["signal"])
+        return value - float(shift), np.concatenate([gradient[name] for name in values])
 
     @property
     def loss_curve(self) -> np.ndarray:
@@ -277,7 +331,7 @@ def fit_exact(
     )
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
-    best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor))
+    best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor, units))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     advice = [best.message, far_from_prior(proper, rows)]
     if options.max_iter > 0:

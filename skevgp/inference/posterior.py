@@ -203,7 +203,7 @@ class Predictor:
     def rows_at_once(self) -> int:
         """How many rows to predict at once, so that memory stays small and products are large."""
         stacked = sum(group.mean.size for group in self.groups)
-        return int(np.clip(_PREDICTED_NUMBERS // stacked, 256, 4096))
+        return int(np.clip(_PREDICTED_NUMBERS // max(stacked, 1), 256, 4096))
 
     @property
     def signal(self) -> np.ndarray:

@@ -24,7 +24,7 @@ Preparation = Callable[[np.ndarray], Any]
 Pull = Callable[[np.ndarray, PerRow], Any]
 
 
-class Sums(tuple):
+class Sums(tuple[Any, ...]):
     """Sums over rows side by side (arrays, or `Sums` again): ``+`` adds them one by one."""
 
     __slots__ = ()

@@ -91,6 +91,8 @@ class KernelSpec:
         The ConstantKernel in it that is s².
     given : Kernel, optional
         What the user gave, of which ``tree`` is made; None if that was no kernel.
+    stays : bool, default=False
+        Whether nothing of it is learned: the fitted kernel is ``tree``, to the last digit.
     """
 
     covariance: Covariance
@@ -98,10 +100,22 @@ class KernelSpec:
     tree: sk.Kernel
     signal: sk.Kernel
     given: sk.Kernel | None = None
+    stays: bool = False
 
-    def with_noise(self, noise_variance: float) -> KernelSpec:
-        """The same kernel with a start of the noise."""
-        return replace(self, starts=replace(self.starts, noise=Start(np.array([float(noise_variance)]))))
+    def with_noise(self, noise_variance: float, fixed: bool = False) -> KernelSpec:
+        """The same kernel with a start of the noise, or a noise that stays where it starts."""
+        value = np.array([float(noise_variance)])
+        noise = Start(value, np.array([[value[0], value[0]]]), np.ones(1, dtype=bool)) if fixed else Start(value)
+        return replace(self, starts=replace(self.starts, noise=noise))
+
+    def as_given(self) -> KernelSpec:
+        """The same kernel, of which nothing is learned: what the user does not say is 1."""
+        starts, one = self.starts, np.ones(1)
+        shape, signal = starts.hyperparameters, starts.signal
+        if shape.value is None:
+            shape = Start(np.ones(self.covariance.n_hyperparameters))
+        starts = Starts(shape, Start(one) if signal.value is None else signal, starts.noise)
+        return replace(self, starts=starts, stays=True)
 
     def to_sklearn(
         self, hyperparameters: np.ndarray, hyper_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
@@ -121,6 +135,8 @@ class KernelSpec:
         -------
         kernel : Kernel
         """
+        if self.stays:
+            return clone(self.tree)
         rows = iter(np.column_stack([hyperparameters, hyper_bounds]))
 
         def fitted(kernel: sk.Kernel) -> sk.Kernel:
@@ -139,6 +155,16 @@ class KernelSpec:
         Gradients in the logarithms go the same way.
         """
         return self._order_in(self.tree)
+
+    @property
+    def adds_signal(self) -> bool:
+        """Whether s² is none of the constants that the user gave."""
+        return self.given is None or all(part is not self.signal for part in _simple_kernels(self.given))
+
+    @property
+    def given_order(self) -> np.ndarray:
+        """The same for theta of the kernel that the user gave, in (k̃'s hyperparameters, s², σ²)."""
+        return self._order_in(self.tree if self.given is None else self.given)
 
     def at_bounds(self, hyperparameters: np.ndarray, signal: float, noise: float) -> list[str]:
         """Which parameters of the user's kernel are at its bounds, in scikit-learn's words.

@@ -120,7 +120,7 @@ class FittedOutputs:
             return limits
         return limits.reshape(*table[name].start.shape, 2)[self.learned[model].model.set_of(within, table[name])]
 
-    def bound_at(self, rows: Rows, output: int, hyperparameters: np.ndarray, signal: float) -> tuple[float, np.ndarray]:
+    def bound_at(self, rows: Rows, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
         """The bound of one output under another kernel, and its gradient in the kernel's logarithms.
 
         Parameters
@@ -128,21 +128,18 @@ class FittedOutputs:
         rows : Rows
             Those of the fit.
         output : int
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        signal : float
-            s², in the user's units.
+        numbers : ndarray of shape (n_hyper + 1,)
+            Hyperparameters of k̃, and s², in the user's units.
 
         Returns
         -------
         bound : float
             In nats, in the user's units.
         gradient : ndarray of shape (n_hyper + 1,)
-            That in log s² last.
         """
         (model, within), own = self._place_of(output), [output]
-        internal, n_rows = signal / self.units.target_unit[own] ** 2, self.learned[model].statistics[0].n_rows
-        bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, hyperparameters, internal)
+        internal, n_rows = numbers[-1] / self.units.target_unit[own] ** 2, self.learned[model].statistics[0].n_rows
+        bound, gradient = self.learned[model].bound_at(rows.outputs(own), within, numbers[:-1], internal)
         return bound - n_rows * self.units.log_unit(own), gradient
 
     def _place_of(self, output: int) -> tuple[int, int]:

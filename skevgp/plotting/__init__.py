@@ -1,9 +1,19 @@
 """Pictures in scikit-learn's Display convention: ``from_...`` computes, ``plot`` draws. Needs matplotlib."""
 
+from .calibration import CalibrationDisplay
 from .coefficients import CoefficientDisplay
 from .learning_curve import LearningCurveDisplay
+from .loss import LossDisplay
 from .posterior import PosteriorDisplay
 from .rollout import RolloutDisplay
 from .signals import SignalsDisplay
 
-__all__ = ["CoefficientDisplay", "LearningCurveDisplay", "PosteriorDisplay", "RolloutDisplay", "SignalsDisplay"]
+__all__ = [
+    "CalibrationDisplay",
+    "CoefficientDisplay",
+    "LearningCurveDisplay",
+    "LossDisplay",
+    "PosteriorDisplay",
+    "RolloutDisplay",
+    "SignalsDisplay",
+]

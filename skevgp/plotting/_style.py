@@ -17,6 +17,12 @@ def axes_of(ax: Any) -> Any:
     return ax if ax is not None else pyplot.subplots()[1]
 
 
+def free_color(ax: Any) -> str:
+    """The first of the palette that no line on the axes has."""
+    used = {line.get_color() for line in ax.lines}
+    return next((free for free in PALETTE if free not in used), PALETTE[0])
+
+
 def check_output(output: int, n_outputs: int) -> None:
     if not -n_outputs <= output < n_outputs:
         raise ValueError(f"output={output!r} must be the index of one of {n_outputs} outputs.")

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
+from .._validation import check_fitted
 from ._style import BLUE, axes_of, check_output
 
 if TYPE_CHECKING:
@@ -88,7 +88,7 @@ class CoefficientDisplay:
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
-        check_is_fitted(estimator)
+        check_fitted(estimator)
         if not hasattr(estimator, "coef_"):
             raise ValueError("The regressor has no weights to show: it was fitted with feature_map=None.")
         n_outputs = len(np.atleast_2d(estimator.coef_))

@@ -15,7 +15,7 @@ from .._optional import require
 from .._sklearn import num_samples, safe_indexing
 from .._validation import check_integer
 from ..metrics import prediction_error
-from ._style import PALETTE, axes_of
+from ._style import axes_of, free_color
 
 
 class LearningCurveDisplay:
@@ -187,9 +187,7 @@ class LearningCurveDisplay:
         if log_scale and not positive:
             raise ValueError(f"log_scale=True needs positive scores; the smallest is {np.nanmin(self.scores)}.")
         ax = axes_of(ax)
-        if color is None:
-            used = {line.get_color() for line in ax.lines}
-            color = next((free for free in PALETTE if free not in used), PALETTE[0])
+        color = free_color(ax) if color is None else color
         low, high = np.nanmin(self.scores, axis=1), np.nanmax(self.scores, axis=1)
         ax.fill_between(self.n_rows, low, high, color=color, alpha=0.2, linewidth=0)
         ax.plot(self.n_rows, np.nanmean(self.scores, axis=1), ".-", color=color, label=label)

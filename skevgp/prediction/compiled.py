@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
 from .._shapes import like_y
+from .._validation import check_fitted
 from ..inference.posterior import Predictor, PredictorGroup
 from ..rows.source import of_outputs
 from .derivatives import MappedRows, chained, mapped
@@ -93,7 +93,7 @@ class CompiledPredictor:
         NotFittedError
             If it is of none.
         """
-        check_is_fitted(model)
+        check_fitted(model)
         predictor = getattr(model, "regressor_", model)._predictor
         if hasattr(self, "_state") and not _goes_on(self._state[0], predictor):
             raise ValueError("update takes on the weights of the same fit; compile a model that was fitted anew.")

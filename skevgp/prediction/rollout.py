@@ -11,9 +11,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch, check_random_state
-from sklearn.utils.validation import check_is_fitted
 
-from .._validation import LARGEST, as_floats, check_integer
+from .._validation import LARGEST, as_floats, check_fitted, check_integer
 from .elementary import as_fitted, package_of
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).
@@ -123,7 +122,7 @@ def rollout(
     >>> rollout(model, [0.5, 0.0], U, random_state=0).mean.shape
     (50, 2)
     """
-    check_is_fitted(regressor)
+    check_fitted(regressor)
     if method not in _METHODS:
         raise ValueError(f"method must be one of {_METHODS}; got {method!r}.")
     if process_noise not in _NOISES:

@@ -10,6 +10,7 @@ import numpy as np
 
 from .._optional import require
 from .loading import layout_of
+from .numbers import RobotNumbers
 
 
 class RigidBody:
@@ -30,7 +31,11 @@ class RigidBody:
         self._driven = np.array(layout_of(model).driven)
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: value for name, value in vars(self).items() if name not in ("_pool", "_weightless", "_idle")}
+        return {"model": RobotNumbers.of(self.model) or self.model}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        model = state["model"]
+        self.__init__(model.model() if isinstance(model, RobotNumbers) else model)  # type: ignore[misc]
 
     def joint_forces(self, u: np.ndarray) -> np.ndarray:
         """B u, the inputs on the driven joints and 0 on the others.

@@ -66,6 +66,24 @@ def test_a_cell_asked_for_twice_runs_once(harness, tmp_path, capsys):
     assert "0 of 2 cells" in capsys.readouterr().out
 
 
+def dated_row_of(cell):
+    return {"name": cell.name, "value": len(cell.name), "more": 7, "date": "2026-02-02"}
+
+
+def test_what_is_older_than_a_day_is_measured_again_and_the_rest_stays(harness, tmp_path):
+    path = tmp_path / "t.csv"
+    old, new = ({"name": name, "value": 0, "date": date} for name, date in (("a", "2026-01-01"), ("bb", "2026-03-03")))
+    harness.append([old, new], path)
+    cells = [Cell("a"), Cell("bb"), Cell("ccc")]
+    assert harness.run_missing(cells, dated_row_of, path, 1, str, since="2026-02-02") == 0
+    rows = {row["name"]: row for row in harness.read(path)}
+    assert {name: row["value"] for name, row in rows.items()} == {"a": "1", "bb": "0", "ccc": "3"}
+    assert {name: row["more"] for name, row in rows.items()} == {"a": "7", "bb": "nan", "ccc": "7"}
+    before = path.read_text()
+    assert harness.run_missing(cells, dated_row_of, path, 1, str, since="2026-02-02") == 0
+    assert path.read_text() == before
+
+
 @pytest.fixture
 def interruptible():
     """Also in the background of a shell, whose jobs ignore Ctrl-C."""

@@ -18,6 +18,9 @@ def test_there_are_as_many_partitions_as_bell_counted(sharing):
     names = [sharing.name_of(partition) for partition in found[3]]
     assert len(set(names)) == 15
     assert [sharing.groups_of(name) for name in names] == found[3]
+    assert sharing.compared("pendulum") == ["0|1", "01"]
+    assert sharing.compared("iiwa14") == ["0123456789abcd"]
+    assert sharing.groups_of("9a|b") == [[9, 10], [11]]
 
 
 def test_it_runs_resumes_and_writes_its_page(run_script, tmp_path):

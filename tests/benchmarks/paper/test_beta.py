@@ -30,10 +30,10 @@ def run(run_script, tmp_path):
 def test_it_runs_and_resumes_and_has_a_row_for_each_weight(run, tmp_path):
     run("--settings", "paper")
     before = (tmp_path / "b.csv").read_text()
-    assert "2 of 4 cells" in run()
+    assert "2 of 8 cells" in run()
     assert (tmp_path / "b.csv").read_text().startswith(before)
     rows = read(tmp_path / "b.csv")
-    assert len(rows) == 2 * (2 * 3 + 2 * 4)
+    assert len(rows) == 4 * (2 * 3 + 2 * 4)
 
     train = make_dynamics("pendulum", 12, random_state=0)
     X, Y = train.data, train.target
@@ -61,7 +61,7 @@ def test_it_runs_and_resumes_and_has_a_row_for_each_weight(run, tmp_path):
     assert (tmp_path / "b_pendulum.png").stat().st_size > 10_000
     page = (tmp_path / "b.md").read_text()
     assert "**A quick run**" in page
-    assert page.count("(dq/dt, sin(q))") == 2
+    assert page.count("(dq/dt, sin(q))") == 4
     assert "(dq/dt, q): " not in page  # the paper's observation is of the acrobot
 
 

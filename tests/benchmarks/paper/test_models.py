@@ -15,7 +15,13 @@ def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():
     from paper.models import MODELS, SYSTEMS
     from paper.results_table_report import PAPER
 
-    widths = {"pendulum": (2, 3, 4), "cartpole": (4, 5, 6), "acrobot": (4, 5, 7), "iiwa14": (14, 21, 33)}
+    widths = {
+        "pendulum": (2, 3, 4),
+        "cartpole": (4, 5, 6),
+        "cartpole_damped": (4, 5, 6),
+        "acrobot": (4, 5, 7),
+        "iiwa14": (14, 21, 33),
+    }
     for place, (system, (n_outputs, d, with_gravity)) in enumerate(widths.items()):
         assert SYSTEMS[place] == system
         for name, p in {"VGP": 0, "RES-VGP": 0, "EVGP-IF": d, "EVGP-IFG": with_gravity}.items():
@@ -28,7 +34,7 @@ def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():
 
 
 def test_settings_are_what_they_say():
-    from paper.models import Fit, build
+    from paper.models import UNTIL_FLAT, Fit, build
 
     def built(system, model, setting, seed=0, size="full", max_iter=None):
         return build(Fit(system, model, setting, seed, size, max_iter))
@@ -40,6 +46,15 @@ def test_settings_are_what_they_say():
     assert {name for name, value in plain.items() if value != defaults[name]} == {
         *("feature_map", "n_inducing", "random_state")
     }
+    author = built("acrobot", "EVGP-IF", "author")
+    assert (author.solver.batch_size, author.solver.learning_rate, author.solver.schedule) == (50, 0.01, "constant")
+    assert (author.noise_variance, author.coef_scale, author.inducing_init.shape) == (1.0, 1.0, (150, 5))
+    np.testing.assert_allclose(author.kernel.k2.length_scale, 150 ** (-1 / 5))
+    assert author.kernel.k1.constant_value == 0.5**2
+    assert np.abs(author.inducing_init).max() <= 2.0
+    assert {name: author.get_params()[name] for name in PAPER if name != "solver"} == {
+        name: value for name, value in PAPER.items() if name != "solver"
+    }
     angles = built("iiwa14", "EVGP-IFG", "skevgp-angles")
     assert isinstance(angles.kernel_map, AngleEncoder)
     assert angles.kernel_map.robot == "iiwa14"
@@ -50,7 +65,7 @@ def test_settings_are_what_they_say():
 
     standard, narrow = (built("iiwa14", "RES-DBNN", setting).regressor for setting in ("paper", "skevgp"))
     assert (standard.hidden_layer_sizes, standard.prior_scale) == ((250, 250), 1.0)
-    assert narrow.get_params() == BayesianMLPRegressor((250, 250), random_state=0).get_params()
+    assert narrow.get_params() == BayesianMLPRegressor((250, 250), random_state=0, **UNTIL_FLAT).get_params()
     encoder, network = built("pendulum", "RES-DBNN", "skevgp-angles", size="quick").regressor
     assert isinstance(encoder, AngleEncoder)
     assert network.max_iter == 400

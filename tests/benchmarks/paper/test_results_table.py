@@ -6,6 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import Bunch
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
@@ -14,9 +15,7 @@ from skevgp.metrics import prediction_error, std_norm
 
 from ..conftest import read
 
-COLUMNS = (
-    "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,n_parameters,fit_seconds"
-)
+COLUMNS = "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,within_0.1,"
 PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
 
 
@@ -38,7 +37,7 @@ def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
     both = ("--models", "RES-VGP", "EVGP-IFG", "--settings")
     said = run(*both, "paper")
     assert "[2/2] pendulum" in said
-    assert table.read_text().startswith(COLUMNS + ",noise,")
+    assert table.read_text().startswith(COLUMNS)
     before = table.read_text()
     said = run(*both, "paper", "skevgp")
     assert "2 of 4 cells" in said
@@ -88,7 +87,7 @@ def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
 def test_a_network_has_a_row_like_the_others():
     from paper import results_table
 
-    row = results_table.run(results_table.Cell("pendulum", "RES-DBNN", "skevgp-angles", 0, 0.0, "quick", 3))
+    row = results_table.run(results_table.Cell("pendulum", "RES-DBNN", "skevgp-angles", 0, "raw", 0.0, "quick", 3))
     assert (row["n_parameters"], row["max_iter"]) == (634 + 2 * 15, "")
     assert 1 <= row["n_iter"] <= 400
     assert np.isnan(row["bound_per_row"])
@@ -98,7 +97,7 @@ def test_a_network_has_a_row_like_the_others():
 def test_noise_is_on_the_targets():
     from paper import results_table
 
-    cell = results_table.Cell("pendulum", "EVGP-IFG", "skevgp", 0, 0.01, "quick", 0)
+    cell = results_table.Cell("pendulum", "EVGP-IFG", "skevgp", 0, "raw", 0.01, "quick", 0)
     exact, noisy = (results_table.data("pendulum", 0, noise, "quick") for noise in (0.0, 0.01))
     scale = exact[0].target.std(axis=0)  # of the training set, for both
     for true, measured in zip(exact, noisy, strict=True):
@@ -113,7 +112,7 @@ def test_a_page_says_where_it_falls_short():
     from paper.results_table_report import group, shortfalls
 
     def rows(model, *errors, cr2=0.95):
-        names = {"system": "pendulum", "model": model, "setting": "skevgp"}
+        names = {"system": "pendulum", "model": model, "setting": "skevgp", "angles": "raw", "seed": "0"}
         return [{**names, "error_mean": str(error), "cr2": str(cr2)} for error in errors]
 
     good = rows("EVGP-IFG", 0.004, 0.006) + rows("EVGP-IF", 0.01) + rows("VGP", 0.02)
@@ -124,3 +123,81 @@ def test_a_page_says_where_it_falls_short():
     assert "skevgp: EVGP-IFG 0.0120, EVGP-IF 0.0110; pendulum skevgp: EVGP-IF 0.0110, RES-VGP 0.00100." in order
     assert paper.endswith(": pendulum EVGP-IFG skevgp (0.0120, there 0.005).")
     assert calibration.endswith(": pendulum EVGP-IF skevgp (0.920); pendulum EVGP-IFG skevgp (0.990).")
+
+
+def test_rows_beyond_the_training_range_are_told_apart():
+    from paper.models import in_range
+
+    train = Bunch(data=np.array([[0.0, -1.0], [1.0, 2.0], [0.5, 0.0]]))
+    test = Bunch(data=np.array([[0.5, 0.0], [0.2, -3.0], [1.5, 2.5], [1.0, 2.0]]))
+    found = in_range(train, test, np.array([1.0, 10.0, 30.0, 3.0]))
+    assert found == {"error_inside": 2.0, "error_outside": 20.0, "inside": 0.5, "outside": "0:1:1:1.5 1:2:2:3"}
+    alone = in_range(train, Bunch(data=test.data[:1]), np.array([1.0]))
+    assert alone["inside"] == 1.0
+    assert np.isnan(alone["error_outside"])
+    assert alone["outside"] == ""
+
+
+def test_intervals_of_normal_errors_hold_what_they_promise():
+    from paper.models import PROMISED, reliability
+
+    errors = np.random.default_rng(0).standard_normal((20_000, 2))
+    held = reliability(errors, np.zeros_like(errors), np.ones_like(errors))
+    np.testing.assert_allclose(list(held.values()), PROMISED, atol=0.01)
+    assert list(held) == [f"within_{share}" for share in PROMISED]
+    narrow = reliability(errors, np.zeros_like(errors), np.full_like(errors, 0.5))
+    assert narrow["within_0.95"] < 0.7
+
+
+@pytest.mark.slow
+def test_wrapped_angles_move_a_row_and_its_target():
+    from paper import results_table
+
+    raw, wrapped = (results_table.data("cartpole", 0, 0.0, "quick", angles) for angles in results_table.ANGLES)
+    for before, after in zip(raw, wrapped, strict=True):
+        turns = (before.data[:, 1] - after.data[:, 1]) / (2 * np.pi)
+        assert np.abs(after.data[:, 1]).max() <= np.pi
+        np.testing.assert_allclose(turns, np.round(turns), atol=1e-9)
+        np.testing.assert_allclose(before.target[:, 1] - after.target[:, 1], 2 * np.pi * turns, atol=1e-9)
+    assert turns.any()
+
+
+def cartpole_rows(system, angles, *errors_by_model):
+    """Of each model two data sets."""
+    from paper.results_table_report import MODELS
+
+    return [
+        {
+            **{"system": system, "angles": angles, "model": model, "setting": "paper", "seed": str(seed)},
+            **{"error_mean": str(error * (1.1 if seed else 0.9)), "error_inside": str(error / 2)},
+            **{"converged": "True", "max_iter": "", "inside": "0.9", "outside": "1:5:3.0:8.3", "noise": "0.0"},
+        }
+        for model, error in zip(MODELS, errors_by_model, strict=True)
+        for seed in (0, 1)
+    ]
+
+
+def test_the_likelier_cartpole_is_the_one_with_the_papers_errors():
+    from paper.results_table_report import PAPER, closeness, group, outside, which_cartpole
+
+    paper = [result.error for result in PAPER["cartpole"].values()]
+    like = cartpole_rows("cartpole_damped", "raw", *paper)
+    unlike = cartpole_rows("cartpole", "raw", *(5 * error for error in paper))
+    groups = group(like + unlike)
+    (close, n), (far, _) = (closeness(groups, case, "paper") for case in ("cartpole_damped", "cartpole"))
+    assert n == 5
+    assert close - far > 5
+    *_, said = which_cartpole(groups)
+    assert f"cartpole_damped +0.0 (5 models); cartpole {far - close:+.1f} (5 models)." in said
+    *_, lines = outside(groups)
+    assert "| cartpole | 1 | 10.0% | theta 5 (to 8.3 for 3.0) |" in lines
+
+
+def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
+    from paper.results_table_report import both
+
+    row = {"error_mean": "0.2", "error_inside": "0.1", "converged": "True", "max_iter": ""}
+    assert both([row] * 4) == "0.200 / 0.100"
+    assert both([row]) == "0.200 / 0.100 (1)"
+    assert both([row] * 3 + [{**row, "converged": "False"}]) == "0.200 / 0.100\\*"
+    assert both([{**row, "max_iter": "60"}] * 4) == "0.200 / 0.100\\*"

@@ -1,0 +1,190 @@
+"""Write REPRODUCTION.md: the text of reproduction.md.in, with its tables and numbers filled in from the CSVs.
+
+A place to fill is written {{name argument ...}}; the names are the functions below that take a `Results`. What a CSV
+does not have is a dash. No number that a CSV holds is written by hand; a test fills the text in again and compares.
+
+    python benchmarks/paper/reproduction.py  # no fit: a second
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import shlex
+import sys
+from collections.abc import Callable
+from functools import cached_property
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
+
+import numpy as np
+
+import harness
+from harness import Row, figure_of
+from harness import column as of
+from paper import cartpole, claims, results_table_report
+from paper.results_table_report import WRAPPED, Groups
+
+TEMPLATE = Path(__file__).with_name("reproduction.md.in")
+PAGE = Path(__file__).parents[2] / "REPRODUCTION.md"
+HEADER = "<!-- Written by benchmarks/paper/reproduction.py: change reproduction.md.in beside it. -->\n\n"
+MISSING = "—"
+
+
+class Results:
+    """The CSVs of a folder, read once.
+
+    Parameters
+    ----------
+    folder : Path
+    """
+
+    def __init__(self, folder: Path):
+        self.folder = folder
+
+    def rows(self, name: str) -> list[Row]:
+        """Those of full size."""
+        return [row for row in harness.read(self.folder / f"{name}.csv") if row["size"] == "full"]
+
+    @cached_property
+    def table(self) -> Groups:
+        """Fits of the results table."""
+        return results_table_report.group(self.rows("results_table"))
+
+    @cached_property
+    def noisy(self) -> Groups:
+        """The same with noise."""
+        return results_table_report.group(self.rows("results_table_noise0.01"))
+
+    @cached_property
+    def variants(self) -> list[Row]:
+        """What was tried on the cartpole."""
+        return self.rows("cartpole")
+
+    @cached_property
+    def verdicts(self) -> list[claims.Verdict]:
+        """On the paper's claims."""
+        return claims.verdicts(self.folder)
+
+
+def without_wrapped(groups: Groups) -> Groups:
+    return {key: own for key, own in groups.items() if WRAPPED not in key[0]}
+
+
+def errors(results: Results) -> str:
+    """Table 4 at a glance."""
+    return results_table_report.glance(without_wrapped(results.table), list(results_table_report.MODELS))
+
+
+def which_cartpole(results: Results) -> str:
+    """Each reading of the cartpole beside the paper."""
+    return "\n\n".join(list(results_table_report.which_cartpole(results.table))[1:])
+
+
+def outside(results: Results) -> str:
+    """The rows outside the training range of both cartpoles."""
+    groups = {key: own for key, own in results.table.items() if key[0] in ("cartpole", "cartpole_damped")}
+    return "\n\n".join(list(results_table_report.outside(groups))[1:])
+
+
+def claims_table(results: Results) -> str:
+    """A line per claim of the paper."""
+    return claims.summary(results.verdicts)
+
+
+def tried(results: Results, model: str) -> str:
+    """A line per variant of the cartpole's fit."""
+    return cartpole.table_of(results.variants, model)
+
+
+def calibration(results: Results) -> str:
+    """Shares that intervals hold, with noise."""
+    return results_table_report.coverage(without_wrapped(results.noisy))
+
+
+def error(results: Results, system: str, model: str, setting: str, which: str = "mean") -> str:
+    """One of a cell's Errors, over its data sets: mean, median, smallest, largest, inside (mean), row (median)."""
+    own = results.table.get((system, model, setting))
+    if not own:
+        return MISSING
+    values = of(own, {"inside": "error_inside", "row": "error_median"}.get(which, "error_mean"))
+    how = {"median": np.median, "smallest": np.min, "largest": np.max}.get(which, np.nanmean)
+    return figure_of(float(how(values)))
+
+
+def spread(results: Results, setting: str, system: str, *models: str) -> str:
+    """The largest Error of four data sets over the smallest, lowest and highest of some models."""
+    ratios = [
+        float(values.max() / values.min())
+        for model in models
+        if len(values := of(results.table.get((system, model, setting), []), "error_mean")) > 1
+    ]
+    if not ratios:
+        return MISSING
+    return " to ".join(dict.fromkeys(figure_of(f(ratios)) for f in (min, max)))
+
+
+def paper(results: Results, system: str, model: str) -> str:
+    """The Error in the paper."""
+    return f"{results_table_report.PAPER[system][model].error:.3f}"
+
+
+def held(results: Results, system: str, model: str, setting: str, which: str) -> str:
+    """With noise: a containing ratio (cr1, cr2, cr3) or the Error, mean over data sets."""
+    own = results.noisy.get((system, model, setting))
+    if not own:
+        return MISSING
+    value = float(of(own, which).mean())
+    return figure_of(value) if which == "error_mean" else f"{value:.3f}"
+
+
+def n_parameters(results: Results, system: str, model: str, setting: str) -> str:
+    """The largest number that a cell's fits learned."""
+    own = results.table.get((system, model, setting))
+    return f"{max(of(own, 'n_parameters')):,.0f}" if own else MISSING
+
+
+def variant(results: Results, name: str, model: str, which: str = "error_mean") -> str:
+    """A column of what was tried on the cartpole, its mean over data sets."""
+    own = [row for row in results.variants if (row["variant"], row["model"]) == (name, model)]
+    return figure_of(float(of(own, which).mean())) if own else MISSING
+
+
+FILLERS: dict[str, Callable[..., str]] = {
+    function.__name__: function
+    for function in (
+        *(errors, which_cartpole, outside, claims_table, tried, calibration),
+        *(error, spread, paper, held, n_parameters, variant),
+    )
+}
+
+
+def filled(text: str, results: Results) -> str:
+    """The text with every place filled in.
+
+    Raises
+    ------
+    KeyError
+        If a place names no function.
+    """
+
+    def fill(place: re.Match[str]) -> str:
+        name, *arguments = shlex.split(place[1])
+        return FILLERS[name](results, *arguments).strip("\n")
+
+    return HEADER + re.sub(r"\{\{(.+?)\}\}", fill, text)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--page", type=Path, default=PAGE, help="what is written; default: %(default)s")
+    options = parser.parse_args()
+    results = Results(harness.RESULTS)
+    harness.write_report(claims.paragraphs(results.verdicts), harness.RESULTS / "claims.csv")
+    options.page.write_text(filled(TEMPLATE.read_text(), results))
+    print(f"{options.page} is written.")
+
+
+if __name__ == "__main__":
+    main()

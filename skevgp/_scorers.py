@@ -1,0 +1,147 @@
+"""Scores of a mean with its standard deviation: what cross-validation asks of any estimator that says both."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from inspect import Parameter, signature
+from typing import Any
+
+import numpy as np
+from sklearn.compose import TransformedTargetRegressor
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.pipeline import Pipeline
+from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
+
+Metric = Callable[..., float]
+# Each column by itself, times a number, plus a number: of these a Gaussian is a Gaussian again.
+_SCALERS = (MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler)
+
+
+class StdScorer:
+    """Predict with a standard deviation, and score both; made by `make_std_scorer`.
+
+    Parameters
+    ----------
+    metric : callable
+        ``metric(y_true, y_pred, std, **options) -> float``.
+    sign : int
+        1, or -1 if lower is better.
+    options : dict
+        For the metric.
+    """
+
+    def __init__(self, metric: Metric, sign: int, options: dict[str, Any]):
+        self.metric = metric
+        self.sign = sign
+        self.options = options
+
+    def __call__(self, estimator: Any, X: Any, y: Any) -> float:
+        """Score: the higher, the better."""
+        mean, std = mean_and_std(estimator, X)
+        return self.sign * self.metric(y, mean, std, **self.options)
+
+    def __repr__(self) -> str:
+        options = "".join(f", {name}={value!r}" for name, value in self.options.items())
+        name = getattr(self.metric, "__name__", repr(self.metric))
+        return f"make_std_scorer({name}{'' if self.sign > 0 else ', greater_is_better=False'}{options})"
+
+
+def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwargs: Any) -> StdScorer:
+    """Make a scorer of a metric that sees the predicted standard deviation.
+
+    For ``scoring=`` of `cross_validate`, `GridSearchCV`, `HalvingGridSearchCV`, `permutation_importance`: what
+    `sklearn.metrics.make_scorer` is for metrics of the mean. Ready are `neg_nlpd`, `neg_crps`
+    and `neg_calibration_error`.
+
+    Parameters
+    ----------
+    score_func : callable
+        ``score_func(y_true, y_pred, std, **kwargs) -> float``, such as `crps`.
+    greater_is_better : bool, default=True
+        Whether a high number is good. If not, the scorer returns minus the number, as scikit-learn's do.
+    **kwargs : dict
+        For ``score_func``.
+
+    Returns
+    -------
+    scorer : callable
+        ``scorer(estimator, X, y) -> float``. The estimator's ``predict`` takes ``return_std``, as of this package's and
+        of scikit-learn's GaussianProcessRegressor and BayesianRidge (std should be that of y: of a
+        GaussianProcessRegressor it holds the noise of a WhiteKernel, not ``alpha``). It may be the last step of a
+        Pipeline, or inside of a search, of a MultiOutputRegressor, or of a TransformedTargetRegressor that scales y
+        (by one of scikit-learn's scalers of columns, or not at all). Otherwise a TypeError says what is missing: of
+        log y, say, mean and std are no Gaussian of y, and a RegressorChain hands on means only.
+
+    Raises
+    ------
+    TypeError
+        If ``score_func`` is not callable.
+
+    Examples
+    --------
+    >>> from sklearn.model_selection import cross_validate
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.metrics import containing_ratios, make_std_scorer, neg_crps
+    >>> within = make_std_scorer(lambda y_true, y_pred, std: containing_ratios(y_true, y_pred, std, k=2)[0])
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(n_inducing=10, random_state=0)
+    >>> found = cross_validate(model, X, y, cv=3, scoring={"crps": neg_crps, "within 2 std": within})
+    >>> float(found["test_within 2 std"].mean().round(2))
+    0.94
+    """
+    if not callable(score_func):
+        raise TypeError(f"score_func must be callable; got {score_func!r}.")
+    return StdScorer(score_func, 1 if greater_is_better else -1, kwargs)
+
+
+def mean_and_std(estimator: Any, X: Any) -> tuple[np.ndarray, np.ndarray]:
+    """What a fitted estimator predicts with ``return_std``, through what scikit-learn may have put around it.
+
+    Parameters
+    ----------
+    estimator : regressor
+        Fitted.
+    X : array-like of shape (n_samples, n_features)
+
+    Returns
+    -------
+    mean, std : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+
+    Raises
+    ------
+    TypeError
+        If there is no standard deviation of y.
+    """
+    if hasattr(estimator, "best_estimator_"):  # of a search
+        return mean_and_std(estimator.best_estimator_, X)
+    if isinstance(estimator, Pipeline):  # itself it would have to be told by set_predict_request
+        return mean_and_std(estimator[-1], estimator[:-1].transform(X) if len(estimator) > 1 else X)
+    if isinstance(estimator, MultiOutputRegressor):
+        parts = [mean_and_std(own, X) for own in estimator.estimators_]
+        mean, std = (np.column_stack(part) for part in zip(*parts, strict=True))
+        return mean, std
+    if isinstance(estimator, TransformedTargetRegressor):
+        return _scaled_back(estimator, *mean_and_std(estimator.regressor_, X))
+    parameters = signature(estimator.predict).parameters
+    if "return_std" not in parameters and all(one.kind != Parameter.VAR_KEYWORD for one in parameters.values()):
+        raise TypeError(f"{type(estimator).__name__}.predict takes no return_std: there is no standard deviation.")
+    mean, std = estimator.predict(X, return_std=True)
+    return mean, std
+
+
+def _scaled_back(model: TransformedTargetRegressor, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """In the units of y."""
+    transformer = model.transformer_
+    given = transformer.get_params(deep=False)
+    identity = "inverse_func" in given and given["func"] is None and given["inverse_func"] is None
+    if not (identity or isinstance(transformer, _SCALERS)) or given.get("clip"):
+        names = ", ".join(scaler.__name__ for scaler in _SCALERS)
+        raise TypeError(
+            f"Of a TransformedTargetRegressor with {transformer!r} there is no standard deviation of y: it is known "
+            f"where y is scaled ({names}). EVGPRegressor scales y itself, and normalize_y=True centres it."
+        )
+    shape, columns = mean.shape, mean.reshape(len(mean), -1)
+    unit = transformer.inverse_transform(np.ones((1, columns.shape[1])))
+    unit = np.abs(unit - transformer.inverse_transform(np.zeros((1, columns.shape[1]))))
+    return transformer.inverse_transform(columns).reshape(shape), std * unit.reshape(shape[1:])

@@ -1,0 +1,87 @@
+"""How kernels are written down: scikit-learn's, and what the inference makes of them."""
+
+from __future__ import annotations
+
+from sklearn.gaussian_process import kernels as sk
+
+from ..kernels import constant, cosine, covariances, dot_product, profiles, stationary
+from ..kernels.parse import KernelSpec, Start, Starts
+from .fields import anything, array, flag, integer, made, nothing, one_of, real, row, several
+from .records import Record, bare, plain
+
+_LENGTH = real(above=0.0) | array("d", above=0.0) | several(real(above=0.0)) | row(real(above=0.0))
+_BOUNDS = (
+    one_of("fixed")
+    | row(real(least=0.0), real(least=0.0, finite=False))
+    | several(anything)
+    | several(anything, tuple)
+    | array("...", least=0.0, finite=False)
+)
+TREE, COVARIANCE = made(sk.Kernel), made(covariances.Covariance)
+_ROWS = made(covariances.CentredSquares)
+_PROFILES = (
+    profiles.Exponential,
+    profiles.Matern12,
+    profiles.Matern32,
+    profiles.Matern52,
+    profiles.RationalQuadratic,
+    profiles.ExpSineSquared,
+)
+
+_SK_KERNELS = [
+    bare(sk.ConstantKernel, "sklearn.ConstantKernel", constant_value=_LENGTH, constant_value_bounds=_BOUNDS),
+    bare(sk.WhiteKernel, "sklearn.WhiteKernel", noise_level=_LENGTH, noise_level_bounds=_BOUNDS),
+    bare(sk.RBF, "sklearn.RBF", length_scale=_LENGTH, length_scale_bounds=_BOUNDS),
+    bare(
+        sk.Matern, "sklearn.Matern", length_scale=_LENGTH, length_scale_bounds=_BOUNDS, nu=real(above=0.0, finite=False)
+    ),
+    bare(
+        sk.RationalQuadratic,
+        "sklearn.RationalQuadratic",
+        length_scale=_LENGTH,
+        alpha=_LENGTH,
+        length_scale_bounds=_BOUNDS,
+        alpha_bounds=_BOUNDS,
+    ),
+    bare(
+        sk.ExpSineSquared,
+        "sklearn.ExpSineSquared",
+        length_scale=_LENGTH,
+        periodicity=_LENGTH,
+        length_scale_bounds=_BOUNDS,
+        periodicity_bounds=_BOUNDS,
+    ),
+    bare(sk.DotProduct, "sklearn.DotProduct", sigma_0=_LENGTH, sigma_0_bounds=_BOUNDS),
+    bare(sk.Sum, "sklearn.Sum", k1=TREE, k2=TREE),
+    bare(sk.Product, "sklearn.Product", k1=TREE, k2=TREE),
+    bare(cosine.Cosine, length_scale=_LENGTH, length_scale_bounds=_BOUNDS),
+]
+
+_OURS = [
+    plain(covariances.CentredSquares, centre=several(real(), tuple)),
+    plain(covariances.Sum, parts=several(COVARIANCE, tuple)),
+    plain(covariances.Product, parts=several(COVARIANCE, tuple)),
+    plain(constant.Constant, "Constant"),
+    plain(dot_product.DotProduct, "DotProduct"),
+    plain(cosine.Wave, n_columns=integer(1), isotropic=flag, rows=_ROWS),
+    *(plain(profile, f"profiles.{profile.__name__}") for profile in _PROFILES),
+    plain(profiles.Matern, "profiles.Matern", nu=real(above=0.0, finite=False)),
+    plain(
+        stationary.Stationary,
+        profile=made(*_PROFILES, profiles.Matern),
+        n_columns=integer(1),
+        isotropic=flag,
+        rows=_ROWS,
+    ),
+    plain(stationary.SquaredExponential, n_columns=integer(1), isotropic=flag, rows=_ROWS),
+    plain(
+        Start,
+        value=array("n", above=0.0) | nothing,
+        bounds=array("n 2", least=0.0, finite=False) | nothing,
+        fixed=flag | array("n", "b"),
+    ),
+    plain(Starts, hyperparameters=made(Start), signal=made(Start), noise=made(Start)),
+    plain(KernelSpec, covariance=COVARIANCE, starts=made(Starts), tree=TREE, signal=TREE, given=TREE | nothing),
+]
+
+RECORDS: list[Record] = [*_SK_KERNELS, *_OURS]

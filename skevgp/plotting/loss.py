@@ -1,0 +1,137 @@
+"""LossDisplay: the bound over the iterations of a fit."""
+
+from __future__ import annotations
+
+from typing import Any, Self
+
+import numpy as np
+from sklearn.utils.validation import check_is_fitted
+
+from ._style import axes_of, free_color
+
+
+class LossDisplay:
+    """The bound on the log marginal likelihood after each iteration of a fit.
+
+    Curves of several fits can share axes: with the same rows and features, the higher bound is the better model.
+
+    Parameters
+    ----------
+    bound : ndarray of shape (n_iter,)
+        After each iteration, in nats.
+    bound_name : str, default="lower bound (nats)"
+        For the vertical axis.
+
+    Attributes
+    ----------
+    ax_ : matplotlib Axes
+    figure_ : matplotlib Figure
+    line_ : matplotlib Line2D
+
+    See Also
+    --------
+    LossDisplay.from_estimator : Make one from a fitted regressor.
+
+    Examples
+    --------
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.plotting import LossDisplay
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, y)
+    >>> display = LossDisplay.from_estimator(model, gap=True)
+    >>> len(display.bound) == model.n_iter_
+    True
+    """
+
+    def __init__(self, bound: np.ndarray, bound_name: str = "lower bound (nats)"):
+        self.bound = bound
+        self.bound_name = bound_name
+
+    @classmethod
+    def from_estimator(
+        cls, estimator: Any, *, gap: bool = False, ax: Any = None, label: str | None = None, color: str | None = None
+    ) -> Self:
+        """Read the bound off a fitted regressor and draw.
+
+        Parameters
+        ----------
+        estimator : EVGPRegressor, EGPRegressor or BayesianMLPRegressor
+            Fitted, with at least one iteration. Of Adam values are estimates from mini-batches.
+        gap : bool, default=False
+            As in `plot`.
+        ax : matplotlib Axes, default=None
+            Where to draw; by default on new axes.
+        label, color : str, default=None
+            As in `plot`.
+
+        Returns
+        -------
+        display : LossDisplay
+            Drawn, with ``ax_`` and ``figure_``.
+
+        Raises
+        ------
+        ValueError
+            If there are no iterations to show, as after ``max_iter=0``.
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        check_is_fitted(estimator)
+        bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
+        if len(bound) == 0:
+            raise ValueError(
+                f"{type(estimator).__name__} has no iterations to show: it has no loss_curve_, or an empty one."
+            )
+        exact = hasattr(estimator, "log_marginal_likelihood_value_")
+        name = "log marginal likelihood (nats)" if exact else "lower bound (nats)"
+        return cls(bound, name).plot(ax, gap=gap, label=label, color=color)
+
+    def plot(self, ax: Any = None, *, gap: bool = False, label: str | None = None, color: str | None = None) -> Self:
+        """Draw.
+
+        Without ``gap`` the vertical axis begins at what comes after the first quarter of the iterations, which gains so
+        much that nothing else would be seen.
+
+        Parameters
+        ----------
+        ax : matplotlib Axes, default=None
+            By default new axes.
+        gap : bool, default=False
+            Whether to draw, on a logarithmic scale, how far each iteration is below the best one: where the last part
+            of a fit is to be seen.
+        label : str, default=None
+            Name of the line, for ``display.ax_.legend()``.
+        color : str, default=None
+            By default the first of a colour-blind-safe palette that is not yet on the axes.
+
+        Returns
+        -------
+        self : LossDisplay
+            With ``ax_`` and ``figure_``.
+
+        Raises
+        ------
+        ImportError
+            If matplotlib is not installed; the message gives the pip command.
+        """
+        ax = axes_of(ax)
+        others = [ax.get_ylim()] if ax.lines else []
+        iterations = np.arange(1, len(self.bound) + 1)
+        below = self.bound.max() - self.bound
+        values = np.where(below > 0.0, below, np.nan) if gap else self.bound
+        options = {"color": free_color(ax) if color is None else color, "label": label}
+        (self.line_,) = ax.plot(iterations, values, **options, marker="." if len(iterations) < 30 else None)
+        if gap:
+            ax.set_yscale("log")
+        else:
+            late = self.bound[len(self.bound) // 4 :]
+            margin = 0.05 * (late.max() - late.min()) or 1.0
+            ax.set_ylim(
+                min(late.min() - margin, *(low for low, _ in others), np.inf),
+                max(self.bound.max() + margin, *(high for _, high in others), -np.inf),
+            )
+        ax.set_xlabel("iteration")
+        ax.set_ylabel(f"{self.bound_name.removesuffix(' (nats)')}: nats below its best" if gap else self.bound_name)
+        self.ax_, self.figure_ = ax, ax.figure
+        return self

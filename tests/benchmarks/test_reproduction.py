@@ -1,0 +1,103 @@
+"""REPRODUCTION.md and the pages behind it say what the CSVs say."""
+
+import importlib
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from .conftest import read
+
+ROOT = Path(__file__).parents[2]
+RESULTS = ROOT / "benchmarks" / "results"
+
+
+@pytest.fixture(scope="module")
+def page():
+    return (ROOT / "REPRODUCTION.md").read_text()
+
+
+def test_the_page_is_the_template_filled_in_from_the_csvs(page):
+    from paper import reproduction
+
+    assert page == reproduction.filled(reproduction.TEMPLATE.read_text(), reproduction.Results(RESULTS))
+
+
+def test_a_place_without_a_function_or_a_number_is_seen():
+    from paper.reproduction import MISSING, Results, filled
+
+    results = Results(RESULTS)
+    with pytest.raises(KeyError, match="figure"):
+        filled("{{figure 7}}", results)
+    assert filled("{{error pendulum EVGP-IF nowhere}}", results).endswith(MISSING)
+    rows = [row for row in read(RESULTS / "results_table.csv") if row["angles"] == "raw" and row["size"] == "full"]
+    wanted = ("pendulum", "EVGP-IFG", "skevgp")
+    errors = [float(row["error_mean"]) for row in rows if (row["system"], row["model"], row["setting"]) == wanted]
+    shown = float(filled("{{error pendulum EVGP-IFG skevgp largest}}", results).split()[-1])
+    assert shown == pytest.approx(max(errors), rel=5e-3)
+
+
+@pytest.mark.parametrize("name", ["results_table", "results_table_noise0.01"])
+def test_the_page_of_the_results_is_what_its_script_writes(name):
+    from paper import results_table_report
+
+    rows = [row for row in read(RESULTS / f"{name}.csv") if row["size"] == "full"]
+    assert (RESULTS / f"{name}.md").read_text() == text_of(results_table_report.paragraphs(rows))
+
+
+@pytest.mark.parametrize("name", ["cartpole", "network", "data_sets", "learning_curves_report"])
+def test_a_page_is_what_its_script_writes(name):
+    module, stem = importlib.import_module(f"paper.{name}"), name.removesuffix("_report")
+    rows = [row for row in read(RESULTS / f"{stem}.csv") if row["size"] == "full"]
+    assert (RESULTS / f"{stem}.md").read_text() == text_of(module.paragraphs(rows))
+
+
+def test_the_page_of_the_weights_is_what_its_script_writes():
+    from paper import beta_report
+
+    output = RESULTS / "beta.csv"
+    rows = [row for row in read(output) if row["size"] == "full"]
+    assert output.with_suffix(".md").read_text() == text_of(beta_report.paragraphs(rows, output))
+
+
+def test_the_page_of_the_claims_is_what_its_script_writes():
+    from paper import claims
+
+    assert (RESULTS / "claims.md").read_text() == text_of(claims.paragraphs(claims.verdicts(RESULTS)))
+
+
+def text_of(parts):
+    return "\n\n".join(part.strip("\n") for part in parts) + "\n"
+
+
+def test_what_it_names_is_there(page):
+    links = re.findall(r"\]\(([^)#]+)[^)]*\)", page)
+    scripts = re.findall(r"python (benchmarks/[\w/]+\.py)", page)
+    assert len(links) > 20
+    assert len(scripts) > 5
+    assert [path for path in (*links, *scripts) if not (ROOT / path).exists()] == []
+
+
+def test_the_readme_has_the_same_errors():
+    readme = (ROOT / "README.md").read_text()
+    columns = {"skevgp": 3, "skevgp-angles": 4, "skevgp-nominal": 5}
+    shown = {
+        cells[0].split()[0]: cells
+        for line in readme.splitlines()
+        if re.match(r"\| (pendulum|cartpole|acrobot|iiwa14).* \| \d+ \| 0\.\d+ \|", line)
+        for cells in [[cell.strip() for cell in line.strip("|").split("|")]]
+    }
+    assert len(shown) == 4
+    errors = {}
+    for row in read(RESULTS / "results_table.csv"):
+        if row["model"] == "EVGP-IFG" and row["setting"] in columns and row["angles"] == "raw":
+            errors.setdefault((row["system"], row["setting"]), []).append(float(row["error_mean"]))
+    compared = 0
+    for (system, setting), values in errors.items():
+        text = shown.get(system, [""] * 6)[columns[setting]]
+        if text:
+            assert len(values) == 4
+            assert text == f"{np.mean(values):.{len(text) - 2}f}"
+            compared += 1
+    assert compared == 8

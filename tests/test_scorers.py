@@ -1,0 +1,269 @@
+"""Scorers that see the predicted standard deviation, in scikit-learn's own hands."""
+
+import pickle
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+import sklearn
+from scipy.stats import norm
+from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.compose import TransformedTargetRegressor
+from sklearn.decomposition import PCA
+from sklearn.experimental import enable_halving_search_cv  # noqa: F401
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, WhiteKernel
+from sklearn.inspection import permutation_importance
+from sklearn.linear_model import BayesianRidge, LinearRegression
+from sklearn.model_selection import (
+    GridSearchCV,
+    GroupKFold,
+    HalvingGridSearchCV,
+    KFold,
+    cross_val_score,
+    cross_validate,
+)
+from sklearn.multioutput import MultiOutputRegressor, RegressorChain
+from sklearn.pipeline import make_pipeline
+from sklearn.preprocessing import MinMaxScaler, PolynomialFeatures, StandardScaler
+
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.datasets import make_toy
+from skevgp.metrics import (
+    crps,
+    make_std_scorer,
+    neg_calibration_error,
+    neg_crps,
+    neg_nlpd,
+    negative_log_predictive_density,
+)
+
+X, y = (part[np.random.RandomState(0).permutation(60)] for part in make_toy(60, random_state=0, return_X_y=True))
+Y = np.column_stack([y, 3.0 - 2.0 * X[:, 0]])
+GROUPS = np.repeat(np.arange(12), 5)
+SPARSE = EVGPRegressor(n_inducing=5, max_iter=0, random_state=0)
+SCORERS = [neg_nlpd, neg_crps, neg_calibration_error]
+
+
+def nlpd_of(model, inputs=X, targets=y):
+    return -negative_log_predictive_density(targets, *model.predict(inputs, return_std=True))
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        SPARSE,
+        EGPRegressor(max_iter=0),
+        ResidualRegressor(SPARSE),
+        GaussianProcessRegressor(RBF() + WhiteKernel(), optimizer=None),
+        BayesianRidge(),
+        make_pipeline(StandardScaler(), SPARSE),
+    ],
+    ids=str,
+)
+def test_a_score_is_minus_the_metric_of_mean_and_std(model):
+    fitted = clone(model).fit(X, y)
+    assert neg_nlpd(fitted, X, y) == pytest.approx(nlpd_of(fitted))
+    assert neg_crps(fitted, X, y) == pytest.approx(-crps(y, *fitted.predict(X, return_std=True)))
+
+
+def test_cross_validation_takes_several_at_once():
+    scoring = {"nlpd": neg_nlpd, "calibration": neg_calibration_error, "r2": "r2"}
+    found = cross_validate(SPARSE, X, y, cv=KFold(3), scoring=scoring, return_estimator=True, error_score="raise")
+    for fold, (_, test) in enumerate(KFold(3).split(X)):
+        assert found["test_nlpd"][fold] == pytest.approx(nlpd_of(found["estimator"][fold], X[test], y[test]))
+    assert (found["test_r2"] > 0.3).all()
+
+
+@pytest.mark.parametrize("search", [GridSearchCV, HalvingGridSearchCV])
+@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
+def test_searches_choose_the_noise_that_is_there(search, scorer):
+    """Of fixed ones; a score of means alone could not tell the largest from the true one."""
+    kernels = [RBF(2.0) + WhiteKernel(noise, "fixed") for noise in (1e-4, 3.0, 3000.0)]
+    grid = search(EGPRegressor(max_iter=0), {"kernel": kernels}, scoring=scorer, cv=3, error_score="raise")
+    found = grid.fit(X, y)
+    assert found.best_params_["kernel"] == kernels[1]
+    assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
+
+
+def test_a_column_whose_shuffling_costs_density_is_important():
+    rows = np.column_stack([X, np.random.RandomState(0).randn(60)])
+    model = SPARSE.set_params(max_iter=None, tol=1.0)
+    model = clone(model).fit(rows, y)
+    found = permutation_importance(model, rows, y, scoring=neg_nlpd, n_repeats=3, random_state=0)
+    assert found.importances_mean[0] > 10 * abs(found.importances_mean[1])
+
+
+@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
+def test_scorers_survive_processes(scorer):
+    fitted = clone(SPARSE).fit(X, y)
+    assert pickle.loads(pickle.dumps(scorer))(fitted, X, y) == scorer(fitted, X, y)
+    assert cross_val_score(SPARSE, X, y, scoring=scorer, cv=2, n_jobs=2).shape == (2,)
+
+
+def test_a_scorer_says_how_it_was_made():
+    assert repr(neg_crps) == "make_std_scorer(crps, greater_is_better=False)"
+    scorer = make_std_scorer(norm.logpdf, where=1)
+    assert repr(scorer) == "make_std_scorer(logpdf, where=1)"
+    with pytest.raises(TypeError, match="score_func must be callable; got 'crps'"):
+        make_std_scorer("crps")
+
+
+def test_options_reach_the_metric():
+    def far(y_true, y_pred, std, k):
+        return float(np.mean(np.abs(y_true - y_pred) > k * std))
+
+    fitted = clone(SPARSE).fit(X, y)
+    shares = [make_std_scorer(far, k=k)(fitted, X, y) for k in (0.0, 1.0, 100.0)]
+    assert shares[0] == 1.0 > shares[1] > shares[2] == 0.0
+
+
+# --- what scikit-learn puts around a regressor -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("transformer", [StandardScaler(), MinMaxScaler((-1.0, 3.0)), None], ids=str)
+@pytest.mark.parametrize("targets", [y, Y, Y[:, :1]], ids=["one", "two", "column"])
+def test_where_y_is_scaled_std_is_scaled_back(transformer, targets):
+    model = TransformedTargetRegressor(SPARSE, transformer=transformer).fit(X, targets)
+    inner = model.transformer_.transform(targets.reshape(60, -1)).reshape(targets.shape)
+    step = np.diff(targets.reshape(60, -1)[:2], axis=0) / np.diff(inner.reshape(60, -1)[:2], axis=0)
+    inside = neg_nlpd(model.regressor_, X, inner)
+    assert neg_nlpd(model, X, targets) == pytest.approx(inside - np.log(np.abs(step)).sum())
+
+
+def test_where_y_is_scaled_downwards_std_stays_positive():
+    scaler = StandardScaler()
+    model = TransformedTargetRegressor(BayesianRidge(), transformer=scaler).fit(X, y)
+    model.transformer_.scale_ *= -1.0
+    assert neg_crps(model, X, y) < 0.0
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"func": np.arcsinh, "inverse_func": np.sinh},
+        {"transformer": PCA()},
+        {"transformer": MinMaxScaler(clip=True)},
+    ],
+    ids=str,
+)
+def test_where_y_is_bent_there_is_no_std_of_y(options):
+    model = TransformedTargetRegressor(SPARSE, **options).fit(X, Y)
+    with pytest.raises(TypeError, match=r"(?s)Of a TransformedTargetRegressor with .* it is known where y is scaled"):
+        neg_nlpd(model, X, Y)
+
+
+def test_independent_models_of_outputs_are_put_side_by_side():
+    model = MultiOutputRegressor(SPARSE).fit(X, Y)
+    expected = sum(nlpd_of(own, X, column) for own, column in zip(model.estimators_, Y.T, strict=True))
+    assert neg_nlpd(model, X, Y) == pytest.approx(expected)
+    nested = make_pipeline(PolynomialFeatures(2), TransformedTargetRegressor(model, transformer=StandardScaler()))
+    assert np.isfinite(cross_val_score(nested, X, Y, scoring=neg_crps, cv=2, error_score="raise")).all()
+
+
+class Bold(RegressorMixin, BaseEstimator):
+    """It hands on what it is asked for."""
+
+    def fit(self, X, y):
+        self.regressor_ = BayesianRidge().fit(X, y)
+        return self
+
+    def predict(self, X, **params):
+        return self.regressor_.predict(X, **params)
+
+
+def test_what_hands_on_is_asked():
+    assert neg_nlpd(Bold().fit(X, y), X, y) == nlpd_of(BayesianRidge().fit(X, y))
+
+
+@pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)
+def test_what_says_no_std_is_an_error_that_says_so(model):
+    with pytest.raises(TypeError, match=rf"{type(model).__name__}.predict takes no return_std"):
+        neg_nlpd(model.fit(X, Y), X, Y)
+
+
+@pytest.mark.parametrize("frame", [pd.DataFrame, pl.DataFrame])
+def test_frames_and_series_of_targets(frame):
+    columns = frame({"a": X[:, 0]})
+    targets = frame({"y": y})
+    for given in (targets["y"], targets):
+        model = clone(SPARSE).fit(columns, given)
+        assert neg_crps(model, columns, given) == pytest.approx(neg_crps(clone(SPARSE).fit(X, y), X, y))
+
+
+# --- groups ------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def routing():
+    with sklearn.config_context(enable_metadata_routing=True):
+        yield
+
+
+class Witness(EVGPRegressor):
+    """Writes down the groups that its fits were told of."""
+
+    def fit(self, X, y, sample_weight=None, *, groups=None, relative_variance=None):
+        self.told_ = groups
+        return super().fit(X, y, sample_weight, groups=groups, relative_variance=relative_variance)
+
+
+WITNESS = Witness(n_inducing=5, max_iter=0, random_state=0)
+
+
+@pytest.mark.usefixtures("routing")
+@pytest.mark.parametrize(
+    ("wrapped", "inner"),
+    [
+        (lambda own: own, lambda model: model),
+        (lambda own: make_pipeline(StandardScaler(), own), lambda model: model[-1]),
+        (
+            lambda own: TransformedTargetRegressor(own, transformer=StandardScaler()),
+            lambda model: model.regressor_,
+        ),
+        (MultiOutputRegressor, lambda model: model.estimators_[0]),
+        (ResidualRegressor, lambda model: model.regressor_),
+    ],
+    ids=["itself", "pipeline", "scaled y", "outputs apart", "residual"],
+)
+def test_groups_are_routed_to_the_fit_and_to_the_split(wrapped, inner):
+    own = clone(WITNESS).set_fit_request(groups=True)
+    model = wrapped(own)
+    targets = Y if isinstance(model, MultiOutputRegressor) else y
+    found = cross_validate(
+        model,
+        *(X, targets),
+        params={"groups": GROUPS},
+        cv=GroupKFold(3),
+        scoring={"nlpd": make_std_scorer(negative_log_predictive_density)}
+        if wrapped is not ResidualRegressor
+        else None,
+        return_estimator=True,
+        error_score="raise",
+    )
+    for (train, _), fitted in zip(GroupKFold(3).split(X, y, GROUPS), found["estimator"], strict=True):
+        np.testing.assert_array_equal(inner(fitted).told_, GROUPS[train])
+
+
+@pytest.mark.usefixtures("routing")
+def test_groups_are_routed_in_a_search():
+    model = make_pipeline(StandardScaler(), clone(WITNESS).set_fit_request(groups=True))
+    grid = GridSearchCV(model, {"witness__n_inducing": [3, 5]}, scoring=neg_nlpd, cv=GroupKFold(3))
+    found = grid.fit(X, y, groups=GROUPS)
+    np.testing.assert_array_equal(found.best_estimator_[-1].told_, GROUPS)
+    assert np.isfinite(found.cv_results_["mean_test_score"]).all()
+
+
+def test_without_routing_groups_split_and_a_parameter_tells_the_fit():
+    found = cross_validate(
+        WITNESS,
+        X,
+        y,
+        groups=GROUPS,
+        params={"groups": GROUPS},
+        cv=GroupKFold(3),
+        scoring=neg_nlpd,
+        return_estimator=True,
+    )
+    assert all(len(np.unique(fitted.told_)) == 8 for fitted in found["estimator"])
