@@ -26,6 +26,8 @@ import sklearn
 import skevgp
 
 RESULTS = Path(__file__).parent / "results"
+# Inches, of a picture in a column of a web page.
+WIDTH = 8.0
 # Okabe & Ito's colours, safe for colour-blind readers; without black and yellow.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
@@ -310,32 +312,41 @@ def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> Non
 
 
 def pyplot() -> Any:
-    """matplotlib's, which draws into files."""
+    """matplotlib's, which draws into files, in the style of all pictures."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
+    pyplot.style.use("skevgp.plotting.page")
     return pyplot
 
 
-def logarithmic(axes: Any) -> None:
-    """Give the vertical axis a logarithmic scale, with plain numbers for 1, 2 and 5 where there is room."""
+def logarithmic(axes: Any, which: str = "y") -> None:
+    """Give an axis, "x" or "y", a logarithmic scale, with plain numbers, for 1, 2 and 5 where there is room."""
     from matplotlib import ticker
 
-    axes.set_yscale("log")
-    low, high = np.log10(axes.get_ylim())
-    if high - low < 3.0:
-        axes.yaxis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5)))
-        axes.yaxis.set_major_formatter(ticker.FormatStrFormatter("%g"))
-    axes.yaxis.set_minor_formatter(ticker.NullFormatter())
+    axes.set(**{f"{which}scale": "log"})
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = np.log10(axis.get_view_interval())
+    axis.set_major_locator(ticker.LogLocator(subs=(1, 2, 5) if high - low < (2.0 if which == "x" else 3.0) else (1,)))
+    if low > -5.0 and high < 6.5:
+        axis.set_major_formatter(lambda value, _: f"{value:,g}")
+    axis.set_minor_formatter(ticker.NullFormatter())
+
+
+def legend(figure: Any, where: str = "upper", **options: Any) -> Any:
+    """One for all panels, outside of them, above ("upper") or below ("lower"): each label once."""
+    pairs = (pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True))
+    handles = {label: handle for handle, label in pairs}
+    return figure.legend(handles.values(), handles, loc=f"outside {where} center", **options)
 
 
 def save_picture(figure: Any, path: Path) -> None:
     """Write a figure as a PNG of at most 256 colours, half of the usual size, and close it."""
     from PIL import Image
 
-    figure.set_dpi(110)
+    figure.set_dpi(pyplot().rcParams["savefig.dpi"])
     figure.canvas.draw()
     image = Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
     image.quantize(256, dither=Image.Dither.NONE).save(path, optimize=True)

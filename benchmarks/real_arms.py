@@ -575,9 +575,8 @@ def draw(rows: Sequence[Row], path: Path) -> None:
     plt = harness.pyplot()
     splits = [(robot, split) for robot in SPLITS for split in SPLITS[robot] if of(rows, robot=robot, split=split)]
     models = [model for model in models_in(rows) if model != LEAST_SQUARES]
-    figure, axes = plt.subplots(
-        len(splits), 2, figsize=(9.0, 0.9 + 1.8 * len(splits)), sharex="col", squeeze=False, layout="constrained"
-    )
+    size = (harness.WIDTH, 0.9 + 1.7 * len(splits))
+    figure, axes = plt.subplots(len(splits), 2, figsize=size, sharex="col", squeeze=False)
     for (ratios, shares), (robot, split) in zip(axes, splits, strict=True):
         own = of(rows, robot=robot, split=split)
         for place, model in enumerate(models):
@@ -597,7 +596,7 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         shares.axvspan(0.9, 0.99, color="0.9", zorder=0)
         shares.axvline(0.954, color="0.5", linewidth=0.8)
         shares.set(yticks=range(len(banded)), yticklabels=banded, ylim=(len(banded) - 0.5, -0.5))
-        ratios.set_title(f"{robot}, trained on {split}", loc="left", fontsize=10)
+        ratios.set_title(f"{robot}, trained on {split}", loc="left")
     axes[-1, 0].set_xticks([0.1, 1.0, 10.0, 100.0, 1000.0], ["0.1", "1", "10", "100", "1000"])
     axes[-1, 0].set_xlabel("error / least squares'\n(each file and joint; bar: geometric mean)")
     axes[-1, 1].set_xlabel("share of rows within ± 2 std\n(each joint; gray: 90 to 99 %)")

@@ -54,6 +54,7 @@ n_folds, n_inducing, sharing = (2, 15, "all") if quick else (3, 30, "none")
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     robot = load_robot(options.robot)
     moves = make_dynamics(options.robot, n_trajectories, random_state=options.seed)
 except ImportError as error:
@@ -123,25 +124,23 @@ rows = moves.groups == 0
 seconds = moves.dt * (1 + np.arange(rows.sum()))
 change = (moves.target - constant)[:, n_joints:]
 joints = np.sort(np.argsort(change[rows].std(axis=0))[-2:])
-figure, axes = plt.subplots(
-    len(joints), 2, figsize=(9, 3.2 * len(joints)), layout="constrained", sharex=True, squeeze=False
-)
+figure, axes = plt.subplots(len(joints), 2, figsize=(8, 2.6 * len(joints)), sharex=True, squeeze=False)
 for row, joint in zip(axes, joints.tolist(), strict=True):
     velocity = n_joints + joint
     for ax, name in zip(row, ("IFG", "IF + wrong URDF"), strict=True):
         mean, std = (part[rows, velocity] for part in predictions[name])
         now, after = moves.data[rows, velocity], moves.target[rows, velocity]
         PosteriorDisplay(seconds, mean - now, std, after - now).plot(ax, label="predicted")
-        ax.set_title(f"{robot.names[joint + 1]}: {name}", fontsize=10)
+        ax.set_title(f"{robot.names[joint + 1]}: {name}")
     row[1].sharey(row[0])
     unit = "rad/s" if layout_of(robot).revolute[joint] else "m/s"
     row[0].set_ylabel(f"change of velocity in {moves.dt} s ({unit})")
-axes[0, 0].legend(fontsize=8)
+axes[0, 0].legend()
 for ax in axes[-1]:
     ax.set_xlabel("time (s)")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"any_robot_{robot.name}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -54,6 +54,8 @@ try:
     import crocoddyl
     import matplotlib.pyplot as plt
     import pinocchio  # noqa: F401
+
+    plt.style.use("skevgp.plotting.page")
 except ImportError as error:
     packages = "pip install pin crocoddyl matplotlib"
     sys.exit(f"error: {error}\nThis example needs Pinocchio, Crocoddyl and matplotlib: {packages}")
@@ -206,7 +208,7 @@ print(f"in the model, with the gains, {particles.sum()} of {n_particles} particl
 
 colours = {"inputs as planned": "#D55E00", "with FDDP's gains": "#0072B2"}
 times, pole = DT * np.arange(task.n_steps + 1), task.pole
-figure, ((top_left, top_right), (bottom_left, bottom_right)) = plt.subplots(2, 2, figsize=(11, 7), layout="constrained")
+figure, ((top_left, top_right), (bottom_left, bottom_right)) = plt.subplots(2, 2, figsize=(8, 5.6))
 for name, states in runs.items():
     top_left.plot(times, states[:, pole], color=colours[name], linewidth=2.5, label=name)
     bottom_left.plot(times, np.abs(states - Z)[:, pole], color=colours[name], label=name)
@@ -233,11 +235,11 @@ bottom_right.set(
     title="FDDP: motions with gaps are cheap, until these close", xlabel="iteration", ylabel="cost", yscale="log"
 )
 for ax in (top_left, top_right, bottom_left, bottom_right):
-    ax.legend(fontsize=8)
-figure.suptitle(f"Crocoddyl's FDDP on EVGP-IFG, learned from {seconds:g} s of data", fontsize=11)
+    ax.legend()
+figure.suptitle(f"Crocoddyl's FDDP on EVGP-IFG, learned from {seconds:g} s of data")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"crocoddyl_{task.system}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -84,6 +84,7 @@ m_vgp, m_evgp = options.inducing or INDUCING[options.system]
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     sizes = {"n_trajectories": options.trajectories, "n_steps": options.steps}
     train = make_dynamics(options.system, **sizes, noise=options.noise, random_state=options.seed)
     test = make_dynamics(options.system, **sizes, random_state=options.seed + 1000)
@@ -144,9 +145,10 @@ hardest = np.argmax([errors_vgp[test.groups == group].sum() for group in np.uniq
 rows = test.groups == hardest
 seconds = 0.03 * (1 + np.arange(rows.sum()))
 truth = test.target[rows, output]
-colours = {"VGP": "#D55E00", "EVGP-IFG": "#0072B2"}
+velocity = f"{test.target_names[output]} (rad/s)"
+colours = {"VGP": "C1", "EVGP-IFG": "C0"}
 
-figure, axes = plt.subplots(2, 2, figsize=(10, 6), layout="constrained", width_ratios=(1.4, 1))
+figure, axes = plt.subplots(2, 2, figsize=(8, 5.2), width_ratios=(1.5, 1))
 for name, colour in colours.items():
     mean, std = (part[rows, output] for part in predictions[name])
     axes[0, 0].plot(seconds, mean, color=colour, label=name)
@@ -154,21 +156,17 @@ for name, colour in colours.items():
     axes[1, 0].plot(seconds, np.abs(mean - truth), color=colour, label=f"{name}: |error|")
     axes[1, 0].plot(seconds, 2 * std, color=colour, linestyle=":", label=f"{name}: 2 std")
 axes[0, 0].plot(seconds, truth, "k--", linewidth=1, label="truth")
-axes[0, 0].set_title("One-step predictions along a test trajectory", fontsize=10)
-axes[0, 0].set_ylabel(test.target_names[output])
-axes[1, 0].set_title("Their errors, and what they promise", fontsize=10)
-axes[1, 0].set_ylabel(test.target_names[output])
-axes[1, 0].set_yscale("log")
-axes[1, 0].set_xlabel("time (s)")
+axes[0, 0].set(title="One-step predictions along a test trajectory, ±2 std", ylabel=velocity)
+axes[1, 0].set(title="Their errors, and what they promise", ylabel=velocity, yscale="log", xlabel="time (s)")
 for ax in axes[:, 0]:
-    ax.legend(fontsize=8)
+    ax.legend(loc="upper left")
 for ax, state in zip(axes[:, 1], range(n_states - 2, n_states), strict=True):
     CoefficientDisplay.from_estimator(models["EVGP-IFG"], output=state, ax=ax)
-    ax.set_title(f"Weights of the next {test.target_names[state]}", fontsize=10)
-axes[0, 1].legend(fontsize=8, loc="upper left")
+    ax.set(title=f"EVGP-IFG: weights of the next {test.target_names[state]}", xlabel="weight (SI units)")
+axes[0, 1].legend(loc="lower left", ncols=2, bbox_to_anchor=(0, 1.08))
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"learn_dynamics_{options.system}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

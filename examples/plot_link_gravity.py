@@ -45,6 +45,7 @@ try:
     import matplotlib.pyplot as plt
     import pinocchio
 
+    plt.style.use("skevgp.plotting.page")
     robots = {name: load_robot(name) for name in ("iiwa14", "ur5")}
 except (ImportError, ValueError) as error:
     sys.exit(f"error: {error}\nThis example needs: pip install pin example-robot-data matplotlib")
@@ -127,13 +128,13 @@ print(f"weight of u_y at iiwa14's q6: {weights[1]:.4f} kg m; the model's mass ti
 # joints that matter turn about parallel axes. At iiwa14's q2 other joints turn the arm about axes that themselves turn
 # in the frame of link 2: no weights fit. What is left over there is for the Gaussian process.
 
-figure, axes = plt.subplots(2, 2, figsize=(9, 6.4), layout="constrained", sharex=True)
+figure, axes = plt.subplots(2, 2, figsize=(8, 5.6), sharex=True)
 features = LinkGravity("iiwa14", links=["q6"])
 for values, colour, label in zip(
     features.fit_transform(rows(swings["iiwa14"])).T, ("#D55E00", "#0072B2"), ("u_x", "u_y"), strict=True
 ):
     axes[0, 0].plot(times, values, color=colour, label=f"gravity(q6, {label})")
-axes[0, 0].set_title("iiwa14: the two features of link 6", fontsize=10)
+axes[0, 0].set_title("iiwa14: the two features of link 6")
 axes[0, 0].set_ylabel("feature (m/s²)")
 styles = {
     "gravity's torque": {"color": "0.7", "linewidth": 5},
@@ -148,16 +149,16 @@ for ax, case, title in (
 ):
     for label, curve in curves[case].items():
         ax.plot(times, curve, label=label, **styles[label])
-    ax.set_title(title, fontsize=10)
+    ax.set_title(title)
     ax.set_ylabel("torque (N m)")
 for ax in axes.flat:
     ax.axhline(0.0, color="0.85", linewidth=0.8, zorder=0)
-    ax.legend(fontsize=8)
+    ax.legend()
 for ax in axes[1]:
     ax.set_xlabel("time (s)")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "link_gravity.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

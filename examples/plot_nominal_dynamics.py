@@ -50,6 +50,7 @@ sizes, n_inducing = ((5, 10), 15) if quick else ((10, 20, 40, 80, 160), 50)
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     train = make_dynamics("iiwa14", sizes[-1], random_state=options.seed)
     test = make_dynamics("iiwa14", 20, random_state=options.seed + 1000)
     wrong = perturb_robot("iiwa14", options.scale, random_state=options.seed)
@@ -111,8 +112,8 @@ print("weights of the nominal accelerations, as multiples of Δt:", *(f"{weight:
 # --------
 # The weights stay within about 20 % of Δt.
 
-colours = dict(zip(names, ("#D55E00", "#0072B2"), strict=True))
-figure, axes = plt.subplots(2, 2, figsize=(9, 6.8), layout="constrained")
+colours = dict(zip(names, ("C1", "C0"), strict=True))
+figure, axes = plt.subplots(2, 2, figsize=(8, 6.2))
 
 ax = axes[0, 0]
 for name, marker in zip(names, "so", strict=True):
@@ -122,7 +123,7 @@ ax.set_xticks(sizes, sizes)
 ax.minorticks_off()
 ax.set_xlabel("training moves of 50 steps")
 ax.set_ylabel("Error (rad, rad/s)")
-ax.set_title("Error on new moves", fontsize=10)
+ax.set_title("Error on new moves")
 
 ax = axes[0, 1]
 k = np.linspace(0.0, 4.0, 41)[1:]
@@ -132,7 +133,7 @@ ax.plot(k, erf(k / np.sqrt(2.0)), "k--", linewidth=1, label="calibrated")
 ax.set_ylim(0.0, 1.02)
 ax.set_xlabel("k (standard deviations)")
 ax.set_ylabel("share of truths within k std")
-ax.set_title(f"Calibration after {sizes[-1]} moves", fontsize=10)
+ax.set_title(f"Calibration after {sizes[-1]} moves")
 
 ax = axes[1, 0]
 output = n_joints + np.argmax(test.target[:, n_joints:].std(axis=0))
@@ -143,9 +144,10 @@ for name in names:
     ax.plot(seconds, np.abs(mean - test.target[move, output]), color=colours[name], label=f"{name}: |error|")
     ax.plot(seconds, 2 * std, color=colours[name], linestyle=":", label=f"{name}: 2 std")
 ax.set_yscale("log")
+ax.set_ylim(top=20 * ax.get_ylim()[1])  # room for the legend
 ax.set_xlabel("time (s)")
 ax.set_ylabel(f"{test.target_names[output]} (rad/s)")
-ax.set_title("One-step predictions along a test move", fontsize=10)
+ax.set_title("One-step predictions along a test move")
 
 ax = axes[1, 1]
 parts = (nominal.coef_, nominal.coef_std_, nominal.coef_prior_mean_, nominal.coef_prior_scale_)
@@ -155,12 +157,12 @@ CoefficientDisplay(
 ).plot(ax=ax)
 ax.set_ylim(bottom=-2.0)  # room for the legend
 ax.set_xlabel("weight for the joint's velocity, divided by Δt")
-ax.set_title("Weights of the nominal accelerations", fontsize=10)
+ax.set_title("Weights of the nominal accelerations")
 
-for ax in axes.flat:
-    ax.legend(fontsize=8, loc="lower center" if ax is axes[1, 1] else "best")
+for ax, place in zip(axes.flat, ("upper right", "lower right", "upper left", "lower center"), strict=True):
+    ax.legend(loc=place, ncols=2 if ax is axes[1, 0] else 1)
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "nominal_dynamics.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -52,6 +52,7 @@ n_steps, change = (60, 30) if quick else (400, 200)
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     train = make_dynamics("cartpole", 10 if quick else 24, noise=options.noise, random_state=options.seed)
     light = SYSTEMS["cartpole"]
     heavy = replace(light, links=(light.links[0], replace(light.links[1], mass=options.mass)))
@@ -109,7 +110,7 @@ for name, factor in ways.items():
 # ----------------
 # In units of the noise of each state; the mean over the last second.
 
-figure, axes = plt.subplots(2, 1, figsize=(9, 6), layout="constrained", sharex=True)
+figure, axes = plt.subplots(2, 1, figsize=(8, 5), sharex=True)
 colours = ("#D55E00", "#999999", "#0072B2")
 window = np.ones(33) / 33.0
 times = 0.03 * (1.0 + np.arange(n_steps))
@@ -121,8 +122,8 @@ for ax in axes:
     ax.axvline(0.03 * change, color="k", linestyle=":", linewidth=1)
 axes[0].set_yscale("log")
 axes[0].set_ylabel("one-step error / noise")
-axes[0].set_title(f"The pole's mass goes from 1 to {options.mass:g} kg (dotted line)", fontsize=10)
-axes[0].legend(fontsize=8)
+axes[0].set_title(f"The pole's mass goes from 1 to {options.mass:g} kg (dotted line)")
+axes[0].legend()
 axes[1].axhline(0.954, color="k", linewidth=0.5)
 axes[1].set_ylim(0.0, 1.05)
 axes[1].set_ylabel("share within 2 std")
@@ -130,6 +131,6 @@ axes[1].set_xlabel("time (s)")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "online.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -65,6 +65,7 @@ scratch = tempfile.TemporaryDirectory()
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     from simulated_arm import CATALOGUE_GAINS, with_payload, write_log
 
     columns = {"time": 0, "position": range(1, 7), "velocity": range(7, 13), "current": range(13, 19)}
@@ -165,9 +166,7 @@ if online is not None:
 # Mass and centre of mass against seconds of log
 # ----------------------------------------------
 
-figure, axes = plt.subplots(
-    2 if online is None else 3, 1, figsize=(9, 6 if online is None else 8.5), layout="constrained"
-)
+figure, axes = plt.subplots(2 if online is None else 3, 1, figsize=(8, 5 if online is None else 7.2))
 colours = ("#D55E00", "#0072B2", "#009E73")
 for (gain_scale, loads), colour, shift in zip(found.items(), colours, (-0.15, 0.15), strict=False):
     masses, deviations = np.array([(load.mass, load.mass_std) for load in loads]).T
@@ -175,7 +174,7 @@ for (gain_scale, loads), colour, shift in zip(found.items(), colours, (-0.15, 0.
     axes[0].errorbar(lengths + shift, masses, 1.96 * deviations, fmt="o", color=colour, capsize=3, label=label)
 axes[0].axhline(mass, color="k", linewidth=1, label="truth")
 axes[0].set_ylabel("mass (kg)")
-axes[0].set_title("The load, with 95 % intervals of the model", fontsize=10)
+axes[0].set_title("The load, with 95 % intervals of the model")
 for axis, colour in enumerate(colours):
     middle, half = 1e3 * np.array([(load.com[axis], 1.96 * load.com_std[axis]) for load in found[0.1]]).T
     axes[1].errorbar(
@@ -184,7 +183,7 @@ for axis, colour in enumerate(colours):
     if com:
         axes[1].axhline(1e3 * com[axis], color=colour, linewidth=1)
 axes[1].set_ylabel("centre of mass (mm)")
-axes[1].set_title("gain_scale=0.1" + (", and the truth as lines" if com else ""), fontsize=10)
+axes[1].set_title("gain_scale=0.1" + (", and the truth as lines" if com else ""))
 axes[1].set_xlabel("seconds of log with the load")
 axes[1].sharex(axes[0])
 for (factor, (load, deviation)), colour in zip(followed.items(), colours, strict=False):
@@ -193,14 +192,14 @@ for (factor, (load, deviation)), colour in zip(followed.items(), colours, strict
 if followed:
     axes[2].step([0.0, change, online.time[-1]], [0.0, 0.0, mass], "k", linewidth=1, label="truth")
     axes[2].axvline(change, color="k", linestyle=":", linewidth=1)
-    axes[2].set_title("Online: the arm picks the load up (dotted line)", fontsize=10)
+    axes[2].set_title("Online: the arm picks the load up (dotted line)")
     axes[2].set_ylabel("mass (kg)")
     axes[2].set_xlabel("time (s)")
 for ax in axes:
-    ax.legend(fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / ("payload.png" if online is not None else "payload_measured.png")
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

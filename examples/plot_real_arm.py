@@ -58,6 +58,7 @@ scratch = tempfile.TemporaryDirectory()
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
     from simulated_arm import CATALOGUE_GAINS, write_log
 
     if options.data is None:
@@ -91,7 +92,7 @@ print(f"{robot.name}, {'simulated' if truth else 'its logs'}: {len(train.data)} 
 options.output.mkdir(parents=True, exist_ok=True)
 stem = "real_arm" if options.data is None else "real_arm_measured"
 shown = [1, 2, 4]
-SignalsDisplay.from_log(train, joints=shown).figure_.savefig(options.output / f"{stem}_signals.png", dpi=100)
+SignalsDisplay.from_log(train, joints=shown).figure_.savefig(options.output / f"{stem}_signals.png")
 
 # %%
 # Three ways to predict torques
@@ -156,7 +157,7 @@ for name, row in asked.items():
 # The URDF alone knows gravity, but nothing of friction. The band is that of InverseDynamics, two standard deviations to
 # each side of its mean.
 
-figure, axes = plt.subplots(3, 2, figsize=(10, 7.5), layout="constrained", width_ratios=(1.6, 1))
+figure, axes = plt.subplots(3, 2, figsize=(8, 6.8), width_ratios=(1.3, 1))
 colours = {"URDF": "#D55E00", "least squares": "#999999", "InverseDynamics": "#0072B2"}
 window = slice(0, 1000)
 # No line reaches across a gap or rest: one row less there.
@@ -166,7 +167,7 @@ for ax, joint in zip(axes[:, 0], shown, strict=True):
     ax.plot(seconds, new.target[window, joint], "k", linewidth=1, label="measured")
     band = mean[window, joint] + 2.0 * np.array([[-1.0], [1.0]]) * std[window, joint]
     ax.fill_between(seconds, *band, color=colours["InverseDynamics"], alpha=0.5, linewidth=0)
-    ax.set_title(joints[joint].removesuffix("_joint").replace("_", " "), fontsize=10)
+    ax.set_title(joints[joint].removesuffix("_joint").replace("_", " "))
     ax.set_ylabel("torque (N m)")
 axes[2, 0].set_xlabel("time (s)")
 
@@ -176,7 +177,7 @@ for (name, error), marker in zip(errors.items(), "s^o", strict=True):
     axes[0, 1].plot(places, error, marker, color=colours[name], label=name)
 axes[0, 1].set_yscale("log")
 axes[0, 1].grid(axis="y", color="0.9")
-axes[0, 1].set_title("Mean squared error / variance", fontsize=10)
+axes[0, 1].set_title("Mean squared error / variance")
 for ax, start, title in (
     (axes[1, 1], "m(", "Mass of the link (kg)"),
     (axes[2, 1], "coulomb(", "Coulomb's friction (N m)"),
@@ -197,16 +198,16 @@ for ax, start, title in (
     )
     if truth and start == "m(":
         ax.plot(places, [row @ true_weights for row in rows], "kx", label="truth")
-    ax.set_title(title, fontsize=10)
+    ax.set_title(title)
     ax.set_ylim(bottom=0.0)
 for ax in axes[:, 1]:
-    ax.set_xticks(places, short, fontsize=8)
+    ax.set_xticks(places, short, fontsize=7)
     ax.set_xlim(-0.5, len(joints) - 0.5)
-axes[1, 1].legend(fontsize=8)
+axes[1, 1].legend()
 handles = [*axes[0, 0].get_lines()[1:], *axes[0, 1].get_lines()]
-figure.legend(handles, [line.get_label() for line in handles], loc="outside lower center", ncols=4, fontsize=9)
+figure.legend(handles, [line.get_label() for line in handles], loc="outside lower center", ncols=4)
 
 picture = options.output / f"{stem}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -57,6 +57,8 @@ print(f"{'':10s}{'rows':>6s}", *(f"{f'step {step}':>9s}" for step in horizons), 
 try:
     import matplotlib.pyplot as plt
 
+    plt.style.use("skevgp.plotting.page")
+
     for system, (n_inducing, n_trajectories, *_) in SYSTEMS.items():
         train = make_dynamics(system, n_trajectories, random_state=options.seed)
         test = make_dynamics(system, n_test, n_steps, random_state=options.seed + 1000)
@@ -92,7 +94,7 @@ except ValueError as error:
 # Above, of each system, a test trajectory: the one of which the particles are least sure at the end. Below, medians
 # over all of them: errors grow hundreds of times within a second, and the particles' standard deviations with them.
 
-figure, axes = plt.subplots(2, len(SYSTEMS), figsize=(11, 6), layout="constrained", sharex=True)
+figure, axes = plt.subplots(2, len(SYSTEMS), figsize=(8, 5.1), sharex=True)
 times = train.dt * np.arange(1, n_steps + 1)
 for (upper, lower), (system, (_, n_trajectories, state, name)) in zip(axes.T, SYSTEMS.items(), strict=True):
     ahead, truth = rollouts[system], truths[system]
@@ -107,24 +109,22 @@ for (upper, lower), (system, (_, n_trajectories, state, name)) in zip(axes.T, SY
         axes=upper,
     )
     upper.set_xlabel("")
-    upper.set_title(
-        f"{system}, learned from {n_trajectories} × 3 s:\nthe least sure of {n_test} test trajectories", fontsize=10
-    )
+    upper.set_title(f"{system}, learned from {n_trajectories} × 3 s:\nthe least sure of {n_test} trajectories")
     errors = np.abs(ahead.mean - truth)[:, :, state]
     lower.plot(times, np.median(errors, axis=0), color="#D55E00", linestyle="--", label="|error|, median")
     lower.plot(times, np.median(ahead.std[:, :, state], axis=0), color="#0072B2", label="std, median")
     lower.set_yscale("log")
     lower.set_xlabel("time (s)")
     lower.set_ylabel(name)
-    lower.set_title(f"all {n_test}: {coverage[system].mean():.0%} of true states within 2 std", fontsize=10)
-for ax in axes[:, 0]:
-    ax.legend(fontsize=8, loc="best")
+    lower.set_title(f"all {n_test}: {coverage[system].mean():.0%} within 2 std")
+known = [ax.get_legend_handles_labels() for ax in axes[:, 0]]
+figure.legend(*(above + below for above, below in zip(*known, strict=True)), loc="outside lower center", ncols=6)
 limits = np.array([ax.get_ylim() for ax in axes[1]])
 for ax in axes[1]:
     ax.set_ylim(limits.min(), limits.max())
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "rollout.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

@@ -24,6 +24,7 @@ from sklearn.preprocessing import PolynomialFeatures
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
 
+plt.style.use("skevgp.plotting.page")
 quick = os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1"
 X, y = make_toy(200 if quick else 1000, random_state=0, return_X_y=True)
 x_grid = np.linspace(-3.0, 9.0, 400)[:, np.newaxis]
@@ -63,7 +64,7 @@ print(
 # The same picture inside the data; outside, one falls back to a constant, the other to the trend
 # ------------------------------------------------------------------------------------------------
 
-figure, axes = plt.subplots(1, 2, figsize=(10, 3.8), sharey=True, layout="constrained")
+figure, axes = plt.subplots(1, 2, figsize=(8, 3.1), sharey=True)
 for ax, title, mean, std in (
     (axes[0], f"GaussianProcessRegressor: {len(X)} points, {exact_seconds:.1f} s", exact_mean, exact_std),
     (
@@ -78,7 +79,7 @@ for ax, title, mean, std in (
     ax.fill_between(
         x_grid[:, 0], mean - 2 * std, mean + 2 * std, color="#0072B2", alpha=0.2, linewidth=0, label="±2 std"
     )
-    ax.set_title(title, fontsize=10)
+    ax.set_title(title)
     ax.set_xlabel("x")
 axes[0].set_ylabel("y")
 axes[1].plot(
@@ -89,7 +90,7 @@ axes[1].plot(
     transform=axes[1].get_xaxis_transform(),
     label="inducing points",
 )
-axes[1].legend(loc="upper left", fontsize=8)
+axes[1].legend(loc="upper left")
 if len(sys.argv) > 1 and not sys.argv[1].startswith("-"):
-    figure.savefig(sys.argv[1], dpi=100)
+    figure.savefig(sys.argv[1])
 plt.show()

@@ -57,6 +57,7 @@ try:
     import matplotlib.pyplot as plt
     from matplotlib.patches import Rectangle
 
+    plt.style.use("skevgp.plotting.page")
     learned, runs = {}, {}
     for name, physics in (("EVGP-IFG", True), ("without physics", False)):
         start = time.perf_counter()
@@ -95,7 +96,7 @@ def draw(ax, state, u, center):
     # The cartpole's axis points at us, the pendulum's away from us.
     tip = center + x + (1.0 if has_cart else -1.0) * 0.5 * np.sin(pole), -0.5 * np.cos(pole)
     ax.plot([center + x, tip[0]], [0.0, tip[1]], color="0.2", linewidth=2.5, solid_capstyle="round", zorder=3)
-    ax.plot(*tip, "o", color=colours["EVGP-IFG"], markersize=8, zorder=4)
+    ax.plot(*tip, "o", color=colours["EVGP-IFG"], markersize=7, zorder=4)
     if not has_cart:
         ax.plot(center, 0.0, "o", color="0.5", markersize=6, zorder=4)
     else:
@@ -111,13 +112,13 @@ times = DT * np.arange(task.n_steps + 1)
 until = np.flatnonzero(shown.distance >= NEAR)[-1] if shown.success else task.n_steps - 1
 frames = np.linspace(0, min(until + 10, task.n_steps - 1), 12).astype(int)
 
-figure = plt.figure(figsize=(12, 8), layout="constrained")
+figure = plt.figure(figsize=(8, 6.4))
 strip, middle, bottom = figure.subfigures(3, 1, height_ratios=(0.6, 1.2, 1.0))
 ax = strip.subplots()
 for place, frame in enumerate(frames):
     draw(ax, shown.states[frame], shown.inputs[frame, 0], 1.5 * place)
-    ax.text(1.5 * place, -0.82, f"{times[frame]:.2f} s", ha="center", fontsize=9)
-ax.set(aspect="equal", xlim=(-0.9, 1.5 * len(frames) - 0.6), ylim=(-0.9, 0.65))
+    ax.text(1.5 * place, -1.0, f"{times[frame]:.2f} s", ha="center")
+ax.set(aspect="equal", xlim=(-0.9, 1.5 * len(frames) - 0.6), ylim=(-1.1, 0.65))
 ax.axis("off")
 ax.set_title(f"EVGP-IFG, learned from {seconds:g} s of data" + (", with the force that acts" if has_cart else ""))
 
@@ -131,7 +132,7 @@ for ax, (name, run) in zip(middle.subplots(1, 2, sharey=True), runs.items(), str
     ax.axhline(np.pi * (1.0 + 2.0 * turns), color="0.3", linestyle=":", label="upright")
     ax.set(title=f"{name}: {'upright' if run.success else 'not upright'} in the last second", xlabel="time (s)")
     ax.set(xlim=(0.0, times[-1]), ylabel="pole's angle from hanging (rad)")
-    ax.legend(fontsize=8)
+    ax.legend()
 
 left, right = bottom.subplots(1, 2)
 for name, run in runs.items():
@@ -142,12 +143,12 @@ for name, run in runs.items():
     right.plot(times[1:], 2.0 * std[:, -1], color=colours[name], linestyle=":", label="2 std")
 left.set(title="What the controller did", xlabel="time (s)", ylabel=push, xlim=(0.0, times[-1]))
 right.set(title="One step ahead: the pole's angular velocity", xlabel="time (s)", ylabel="rad/s", yscale="log")
-right.set(xlim=(0.0, times[-1]))
-for ax in (left, right):
-    ax.legend(fontsize=8)
+right.set(xlim=(0.0, times[-1]), ylim=(0.02 * right.get_ylim()[0], None))  # room for the legend
+left.legend()
+right.legend(loc="lower center", ncols=2)
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / f"swing_up_{task.system}.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

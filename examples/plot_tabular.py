@@ -87,6 +87,8 @@ try:
     import matplotlib.pyplot as plt
 
     from skevgp.plotting import CalibrationDisplay
+
+    plt.style.use("skevgp.plotting.page")
 except ImportError as error:
     sys.exit(f"error: {error}\nThis example needs matplotlib: pip install matplotlib")
 
@@ -162,13 +164,12 @@ print(fitted["friedman1", "EVGPRegressor"][-1].summary())
 # Left: how often values of the houses lie inside of intervals. Beside it error and density, and how far they are from
 # the best of each set.
 
-figure, axes = plt.subplots(1, 3, figsize=(13, 4.2), layout="constrained")
+figure, axes = plt.subplots(1, 3, figsize=(8, 3.4))
 labels = list(models(1))
 colors = dict(zip(labels, ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=True))
 for label, color in colors.items():
     CalibrationDisplay.from_estimator(fitted["houses", label], *tests["houses"], ax=axes[0], label=label, color=color)
-axes[0].set_title("houses", fontsize=10)
-axes[0].legend(fontsize=7)
+axes[0].set_title("houses; grey: chance")
 for ax, column, title in ((axes[1], 0, "RMSE / the best"), (axes[2], 1, "NLPD, above the best (nats)")):
     for place, label in enumerate(labels):
         values = [results[name, label][column] for name in sets]
@@ -177,11 +178,10 @@ for ax, column, title in ((axes[1], 0, "RMSE / the best"), (axes[2], 1, "NLPD, a
         ax.plot(values, np.arange(len(sets)) + 0.15 * (place - 1.5), "o", color=colors[label], label=label)
     ax.set_yticks(range(len(sets)), sets)
     ax.invert_yaxis()
-    ax.set_title(title, fontsize=10)
-    ax.grid(axis="y", color="0.92")
+    ax.set_title(title)
 axes[2].set_xscale("symlog", linthresh=0.1)
 axes[2].set_xlim(-0.02, 2.0 * axes[2].get_xlim()[1])
-axes[1].legend(fontsize=7)
+figure.legend(*axes[1].get_legend_handles_labels(), loc="outside lower center", ncols=4)
 options.output.mkdir(parents=True, exist_ok=True)
-figure.savefig(options.output / "tabular.png", dpi=100)
+figure.savefig(options.output / "tabular.png")
 plt.show()

@@ -53,6 +53,7 @@ try:
     import matplotlib.pyplot as plt
     import pinocchio as pin
 
+    plt.style.use("skevgp.plotting.page")
     from skevgp.datasets import load_robot
     from skevgp.robots import RigidBody
 
@@ -108,7 +109,7 @@ for width, (durations, _) in planned.items():
 
 blue, orange, grey = "#0072B2", "#D55E00", "0.35"
 colours = dict(zip(runs, (orange, blue), strict=True))
-figure, axes = plt.subplots(2, 3, figsize=(13, 7.5), layout="constrained")
+figure, axes = plt.subplots(3, 2, figsize=(8, 8))
 data = nominal.model.createData()
 
 
@@ -137,7 +138,7 @@ joint = 3
 run = runs["with what was learned"]
 mean, std = (part[:, joint] for part in model.predict(run.motion[:, 0], return_std=True))
 believed = nominal.forces(*np.split(run.motion[:, 0], 3, axis=1))[:, joint]
-ax = axes[0, 2]
+ax = axes[2, 0]
 ax.plot(times, run.torque[:, 0, joint], ".", color="0.6", markersize=2, label="measured")
 ax.plot(times, believed, color=orange, linewidth=1, label="nominal model")
 ax.plot(times, mean, color=blue, linewidth=1, label="learned, ± 2 std")
@@ -171,23 +172,23 @@ for ax, (width, (durations, path, torque, _)) in zip(axes[1], tried.items(), str
     ax.set(ylabel=f"torque of joint {joint + 1} (N m)")
     shown.append(side * mean - k * std)
 low = min(values.min() for values in shown)
-for ax in axes[1, :2]:
+for ax in axes[1]:
     ax.set_ylim(low, limits[joint] + 0.12 * (limits[joint] - low))
 
 bins = np.linspace(*np.percentile(np.concatenate([each[3] for each in tried.values()]), (0, 100)), 25)
 for (width, (*_, peak)), colour in zip(tried.items(), (orange, blue), strict=True):
     what = f"mean + {width:.1f} std" if width else "mean"
     label = f"{what}: {np.mean(peak > 1.0):.0%} break a limit"
-    axes[1, 2].hist(peak, bins, color=colour, alpha=0.6, label=label)
-axes[1, 2].axvline(1.0, color="k", linestyle="--", linewidth=1)
-axes[1, 2].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="moves")
-axes[1, 2].yaxis.get_major_locator().set_params(integer=True)
-axes[1, 2].margins(y=0.25)  # above which the legend is
+    axes[2, 1].hist(peak, bins, color=colour, alpha=0.6, label=label)
+axes[2, 1].axvline(1.0, color="k", linestyle="--", linewidth=1)
+axes[2, 1].set(title=f"Largest torque of {len(starts)} moves", xlabel="share of the limit", ylabel="moves")
+axes[2, 1].yaxis.get_major_locator().set_params(integer=True)
+axes[2, 1].margins(y=0.25)  # above which the legend is
 for ax in axes.ravel():
-    ax.legend(fontsize=8, loc="lower center" if ax in axes[1, :2] else "best")
+    ax.legend(loc="lower center" if ax in axes[1] else "best")
 
 options.output.mkdir(parents=True, exist_ok=True)
 picture = options.output / "tracking.png"
-figure.savefig(picture, dpi=100)
+figure.savefig(picture)
 print(f"picture: {picture}")
 plt.show()

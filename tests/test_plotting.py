@@ -1,4 +1,5 @@
 import sys
+from pathlib import Path
 
 import matplotlib as mpl
 import numpy as np
@@ -20,6 +21,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_toy
 from skevgp.metrics import prediction_error
 from skevgp.plotting import CoefficientDisplay, LearningCurveDisplay, PosteriorDisplay, RolloutDisplay
+from skevgp.plotting._style import PALETTE
 
 mpl.use("Agg")
 X, y = make_toy(30, random_state=0, return_X_y=True)
@@ -218,6 +220,29 @@ def test_bars_are_so_many_standard_deviations():
         assert_array_equal(points.get_xdata(), means)
         ends = np.array([segment[:, 0] for segment in bars.get_segments()])
         assert_allclose(ends.T, [np.subtract(means, np.multiply(3, stds)), np.add(means, np.multiply(3, stds))])
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "text"),
+    [
+        (1.0004, 0.0002, "1.0004 ± 0.0004"),
+        (-0.4316, 0.0011, "-0.432 ± 0.002"),
+        (-1e-5, 0.005, "0.00 ± 0.01"),
+        (12.34, 2.0, "12 ± 4"),
+        (0.5, 1e-9, "0.500000 ± 2e-09"),
+        (2.0, 0.0, "2.000 ± 0"),
+    ],
+)
+def test_bars_that_are_shorter_than_their_symbol_stand_in_numbers(mean, std, text):
+    display = CoefficientDisplay(["a"], *np.array([[mean], [std], [0.0], [1.0]])).plot()
+    assert [shown.get_text() for shown in display.ax_.texts] == [text]
+
+
+def test_the_style_has_the_palette_and_all_examples_have_the_style():
+    with pyplot.style.context("skevgp.plotting.page"):
+        assert tuple(pyplot.rcParams["axes.prop_cycle"].by_key()["color"]) == PALETTE
+    for script in (Path(__file__).parents[1] / "examples").glob("plot_*.py"):
+        assert 'style.use("skevgp.plotting.page")' in script.read_text(), script
 
 
 def test_weights_are_listed_from_the_top(trend):

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import re
+import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from harness import Row, column, figure_of, provenance_text, pyplot, save_picture, table
+from harness import WIDTH, Row, column, figure_of, provenance_text, pyplot, save_picture, table
 
 SETTINGS = {
     "paper": "paper's setting",
@@ -17,10 +18,10 @@ SETTINGS = {
     "author-100": "author's starts, prior scale 100",
     "skevgp": "skevgp's setting",
 }
-# Blue, white and vermilion of Okabe & Ito's palette; white to black for standard deviations.
-DIVERGING = ("#0072B2", "#8cc1e0", "#ffffff", "#edb48c", "#D55E00")
+# Blue, white and vermilion of Okabe & Ito's palette, on to dark ones, so that large weights differ too.
+DIVERGING = ("#002a42", "#0066a3", "#6fb1d9", "#cfe4f2", "#ffffff", "#f9dcc4", "#f0a469", "#c65600", "#4f2300")
 # Weights smaller than this are coloured in proportion, larger ones by their logarithm: 1 and Δt are not all one sees.
-LINEAR = 0.02
+LINEAR = 0.05
 # Entries are written into cells up to so many columns.
 WRITTEN = 12
 
@@ -95,11 +96,12 @@ def paragraphs(rows: list[Row], output: Path) -> list[str]:
         parts += [
             f"## {system}",
             f"![b of the {system}]({picture_of(output, system).name})",
-            f"Shown: seed {seeds[0]}. The weights of positions on the next velocities:",
+            f"Shown: {'means over seeds' if len(seeds) > 1 else 'seed'} {', '.join(seeds)}. The weights of positions "
+            "on the next velocities:",
             in_question(own),
             "Mean ± standard error over seeds (of one seed: none); std: the posterior's own. *Least squares* is what "
             "the features alone would say of the same rows; *GP*: what least squares reads off the mean of the "
-            "Gaussian process. In the picture these entries of b have a frame.",
+            "Gaussian process. In the picture the entries of positions have a frame.",
             verdict(own) if system == "acrobot" else "",
             explanation(own),
             f"Iterations: {iterations(own)}.",
@@ -207,8 +209,22 @@ def picture_of(output: Path, system: str) -> Path:
     return output.with_name(f"{output.stem}_{system}.png")
 
 
+def panels_of(rows: list[Row]) -> list[tuple[str, str, str]]:
+    """Lines of the picture: title, setting and column of the CSV. The first two are the same in all settings."""
+    settings = [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
+    first = settings[0]
+    # Of many settings, standard deviations are shown for the two that differ most.
+    posteriors = settings if len(settings) < 3 else [settings[0], settings[-1]]
+    return [
+        ("Prior mean", first, "prior_mean"),
+        ("Least squares, features alone", first, "least_squares"),
+        *((f"Posterior mean b, {SETTINGS[setting]}", setting, "mean") for setting in settings),
+        *((f"Posterior std, {SETTINGS[setting]}", setting, "std") for setting in posteriors),
+    ]
+
+
 def plot(rows: list[Row], path: Path) -> None:
-    """Prior mean, posterior mean and posterior std of the first seed, a row for each setting and model.
+    """A column of panels per model, one below the other prior, least squares and posterior: means over seeds.
 
     Parameters
     ----------
@@ -218,48 +234,78 @@ def plot(rows: list[Row], path: Path) -> None:
         Of the PNG.
     """
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, SymLogNorm
+
+    models, lines = sorted({row["model"] for row in rows}), panels_of(rows)
+    found = {(setting, model): own for setting, model, own in groups(rows)}
+    height = max(0.33, 0.16 + 0.5 / len(names(rows, "output"))) if is_written(rows) else 0.12
+    stds = np.concatenate([matrix(own, "std").ravel() for own in found.values()])
+    stds = stds[stds > 0.0]
+    diverging = LinearSegmentedColormap.from_list("blue to vermilion", DIVERGING)
+    colours: dict[bool, tuple[Any, Any]] = {
+        False: (diverging, SymLogNorm(LINEAR, vmin=-1.0, vmax=1.0)),
+        True: ("Greys", LogNorm(stds.min(), 10.0 * stds.max())),  # no black, on which nothing can be read
+    }
+    figure, grid = pyplot().subplots(
+        *(len(lines), len(models)),
+        figsize=(WIDTH, 0.4 + len(lines) * (0.45 + height * len(names(rows, "output")))),
+        squeeze=False,
+    )
+    for axes_of_line, (title, setting, value) in zip(grid, lines, strict=True):
+        for axes, model in zip(axes_of_line, models, strict=True):
+            own = found.get((setting, model), [])
+            axes.set_visible(bool(own))
+            if own:
+                heat_map(axes, own, value, *colours[value == "std"])
+                axes.set_title(f"{model}: {title[0].lower()}{title[1:]}")
+    for which, label in ((False, "weight (SI units)"), (True, "std (SI units)")):
+        own = [
+            axes for line, (*_, value) in zip(grid, lines, strict=True) for axes in line if (value == "std") == which
+        ]
+        picture = next(axes.images[0] for axes in own if axes.images)
+        bar = figure.colorbar(picture, ax=own, label=label, aspect=40, pad=0.01, extend="neither" if which else "both")
+        bar.outline.set_visible(False)
+        if not which:
+            ticks = [sign * size for sign in (-1, 1) for size in (1.0, 0.3, 0.1, 0.03, 0.01)]
+            bar.set_ticks([*ticks, 0.0], labels=[f"{tick:g}" for tick in (*ticks, 0.0)])
+            bar.ax.minorticks_off()
+    n_seeds = len({row["seed"] for row in rows})
+    said = f"means over {n_seeds} seeds" if n_seeds > 1 else "one seed"
+    if is_written(rows):
+        said += ", ± standard deviation between seeds" * (n_seeds > 1) + "; framed: what would imitate gravity"
+    steps = textwrap.fill(f"iterations: {iterations(rows)}", 120)
+    figure.suptitle(f"{rows[0]['system']}: {said}\n{steps}")
+    save_picture(figure, path)
+
+
+def is_written(rows: list[Row]) -> bool:
+    """Whether entries have room for their numbers."""
+    return len(names(rows, "feature")) <= WRITTEN
+
+
+def heat_map(axes: Any, rows: list[Row], value: str, colours: Any, norm: Any) -> None:
+    """Of a column's means over seeds, with their standard deviation between seeds where there is room."""
     from matplotlib.patches import Rectangle
 
-    first = min((row["seed"] for row in rows), key=int)
-    shown = list(groups([row for row in rows if row["seed"] == first]))
-    heights = [len(names(own, "output")) for _, _, own in shown]
-    widest = max(len(names(own, "feature")) for _, _, own in shown)
-    figure, grid = pyplot().subplots(
-        *(len(shown), 3),
-        figsize=(8.6, 0.9 + sum(0.5 + min(0.33, 8.0 / widest) * height for height in heights)),
-        squeeze=False,
-        layout="constrained",
-    )
-    stds = np.concatenate([matrix(own, "std").ravel() for _, _, own in shown])
-    stds = stds[stds > 0.0]
-    means = SymLogNorm(LINEAR, vmin=-1.0, vmax=1.0)
-    diverging = LinearSegmentedColormap.from_list("blue to vermilion", DIVERGING)
-    panels: tuple[tuple[str, str, Any, Any], ...] = (
-        ("prior mean", "prior_mean", diverging, means),
-        ("posterior mean b", "mean", diverging, means),
-        ("posterior std", "std", "Greys", LogNorm(stds.min(), 10.0 * stds.max())),
-    )
-    for axes_of_row, (setting, model, own) in zip(grid, shown, strict=True):
-        outputs, features = names(own, "output"), names(own, "feature")
-        wide = widest > WRITTEN
-        for axes, (title, value, colours, norm) in zip(axes_of_row, panels, strict=True):
-            values = matrix(own, value)[0]
-            picture = axes.imshow(values, cmap=colours, norm=norm, aspect="auto")
-            axes.set_xticks(range(len(features)), map(pretty, features), fontsize=5 if wide else 7, rotation=90 * wide)
-            axes.set_yticks(range(len(outputs)), map(pretty, outputs), fontsize=8)
-            axes.tick_params(length=0, top=False)
-            axes.spines[:].set_visible(False)
-            axes.set_title(f"{model}, {SETTINGS[setting]}: {title}" if value == "prior_mean" else title, fontsize=8)
-            for velocity, position in positions(own) if value == "mean" else ():
-                corner = features.index(position) - 0.47, outputs.index(velocity) - 0.47
-                axes.add_patch(Rectangle(corner, 0.94, 0.94, fill=False, edgecolor="k", linewidth=1.2))
-            if wide and value != "prior_mean":
-                figure.colorbar(picture, ax=axes, aspect=30, pad=0.01).ax.tick_params(labelsize=7)
-            for o, j in () if wide else np.ndindex(*values.shape):
-                red, green, blue, _ = picture.cmap(norm(values[o, j]))
-                dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
-                axes.text(j, o, written(values[o, j]), ha="center", va="center", fontsize=6, color="w" if dark else "k")
-    save_picture(figure, path)
+    values, outputs, features = matrix(rows, value), names(rows, "output"), names(rows, "feature")
+    mean, is_wide = values.mean(axis=0), not is_written(rows)
+    picture = axes.imshow(mean, cmap=colours, norm=norm, aspect="auto")
+    axes.set_xticks(range(len(features)), map(pretty, features), fontsize=6 if is_wide else 8.5, rotation=90 * is_wide)
+    axes.set_yticks(range(len(outputs)), map(pretty, outputs), fontsize=6 if is_wide else 8.5)
+    axes.tick_params(length=0)
+    axes.grid(False)
+    axes.spines[:].set_visible(False)
+    if is_wide:
+        return
+    for o, j in np.ndindex(*mean.shape):
+        red, green, blue, _ = picture.cmap(norm(mean[o, j]))
+        dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
+        text = written(mean[o, j])
+        if len(values) > 1 and value in ("mean", "least_squares"):
+            text += f"\n±{written(values[:, o, j].std(ddof=1))}"
+        axes.text(j, o, text, ha="center", va="center", fontsize=7.5, linespacing=1.0, color="w" if dark else "k")
+    for velocity, position in positions(rows) if value in ("mean", "least_squares") else ():
+        corner = features.index(position) - 0.48, outputs.index(velocity) - 0.48
+        axes.add_patch(Rectangle(corner, 0.96, 0.96, fill=False, edgecolor="k", linewidth=1.2))
 
 
 def written(value: float) -> str:

@@ -23,7 +23,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 import numpy as np
 
 import harness
-from harness import PALETTE, Row, column, figure_of, pyplot, save_picture
+from harness import PALETTE, WIDTH, Row, column, figure_of, legend, logarithmic, pyplot, save_picture
 from paper import results_table
 from paper.models import Fit, fitted_row
 from paper.results_table_report import PAPER
@@ -148,7 +148,7 @@ def table_of(rows: list[Row], model: str) -> str:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """A panel per model, a line per variant, a symbol per data set; across, the paper's Error.
+    """A panel per model, a line per variant, a symbol per data set and their median; across, the paper's Error.
 
     Parameters
     ----------
@@ -159,34 +159,32 @@ def plot(rows: list[Row], path: Path) -> None:
     """
     models = list(dict.fromkeys(model for model, _, _ in groups(rows)))
     variants = [variant for variant in VARIANTS if any(variant == row["variant"] for row in rows)]
-    figure, grid = pyplot().subplots(
-        *(1, len(models)),
-        figsize=(2.6 + 2.9 * len(models), 1.2 + 0.25 * len(variants)),
-        squeeze=False,
-        sharey=True,
-        layout="constrained",
-    )
+    size = (WIDTH, 1.3 + 0.27 * len(variants))
+    figure, grid = pyplot().subplots(1, len(models), figsize=size, squeeze=False, sharex=True, sharey=True)
+    seeds = sorted({int(row["seed"]) for row in rows})
+    styles = dict(zip(seeds, itertools.cycle(zip(PALETTE, "os^Dv<", strict=True)), strict=False))
     for axes, model in zip(grid[0], models, strict=True):
-        for seed, (colour, marker) in enumerate(zip(PALETTE, "os^Dv<", strict=True)):
-            own = [row for row in rows if (row["model"], row["seed"]) == (model, str(seed))]
-            if own:
-                places = [variants.index(row["variant"]) for row in own]
-                axes.plot(column(own, "error_mean"), places, marker, color=colour, alpha=0.8, label=f"data set {seed}")
-        axes.axvline(PAPER["cartpole"][model].error, color="black", linewidth=1.2, label="in the paper")
-        axes.set_xscale("log")
-        ticks = [0.01, 0.02, 0.05, 0.1]
-        axes.set_xticks(ticks, map(str, ticks))
-        axes.set_xticks([], minor=True)
-        axes.set_title(model, fontsize=11)
-        axes.set_xlabel("test Error")
-        axes.grid(alpha=0.3)
-        axes.spines[["top", "right"]].set_visible(False)
-    grid[0, 0].set_yticks(range(len(variants)), variants, fontsize=9)
-    grid[0, 0].invert_yaxis()
-    handles = {
-        label: handle for axes in grid[0] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=3, frameon=False)
+        for own_model, variant, own in groups(rows):
+            if own_model != model:
+                continue
+            place = variants.index(variant)
+            for row in own:
+                (colour, marker), limited = styles[int(row["seed"])], row["converged"] == "False"
+                face = "white" if limited else colour
+                axes.plot(float(row["error_mean"]), place, marker, color=colour, markerfacecolor=face, alpha=0.9)
+            if len(own) > 1:
+                axes.plot(np.median(column(own, "error_mean")), place, "k|", markersize=14, markeredgewidth=2)
+        axes.axvline(PAPER["cartpole"][model].error, color="0.3", linestyle="--", linewidth=1.2, label="in the paper")
+        logarithmic(axes, "x")
+        axes.set(title=model, xlabel="test Error (SI units)")
+    axes = grid[0, 0]
+    axes.set_yticks(range(len(variants)), variants)
+    axes.set_ylim(len(variants) - 0.5, -0.5)
+    for seed, (colour, marker) in styles.items():
+        axes.plot([], [], marker, color=colour, label=f"data set {seed}")
+    axes.plot([], [], "k|", markersize=12, markeredgewidth=2, label="median")
+    axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="ended by its limit of iterations")
+    legend(figure, ncols=4)
     save_picture(figure, path)
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness import Row, figure_of, provenance_text, pyplot, save_picture, table
+from harness import WIDTH, Row, figure_of, logarithmic, provenance_text, pyplot, save_picture, table
 
 BATCH, NETWORK_BATCH = 512, 200
 # Few rows: what an evaluation takes whatever their number.
@@ -55,18 +55,15 @@ STYLES = {
     ("model", "paper"): ("#E69F00", "D"),
     ("network", ""): ("#CC79A7", "v"),
 }
-# Of each panel: title, what is varied, slopes of the thin lines.
+# Of each panel: title, horizontal and vertical axis, slopes of the thin lines.
 PANELS = (
-    (f"bound and gradient, N = {MANY}, o = 4", "inducing points m", (1, 2, 3)),
-    ("m = 100, o = 4", "rows N", (1,)),
-    (f"m = 100, N = {MANY}", "outputs o", (1,)),
-    ("paper's setting, o = 4", "inducing points m", (1, 2, 3)),
-    (f"network's step, {NETWORK_BATCH} rows", "units n, or layers L", (1, 2)),
-    (f"model, N = {MANY}, o = 4", "inducing points m", (1, 2)),
-    ("model, m = 100, o = 4", "rows N", ()),
-    (f"model, m = 100, N = {MANY}", "outputs o", (1,)),
-    ("network, 2 layers", "units n", (1, 2)),
+    ("Time of wider models", "inducing points m, or the network's units n", "milliseconds", (1, 2, 3)),
+    ("Time with more rows", "rows N", "milliseconds", (1,)),
+    ("Time with more outputs or layers", "outputs o, or the network's hidden layers L", "milliseconds", (1,)),
+    ("Space of wider models", "inducing points m, or the network's units n", "megabytes", (1, 2)),
 )
+NOTES = f"""Behind each name its exponent; grey: slopes 1, 2 and 3; bound: with its gradient; a parameter: 8 bytes
+What is not varied: N = {MANY:,}, m = 100, o = 4, n = 100, L = 2"""
 
 
 def by_cell(rows: list[Row]) -> dict[tuple[str, ...], Row]:
@@ -80,8 +77,8 @@ class Curve:
 
     Attributes
     ----------
-    panel : int
-        Of the picture.
+    panel : int or None
+        Of the picture; None is for the table only.
     what, setting : str
         Of a cell.
     varied : str
@@ -97,7 +94,7 @@ class Curve:
         Empty: the usual ones.
     """
 
-    panel: int
+    panel: int | None
     what: str
     setting: str
     varied: str
@@ -140,15 +137,13 @@ class Curve:
 
     @property
     def label(self) -> str:
-        """What of its name is not in the panel's title; in panels of one model, what is varied."""
-        if self.what == "network step":
-            return WORDS[self.varied]
-        return self.name.removeprefix(f"{WORDS[self.what]}, ") if self.what != "adam step" else self.name
+        """Its name in the picture."""
+        return self.name.replace(" and gradient", "").removeprefix("model, ")
 
 
 CURVES = (
     Curve(0, "bound", "all", "n_inducing", 100, 3),
-    Curve(0, "bound", "all", "n_inducing", 200, 3, few=True),
+    Curve(None, "bound", "all", "n_inducing", 200, 3, few=True),
     Curve(0, "bound", "kernel", "n_inducing", 100, 3),
     Curve(0, "bound", "kernel", "n_inducing", 200, 3, few=True),
     Curve(1, "bound", "all", "n_rows", 3000, 1),
@@ -158,21 +153,21 @@ CURVES = (
     Curve(2, "bound", "kernel", "n_outputs", 4, 1),
     Curve(2, "bound", "none", "n_outputs", 4, 1),
     Curve(2, "adam step", "", "n_outputs", 4, 1),
-    Curve(3, "adam step", "", "n_inducing", 100, 3),
-    Curve(3, "adam step", "", "n_inducing", 200, 3, few=True),
-    Curve(4, "network step", "", "n_units", 200, 2),
-    Curve(4, "network step", "", "n_layers", 4, 1),
-    Curve(5, "model", "skevgp", "n_inducing", 200, 1, "n_bytes"),
-    Curve(5, "model", "skevgp", "n_inducing", 200, 1, "n_parameters"),
-    Curve(5, "model", "paper", "n_inducing", 200, 1, "n_bytes"),
-    Curve(5, "model", "paper", "n_inducing", 200, 1, "n_parameters"),
-    Curve(6, "model", "skevgp", "n_rows", 1000, 0, "n_bytes"),
-    Curve(6, "model", "paper", "n_rows", 1000, 0, "n_bytes"),
-    Curve(7, "model", "skevgp", "n_outputs", 4, 1, "n_bytes"),
-    Curve(7, "model", "paper", "n_outputs", 4, 1, "n_bytes"),
-    Curve(7, "model", "paper", "n_outputs", 4, 1, "n_parameters"),
-    Curve(8, "network", "", "n_units", 50, 2, "n_bytes", sizes=_SIZES[:-2]),
-    Curve(8, "network", "", "n_units", 50, 2, "n_parameters", sizes=_SIZES[:-2]),
+    Curve(0, "adam step", "", "n_inducing", 100, 3),
+    Curve(None, "adam step", "", "n_inducing", 200, 3, few=True),
+    Curve(0, "network step", "", "n_units", 200, 2),
+    Curve(2, "network step", "", "n_layers", 4, 1),
+    Curve(3, "model", "skevgp", "n_inducing", 200, 1, "n_bytes"),
+    Curve(None, "model", "skevgp", "n_inducing", 200, 1, "n_parameters"),
+    Curve(3, "model", "paper", "n_inducing", 200, 1, "n_bytes"),
+    Curve(3, "model", "paper", "n_inducing", 200, 1, "n_parameters"),
+    Curve(None, "model", "skevgp", "n_rows", 1000, 0, "n_bytes"),
+    Curve(None, "model", "paper", "n_rows", 1000, 0, "n_bytes"),
+    Curve(None, "model", "skevgp", "n_outputs", 4, 1, "n_bytes"),
+    Curve(None, "model", "paper", "n_outputs", 4, 1, "n_bytes"),
+    Curve(None, "model", "paper", "n_outputs", 4, 1, "n_parameters"),
+    Curve(3, "network", "", "n_units", 50, 2, "n_bytes", sizes=_SIZES[:-2]),
+    Curve(None, "network", "", "n_units", 50, 2, "n_parameters", sizes=_SIZES[:-2]),
 )
 QUICK = tuple(replace(curve, above=0, sizes=SIZES[curve.varied][:3]) for curve in CURVES)
 
@@ -289,7 +284,7 @@ def explanations(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
 
 
 def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
-    """A panel for each thing that is varied: measurements, exponents in the legends, thin lines of whole slopes.
+    """Four panels: measurements, exponents in the legends, thin lines of whole slopes.
 
     Parameters
     ----------
@@ -298,10 +293,8 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    from matplotlib.ticker import LogLocator, NullFormatter
-
-    figure, grid = pyplot().subplots(3, 3, figsize=(8.6, 8.4), layout="constrained")
-    for panel, (axes, (title, xlabel, slopes)) in enumerate(zip(grid.flat, PANELS, strict=True)):
+    figure, grid = pyplot().subplots(2, 2, figsize=(WIDTH, 7.0))
+    for panel, (axes, (title, xlabel, ylabel, slopes)) in enumerate(zip(grid.flat, PANELS, strict=True)):
         shown, corner = [own for own in curves if own.panel == panel], np.zeros(2)
         axes.set_visible(bool(shown))
         if not shown:
@@ -312,33 +305,21 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
             (colour, marker), dotted = STYLES[curve.what, curve.setting], curve.few or curve.value == "n_parameters"
             axes.plot(
                 *(sizes, values, marker),
-                linestyle=":" if dotted or (panel == 4 and curve.varied == "n_layers") else "-",
+                linestyle=":" if dotted else "-",
                 color=colour,
-                markersize=4,
                 markerfacecolor="white" if dotted else colour,
                 label=f"{curve.label}: {two_digits(curve.exponent(rows)[0])}",
             )
             corner = np.maximum(corner, [sizes[-1], values.max()])
-        axes.set_xscale("log")
-        axes.set_yscale("log")
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if corner[0] < 50 else (1.0,)))
-        for axis in (axes.xaxis, axes.yaxis):
-            axis.set_major_formatter(lambda value, _: f"{value:g}")
-            axis.set_minor_formatter(NullFormatter())
+        for which in "xy":
+            logarithmic(axes, which)
         low, high = axes.get_ylim()
-        if high < 10.0 * low:  # a tick below and one above
-            low, high = 10.0 ** np.floor(np.log10(low)), 10.0 ** np.ceil(np.log10(high))
         ends = np.array([axes.get_xlim()[0], corner[0]])
         for slope in slopes:
             line = 1.5 * corner[1] * (ends / corner[0]) ** slope
-            axes.plot(ends, line, color="0.75", linewidth=0.7, zorder=0)
-        axes.set_ylim(low, high * (high / low) ** (0.1 + 0.085 * len(shown)))
-        axes.set_title(title, fontsize=9)
-        axes.set_xlabel(xlabel, fontsize=9)
-        axes.tick_params(labelsize=8)
-        axes.legend(frameon=False, fontsize=7, loc="upper left", handlelength=1.6, borderaxespad=0.2)
-        axes.spines[["top", "right"]].set_visible(False)
-    for axes, unit in zip(grid.flat, ("ms",) * 5 + ("MB, or parameters × 8 bytes",) * 4, strict=True):
-        axes.set_ylabel(unit, fontsize=9)
-    figure.suptitle("Behind each name its exponent; grey: slopes 1, 2 and 3", fontsize=9)
+            axes.plot(ends, line, color="0.6", linewidth=0.8, zorder=0)
+        axes.set_ylim(low, high * (high / low) ** (0.1 + 0.075 * len(shown)))  # room for the legend
+        axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
+        axes.legend(loc="upper left", handlelength=2.2, borderaxespad=0.2)
+    figure.suptitle(NOTES)
     save_picture(figure, path)

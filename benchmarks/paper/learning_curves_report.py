@@ -6,12 +6,12 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from harness import Row, figure_of, logarithmic, provenance_text, pyplot, save_picture, table
+from harness import WIDTH, Row, figure_of, legend, logarithmic, provenance_text, pyplot, save_picture, table
 from paper.results_table_report import PAPER
-from skevgp.plotting import LearningCurveDisplay
 
 NOMINAL = "EVGP-IFG, nominal"  # EVGP-IFG in the setting skevgp-nominal
 # Colours of Okabe & Ito's palette, safe for colour-blind readers.
@@ -23,7 +23,7 @@ COLOURS = {
     "EVGP-IFG": "#0072B2",
     NOMINAL: "#CC79A7",
 }
-CLOSE_UP = ("EVGP-IF", "EVGP-IFG", NOMINAL)
+WORDS = {"skevgp": "skevgp's defaults", "paper": "the paper's setting"}
 # An Error that a doubling of the rows leaves above this share of what it was has reached a plateau.
 PLATEAU = 0.9
 
@@ -37,10 +37,13 @@ class Curve:
     n_rows : ndarray of shape (n_sizes,)
     errors : ndarray of shape (n_sizes, n_runs)
         NaN where a run is missing.
+    limited : ndarray of shape (n_sizes,)
+        Whether a fit ended by its limit of iterations.
     """
 
     n_rows: np.ndarray
     errors: np.ndarray
+    limited: np.ndarray
 
     @property
     def mean(self) -> np.ndarray:
@@ -67,7 +70,8 @@ def curve_of(rows: list[Row], measure: str) -> Curve:
     errors = np.full((len(sizes), len(seeds)), np.nan)
     for row in rows:
         errors[sizes.index(int(row["n_rows"])), seeds.index(int(row["seed"]))] = float(row[measure])
-    return Curve(np.array(sizes), errors)
+    limited = {int(row["n_rows"]) for row in rows if row["converged"] == "False"}
+    return Curve(np.array(sizes), errors, np.isin(sizes, list(limited)))
 
 
 def curves_of(rows: list[Row], setting: str, measure: str = "error_mean") -> Curves:
@@ -233,48 +237,55 @@ def lowest(models: dict[str, Curve]) -> str:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """For the first setting, a column of panels per system: all models above, the EVGP below.
+    """A picture per setting, with a panel per system: medians and quartiles of runs, and the paper's last points.
 
     Parameters
     ----------
     rows : list of dict
         Of the CSV, of one size.
     path : Path
-        Of the PNG.
+        Of the PNG of the first setting; the others have their setting behind the name.
     """
-    setting = settings_of(rows)[0]
-    curves = curves_of(rows, setting)
-    figure, grid = pyplot().subplots(
-        2, len(curves), figsize=(max(2.05 * len(curves), 3.6), 5.0), squeeze=False, layout="constrained"
-    )
-    for column, (system, models) in zip(grid.T, curves.items(), strict=True):
-        for axes, names in zip(column, (set(COLOURS) - {NOMINAL}, CLOSE_UP), strict=True):
-            for name, curve in models.items():
-                if name in names:
-                    LearningCurveDisplay(curve.n_rows, curve.errors).plot(axes, label=name, color=COLOURS[name])
-            axes.set(xlabel="", ylabel="")
-            axes.grid(alpha=0.3)
-            axes.tick_params(which="both", labelsize=7)
-            logarithmic(axes)
-            axes.spines[["top", "right"]].set_visible(False)
+    for setting in settings_of(rows):
+        own = path if setting == settings_of(rows)[0] else path.with_stem(f"{path.stem}_{setting}")
+        plot_setting(curves_of(rows, setting), own, WORDS.get(setting, setting), rows[0]["size"] == "quick")
+
+
+def plot_setting(curves: Curves, path: Path, setting: str, quick: bool) -> None:
+    """One of its pictures."""
+    n_columns = min(2, len(curves))
+    n_lines = -(-len(curves) // n_columns)
+    figure, grid = pyplot().subplots(n_lines, n_columns, figsize=(WIDTH, 0.8 + 2.7 * n_lines), squeeze=False)
+    for axes, (system, models) in zip(grid.flat, curves.items(), strict=False):
+        for number, (name, curve) in enumerate(models.items()):
+            plot_curve(axes, curve, name, 1.02 ** (number - (len(models) - 1) / 2))
+            result = PAPER[system].get(name)
+            if result:
+                axes.plot(1.25 * max(curve.n_rows), result.error, "*", color=COLOURS[name], markersize=8, zorder=4)
         n_runs = max(curve.errors.shape[1] for curve in models.values())
-        column[0].set_title(f"{system} ({n_runs} run{'s' * (n_runs > 1)})", fontsize=11)
-        column[1].set_xlabel("training rows", fontsize=9)
-    for axes, what in zip(grid[:, 0], ("all models", "EVGP only"), strict=True):
-        axes.set_ylabel(f"test Error, {what}", fontsize=9)
-    notes = ["mean, and band from lowest to highest run"]
-    notes += ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
-    handles = {
-        label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        [handles[name] for name in COLOURS if name in handles],
-        [name for name in COLOURS if name in handles],
-        loc="outside upper center",
-        ncols=6 if len(curves) > 2 else 2,
-        fontsize=9,
-        frameon=False,
-        title="; ".join(notes),
-        title_fontsize=9,
-    )
+        axes.set_title(f"{system} ({n_runs} run{'s' * (n_runs > 1)})")
+        axes.set(xlabel="training rows", ylabel="test Error (SI units)")
+        logarithmic(axes, "x")
+        sizes = sorted({size for curve in models.values() for size in curve.n_rows})
+        axes.set_xticks(sizes, [f"{size:,}" for size in sizes])
+        axes.set_xticks([], minor=True)
+        logarithmic(axes)
+    for axes in grid.flat[len(curves) :]:
+        axes.set_axis_off()
+    axes = grid.flat[len(curves) - 1]
+    axes.plot([], [], "*", color="0.3", markersize=8, label="in the paper, with all rows")
+    axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="a fit ended by its limit of iterations")
+    title = f"{setting}: medians of runs, bars from first to third quartile"
+    legend(figure, ncols=4, title=title + ("; a quick run, not to be compared" if quick else ""))
     save_picture(figure, path)
+
+
+def plot_curve(axes: Any, curve: Curve, name: str, shift: float) -> None:
+    """Medians with bars of quartiles, hollow where a fit ended by its limit; shifted, so that bars stand apart."""
+    middle, low, high = np.nanpercentile(curve.errors, (50, 25, 75), axis=1)
+    x, colour = shift * curve.n_rows, COLOURS[name]
+    zorder = 3 if name.startswith("EVGP") else 2
+    axes.plot(x, middle, color=colour, linewidth=1.4, zorder=zorder, label=name)
+    axes.errorbar(x, middle, (middle - low, high - middle), fmt="none", color=colour, linewidth=1.4, zorder=zorder)
+    for face, shown in ((colour, ~curve.limited), ("white", curve.limited)):
+        axes.plot(x[shown], middle[shown], "o", color=colour, markerfacecolor=face, markersize=4.5, zorder=zorder)

@@ -184,7 +184,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
     displays : dict of PosteriorDisplay
         By name.
     """
-    figure, grid = harness.pyplot().subplots(2, 2, figsize=(9, 6.6), sharex=True, sharey=True, layout="constrained")
+    figure, grid = harness.pyplot().subplots(2, 2, figsize=(harness.WIDTH, 6.0), sharex=True, sharey=True)
     displays = {}
     for axes, (name, model) in zip(grid.flat, models.items(), strict=True):
         displays[name] = PosteriorDisplay.from_estimator(
@@ -199,16 +199,14 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, title: str, path: Path)
             linewidth=1.2,
             label="explicit part: h(x)ᵀb, or 0",
         )
-        axes.set_title(TITLES[name], fontsize=11)
-        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_title(TITLES[name])
         axes.margins(x=0.0)
         axes.set_xticks(range(-2, 10, 2))
     for axes in grid[-1]:
         axes.set_xlabel("x")
     for axes in grid[:, 0]:
         axes.set_ylabel("y")
-    handles, labels = grid[-1, -1].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside upper center", ncols=3, frameon=False, title=title)
+    harness.legend(figure, ncols=5, title=title)
     harness.save_picture(figure, path)
     return displays
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from harness import Row, column, figure_of, provenance_text, pyplot, save_picture, table
+from harness import WIDTH, Row, column, figure_of, legend, logarithmic, provenance_text, pyplot, save_picture, table
 
 # Colour (Okabe & Ito's palette, safe for colour-blind readers), marker and line of each model.
 STYLES = {
@@ -27,7 +27,7 @@ SYSTEMS = {"pendulum": "pendulum", "cartpole": "cartpole", "smooth": "smooth fun
 MEASURES = {
     "fit_seconds": "seconds to fit",
     "memory_mb": "MB while fitting",
-    "error": "test error",
+    "error": "test error (SI units)",
     "nlpd": "NLPD, nats per row",
 }
 # Sizes, the largest, over which exponents are fitted.
@@ -207,40 +207,25 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    from matplotlib.ticker import NullLocator
-
     found = {system: lines for system in SYSTEMS if (lines := lines_of(rows, system))}
-    figure, grid = pyplot().subplots(
-        *(len(MEASURES), len(found)),
-        figsize=(0.9 + 2.4 * len(found), 8.0),
-        squeeze=False,
-        sharex="col",
-        layout="constrained",
-    )
+    size = (WIDTH, 8.4)
+    figure, grid = pyplot().subplots(len(MEASURES), len(found), figsize=size, squeeze=False, sharex="col")
     for panels, (system, lines) in zip(grid.T, found.items(), strict=True):
-        panels[0].set_title(SYSTEMS[system].replace(", ", "\n"), fontsize=10)
+        panels[0].set_title(SYSTEMS[system].replace(", ", "\n"))
         for axes, name in zip(panels, MEASURES, strict=True):
             for model, line in lines.items():
                 colour, marker, style = STYLES[model]
-                n, values = curve(line, name)
-                axes.plot(n, values, marker + style, color=colour, markersize=4.5, linewidth=1.4, label=LABELS[model])
-            axes.set_xscale("log")
+                axes.plot(*curve(line, name), marker + style, color=colour, label=LABELS[model])
             if name != "nlpd":
-                axes.set_yscale("log")
-            if name == "error":
-                axes.yaxis.set_major_formatter(lambda value, _: f"{value:g}")
-                axes.yaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-                axes.tick_params(axis="y", which="both", labelsize=8)
-            axes.grid(alpha=0.25)
-            axes.spines[["top", "right"]].set_visible(False)
+                logarithmic(axes)
+        logarithmic(panels[-1], "x")
         sizes = sorted({n for line in lines.values() for n in line})[::2]
-        panels[-1].set_xticks(sizes, [f"{n:,}" for n in sizes], fontsize=8)
-        panels[-1].xaxis.set_minor_locator(NullLocator())
+        panels[-1].set_xticks(sizes, [f"{n:,}" for n in sizes])
+        panels[-1].set_xticks([], minor=True)
         panels[-1].set_xlabel("rows, N")
     for axes, label in zip(grid[:, 0], MEASURES.values(), strict=True):
         axes.set_ylabel(label)
-    handles = {
-        label: handle for axes in grid[0] for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles, loc="outside upper center", ncols=min(3, 1 + len(found)), frameon=False)
+    figure.align_ylabels(grid[:, 0])
+    n_seeds = max(len(own) for lines in found.values() for line in lines.values() for own in line.values())
+    legend(figure, ncols=3, title=f"means over {n_seeds} seeds" if n_seeds > 1 else None)
     save_picture(figure, path)

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from harness import Row, column, figure_of, pyplot, save_picture, table
+from harness import WIDTH, Row, column, figure_of, legend, logarithmic, pyplot, save_picture, table
 
 # Whose last bound and NLPD the others are timed against.
 REFERENCE = ("GPflow SGPR", "none")
@@ -24,7 +24,6 @@ STYLES = {
     ("scikit-learn GPR", "none"): ("#555555", "-", "scikit-learn GPR, up to 1,500 rows"),
 }
 LINEAR = "scikit-learn BayesianRidge"
-_COLUMNS = 4
 # The curve's bounds are rounded to 0.001 nats.
 _ROUNDING = 0.01
 
@@ -212,37 +211,31 @@ def draw(rows: list[Row], curves: Curve, path: Path) -> None:
     datasets = list(dict.fromkeys(row["dataset"] for row in done))
     if not datasets:
         return
-    n_columns = min(len(datasets), _COLUMNS)
-    n_lines = -(-len(datasets) // n_columns)
-    size = (1.0 + 3.4 * n_columns, 1.0 + 5.0 * n_lines)
-    figure, grid = pyplot().subplots(2 * n_lines, n_columns, figsize=size, squeeze=False, layout="constrained")
-    for axes in grid.ravel():
-        axes.set_visible(False)
-    for index, dataset in enumerate(datasets):
-        line, place = divmod(index, n_columns)
-        bound, nlpd = grid[2 * line, place], grid[2 * line + 1, place]
+    size = (WIDTH, 1.0 + 1.9 * len(datasets))
+    figure, grid = pyplot().subplots(len(datasets), 2, figsize=size, squeeze=False, sharex="row")
+    for (bound, nlpd), dataset in zip(grid, datasets, strict=True):
         own = _own(done, dataset=dataset)
         first = min(own, key=lambda row: int(row["seed"]))["seed"]
         own, on_the_way = _own(own, seed=first), _own(curves, dataset=dataset, seed=first)
-        n_train = max(int(row["n_train"]) for row in own)
-        _panel(bound, on_the_way, "bound", None)
+        limited = {(row["peer"], row["sharing"]) for row in own if "iterations" in row["stop"]}
         linear = _done(_own(rows, dataset=dataset, seed=first, peer=LINEAR))
-        _panel(nlpd, on_the_way, "nlpd", float(linear[0]["nlpd"]) if linear else None)
-        bound.set_title(f"{dataset}: {n_train} rows", fontsize=10)
-        nlpd.set_xlabel("seconds")
-        nlpd.sharex(bound)
-    grid[0, 0].set_ylabel("bound, nats per row")
-    grid[1, 0].set_ylabel("test NLPD")
-    handles = {
-        text: handle for axes in grid.ravel() for handle, text in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles, loc="outside lower center", ncols=n_columns, fontsize=8, frameon=False)
+        _panel(bound, on_the_way, "bound", limited, None)
+        _panel(nlpd, on_the_way, "nlpd", limited, float(linear[0]["nlpd"]) if linear else None)
+        points = " or ".join(dict.fromkeys(row["m"] for row in own))
+        for axes, what in ((bound, "bound"), (nlpd, "test NLPD")):
+            axes.set_title(f"{dataset}, {max(int(row['n_train']) for row in own):,} rows, {points} points: {what}")
+            axes.set_ylabel("nats per row")
+    for axes in grid[-1]:
+        axes.set_xlabel("seconds of the fit")
+    grid[-1, -1].plot([], [], "o", color="0.3", label="converged")
+    grid[-1, -1].plot([], [], "o", color="0.3", markerfacecolor="white", label="ended by its limit of iterations")
+    note = "Models of one output each are fitted one after the other: they have a bound once the last has begun"
+    legend(figure, ncols=4, title=note)
     save_picture(figure, path)
 
 
-def _panel(axes: Any, curves: Curve, name: str, linear: float | None) -> None:
-    """The best so far of the bound, and NLPD as it was."""
-    axes.set_visible(True)
+def _panel(axes: Any, curves: Curve, name: str, limited: set[tuple[str, str]], linear: float | None) -> None:
+    """The best so far of the bound, and NLPD as it was; hollow ends are those of a limit."""
     ends = []
     for (peer, sharing), (colour, line, label) in STYLES.items():
         own = [row for row in _own(curves, peer=peer, sharing=sharing) if row[f"{name}_so_far"] not in ("", "nan")]
@@ -251,17 +244,14 @@ def _panel(axes: Any, curves: Curve, name: str, linear: float | None) -> None:
         seconds, values = column(own, "seconds_so_far"), column(own, f"{name}_so_far")
         if name == "bound":
             values = np.maximum.accumulate(values) / int(own[0]["n_train"])
-        axes.plot(seconds, values, line, color=colour, linewidth=1.6, label=label)
-        axes.plot(seconds[-1], values[-1], "o", color=colour, markersize=4)
+        axes.plot(seconds, values, line, color=colour, label=label)
+        face = "white" if (peer, sharing) in limited else colour
+        axes.plot(seconds[-1], values[-1], "o", color=colour, markerfacecolor=face, zorder=4)
         ends.append(values[-1])
     if linear is not None and np.isfinite(linear):
         axes.axhline(linear, color="#999999", linestyle=":", linewidth=1.2, label="BayesianRidge")
-    axes.set_xscale("log")
-    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
-    axes.xaxis.set_minor_formatter(lambda value, _: f"{value:g}" if f"{value:e}"[0] in "25" else "")
-    axes.tick_params(which="both", labelsize=8)
-    axes.grid(alpha=0.25)
-    axes.spines[["top", "right"]].set_visible(False)
+    logarithmic(axes, "x")
+    axes.tick_params(labelbottom=True)
     if ends:
         # The way up to where the worst fit ended says little.
         low, room = min(ends), max(np.ptp(ends), 0.1)

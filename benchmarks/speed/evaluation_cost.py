@@ -80,12 +80,10 @@ def _first(rows: list[dict[str, str]], sweep: str) -> dict[str, str]:
 
 def draw(rows: list[dict[str, str]], path: Path) -> None:
     """The ratio over rows and over inducing points, and for the data sets; the aim of 2 as a line."""
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import FixedLocator, NullLocator
+    from matplotlib.ticker import FixedLocator
 
-    figure, axes = plt.subplots(1, 3, figsize=(11, 3.6), sharey=True, layout="constrained")
-    # Okabe & Ito's colours, and other markers.
-    styles = (("#0072B2", "o", "-"), ("#D55E00", "s", "--"), ("#009E73", "^", ":"))
+    figure, axes = harness.pyplot().subplots(1, 3, figsize=(harness.WIDTH, 3.0), sharey=True)
+    styles = tuple(zip(harness.PALETTE, "os^", ("-", "--", ":"), strict=False))
     for cores, (colour, marker, line) in zip(sorted({int(row["cores"]) for row in rows}), styles, strict=False):
         label = "1 core" if cores == 1 else f"{cores} cores"
         for ax, sweep, column in ((axes[0], "rows", "n"), (axes[1], "points", "m"), (axes[2], "data", "name")):
@@ -99,25 +97,18 @@ def draw(rows: list[dict[str, str]], path: Path) -> None:
         (axes[2], "sizes of the data sets", ""),
     ):
         ax.axhline(2.0, color="#555555", linewidth=1, linestyle=":")
-        ax.set_title(title, fontsize=10)
-        ax.set_xlabel(xlabel)
-        ax.grid(alpha=0.25)
-        ax.spines[["top", "right"]].set_visible(False)
+        ax.set(title=title, xlabel=xlabel)
     for ax in axes[:2]:
-        ax.set_xscale("log")
-        ax.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
+        harness.logarithmic(ax, "x")
     axes[2].margins(x=0.15)
-    axes[0].set_yscale("log")
+    harness.logarithmic(axes[0])
     axes[0].yaxis.set_major_locator(FixedLocator([1, 2, 5, 10, 20, 50, 100]))
-    axes[0].yaxis.set_minor_locator(NullLocator())
-    axes[0].yaxis.set_major_formatter(lambda value, _: f"{value:g}")
     axes[0].set_ylabel("time / time of the dense products")
-    axes[0].legend(frameon=False)
+    axes[0].legend()
     axes[2].text(
         1.0, 2.02, "aim: 2×", color="#555555", transform=axes[2].get_yaxis_transform(), va="bottom", ha="right"
     )
-    figure.savefig(path, dpi=110)
-    plt.close(figure)
+    harness.save_picture(figure, path)
 
 
 def main() -> None:

@@ -136,27 +136,27 @@ def say(row: dict[str, Any]) -> str:
 
 
 def plot(rows: list[dict[str, str]], path: Path) -> None:
-    figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(9, 3.4), layout="constrained")
-    for engine, colour, marker in zip(ENGINES, ("#0072B2", "#D55E00", "#009E73"), "os^", strict=True):
+    figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(harness.WIDTH, 3.2))
+    for engine, colour, marker in zip(ENGINES, harness.PALETTE[:3], "os^", strict=True):
         of = [row for row in rows if row["engine"] == engine and int(row["max_iter"]) < 1000]
         if not of:
             continue
         of.sort(key=lambda row: int(row["n_rows"]))
         n, seconds, memory = (harness.column(of, name) for name in ("n_rows", "evaluation_seconds", "memory_mb"))
-        left.loglog(n, seconds, marker + "-", color=colour, label=engine)
-        right.semilogx(
-            n, memory, marker + "-", color=colour, label=engine + (": the client" if "Dask" in engine else "")
-        )
+        left.plot(n, seconds, marker + "-", color=colour, label=engine)
+        right.plot(n, memory, marker + "-", color=colour, label=engine + (": the client" if "Dask" in engine else ""))
     data = sorted({(float(r["n_rows"]), float(r["data_mb"])) for r in rows})
-    right.semilogx(*np.array(data).T, ":", color="0.4", label="the data themselves (not counted)")
+    right.plot(*np.array(data).T, ":", color="0.4", label="the data themselves (not counted)")
     right.axhline(300, color="0.4", linewidth=0.8)
     right.annotate("300 MB", (data[0][0], 300), (0, -11), textcoords="offset points", color="0.4")
     left.set(xlabel="rows", ylabel="seconds", title="One evaluation of bound and gradient")
     right.set(xlabel="rows", ylabel="MB", title="Peak memory of the fit above the data", ylim=(0, 320))
-    left.legend(frameon=False)
-    right.legend(frameon=False, loc="upper left", bbox_to_anchor=(0.0, 0.88))
-    figure.suptitle(f"{N_COLUMNS} columns, {N_INDUCING} inducing points", fontsize=10)
-    figure.savefig(path, dpi=110)
+    for axes, which in ((left, "x"), (left, "y"), (right, "x")):
+        harness.logarithmic(axes, which)
+    left.legend()
+    right.legend(loc="upper left", bbox_to_anchor=(0.0, 0.88))
+    figure.suptitle(f"{N_COLUMNS} columns, {N_INDUCING} inducing points")
+    harness.save_picture(figure, path)
 
 
 def main() -> None:

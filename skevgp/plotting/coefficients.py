@@ -16,6 +16,9 @@ if TYPE_CHECKING:
 class CoefficientDisplay:
     """Posterior weights of the explicit features beside their prior, with bars of standard deviations.
 
+    Data often determine weights so well that a bar is shorter than its symbol: posteriors stand at the right in
+    numbers, too.
+
     Parameters
     ----------
     names : sequence of str
@@ -137,9 +140,18 @@ class CoefficientDisplay:
                 capsize=3,
                 label=f"{label} ±{n_std:g} std",
             )
+        for place, mean, half in zip(places, self.mean, n_std * self.std, strict=True):
+            beside = {"transform": ax.get_yaxis_transform(), "va": "center", "color": BLUE}
+            ax.text(1.02, place, _in_numbers(mean, half), **beside)
         ax.axvline(0.0, color="0.85", linewidth=0.8, zorder=0)
         ax.set_yticks(places, self.names)
         ax.margins(x=0.1)
         ax.set_ylim(-0.6, len(self.names) - 0.4)
         self.ax_, self.figure_ = ax, ax.figure
         return self
+
+
+def _in_numbers(mean: float, half: float) -> str:
+    """A mean, to the digit that its bar leaves certain, and the bar."""
+    decimals = int(np.clip(-np.floor(np.log10(half)), 0, 6)) if half > 0.0 else 3
+    return f"{round(mean, decimals) + 0.0:.{decimals}f} ± {half:.1g}"

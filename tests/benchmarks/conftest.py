@@ -6,6 +6,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from matplotlib import pyplot, rc_context
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
 
@@ -15,6 +16,23 @@ def benchmarks(monkeypatch):
     """Their folder on the path, where a script puts it itself; pictures are drawn into files."""
     monkeypatch.syspath_prepend(str(BENCHMARKS))
     monkeypatch.setenv("MPLBACKEND", "Agg")
+    with rc_context():  # their style ends with them
+        yield
+
+
+@pytest.fixture
+def drawn(monkeypatch):
+    """Draw with a script's function; gives the figures that it saved."""
+
+    def draw(plot, *arguments):
+        figures = []
+        with monkeypatch.context() as patch:
+            patch.setattr(pyplot, "close", figures.append)
+            plot(*arguments)
+        return figures
+
+    yield draw
+    pyplot.close("all")
 
 
 @pytest.fixture

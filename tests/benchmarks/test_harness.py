@@ -132,3 +132,46 @@ def test_benchmarks_of_the_paper_have_the_same_options(harness, script, monkeypa
     said = capsys.readouterr().out
     for option in ("--quick", "--seeds", "--systems", "--jobs", "--output"):
         assert option in said, option
+
+
+def test_pictures_have_the_palette_of_the_displays_and_the_width_of_a_page(harness, tmp_path):
+    from PIL import Image
+
+    from skevgp.plotting._style import PALETTE
+
+    pyplot = harness.pyplot()
+    assert harness.PALETTE == PALETTE
+    assert tuple(pyplot.rcParams["axes.prop_cycle"].by_key()["color"]) == PALETTE
+    figure, axes = pyplot.subplots(figsize=(harness.WIDTH, 1.0))
+    assert not axes.spines["right"].get_visible()
+    assert harness.WIDTH * figure.dpi == 880
+    harness.save_picture(figure, tmp_path / "picture.png")
+    with Image.open(tmp_path / "picture.png") as image:
+        assert image.size == (1760, 220)
+
+
+@pytest.mark.parametrize(
+    ("which", "low", "high", "ticks"),
+    [
+        ("y", 0.009, 0.3, ["0.01", "0.02", "0.05", "0.1", "0.2"]),
+        ("x", 90, 20_001, ["100", "1,000", "10,000"]),
+        ("x", 300, 5000, ["500", "1,000", "2,000", "5,000"]),
+    ],
+)
+def test_logarithmic_axes_have_plain_numbers_that_do_not_collide(harness, which, low, high, ticks):
+    axes = harness.pyplot().subplots()[1]
+    axes.set(**{f"{which}lim": (low, high)})
+    harness.logarithmic(axes, which)
+    axis = axes.xaxis if which == "x" else axes.yaxis
+    low, high = axis.get_view_interval()
+    axes.figure.canvas.draw()
+    shown = [tick.label1.get_text() for tick in axis.get_major_ticks() if low <= tick.get_loc() <= high]
+    assert shown == ticks
+
+
+def test_a_legend_has_each_label_once(harness):
+    figure, grid = harness.pyplot().subplots(1, 2)
+    for axes, labels in zip(grid, ("ab", "bc"), strict=True):
+        for label in labels:
+            axes.plot([0, 1], label=label)
+    assert [text.get_text() for text in harness.legend(figure).get_texts()] == ["a", "b", "c"]

@@ -96,6 +96,37 @@ def test_the_papers_observation_is_looked_for(plain, gravity, seen):
     assert "(dq2, q2): **not** as in the paper" in said[1]
 
 
+def test_the_picture_has_prior_least_squares_and_posterior_of_each_model_and_colour_bars(drawn, tmp_path):
+    from paper import beta_report
+
+    given = {"system": "acrobot", "prior_mean": "0", "n_iter": "7", "max_iter": "7"}
+    rows = [{**row, **given} for row in fits({("EVGP-IF", "dq1"): -0.1})]
+    for row in rows:
+        if row["seed"] == "1" and (row["output"], row["feature"]) == ("dq1", "q1"):
+            row["mean"] = str(float(row["mean"]) - 0.2)
+    (figure,) = drawn(beta_report.plot, rows, tmp_path / "b.png")
+    maps = [axes for axes in figure.axes if axes.images]
+    said = ("prior mean", "least squares, features alone", "posterior mean b, paper's setting")
+    titles = [f"{model}: {what}" for what in said for model in ("EVGP-IF", "EVGP-IFG")]
+    assert [axes.get_title() for axes in maps[:6]] == titles
+    assert len(maps) == 8  # and standard deviations
+    plain, gravity = maps[4:6]
+    at = 2, 0  # the next dq1 from q1
+    assert plain.images[0].get_array()[at] == pytest.approx(-0.2)  # mean of -0.1 and -0.3
+    assert gravity.images[0].get_array()[at] == pytest.approx(-0.1)
+    assert "-.200\n±.141" in {text.get_text() for text in plain.texts}
+    assert len(plain.patches) == 2  # frames
+    assert not maps[0].patches
+    bars = [axes.get_ylabel() for axes in figure.axes if axes not in maps]
+    assert bars == ["weight (SI units)", "std (SI units)"]
+    title = figure.get_suptitle()
+    assert "means over 2 seeds, ± standard deviation between seeds" in title
+    assert "paper's setting 7 (limited to 7)" in title
+    # .063 and .164 were hard to tell apart.
+    brightness = plain.images[0].to_rgba(np.array([0.063, 0.164]))[:, :3] @ (0.3, 0.59, 0.11)
+    assert np.diff(brightness) < -0.15
+
+
 @pytest.mark.parametrize(
     ("name", "formula"),
     [

@@ -51,3 +51,26 @@ def test_a_page_has_the_mean_of_data_sets_and_each():
     names = {"variant": "Adam", "model": "EVGP-IF", "size": "full", "date": "today", "versions": "", "machine": ""}
     rows = [{**names, **numbers, "seed": seed, "error_mean": error} for seed, error in (("1", "0.03"), ("0", "0.01"))]
     assert "| Adam | 0.0200 (0.0100, 0.0300) | 1.00 |" in "\n".join(paragraphs(rows))
+
+
+def test_the_picture_has_each_data_set_their_median_and_the_paper(drawn, tmp_path):
+    from paper.cartpole import MODELS, plot
+
+    rows = [
+        {"variant": variant, "model": model, "seed": str(seed), "error_mean": error, "converged": str(seed < 2)}
+        for variant in ("Adam", "L-BFGS")
+        for model in MODELS
+        for seed, error in enumerate(("0.01", "0.03", "0.08"))
+    ]
+    (figure,) = drawn(plot, rows, tmp_path / "cart.png")
+    assert [axes.get_title() for axes in figure.axes] == list(MODELS)
+    for axes, paper in zip(figure.axes, (0.011, 0.016), strict=True):
+        assert axes.get_xlabel() == "test Error (SI units)"
+        assert [tick.get_text() for tick in axes.get_yticklabels()] in (["Adam", "L-BFGS"], [])
+        medians = [line.get_xdata() for line in axes.lines if line.get_marker() == "|" and len(line.get_xdata())]
+        assert medians == [pytest.approx([0.03])] * 2
+        assert paper in [line.get_xdata()[0] for line in axes.lines if line.get_linestyle() == "--"]
+        hollow = [line for line in axes.lines if line.get_markerfacecolor() == "white" and len(line.get_xdata())]
+        assert [line.get_xdata()[0] for line in hollow] == [0.08, 0.08]
+    labels = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"data set 0", "data set 2", "median", "in the paper", "ended by its limit of iterations"} <= labels

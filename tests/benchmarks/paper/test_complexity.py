@@ -119,3 +119,19 @@ def test_what_is_there_is_not_measured_again_and_the_page_is_written(run_script,
     assert "points per output, 16 rows | inducing points m | 3 |" in page
     assert "bytes differ by 0.0%" in page
     assert output.with_suffix(".png").stat().st_size > 10_000
+
+
+def test_the_picture_has_four_panels_with_units(drawn, tmp_path):
+    from paper.complexity_report import CURVES, PANELS, plot
+
+    sizes = [size for curve in CURVES for size in curve.cells()]
+    measured = {"seconds": "0.01", "n_bytes": "1e6", "n_parameters": "100"}
+    rows = [{**{name: str(value) for name, value in size.items()}, **measured} for size in sizes]
+    (figure,) = drawn(plot, CURVES, rows, tmp_path / "c.png")
+    assert len(figure.axes) == 4
+    for panel, (axes, (title, xlabel, ylabel, slopes)) in enumerate(zip(figure.axes, PANELS, strict=True)):
+        assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == (title, xlabel, ylabel)
+        shown = [curve for curve in CURVES if curve.panel == panel]
+        assert len(axes.lines) == len(shown) + len(slopes)
+        assert len(axes.get_legend().get_texts()) == len(shown) == len({curve.label for curve in shown}) <= 5
+        assert axes.lines[0].get_ydata()[0] == pytest.approx(10.0 if ylabel == "milliseconds" else 1.0)

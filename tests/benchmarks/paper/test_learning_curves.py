@@ -126,19 +126,40 @@ def test_a_page_of_few_rows_says_what_it_can(tmp_path):
     plot(nominal, tmp_path / "nominal.png")
 
 
-def test_each_panel_draws_its_models(tmp_path, monkeypatch):
-    from matplotlib import pyplot
-    from matplotlib.colors import to_rgb
+def test_each_panel_draws_medians_quartiles_limits_and_the_papers_points(drawn, tmp_path):
+    from matplotlib.colors import to_hex
 
     from paper.learning_curves_report import COLOURS, plot
 
-    drawn = []
-    monkeypatch.setattr(pyplot, "close", drawn.append)
-    plot(made_up(VGP={100: [4.0, 2.0], 400: [1.0]}, EVGP_IFG={100: [1.0], 400: [0.5]}), tmp_path / "curves.png")
-    monkeypatch.undo()
-    (figure,) = drawn
-    above, below = ({line.get_label(): line for line in axes.lines} for axes in figure.axes)
-    assert (set(above), set(below)) == ({"VGP", "EVGP-IFG"}, {"EVGP-IFG"})
-    np.testing.assert_array_equal(above["VGP"].get_xydata(), [[100, 3.0], [400, 1.0]])
-    assert to_rgb(below["EVGP-IFG"].get_color()) == to_rgb(COLOURS["EVGP-IFG"])
-    pyplot.close(figure)
+    rows = made_up(VGP={100: [4.0, 1.0, 1.0], 400: [1.0]}, EVGP_IFG={100: [1.0], 400: [0.5]})
+    rows += [{**row, "system": "acrobot"} for row in rows if row["model"] == "VGP"]
+    rows[0]["converged"] = "False"
+    (figure,) = drawn(plot, rows, tmp_path / "curves.png")
+    assert [axes.get_title() for axes in figure.axes] == ["pendulum (3 runs)", "acrobot (3 runs)"]
+    for axes in figure.axes:
+        assert (axes.get_xlabel(), axes.get_ylabel()) == ("training rows", "test Error (SI units)")
+        assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+    pendulum = figure.axes[0]
+    lines = {line.get_label(): line for line in pendulum.lines}
+    assert {"VGP", "EVGP-IFG"} < set(lines)
+    np.testing.assert_array_equal(lines["VGP"].get_ydata(), [1.0, 1.0])  # medians
+    assert lines["EVGP-IFG"].get_color() == COLOURS["EVGP-IFG"]
+    (first, _), (_, last) = pendulum.collections[0].get_segments()[0]
+    assert (first, last) == (pytest.approx(100, rel=0.05), 2.5)  # the third quartile of 4, 1, 1
+    stars = {line.get_color(): line.get_ydata()[0] for line in pendulum.lines if line.get_marker() == "*"}
+    assert stars == {COLOURS["VGP"]: 0.343, COLOURS["EVGP-IFG"]: 0.005}
+    hollow = [
+        line for line in pendulum.lines if to_hex(line.get_markerfacecolor()) == "#ffffff" and len(line.get_xdata())
+    ]
+    assert [(line.get_color(), line.get_ydata().tolist()) for line in hollow] == [(COLOURS["VGP"], [1.0])]
+    said = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert {"VGP", "EVGP-IFG", "in the paper, with all rows", "a fit ended by its limit of iterations"} == said
+    assert "bars from first to third quartile" in figure.legends[0].get_title().get_text()
+
+
+def test_each_setting_has_a_picture(tmp_path):
+    from paper.learning_curves_report import plot
+
+    rows = made_up(EVGP_IFG={100: [1.0], 400: [0.5]})
+    plot(rows + [{**row, "setting": "paper"} for row in rows], tmp_path / "curves.png")
+    assert {path.name for path in tmp_path.iterdir()} == {"curves.png", "curves_paper.png"}

@@ -66,7 +66,7 @@ def test_without_snelsons_points_those_of_make_toy_are_taken(run, tmp_path, monk
     from skevgp.datasets import snelson
 
     monkeypatch.setattr(snelson, "_ADDRESS", (tmp_path / "moved.tgz").as_uri())
-    monkeypatch.setattr(harness, "run_missing", lambda cells, *_rest: print({cell.data for cell in cells}) or 0)
+    monkeypatch.setattr(harness, "run_missing", lambda cells, *_, **__: print({cell.data for cell in cells}) or 0)
     home = ("--data-home", tmp_path / "home")
     said = run(*home)
     assert "could not be fetched" in said

@@ -152,3 +152,31 @@ def test_a_fit_is_timed_against_the_last_bound_and_nlpd_of_the_reference():
     assert to["faster_cpu"] == pytest.approx(to["faster"])
     assert to["to_nlpd"] == pytest.approx(2.0, rel=1e-4)
     assert np.isnan(list(against_reference(own, [own], curves).values())).all()
+
+
+def test_each_data_set_has_a_line_of_panels_in_which_fits_end_as_they_did(drawn, tmp_path):
+    from peers.against_peers_report import draw
+
+    def fit(peer, dataset, stop):
+        key = {"peer": peer, "dataset": dataset, "sharing": "none", "m": "9", "n_train": "5000", "seed": "0"}
+        return {**key, "seconds": "4.0", "stop": stop}
+
+    rows = [fit("skevgp", "kin40k", "converged"), fit("GPflow SGPR", "kin40k", "iterations")]
+    rows.append(fit("skevgp", "acrobot", "converged"))
+    curves = [
+        {**curve_row(seconds, bound, nlpd, row["peer"]), "dataset": row["dataset"], "n_train": "5000"}
+        for row in rows
+        for seconds, bound, nlpd in ((1.0, -20.0, 0.5), (4.0, -10.0, 0.1))
+    ]
+    (figure,) = drawn(draw, rows, curves, tmp_path / "peers.png")
+    titles = [
+        f"{name}, 5,000 rows, 9 points: {what}" for name in ("kin40k", "acrobot") for what in ("bound", "test NLPD")
+    ]
+    assert [axes.get_title() for axes in figure.axes] == titles
+    assert {axes.get_ylabel() for axes in figure.axes} == {"nats per row"}
+    assert [axes.get_xlabel() for axes in figure.axes[2:]] == ["seconds of the fit"] * 2
+    ends = [line for line in figure.axes[0].lines if line.get_marker() == "o"]
+    assert [line.get_markerfacecolor() == "white" for line in ends] == [False, True]  # GPflow's hit its limit
+    assert ends[0].get_ydata()[0] == -10.0 / 5000
+    labels = {text.get_text() for text in figure.legends[0].get_texts()}
+    assert labels == {"skevgp", "GPflow SGPR", "converged", "ended by its limit of iterations"}
