@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from harness import Row, logarithmic, pyplot, save_picture
+from harness import WIDTH, Row, logarithmic, pyplot, save_picture
 from harness import column as of
 from paper.models import PROMISED
 from paper.results_table_report import PAPER, STYLES, WRAPPED, group, marks, models_of, noisy
@@ -29,9 +29,7 @@ def plot(rows: list[Row], path: Path) -> None:
     systems = list(dict.fromkeys(key[0] for key in groups))
     n_columns = min(2, len(systems))
     n_rows = -(-len(systems) // n_columns)
-    figure, grid = pyplot().subplots(
-        n_rows, n_columns, figsize=(1 + 4.2 * n_columns, 0.9 + 2.7 * n_rows), squeeze=False, layout="constrained"
-    )
+    figure, grid = pyplot().subplots(n_rows, n_columns, figsize=(WIDTH, 0.9 + 2.7 * n_rows), squeeze=False)
     settings = [setting for setting in STYLES if any(key[2] == setting for key in groups)]
     for axes, system in zip(grid.flat, systems, strict=False):
         own = {key[1:]: rows for key, rows in groups.items() if key[0] == system}
