@@ -239,18 +239,15 @@ def which_cartpole(groups: Groups) -> Iterator[str]:
         ]
         yield f"Setting {setting}: the Error of each data set, all rows; in brackets those inside the training range."
         yield table(["model", "in the paper", *cases], lines)
-        scores = {case: closeness(groups, case, setting) for case in cases}
-        scores = {case: score for case, score in scores.items() if score}
+        scores = closeness(groups, cases, setting)
         if len(scores) > 1:
-            highest = max(score[0] for score in scores.values())
-            said = [
-                f"{case} {score - highest:+.1f} ({n} models)"
-                for case, (score, n) in sorted(scores.items(), key=lambda item: -item[1][0])
-            ]
+            best = max(scores.values())
+            ranked = sorted(scores.items(), key=lambda item: -item[1])
             yield (
                 "Log likelihood of the paper's Errors, nats, against that of the best reading (log Error is normal "
-                "over data sets, with their mean and scatter, and a factor of 1.5 for what the paper does not say): "
-                f"{'; '.join(said)}."
+                "over data sets, with their mean and scatter, and a factor of 1.5 for what the paper does not say; of "
+                "readings and models with two data sets and more): "
+                f"{'; '.join(f'{case} {score - best:+.1f}' for case, score in ranked)}."
             )
 
 
@@ -261,17 +258,24 @@ def spread(own: list[Row]) -> str:
     return ", ".join(map(figure_of, of(own, "error_mean"))) + inside
 
 
-def closeness(groups: Groups, case: str, setting: str) -> tuple[float, int] | None:
-    """The log likelihood of the paper's Errors under our data sets' of one reading, and of how many models."""
-    found = {model: groups[case, model, setting] for model in MODELS if len(groups.get((case, model, setting), [])) > 1}
-    if not found:
-        return None
-    scores = []
-    for model, own in found.items():
-        errors = np.log(of(own, "error_mean"))
-        scale = np.hypot(errors.std(ddof=1) * np.sqrt(1.0 + 1.0 / len(errors)), UNSAID)
-        scores.append(norm.logpdf(np.log(published(case, model).error), errors.mean(), scale))
-    return float(np.sum(scores)), len(found)
+def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, float]:
+    """The log likelihood of the paper's Errors under our data sets' of each reading, by the models that all have."""
+    models = {case: {model for model in MODELS if len(groups.get((case, model, setting), [])) > 1} for case in cases}
+    # A reading with less than three models would leave too few to compare by.
+    models = {case: own for case, own in models.items() if len(own) > 2}
+    common = set.intersection(*models.values()) if models else set()
+    return {
+        case: sum(likelihood(published(case, model).error, groups[case, model, setting]) for model in common)
+        for case in models
+        if common
+    }
+
+
+def likelihood(error: float, own: list[Row]) -> float:
+    """The logarithm of it, of one Error."""
+    errors = np.log(of(own, "error_mean"))
+    scale = np.hypot(errors.std(ddof=1) * np.sqrt(1.0 + 1.0 / len(errors)), UNSAID)
+    return float(norm.logpdf(np.log(error), errors.mean(), scale))
 
 
 def outside(groups: Groups) -> Iterator[str]:
