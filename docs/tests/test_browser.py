@@ -1,5 +1,7 @@
 """The pages as they are seen: one of each type, at the width of a desk and of a phone."""
 
+from pathlib import Path
+
 import pytest
 
 selenium = pytest.importorskip("selenium", reason="the extra 'docs-test' is not installed")
@@ -119,3 +121,19 @@ def test_search_finds_the_regressor(browser, address):
     link = next(link for link in browser.find_elements(By.CSS_SELECTOR, found) if link.text == "skevgp.EVGPRegressor")
     assert "generated/api/skevgp.EVGPRegressor.html" in link.get_attribute("href")
     assert not complaints(browser)
+
+
+GUIDE = sorted(page.name for page in (Path(__file__).parents[1] / "guide").glob("*.md") if "$$" in page.read_text())
+
+
+@pytest.mark.parametrize("page", GUIDE)
+def test_no_formula_has_to_be_scrolled_at_a_desk(browser, address, page):
+    if browser.size == "phone":
+        return  # there they may
+    wait = opened(browser, address, f"guide/{page.replace('.md', '.html')}")
+    check_formulas(browser, wait)
+    wide = browser.execute_script(
+        """return [...document.querySelectorAll('article div.math')].filter(e => e.scrollWidth > e.clientWidth + 1)
+             .map(e => e.id)"""
+    )
+    assert wide == []
