@@ -28,7 +28,7 @@ from paper.results_table_report import WRAPPED, Groups
 
 TEMPLATE = Path(__file__).with_name("reproduction.md.in")
 PAGE = Path(__file__).parents[2] / "REPRODUCTION.md"
-HEADER = "<!-- Written by benchmarks/paper/reproduction.py: change reproduction.md.in beside it. -->\n\n"
+NOTE = "\n<!-- Written by benchmarks/paper/reproduction.py: change reproduction.md.in beside it. -->\n"
 MISSING = "—"
 
 
@@ -173,7 +173,8 @@ def filled(text: str, results: Results) -> str:
         name, *arguments = shlex.split(place[1])
         return FILLERS[name](results, *arguments).strip("\n")
 
-    return HEADER + re.sub(r"\{\{(.+?)\}\}", fill, text)
+    title, _, rest = re.sub(r"\{\{(.+?)\}\}", fill, text).partition("\n")
+    return f"{title}\n{NOTE}{rest}"
 
 
 def main() -> None:

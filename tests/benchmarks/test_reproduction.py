@@ -30,11 +30,11 @@ def test_a_place_without_a_function_or_a_number_is_seen():
     results = Results(RESULTS)
     with pytest.raises(KeyError, match="figure"):
         filled("{{figure 7}}", results)
-    assert filled("{{error pendulum EVGP-IF nowhere}}", results).endswith(MISSING)
+    assert filled("# A\n\n{{error pendulum EVGP-IF nowhere}}", results).endswith(f"-->\n\n{MISSING}")
     rows = [row for row in read(RESULTS / "results_table.csv") if row["angles"] == "raw" and row["size"] == "full"]
     wanted = ("pendulum", "EVGP-IFG", "skevgp")
     errors = [float(row["error_mean"]) for row in rows if (row["system"], row["model"], row["setting"]) == wanted]
-    shown = float(filled("{{error pendulum EVGP-IFG skevgp largest}}", results).split()[-1])
+    shown = float(filled("# A\n\n{{error pendulum EVGP-IFG skevgp largest}}", results).split()[-1])
     assert shown == pytest.approx(max(errors), rel=5e-3)
 
 
