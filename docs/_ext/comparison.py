@@ -12,6 +12,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 DATA = {
     "elevators": "elevators",
     "kin40k": "kin40k",
+    "airfoil": "airfoil",
+    "smooth": "smooth, 8 columns",
     "cartpole": "cartpole, 4 outputs",
     "acrobot": "acrobot, 4 outputs",
 }
