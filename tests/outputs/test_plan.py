@@ -482,7 +482,7 @@ def test_limits_and_bounds_of_groups_are_those_of_the_outputs():
     done = fitted(sharing=[[0, 2], [1, 3]], max_iter=3, **FOUR)
     rows, predictor = FOUR["units"].rows(source_of(Y=FOUR["Y"], H=NO_FEATURES)), done.predictor()
     bounds = [
-        done.bound_at(rows, o, group.hyperparameters, float(predictor.signal[o]))[0]
+        done.bound_at(rows, o, np.append(group.hyperparameters, predictor.signal[o]))[0]
         for o, group in enumerate(predictor.by_output)
     ]
     assert sum(bounds) == pytest.approx(done.lower_bound, rel=1e-9)
