@@ -126,8 +126,17 @@ def mean_and_std(estimator: Any, X: Any) -> tuple[np.ndarray, np.ndarray]:
     parameters = signature(estimator.predict).parameters
     if "return_std" not in parameters and all(one.kind != Parameter.VAR_KEYWORD for one in parameters.values()):
         raise TypeError(f"{type(estimator).__name__}.predict takes no return_std: there is no standard deviation.")
-    mean, std = estimator.predict(X, return_std=True)
-    return mean, std
+    try:
+        predicted = estimator.predict(X, return_std=True)
+    except (TypeError, ValueError) as problem:
+        if "return_std" in parameters:
+            raise
+        raise TypeError(
+            f"{type(estimator).__name__}.predict takes no return_std: there is no standard deviation ({problem})."
+        ) from problem
+    if not isinstance(predicted, tuple) or len(predicted) != 2:
+        raise TypeError(f"{type(estimator).__name__}.predict(return_std=True) returns no pair of mean and std.")
+    return predicted
 
 
 def _scaled_back(model: TransformedTargetRegressor, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

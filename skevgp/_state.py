@@ -27,12 +27,12 @@ class StatefulEstimator(BaseEstimator):
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         state = {name: _from_data(value) for name, value in state.items()}
-        version = state.pop(_KEY, "before 0.2")
+        version = state.pop(_KEY, None)
         if _is_ours(self) and version != __version__:
             warn_user(
-                f"{type(self).__name__} is a pickle of skevgp {version}, and this is {__version__}: it may fail, or "
-                "predict something else. Load it with that version and save it with skevgp.io.save, whose files are "
-                "checked when they are read; or fit it again.",
+                f"{type(self).__name__} is a pickle of skevgp {version or '(version unknown)'}, and this is "
+                f"{__version__}: it may fail, or predict something else. Fit it again, or load it with that version "
+                "and save it with skevgp.io.save, whose files are checked when they are read.",
                 InconsistentVersionWarning,
             )
         super().__setstate__(state)

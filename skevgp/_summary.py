@@ -21,6 +21,8 @@ from ._validation import check_fitted
 _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
 # Lines of weights that are printed, and columns of text.
 _LINES, _WIDTH = 40, 100
+# Lines of a fact, such as a kernel of many columns.
+_FACT_LINES = 6
 _CELL = 'style="text-align: left; padding: 0 1em 0 0"'
 _TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
 _SCROLLED = 'style="max-height: 30em; max-width: fit-content; overflow: auto"'
@@ -125,6 +127,8 @@ class ModelSummary:
             lines = [] if output is None else [f"output {output}"]
             for name, text in facts.items():
                 wrapped = wrap(text, _WIDTH - width, break_long_words=False, break_on_hyphens=False)
+                if len(wrapped) > _FACT_LINES + 1:
+                    wrapped[_FACT_LINES:] = [f"... and {len(wrapped) - _FACT_LINES} more lines: to_frame() has all"]
                 labels = [name, *[""] * (len(wrapped) - 1)]
                 lines += [f"{label:{width}}{line}" for label, line in zip(labels, wrapped, strict=True)]
             parts.append("\n".join(lines))

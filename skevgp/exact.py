@@ -312,7 +312,9 @@ class EGPRegressor(ExplicitGaussianProcess):
     def _before_fit(self, X: Any) -> Self:
         """A copy that predicts what is known without data. Its maps are fitted to X."""
         model = clone(self)
-        n_rows = len(X) if isinstance(X, list | tuple) else np.shape(X)[0]
+        model._validate_params()
+        # What is no table has one row, until it is refused in scikit-learn's words.
+        n_rows = len(X) if isinstance(X, list | tuple) else np.shape(X)[0] if np.ndim(X) else 1
         problem = model._exact_problem(X, np.zeros((n_rows, self.n_targets or 1)))
         if problem.vague.any():
             raise NotFittedError(

@@ -8,9 +8,11 @@ from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
 from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp.datasets import make_toy
 from skevgp.features import InertiaForceGravity
 from skevgp.plotting import CoefficientDisplay, PosteriorDisplay
 
@@ -248,3 +250,35 @@ def test_few_rows_without_noise_are_met_to_rounding():
     np.testing.assert_allclose(mean, y, atol=1e-8)
     np.testing.assert_allclose(std, 0.0, atol=1e-4)
     assert np.abs(EGPRegressor(kernel=RBF(), tol=0.01).fit(x, y).predict(x) - y).max() > 1e-6
+
+
+@pytest.mark.parametrize(
+    ("parameters", "named"),
+    [
+        ({"alpha": -1.0}, "alpha"),
+        ({"alpha": 0.0}, "alpha"),
+        ({"noise_variance": -1.0}, "noise_variance"),
+        ({"optimizer": 5}, "optimizer"),
+        ({"n_targets": -1}, "n_targets"),
+        ({"n_targets": 1.5}, "n_targets"),
+        ({"max_iter": -1}, "max_iter"),
+        ({"tol": "x"}, "tol"),
+    ],
+    ids=str,
+)
+def test_parameters_are_checked_before_a_fit_too(parameters, named):
+    with pytest.raises(InvalidParameterError, match=f"'{named}' parameter"):
+        EGPRegressor(**parameters).predict([[0.0, 1.0]], return_std=True)
+
+
+@pytest.mark.parametrize("nonsense", ["abc", None, 3.0], ids=str)
+def test_what_is_no_table_is_refused_before_a_fit_too(nonsense):
+    with pytest.raises(ValueError, match=r"array|scalar|convert|string"):
+        EGPRegressor().predict(nonsense)
+
+
+@pytest.mark.parametrize("rubbish", [None, (1.0, 2.0, 3.0), ("a", "b"), np.zeros(7)], ids=str)
+def test_what_an_optimizer_returns_is_named(rubbish):
+    X, y = make_toy(20, random_state=0, return_X_y=True)
+    with pytest.raises(ValueError, match="optimizer must return 3 finite numbers and their value; got"):
+        EGPRegressor(optimizer=lambda objective, theta, bounds: rubbish).fit(X, y)

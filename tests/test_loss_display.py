@@ -76,3 +76,21 @@ def test_what_has_no_iterations_is_an_error():
         LossDisplay.from_estimator(EVGPRegressor(n_inducing=8, max_iter=0, random_state=0).fit(X, y))
     with pytest.raises(NotFittedError):
         LossDisplay.from_estimator(EVGPRegressor())
+
+
+def test_points_that_cannot_be_evaluated_are_gaps():
+    def wanders(objective, theta, bounds):
+        objective(theta * np.nan)
+        return theta, objective(theta)[0]
+
+    model = EGPRegressor(optimizer=wanders).fit(X, y)
+    assert not np.isfinite(model.loss_curve_).all()
+    for gap in (False, True):
+        display = LossDisplay.from_estimator(model, gap=gap)
+        display.figure_.canvas.draw()
+        assert np.isfinite(display.ax_.get_ylim()).all()
+
+
+def test_an_unfitted_exact_model_has_nothing_to_show():
+    with pytest.raises(NotFittedError):
+        LossDisplay.from_estimator(EGPRegressor())

@@ -11,6 +11,7 @@ from scipy.stats import norm
 from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
+from sklearn.ensemble import BaggingRegressor
 from sklearn.experimental import enable_halving_search_cv  # noqa: F401
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
@@ -175,6 +176,24 @@ class Bold(RegressorMixin, BaseEstimator):
 
 def test_what_hands_on_is_asked():
     assert neg_nlpd(Bold().fit(X, y), X, y) == nlpd_of(BayesianRidge().fit(X, y))
+
+
+class Deaf(BayesianRidge):
+    """Takes any argument, and does nothing with it."""
+
+    def predict(self, X, **_):
+        return super().predict(X)
+
+
+def test_a_mean_alone_is_no_pair():
+    with pytest.raises(TypeError, match="returns no pair of mean and std"):
+        neg_crps(Deaf().fit(X, y), X[:2], y[:2])
+
+
+def test_what_knows_no_return_std_says_so():
+    model = BaggingRegressor(BayesianRidge(), n_estimators=2).fit(X, y)
+    with pytest.raises(TypeError, match="BaggingRegressor.predict takes no return_std"):
+        neg_crps(model, X, y)
 
 
 @pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)

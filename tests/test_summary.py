@@ -264,3 +264,11 @@ def test_without_pandas_there_is_text_and_the_pip_command(monkeypatch):
     assert "posterior" in str(summary)
     with pytest.raises(ImportError, match="A data frame needs the optional package 'pandas'.*pip install pandas"):
         summary.to_frame()
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_a_kernel_of_many_columns_takes_few_lines():
+    X = np.random.RandomState(0).randn(60, 300)
+    said = str(EVGPRegressor(n_inducing=5, max_iter=2, tol=1e9).fit(X, X[:, 0]).summary()).splitlines()
+    assert len(said) < 40
+    assert sum("more lines: to_frame() has all" in line for line in said) == 2

@@ -145,10 +145,14 @@ class ExactTask:
 
         with monitor.keeping_the_best():
             bounds = np.column_stack([lower, upper]) + in_users_units[:, np.newaxis]
-            theta, _ = optimizer(objective, table.start() + in_users_units, bounds=bounds)
-            theta = np.asarray(theta, dtype=float)
+            found = optimizer(objective, table.start() + in_users_units, bounds=bounds)
+            try:
+                theta, _ = found
+                theta = np.asarray(theta, dtype=float)
+            except (TypeError, ValueError):
+                theta = np.empty(0)
             if theta.shape != lower.shape or not np.isfinite(theta).all():
-                raise ValueError(f"optimizer must return {len(lower)} finite numbers and their value; got {theta!r}.")
+                raise ValueError(f"optimizer must return {len(lower)} finite numbers and their value; got {found!r}.")
             best.x = np.clip(theta - in_users_units, lower, upper)
             best.loss = loss(best.x)[0]
         return Fit(table.values(best.x), -n * best.loss, curve)

@@ -15,9 +15,10 @@ import scipy
 import sklearn
 from joblib import parallel_config
 from sklearn.base import BaseEstimator
-from sklearn.utils.validation import check_is_fitted
+from sklearn.pipeline import Pipeline
 
 from .._frames import FrameColumns
+from .._validation import check_fitted
 from .._version import __version__
 from ..exceptions import InconsistentVersionWarning, warn_user
 from ..rows.maps import take_rows
@@ -87,7 +88,7 @@ def save(model: BaseEstimator, path: str | os.PathLike[str]) -> None:
     >>> bool((again.predict(X) == model.predict(X)).all())
     True
     """
-    check_is_fitted(model)
+    check_fitted(model[-1] if isinstance(model, Pipeline) else model)
     writer = Writer({record.kind: record for record in _records().values()})
     root = writer.value(model, "model")
     if type(root) is not dict or "object" not in root:
@@ -205,7 +206,7 @@ def _read(file: IO[bytes]) -> tuple[Any, dict[str, str], bool]:
     model, trial = reader.value(content["model"]), reader.value(content["trial"])
     if not isinstance(model, BaseEstimator):
         raise MalformedError(f"it has a {type(model).__name__} in place of a model")
-    check_is_fitted(model)
+    check_fitted(model)
     if trial is not None:
         _compare(model, trial, made_with)
     return model, made_with, trial is not None

@@ -125,9 +125,11 @@ def refusal(value: Any, where: str) -> str:
         if callable(value) and kind.__module__ in ("builtins", "numpy", "functools")
         else f"a {name}"
     )
+    inside = next((name for name in ("best_estimator_", "regressor_", "estimators_") if hasattr(value, name)), None)
+    advice = f"Save its {inside}" if inside and where == "model" else "Leave it out"
     return (
         f"{where} is {what}, which a data-only file does not hold: it has numbers and the classes that "
-        "skevgp.io knows, and no code. Leave it out, or save the model with skops.io.dump, which says what has to be "
+        f"skevgp.io knows, and no code. {advice}, or save the model with skops.io.dump, which says what has to be "
         "trusted, or with pickle or joblib, for those who trust the file."
     )
 

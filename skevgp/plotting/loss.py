@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any, Self
 
 import numpy as np
-from sklearn.utils.validation import check_is_fitted
 
+from .._validation import check_fitted
 from ._style import axes_of, free_color
 
 
@@ -77,9 +77,10 @@ class LossDisplay:
         ImportError
             If matplotlib is not installed; the message gives the pip command.
         """
-        check_is_fitted(estimator)
+        check_fitted(estimator)
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
-        if len(bound) == 0:
+        bound[~np.isfinite(bound)] = np.nan  # where an optimizer of the user's tried what cannot be evaluated
+        if not np.isfinite(bound).any():
             raise ValueError(
                 f"{type(estimator).__name__} has no iterations to show: it has no loss_curve_, or an empty one."
             )
@@ -118,18 +119,19 @@ class LossDisplay:
         ax = axes_of(ax)
         others = [ax.get_ylim()] if ax.lines else []
         iterations = np.arange(1, len(self.bound) + 1)
-        below = self.bound.max() - self.bound
+        below = np.nanmax(self.bound) - self.bound
         values = np.where(below > 0.0, below, np.nan) if gap else self.bound
         options = {"color": free_color(ax) if color is None else color, "label": label}
         (self.line_,) = ax.plot(iterations, values, **options, marker="." if len(iterations) < 30 else None)
         if gap:
             ax.set_yscale("log")
         else:
-            late = self.bound[len(self.bound) // 4 :]
+            known = self.bound[np.isfinite(self.bound)]
+            late = known[len(known) // 4 :]
             margin = 0.05 * (late.max() - late.min()) or 1.0
             ax.set_ylim(
                 min(late.min() - margin, *(low for low, _ in others), np.inf),
-                max(self.bound.max() + margin, *(high for _, high in others), -np.inf),
+                max(known.max() + margin, *(high for _, high in others), -np.inf),
             )
         ax.set_xlabel("iteration")
         ax.set_ylabel(f"{self.bound_name.removesuffix(' (nats)')}: nats below its best" if gap else self.bound_name)

@@ -10,11 +10,12 @@ import pytest
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.exceptions import NotFittedError
 from sklearn.linear_model import Ridge
-from sklearn.pipeline import make_pipeline
+from sklearn.model_selection import GridSearchCV
+from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 import skevgp.io.files
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.exceptions import InconsistentVersionWarning
 from skevgp.features import NominalDynamics
 from skevgp.io import load, save
@@ -99,10 +100,21 @@ def test_random_states_go_on_where_they_were(path):
     np.testing.assert_array_equal(loaded.random_state.uniform(size=9), model.random_state.uniform(size=9))
 
 
-def test_an_unfitted_model_is_not_saved(path):
+@pytest.mark.parametrize(
+    "model", [EVGPRegressor(), EGPRegressor(), make_pipeline(StandardScaler(), EGPRegressor())], ids=str
+)
+def test_an_unfitted_model_is_not_saved(path, model):
+    if isinstance(model, Pipeline):
+        model[0].fit(X)
     with pytest.raises(NotFittedError):
-        save(EVGPRegressor(), path)
+        save(model, path)
     assert not path.exists()
+
+
+def test_of_a_search_what_is_inside_is_advised(path):
+    search = GridSearchCV(CASES["plain"][0], {"n_inducing": [5]}, cv=2).fit(X, Y[:, 0])
+    with pytest.raises(ValueError, match=r"GridSearchCV.*Save its best_estimator_, or"):
+        save(search, path)
 
 
 # --- robots ------------------------------------------------------------------------------------------------------
