@@ -18,11 +18,12 @@ _MADE_ANEW = (
     "skevgp.kernels.stationary.SquaredExponentialAt",
     "skevgp.kernels.stationary.StationaryAt",
 )
-# Of scikit-learn's maps, in some of its versions: inside ColumnTransformer, SplineTransformer and SimpleImputer.
+# Of scikit-learn's maps, in some versions of it and of SciPy: inside ColumnTransformer, SplineTransformer and SimpleImputer.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",
     "numpy.number",
     "scipy._lib.array_api_compat.numpy._aliases.asarray",
+    "scipy.interpolate._bsplines._BSpline",
     "sklearn.compose._column_transformer._RemainderColsList",
 )
 

@@ -26,6 +26,7 @@ def test_skops_needs_to_trust_no_others(name):
 # Which some versions of their packages do not have.
 OF_VERSIONS = {
     "scipy._lib.array_api_compat.numpy._aliases.asarray",
+    "scipy.interpolate._bsplines._BSpline",
     "sklearn.compose._column_transformer._RemainderColsList",
 }
 
