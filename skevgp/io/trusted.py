@@ -18,7 +18,7 @@ _MADE_ANEW = (
     "skevgp.kernels.stationary.SquaredExponentialAt",
     "skevgp.kernels.stationary.StationaryAt",
 )
-# Of scikit-learn's maps, in some versions of it and of SciPy: inside ColumnTransformer, SplineTransformer and SimpleImputer.
+# In some versions of scikit-learn and SciPy: inside ColumnTransformer, SplineTransformer and SimpleImputer.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",
     "numpy.number",
