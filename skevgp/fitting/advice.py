@@ -74,7 +74,9 @@ def signal_gone(gone: int, n_outputs: int) -> str:
 
 def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     """Whether y, or a weight, is so far from its prior mean that the fit suffers."""
-    if (rows.scatter() / rows.mean_precision < _FAR**-2).any():
+    # Of residuals at the rounding error of y, neither is of size one.
+    far = rows.residuals.mean[rows.columns] ** 2
+    if (rows.scatter() / rows.mean_precision < _FAR**-2 * np.minimum(far, 1.0)).any():
         return (
             f"y is more than {_FAR:g} times its scatter away from its prior mean of 0: explaining that leaves the "
             "kernel little accuracy for the rest. Set normalize_y=True, or give the feature_map an intercept."

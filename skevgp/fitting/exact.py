@@ -20,8 +20,9 @@ from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from ..rows.source import RawRows
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
+from .rules import Rules
 from .start import centred_kernels, checked_variance, starting_table
-from .strategy import Attempt, Fit, Rules, Strategy, drawn, search
+from .strategy import Attempt, Fit, Strategy, drawn, search
 from .units import Units
 
 # (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
@@ -93,22 +94,23 @@ class ExactTask:
 
     def minimise(self, attempt: Attempt) -> Fit:
         """L-BFGS on the log marginal likelihood per row."""
-        n, table = len(self.model.rows.inputs), self.table.started_at(attempt.values)
+        table = self.table.started_at(attempt.values)
+        n, spent = len(self.model.rows.inputs), len(attempt.loss_curve)
 
         def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
             likelihood, gradient = self.model.log_likelihood(table.values(flat))
             return -likelihood / n, -table.gradient(gradient) / n
 
-        monitor = self.monitor.seen_as(factor=n, is_last=attempt.is_last and self.options.n_restarts == 0)
+        monitor = self.monitor.seen_as(spent, n, is_last=attempt.is_last and self.options.n_restarts == 0)
         if self.options.optimizer is not None and table.size > 0:
             return self._minimised_by(self.options.optimizer, table, loss, monitor)
-        minimum = lbfgs(loss, table.start(), table.limits(), attempt.until, self.options.tol / n, monitor)
+        minimum = lbfgs(loss, table.start(), table.limits(), attempt.until - spent, self.options.tol / n, monitor)
         return Fit(
             table.values(minimum.x),
             -n * minimum.loss,
-            [n * value for value in minimum.loss_curve],
+            attempt.loss_curve + [n * value for value in minimum.loss_curve],
             minimum.converged,
-            how_it_ended(minimum, minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
+            how_it_ended(minimum, spent + minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
         )
 
     def _minimised_by(
@@ -131,7 +133,10 @@ class ExactTask:
         best, curve = Minimum(table.start(), np.inf), list[float]()
 
         def objective(theta: np.ndarray, eval_gradient: bool = True) -> Any:
-            flat = np.asarray(theta, dtype=float) - in_users_units
+            theta = np.atleast_1d(np.asarray(theta, dtype=float))
+            if theta.shape != in_users_units.shape:
+                raise ValueError(f"theta must be {len(in_users_units)} numbers; got an array of shape {theta.shape}.")
+            flat = theta - in_users_units
             try:
                 value, gradient = loss(flat)
             except NotPositiveDefiniteError:
@@ -333,6 +338,9 @@ def fit_exact(
         variance,
         rows.mean_precision,
     )
+    if options.optimizer is not None:
+        # It is the user's when to go where.
+        table = table.widened()
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor, units))

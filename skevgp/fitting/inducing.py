@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from typing import Any, Literal, cast
 
@@ -11,6 +10,7 @@ from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
 from .._validation import as_floats, check_magnitude
+from ..exceptions import ignored
 from ..inference.statistics import Kernel, Whitening
 from ..rows.source import Moments
 from .start import column_scale
@@ -164,9 +164,8 @@ def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomS
     """k-means, each column scaled to unit standard deviation; fewer points where rows differ by rounding only."""
     moments = Moments.of(inputs)
     scale = column_scale(moments)
-    with warnings.catch_warnings():
-        # Of rows that differ by rounding only: fewer points are then the right answer.
-        warnings.simplefilter("ignore", ConvergenceWarning)
+    # Of rows that differ by rounding only: fewer points are then the right answer. (Other fits may warn meanwhile.)
+    with ignored("Number of distinct clusters", ConvergenceWarning):
         clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit((inputs - moments.mean) / scale)
     # Kept in k-means++'s order, the first ones far apart: sorted, each would almost follow from the one before, and
     # Adam's steps in whitened coordinates would be smaller (its error on the pendulum grew by half).

@@ -99,17 +99,18 @@ class Learned:
         if found is not None:
             values = values | {"signal": found.signal, "noise": found.noise}
             advice.append(signal_gone(found.gone, len(found.noise)))
-        bound, predictor = None, None
-        if found is None:
-            # Summed row by row, which keeps its digits where the noise is low.
-            bound = fit.bound if np.isfinite(fit.bound) and fit.n_rows is None else None
-            predictor = fit.predictor
+        # Summed row by row, which keeps its digits where the noise is low.
+        if found is None and np.isfinite(fit.bound) and fit.n_rows is None:
+            bound = fit.bound
+        else:
+            bound = model.bound(values, statistics, task.blocks)
+        predictor = None if found is not None else fit.predictor
         learned = cls(
             model,
             task.table,
             values,
             statistics,
-            model.at_optimum(values, statistics) if predictor is None else predictor,
+            model.at_optimum(values, statistics, blocks=task.blocks) if predictor is None else predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
             found is not None and found.dependent,

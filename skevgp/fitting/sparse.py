@@ -20,7 +20,8 @@ from ..rows.source import of_outputs
 from .advice import learned_too_little
 from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
-from .strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
+from .rules import Rules
+from .strategy import Attempt, Fit, Strategy, better, drawn, search
 
 # By what factor inducing points become more, until that raises the bound by less than so many nats per row and output.
 _GROWTH, _GAIN = 1.5, 0.01

@@ -1,4 +1,4 @@
-"""Where a fit starts: first values and limits of parameters, and what is seen of the rows before."""
+"""Where a fit starts: first values and limits, what is seen of the rows before, and predictions without any rows."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from .._linalg import NotPositiveDefiniteError, jittered_cholesky
-from ..inference.statistics import Kernel
+from ..inference.posterior import CoefficientPrior, Predictor, PredictorGroup
+from ..inference.statistics import Kernel, Whitening
 from ..kernels.covariances import Covariance
-from ..kernels.parse import Start, Starts
+from ..kernels.parse import KernelSpec, Start, Starts
 from ..optimizers.parameters import Parameter, ParameterTable
 from ..rows.internal import Rows
 from ..rows.source import Moments, RawRows
-from .strategy import Rules
+from .rules import Rules
 from .units import SMALLEST_UNIT
 
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
@@ -193,6 +194,7 @@ def starting_table(
                 rules.signal_limits[0] * signal,
                 rules.signal_limits[1] * signal,
                 target_unit**2,
+                None if rules.widest_signal is None else rules.widest_signal * signal,
             ),
             parameter_of(
                 starts.noise,
@@ -213,7 +215,13 @@ def starting_table(
 
 
 def parameter_of(
-    start: Start, name: str, default: np.ndarray, lower: np.ndarray, upper: np.ndarray, unit: np.ndarray | float
+    start: Start,
+    name: str,
+    default: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    unit: np.ndarray | float,
+    widest: np.ndarray | None = None,
 ) -> Parameter:
     """A row of the table, in internal units.
 
@@ -226,8 +234,48 @@ def parameter_of(
         Start and limits, in internal units, where the user says nothing; a start is put inside the limits.
     unit : ndarray or float
         The user's values are divided by it.
+    widest : ndarray of the parameter's shape, optional
+        The upper limit once a fit has ended at the other, where the user says nothing.
     """
     first = default if start.value is None else np.broadcast_to(start.value / unit, default.shape)
     if start.bounds is not None:
-        lower, upper = start.bounds[:, 0] / unit, start.bounds[:, 1] / unit
-    return Parameter(name, first, "log", lower, upper, fixed=start.fixed)
+        lower, upper, widest = start.bounds[:, 0] / unit, start.bounds[:, 1] / unit, None
+    return Parameter(name, first, "log", lower, upper, fixed=start.fixed, widest=widest)
+
+
+def prior_predictor(rows: Rows, spec: KernelSpec, prior: CoefficientPrior) -> Predictor:
+    """The prior of y: a predictor without points.
+
+    Parameters
+    ----------
+    rows : Rows
+        Where it is used.
+    spec : KernelSpec
+        Of which nothing starts from the data (`KernelSpec.as_given`). Noise of which it says nothing is left out.
+    prior : CoefficientPrior
+        Of the weights, in the user's units.
+    """
+    o, p = prior.scale.shape
+    starts, kernels = spec.starts, centred_kernels(spec.covariance, rows.inputs)
+    assert starts.hyperparameters.value is not None
+    assert starts.signal.value is not None
+    hyperparameters, signal = starts.hyperparameters.value, np.repeat(starts.signal.value, o)
+    noise = np.zeros(o) if starts.noise.value is None else np.repeat(starts.noise.value, o)
+    nowhere, groups = np.empty((0, rows.inputs.mean.shape[-1])), []
+    for index in range(o):
+        own, kernel = slice(index, index + 1), kernels[index % len(kernels)]
+        checked_variance(kernel, hyperparameters, rows.some(np.zeros(1, dtype=int)).of(own).inputs)
+        groups.append(
+            PredictorGroup.of(
+                own,
+                kernel,
+                hyperparameters,
+                nowhere,
+                Whitening.of(kernel, hyperparameters, nowhere),
+                signal[own],
+                prior.outputs(own),
+                [np.zeros(p)],
+                [np.eye(p) if p else np.zeros((1, 0))],
+            )
+        )
+    return Predictor(tuple(groups), noise, prior.mean, np.zeros(o), prior.shared)

@@ -14,99 +14,10 @@ from typing import Protocol
 
 import numpy as np
 
-from .._linalg import JITTER, Jitter
 from .._progress import Monitor
 from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
-
-# Numbers: samples are held in memory.
-LARGEST_SAMPLE = 2_000_000
-
-
-@dataclass(frozen=True)
-class Rules:
-    """What the strategy goes by: a property of the solver.
-
-    Attributes
-    ----------
-    first_noise : float
-        Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
-        keeps L-BFGS out of the optimum where the noise explains everything.
-    lowest_noise : float
-        Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
-        outweighs the noise.
-    highest_noise : float
-        Its upper limit, in units of the variance that the features leave over.
-    lengthscale : float
-        Where lengthscales start, in standard deviations of their column, times √d: rows are then neither all alike nor
-        all strangers, whatever the number of columns.
-    lengthscale_limits : (float, float)
-        In the same units, the lower one without √d.
-    signal_limits : (float, float)
-        Of the signal variance, in units of the variance that the features leave over. A function that varies by more
-        than ten times the data's scatter would do so outside of them only: without an upper limit L-BFGS makes long
-        waves of huge height from small ones.
-    jitter : Jitter
-        Of k(X_m, X_m).
-    collapsed : float
-        An output counts as not learned when noise comes to explain this share of what the features leave over.
-    other_starts : tuple of (float, float)
-        Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
-    much_noise : float, optional
-        A start from a noise so many times higher comes after the first, where it costs little: on a sample of the rows,
-        or with as many inducing points as rows. The kernel may then explain every row by itself, and a low noise lead
-        to that plateau; a high one finds much noise sooner.
-    stage : int, optional
-        Iterations after which inducing points are placed anew, and so many again until it shows whether that was
-        better; on all rows, or on the smallest sample. None leaves the points.
-    sample : (int, int), optional
-        Rows, and rows per inducing point and feature: so many are enough to begin with, the larger number counts. None
-        takes all.
-    growth : int
-        A sample is followed by one so many times larger; one of more than half of the rows, or of more numbers than
-        `LARGEST_SAMPLE`, is left out.
-    restart_factors : dict
-        A restart multiplies the first values by numbers between 1 / factor and the factor, drawn log-uniformly.
-    """
-
-    first_noise: float
-    lowest_noise: float = 1e-10
-    highest_noise: float = 1e2
-    lengthscale: float = 0.6
-    lengthscale_limits: tuple[float, float] = (1e-2, 1e4)
-    signal_limits: tuple[float, float] = (1e-8, 1e2)
-    jitter: Jitter = JITTER
-    collapsed: float = 0.9
-    other_starts: tuple[tuple[float, float], ...] = ()
-    much_noise: float | None = None
-    stage: int | None = None
-    sample: tuple[int, int] | None = None
-    growth: int = 4
-    restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
-
-    def samples(self, n_rows: int, n_weights: int, width: int) -> tuple[int, ...]:
-        """The sizes of the samples that a fit begins with; none if there are too few rows.
-
-        Parameters
-        ----------
-        n_rows : int
-            In all.
-        n_weights : int
-            Inducing points and features.
-        width : int
-            Numbers in a row.
-
-        Returns
-        -------
-        sizes : tuple of int
-        """
-        if self.sample is None:
-            return ()
-        sizes, size = [], max(self.sample[0], self.sample[1] * n_weights)
-        while size <= min(n_rows // 2, LARGEST_SAMPLE // width):
-            sizes.append(size)
-            size *= self.growth
-        return tuple(sizes)
+from .rules import Rules
 
 
 @dataclass(frozen=True)
@@ -242,17 +153,17 @@ class Strategy:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
         first = self.table.values_at_start()
         if self.warm is None:
-            yield from self._climbing(first)
+            yield from self._released(self._climbing(first))
         else:
             # Inducing points that another fit moved have found their places.
             moved_before = self.placed or not np.array_equal(self.warm["inducing_points"], first["inducing_points"])
             again = self._once if moved_before else self._climbing
-            fit = yield from again(first | self.warm)
+            fit = yield from self._released(again(first | self.warm))
             if self.max_iter > 0 and self.collapsed(fit):
-                yield from self._climbing(first)
+                yield from self._released(self._climbing(first))
         if self.restart is not None and self.max_iter > 0 and self.table.size > 0:
             for _ in range(self.n_restarts):
-                yield from self._climbing(self.restart())
+                yield from self._released(self._climbing(self.restart()))
 
     def collapsed(self, fit: Fit) -> bool:
         """Whether noise came to explain everything, or the kernel explains less than nothing would."""
@@ -260,6 +171,13 @@ class Strategy:
             return True
         # What has not ended yet may still be below.
         return fit.n_rows is None and fit.converged and fit.bound < self.alone
+
+    def _released(self, attempts: Attempts) -> Attempts:
+        """Their best fit; one that ended at a limit goes on from there, where the table has a wider one."""
+        best = yield from attempts
+        if best.n_iter < self.max_iter and self.table.holds(best.values):
+            best = better(best, (yield Attempt(best.values, self.max_iter, best)))
+        return best
 
     def _climbing(self, values: Values) -> Attempts:
         """A fit to a sample of the rows, then on from there to larger ones, and at last to all.
@@ -379,7 +297,7 @@ def search(task: Task) -> Fit:
     """
     best: Fit | None = None
     attempts = task.strategy.attempts()
-    with task.monitor.keeping_the_best():
+    with task.monitor.keeping_the_best(patient=True):
         attempt: Attempt | None = next(attempts)
         while attempt is not None:
             fit = task.minimise(attempt)

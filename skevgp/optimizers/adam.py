@@ -13,6 +13,8 @@ from .._progress import Monitor
 from .minimum import Limits, Minimum, Objective
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
+# Of a gradient: the square of a larger one overflows, and no step moves after that.
+_LARGEST = 1e150
 # A plateau is looked for this often, and not before so many steps.
 _WINDOW, _FEWEST = 50, 1500
 
@@ -77,7 +79,7 @@ def adam(
             if pace is not None:
                 pace(share)
             loss, gradient = objective(x)
-            if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+            if not (np.isfinite(loss) and np.abs(gradient).max(initial=0.0) <= _LARGEST):  # False if there is a NaN
                 break
             minimum.loss_curve.append(loss)
             best.see(x, loss)

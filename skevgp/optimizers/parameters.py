@@ -9,6 +9,9 @@ from typing import Any, Literal
 import autograd.numpy as anp
 import numpy as np
 
+# A value so much below its limit, as a share, is there but for rounding.
+_AT_LIMIT = 1e-6
+
 # Of parameters, by name.
 Values = dict[str, np.ndarray]
 
@@ -26,6 +29,8 @@ class Parameter:
         The optimiser moves ``(value - origin) / unit`` or ``log(value)``.
     lower, upper : ndarray or float
         Limits of the value, broadcast to its shape.
+    widest : ndarray or float, optional
+        The upper limit of a fit that starts at ``upper`` or above; None leaves that.
     unit : ndarray or float
         Size of a typical change, for ``"identity"``.
     origin : ndarray or float
@@ -42,6 +47,7 @@ class Parameter:
     unit: np.ndarray | float = 1.0
     origin: np.ndarray | float = 0.0
     fixed: bool | np.ndarray = False
+    widest: np.ndarray | float | None = None
 
     @property
     def free(self) -> np.ndarray:
@@ -57,9 +63,9 @@ class Parameter:
         return ((value - self.origin) / self.unit).ravel()
 
     def value_limits(self) -> np.ndarray:
-        """Limits of each entry, (size, 2), in the parameter's own units."""
-        limits = np.broadcast_to(self.lower, self.start.shape), np.broadcast_to(self.upper, self.start.shape)
-        return np.column_stack([np.ravel(limit) for limit in limits])
+        """Limits of each entry, (size, 2), in the parameter's own units: the widest."""
+        limits = self.lower, self.upper if self.widest is None else self.widest
+        return np.column_stack([np.ravel(np.broadcast_to(limit, self.start.shape)) for limit in limits])
 
     def value(self, coordinate: np.ndarray) -> np.ndarray:
         """The value at a coordinate of the parameter's shape."""
@@ -98,14 +104,33 @@ class ParameterTable:
         return next(parameter for parameter in self.parameters if parameter.name == name)
 
     def started_at(self, values: Values) -> ParameterTable:
-        """The same table with other starts, for what is free of the parameters whose shapes agree."""
+        """The same table with other starts, for what is free of the parameters whose shapes agree.
+
+        Upper limits where these start become the widest.
+        """
+        table = self.widened() if self.holds(values) else self
         return ParameterTable(
             [
                 replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
                 if _shape(values, parameter.name) == parameter.start.shape
                 else parameter
-                for parameter in self.parameters
+                for parameter in table.parameters
             ]
+        )
+
+    def holds(self, values: Values) -> bool:
+        """Whether free ones of the values are at an upper limit that is not the widest, or above."""
+        return any(
+            own.widest is not None
+            and _shape(values, own.name) == own.start.shape
+            and (np.ravel(values[own.name] >= (1.0 - _AT_LIMIT) * own.upper) & own.free).any()
+            for own in self.parameters
+        )
+
+    def widened(self) -> ParameterTable:
+        """The same table with the widest limits."""
+        return ParameterTable(
+            [own if own.widest is None else replace(own, upper=own.widest, widest=None) for own in self.parameters]
         )
 
     def with_start(self, name: str, start: np.ndarray) -> ParameterTable:

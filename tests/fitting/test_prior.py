@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
-from skevgp.fitting.prior import prior_predictor
+from skevgp.fitting.start import prior_predictor
 from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
 

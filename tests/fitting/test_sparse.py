@@ -139,7 +139,7 @@ def test_what_is_kept_is_where_the_fit_ended():
     assert learned.loss_curve == [3.0, 2.0]
     assert learned.bound == fit.bound
     assert learned.message == ""
-    expected = task.model.at_optimum(fit.values, learned.statistics)
+    expected = task.model.at_optimum(fit.values, learned.statistics, blocks=task.blocks)
     for found, value in zip(learned.predictor.predict(X, H, True), expected.predict(X, H, True), strict=True):
         np.testing.assert_array_equal(found, value)
 
@@ -234,8 +234,8 @@ def test_calibrated_are_signal_and_noise_and_q_is_at_its_optimum_for_them():
         assert (learned.values[name] != fit.values[name]).all()
     for name in ("hyperparameters", "inducing_points"):
         np.testing.assert_array_equal(learned.values[name], fit.values[name])
-    bound = task.model.bound(learned.values, learned.statistics)
-    predictor = task.model.at_optimum(learned.values, learned.statistics)
+    bound = task.model.bound(learned.values, learned.statistics, task.blocks)
+    predictor = task.model.at_optimum(learned.values, learned.statistics, blocks=task.blocks)
     assert learned.bound == bound
     np.testing.assert_array_equal(learned.predictor.groups[0].mean, predictor.groups[0].mean)
     assert learned.loss_curve == plain.loss_curve

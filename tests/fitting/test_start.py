@@ -1,8 +1,8 @@
 import numpy as np
 import pytest
 
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import alike_neighbours, parameter_of, starting_table
-from skevgp.fitting.strategy import Rules
 from skevgp.inference.model import SparseModel
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
@@ -50,6 +50,7 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     """Twice as far, or ten times as high, is twice or ten times as much for the parameters too."""
     X = np.random.RandomState(0).randn(50, 2) * [1.0, 2.0]
     limits = {"highest_noise": 50.0, "lengthscale_limits": (0.1, 10.0), "signal_limits": (1e-3, 1e3)}
+    limits |= {"widest_signal": 1e5}
     rules = Rules(1e-4, 1e-10, lengthscale=0.5, **limits)
     scatter, points = np.array([1.0, 0.01]), np.zeros((1, 3, 2))
     starts = Starts(Start(), Start(), Start())
@@ -62,6 +63,13 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     np.testing.assert_allclose([lower["hyperparameters"], upper["hyperparameters"]], [0.1 * sigma, 10.0 * root * sigma])
     np.testing.assert_allclose([lower["signal"], upper["signal"]], [[1e-3] * 2, [1e3] * 2])
     np.testing.assert_allclose([lower["noise"], upper["noise"]], [1e-10 * scatter, [50.0] * 2])
+    np.testing.assert_allclose(table["signal"].widest, 1e5)
+
+
+def test_bounds_of_the_users_are_the_widest():
+    bounds = np.array([[0.5, 5.0]])
+    parameter = parameter_of(Start(bounds=bounds), "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 1.0, 9.0)
+    assert (parameter.lower, parameter.upper, parameter.widest) == ([0.5], [5.0], None)
 
 
 # --- there and back between the user's units and the internal ones ---------------------------------------------------

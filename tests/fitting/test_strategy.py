@@ -7,18 +7,19 @@ import numpy as np
 import pytest
 
 from skevgp._progress import Monitor
-from skevgp.fitting.strategy import Attempt, Fit, Rules, Strategy, better, drawn, search
+from skevgp.fitting.rules import Rules
+from skevgp.fitting.strategy import Attempt, Fit, Strategy, better, drawn, search
 from skevgp.optimizers.parameters import Parameter, ParameterTable
 
 RULES = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
 PLACES = np.arange(4.0).reshape(1, 2, 2)
 
 
-def table(noise_fixed=False, kernel_fixed=False):
+def table(noise_fixed=False, kernel_fixed=False, widest_signal=None):
     return ParameterTable(
         [
             Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
-            Parameter("signal", np.ones(2), "log", 1e-3, 1e3),
+            Parameter("signal", np.ones(2), "log", 1e-3, 1e3, widest=widest_signal),
             Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
             Parameter("inducing_points", PLACES),
         ]
@@ -34,10 +35,12 @@ def place(values):
     return values | {"inducing_points": values["inducing_points"] + 10.0}
 
 
-def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True):
-    """How a fit from a start may have ended: the hyperparameters say after how many iterations."""
+def ended(attempt, bound, noise=1e-4, n_iter=None, converged=True, signal=None):
+    """How a fit from a start may have ended."""
     n_iter = attempt.until if n_iter is None else n_iter
     values = attempt.values | {"noise": np.full(2, noise)}
+    if signal is not None:
+        values["signal"] = np.array(signal)
     return Fit(values, bound, [0.0] * n_iter, converged, n_rows=attempt.n_rows)
 
 
@@ -85,6 +88,19 @@ def test_when_nothing_learns_the_best_bound_is_kept():
     made, best = drive(strategy(), (5.0, COLLAPSED), (7.0, COLLAPSED), (6.0, COLLAPSED))
     assert len(made) == 3
     assert best.bound == 7.0
+
+
+def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
+    """One of two outputs is enough; a limit of the user's has none beyond."""
+    at_limit, inside = {"signal": [1.0, 1e3], "n_iter": 50}, {"signal": [1.0, 900.0], "n_iter": 50}
+    wide = table(widest_signal=1e5)
+    made, best = drive(strategy(table=wide), (5.0, at_limit), (9.0, {"n_iter": 80}))
+    assert best.bound == 9.0
+    assert (made[1].after.bound, made[1].until) == (5.0, 1000)
+    np.testing.assert_array_equal(made[1].values["signal"], [1.0, 1e3])
+    for own in (strategy(table=wide, max_iter=50), strategy()):
+        assert len(drive(own, (5.0, at_limit))[0]) == 1
+    assert len(drive(strategy(table=wide), (5.0, inside))[0]) == 1
 
 
 def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
@@ -249,25 +265,6 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
 
 
 # --- samples of the rows ----------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(
-    ("n_rows", "n_inducing", "width", "sizes"),
-    [
-        (1999, 10, 9, ()),
-        (2000, 10, 9, (1000,)),
-        (36_000, 256, 9, (5120,)),
-        (36_000, 100, 9, (2000, 8000)),
-        (10**7, 10, 9, (1000, 4000, 16_000, 64_000)),
-        (10**7, 10, 100, (1000, 4000, 16_000)),
-    ],
-)
-def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, width, sizes):
-    assert replace(RULES, sample=(1000, 20)).samples(n_rows, n_inducing, width) == sizes
-
-
-def test_without_a_rule_there_are_no_samples():
-    assert RULES.samples(10**6, 10, 9) == ()
 
 
 def test_a_fit_climbs_from_sample_to_sample_to_all_rows():

@@ -131,8 +131,14 @@ def bowl_with_a_wall(failure, at=300):
 
 @pytest.mark.parametrize(
     "failure",
-    [(np.nan, np.zeros(2)), (1.0, np.array([0.0, np.inf])), NotPositiveDefiniteError, KeyboardInterrupt],
-    ids=["nan", "infinite gradient", "not positive definite", "Ctrl-C"],
+    [
+        (np.nan, np.zeros(2)),
+        (1.0, np.array([0.0, np.inf])),
+        (1.0, np.array([0.0, 1e160])),
+        NotPositiveDefiniteError,
+        KeyboardInterrupt,
+    ],
+    ids=["nan", "infinite gradient", "gradient whose square overflows", "not positive definite", "Ctrl-C"],
 )
 @pytest.mark.parametrize("at", [8, 300])
 def test_what_goes_wrong_keeps_the_best_point(failure, at):

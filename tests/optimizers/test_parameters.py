@@ -1,5 +1,6 @@
 import autograd.numpy as anp
 import numpy as np
+import pytest
 from autograd import grad
 
 from skevgp.optimizers.parameters import Parameter, ParameterTable
@@ -56,6 +57,21 @@ def test_warm_starts_take_over_only_what_fits():
     np.testing.assert_allclose(values["length"], [0.7, 0.8])
     np.testing.assert_allclose(values["noise"], [0.1])
     np.testing.assert_allclose(values["points"], np.arange(6.0).reshape(1, 3, 2))
+
+
+@pytest.mark.parametrize(("signal", "upper"), [(9.0, 10.0), (10.0, 1e3), (50.0, 1e3), (5e3, 1e3)])
+def test_a_start_at_an_upper_limit_or_above_has_the_widest(signal, upper):
+    first = ParameterTable([Parameter("signal", np.ones(2), "log", 1e-3, 10.0, widest=1e3)])
+    np.testing.assert_allclose(first.limits()[1], np.log([10.0, 10.0]))
+    np.testing.assert_allclose(first["signal"].value_limits(), [[1e-3, 1e3]] * 2)
+    again = first.started_at({"signal": np.array([1.0, signal])})
+    np.testing.assert_allclose(again.limits()[1], np.log(upper))
+    np.testing.assert_allclose(again.values_at_start()["signal"], [1.0, min(signal, upper)])
+
+
+def test_what_is_fixed_is_held_by_no_limit():
+    fixed = ParameterTable([Parameter("signal", np.ones(1), "log", 1e-3, 10.0, widest=1e3, fixed=True)])
+    assert not fixed.holds({"signal": np.array([10.0])})
 
 
 def test_a_table_where_all_is_fixed_has_no_coordinates():
