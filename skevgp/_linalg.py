@@ -118,6 +118,15 @@ def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray) -> np.ndar
     return out
 
 
+def triangular_solve(L: np.ndarray, B: np.ndarray) -> None:
+    """Put L⁻¹ B in the place of B, for a lower triangular L and a C-contiguous B."""
+    # BLAS reads and writes transposes without a copy: X Lᵀ = Bᵀ.
+    if B.size and B.shape[1] == 1:
+        blas.dtrsv(L.T, B[:, 0], trans=1, overwrite_x=1)
+    elif B.size:
+        blas.dtrsm(1.0, L.T, B.T, side=1, overwrite_b=1)
+
+
 def symmetric_inverse(L_inv: np.ndarray) -> np.ndarray:
     """(L Lᵀ)⁻¹ from L⁻¹."""
     return L_inv.T @ L_inv

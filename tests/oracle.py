@@ -3,8 +3,8 @@
 import autograd.numpy as anp
 import numpy as np
 
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
-from skevgp.fitting.strategy import Rules
 from skevgp.inference.bounds import LOG_2PI
 from skevgp.inference.model import SparseModel
 from skevgp.inference.posterior import CoefficientPrior

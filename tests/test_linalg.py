@@ -13,6 +13,7 @@ from skevgp._linalg import (
     symmetric_inverse,
     triangular_inverse,
     triangular_product,
+    triangular_solve,
 )
 
 
@@ -157,3 +158,16 @@ def test_a_triangular_product_leaves_out_nothing_but_zeros(m):
     np.testing.assert_allclose(found, L @ B, rtol=1e-12, atol=1e-12)
     np.testing.assert_allclose(triangular_product(np.asfortranarray(L), B, out[:m]), L @ B, rtol=1e-12, atol=1e-12)
     assert np.isnan(out[m:]).all()
+
+
+@pytest.mark.parametrize(("n", "k"), [(60, 7), (60, 1), (1, 3), (5, 0), (0, 3), (0, 1)])
+def test_a_solve_has_a_small_residual_however_ill_conditioned_the_factor(n, k):
+    """Within |L| |X| row by row, and in the place of B (Higham 2002, theorem 8.5)."""
+    x = np.linspace(0.0, 1.0, n)
+    L = jittered_cholesky(np.exp(-0.5 * np.subtract.outer(x, x) ** 2), 1e-12)
+    B = np.random.RandomState(0).randn(n + 2, k)
+    X, rest = B[:n], B[n:].copy()
+    before = X.copy()
+    triangular_solve(L, X)
+    assert (np.abs(L @ X - before) <= 4 * n * np.finfo(float).eps * (np.abs(L) @ np.abs(X))).all()
+    np.testing.assert_array_equal(B[n:], rest)

@@ -29,7 +29,7 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..rows.blocks import Blocks, LinearSums
-from .posterior import CoefficientPrior
+from .posterior import CoefficientPrior, diagonal_gap
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -244,7 +244,7 @@ class BoundAtOptimum:
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
-                gap, gap_B_bar, gap_L_bar = _diagonal_gap(q, log_det[o], B_bar, group.whitening)
+                gap, gap_B_bar, gap_L_bar = diagonal_gap(q.B, log_det[o], B_bar, group.whitening)
                 log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
                 L_bar -= gap_L_bar
@@ -282,6 +282,11 @@ class BoundAtOptimum:
         HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
         squares = statistics.RR - ((statistics.VR + VE) * f).sum(axis=0) - ((statistics.HR + HE) * b).sum(axis=0)
         return Residuals(np.maximum(squares, 0.0), VE)
+
+    def left_over(self, blocks: Blocks | None) -> Residuals:
+        """The same from the rows, where no digits cancel; from the statistics if these are all there is."""
+        seen = self.group.whitening, self.group.outputs, self.weights
+        return self.residuals() if blocks is None else errors(blocks, *seen)
 
     def value(self, residuals: Residuals) -> float:
         """The bound, in nats."""
@@ -330,12 +335,9 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
         wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
     # The likelihood with this noise and without a trace term, but for its determinant.
-    total, log_det = 0.0, log_ratio
-    for bound in bounds_at_optimum(wide, "full"):
-        group = bound.group
-        left = bound.residuals() if blocks is None else errors(blocks, group.whitening, group.outputs, bound.weights)
-        total += bound.value(left)
-        log_det += sum(q.log_det for q in bound.posteriors)
+    bounds = bounds_at_optimum(wide, "full")
+    total = sum(bound.value(bound.left_over(blocks)) for bound in bounds)
+    log_det = log_ratio + sum(q.log_det for bound in bounds for q in bound.posteriors)
     log_det -= sum(q.log_det for own in optimal_posteriors(groups) for q in own)
     return total + 0.5 * log_det
 
@@ -345,14 +347,12 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
     o, p = prior.scale.shape
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
     noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
-    empty = np.zeros((0, 0))
+    VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
     groups = [
         Group(
             slice(index, index + 1),
-            Whitening(None, empty, empty),
-            SufficientStatistics(
-                own.n_rows, empty, np.zeros((0, p)), np.zeros((0, 1)), own.HH, own.HR, own.RR, 0.0, own.log_variance
-            ),
+            Whitening(None, VV, VV),
+            SufficientStatistics(own.n_rows, VV, VH, VR, own.HH, own.HR, own.RR, 0.0, own.log_variance, own.surplus),
             np.ones(1),
             noise[index],
             prior.outputs(slice(index, index + 1)),
@@ -360,39 +360,3 @@ def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
         for index, own in enumerate(each)
     ]
     return sum(bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full"))
-
-
-def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
-    m = len(L_inv)
-    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
-    return -np.log(precision), -np.log(np.diagonal(B)[m:])
-
-
-def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
-    """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
-    m = len(L_inv)
-    root = np.zeros((m + len(log_w), m + len(log_w)))
-    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
-    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
-    return root
-
-
-def _diagonal_gap(
-    q: WhitenedPosterior, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and L; ``log_det_bar`` is -½ B⁻¹.
-
-    In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
-    """
-    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    precision = L_inv.T @ q.B[:m, :m] @ L_inv
-    f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(q.B)[m:]
-    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
-    B_bar = log_det_bar.copy()
-    weighted = L_inv / f_diagonal
-    B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
-    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
-    L_bar = -np.tril((weighted @ precision).T)
-    diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
-    return float(gap), B_bar, L_bar

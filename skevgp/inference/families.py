@@ -15,7 +15,8 @@ import numpy as np
 
 from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..optimizers.parameters import Parameter, Values
-from .bounds import Group, WhitenedPosterior, diagonal_root, log_variances, projected
+from .bounds import Group, WhitenedPosterior, projected
+from .posterior import diagonal_root, log_variances
 
 
 @dataclass

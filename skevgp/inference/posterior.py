@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from .._linalg import diagonal_of
 from ..rows.source import Columns, of_outputs, times_weights
 from .statistics import Kernel, Whitening
 
@@ -132,7 +133,7 @@ class PredictorGroup:
         """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""
         m = len(self.points)
         P = np.empty((m + features.shape[1], len(features)))
-        _, V = self.whitening.project(prepared, out=P[:m])
+        V = self.whitening.solve(prepared, out=P[:m])
         P[m:] = features.T
         return P, self.whitening.unexplained(prepared, V)
 
@@ -171,7 +172,7 @@ class Predictor:
         What the groups' weights of features are added to.
     intercept : ndarray of shape (o,)
         What is added to the mean.
-    shared : bool, default=False
+    shared : bool
         Whether outputs have the same weights, and so depend on each other.
     """
 
@@ -179,7 +180,7 @@ class Predictor:
     noise: np.ndarray
     offset: np.ndarray
     intercept: np.ndarray
-    shared: bool = False
+    shared: bool
 
     @classmethod
     def joined(
@@ -302,7 +303,7 @@ class Predictor:
         prepared, kernel = None, None
         for group in self.groups:
             own = of_outputs(inputs, group.outputs)
-            if prepared is None or inputs.ndim == 3 or group.kernel is not kernel:
+            if inputs.ndim == 3 or group.kernel is not kernel:
                 kernel = group.kernel
                 prepared = kernel.prepare(own)
             yield Projected(own, prepared, *group.project(prepared, of_outputs(features, group.outputs)))
@@ -327,3 +328,42 @@ class Predictor:
         for group, part in zip(self.groups, (first, *others), strict=True):
             found[group.outputs] = part
         return found
+
+
+# The best q of independent values (the paper's), for a precision B of the best of all.
+
+
+def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
+    m = len(L_inv)
+    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
+    return -np.log(precision), -np.log(np.diagonal(B)[m:])
+
+
+def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
+    """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
+    m = len(L_inv)
+    root = np.zeros((m + len(log_w), m + len(log_w)))
+    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
+    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
+    return root
+
+
+def diagonal_gap(
+    B: np.ndarray, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (the lower triangle) in L; ``log_det_bar`` is -½ B⁻¹.
+
+    In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
+    """
+    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
+    precision = L_inv.T @ B[:m, :m] @ L_inv
+    f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(B)[m:]
+    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
+    B_bar = log_det_bar.copy()
+    weighted = L_inv / f_diagonal
+    B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
+    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
+    L_bar = -(weighted @ precision).T
+    diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
+    return float(gap), B_bar, L_bar

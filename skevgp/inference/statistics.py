@@ -22,6 +22,7 @@ from .._linalg import (
     diagonal_of,
     triangular_inverse,
     triangular_product,
+    triangular_solve,
 )
 from ..rows.blocks import AnyBlock, Block, Blocks
 
@@ -99,14 +100,28 @@ class Whitening:
 
     def jitter(self) -> float:
         """The most that was added to the diagonal of K; 0 if it is rounding."""
+        return float(self._added()[0].max(initial=0.0))
+
+    def _added(self) -> tuple[np.ndarray, np.ndarray]:
+        """What was added to the diagonal of K, 0 where it is rounding, and the diagonal as it was."""
         diagonal = np.diagonal(self.covariance.matrix())
         added = np.einsum("ij,ij->i", self.L, self.L) - diagonal
-        return float(np.max(added, where=added > _NO_JITTER * diagonal, initial=0.0))
+        return np.where(added > _NO_JITTER * diagonal, added, 0.0), diagonal
 
     def project(self, prepared: Any, out: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """U = k(X_m, X) and V = L⁻¹ U, both (m, n), of rows that `Kernel.prepare` has seen; V is put into ``out``."""
         U = self.covariance.cross(prepared)
         return U, triangular_product(self.L_inv, U, np.empty(U.shape) if out is None else out)
+
+    def solve(self, prepared: Any, out: np.ndarray) -> np.ndarray:
+        """V = L⁻¹ k(X_m, X) as of `project`, into ``out`` (m, n), by a triangular solve.
+
+        With small pivots it keeps one or two digits more of k(x, x) - |v|² than the product with L⁻¹ (Higham 2002,
+        section 14.1), so it is what predicts. (Sums over rows take the product: BLAS lets no other thread run.)
+        """
+        out[...] = self.covariance.cross(prepared)
+        triangular_solve(self.L, out)
+        return out
 
     def unexplained(self, prepared: Any, V: np.ndarray, roots: np.ndarray | None = None) -> np.ndarray:
         """k(x, x) - |v|² of each row, (n,): what the inducing points leave of its variance, clipped at 0.
@@ -117,13 +132,18 @@ class Whitening:
         if roots is not None:
             variance = variance * roots**2
         left = variance - np.einsum("mn,mn->n", V, V)
-        # What is left of a row that is an inducing point is rounding.
-        left -= _ROUNDING * variance
-        return np.maximum(left, 0.0, out=left)
+        # What is left of a row that is an inducing point is rounding. (Subtracted from each row, it would be a bias, in
+        # the bound N s²/σ² times as large.)
+        np.putmask(left, left < _ROUNDING * variance, 0.0)
+        return left
 
     def pull_back(self, rows_bar: Any, L_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in the hyperparameters (their logarithms) and X_m, given those in the rows (`pull_back`) and L."""
-        return self.covariance.finish_pullback(rows_bar, cholesky_pullback(self.L, self.L_inv, L_bar))
+        K_bar = cholesky_pullback(self.L, self.L_inv, L_bar)
+        # A jitter is a share of the diagonal, and moves with it. (The bound of a diagonal q has its logarithm.)
+        added, diagonal = self._added()
+        diagonal_of(K_bar)[...] *= 1.0 + np.divide(added, diagonal, out=np.zeros_like(added), where=diagonal > 0.0)
+        return self.covariance.finish_pullback(rows_bar, K_bar)
 
 
 @dataclass(frozen=True)
@@ -162,8 +182,8 @@ class SufficientStatistics:
     HR: np.ndarray
     RR: np.ndarray
     unexplained: Any
-    log_variance: float = 0.0
-    surplus: float = 0.0
+    log_variance: float
+    surplus: float
 
     @cached_property
     def joint(self) -> np.ndarray:
@@ -184,7 +204,10 @@ class SufficientStatistics:
 
 @dataclass(frozen=True)
 class StatisticsGradient:
-    """Gradients of a scalar in the statistics of these names, and in L; ``VE`` multiplies V e, not V r."""
+    """Gradients of a scalar in the statistics of these names, and in L, of which the lower triangle counts.
+
+    ``VE`` multiplies V e, not V r.
+    """
 
     VV: np.ndarray
     VH: np.ndarray
@@ -203,10 +226,13 @@ class Residuals:
         eᵀe of each output.
     VE : ndarray of shape (m, o)
         V e of each output.
+    HE : ndarray of shape (p, o), optional
+        Hᵀe, where `errors` are all that was asked for.
     """
 
     squares: np.ndarray
     VE: np.ndarray
+    HE: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -243,17 +269,18 @@ def _put_errors(block: Block, P: np.ndarray, outputs: slice, weights: np.ndarray
 
 @dataclass(frozen=True)
 class _Errors:
-    """Block -> eᵀe of each output and V e."""
+    """Block -> eᵀe of each output, V e and Hᵀe."""
 
     whitening: Whitening
     outputs: slice
     weights: np.ndarray
 
-    def __call__(self, block: AnyBlock) -> tuple[np.ndarray, np.ndarray]:
+    def __call__(self, block: AnyBlock) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         block, outputs = block.of(self.outputs)
         U, P = _projected(block, self.whitening, outputs)
         e = _put_errors(block, P, outputs, self.weights)
-        return np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
+        m, PE = len(U), P[: len(self.weights)] @ e.T
+        return np.einsum("on,on->o", e, e), PE[:m], PE[m:]
 
 
 @dataclass(frozen=True)

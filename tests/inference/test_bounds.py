@@ -6,9 +6,9 @@ import pytest
 from autograd import grad
 
 from skevgp._linalg import Jitter, NotPositiveDefiniteError
+from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
-from skevgp.fitting.strategy import Rules
-from skevgp.inference.bounds import BoundAtOptimum, features_alone_bound, upper_bound
+from skevgp.inference.bounds import BoundAtOptimum, features_alone_bound, optimal_posteriors, upper_bound
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.posterior import CoefficientPrior
@@ -109,6 +109,31 @@ def test_residuals_from_statistics_agree_with_those_from_rows():
     np.testing.assert_allclose(bound.residuals().VE, V @ e, rtol=1e-6, atol=1e-8)
 
 
+def test_squares_from_statistics_are_never_negative_whatever_rounding_says():
+    """Of rows that features explain to the last digit."""
+    found = []
+    for seed in range(20):
+        model, rows, table = problem(seed=seed)
+        rows.residuals[:] = rows.features @ np.full((3, 2), 30.0)
+        values = table.values_at_start() | {"noise": np.full(2, 1e-10)}
+        (group,) = model.groups_on(values, rows.blocks(model.kernel, 17))
+        found.append(BoundAtOptimum(group, "full").residuals().squares)
+    assert np.min(found) >= 0.0
+    assert np.max(found) < 1e-6
+
+
+@pytest.mark.parametrize("weights_are_shared", [False, True])
+def test_factors_of_a_posterior_are_those_of_its_precision(weights_are_shared):
+    model, rows, table = problem(shared=False)
+    alike = {name: np.tile(getattr(model.prior, name)[:1], (2, 1)) for name in ("scale", "reference")}
+    model = replace(model, prior=replace(model.prior, shared=weights_are_shared, **alike))
+    groups = list(model.groups_on(table.values_at_start(), rows.blocks(model.kernel, 17)))
+    for (q,) in optimal_posteriors(groups):
+        np.testing.assert_allclose(q.root @ q.root.T, q.B, rtol=1e-10, atol=1e-10)
+        np.testing.assert_array_equal(q.root, np.tril(q.root))
+        np.testing.assert_allclose(q.root_inv @ q.root, np.eye(9), atol=1e-10)
+
+
 def test_statistics_that_are_not_finite_raise_a_named_error():
     model, rows, table = problem()
     values = table.values(table.start())
@@ -173,7 +198,8 @@ def bounds_of(model, rows, values, from_rows=True):
     """The lower and the upper bound."""
     blocks = rows.blocks(model.kernel, 17)
     statistics = model.statistics(values, blocks)
-    return model.bound(values, statistics), model.upper_bound(values, statistics, blocks if from_rows else None)
+    seen = blocks if from_rows else None
+    return model.bound(values, statistics, seen), model.upper_bound(values, statistics, seen)
 
 
 @pytest.mark.parametrize("from_rows", [True, False])
@@ -208,6 +234,16 @@ def on_rows(copies=1, n=30, p=3):
     rows = type(rows)(*(np.repeat(own, copies, axis=0) for own in (points, rows.features, rows.residuals)))
     model = SparseModel(model.kernel, model.prior, "full", model.groups, complete=True)
     return model, rows, table.values_at_start() | {"inducing_points": points[np.newaxis]}
+
+
+def test_with_points_at_all_rows_the_gradient_is_that_of_the_bound_whatever_a_jitter_leaves_over():
+    model, rows, table = problem(n=20, m=20)
+    values = {"inducing_points": rows.inputs[np.newaxis], "hyperparameters": np.full(2, 3.0), "noise": np.full(2, 1e-2)}
+    table = table.started_at(table.values_at_start() | values)
+    model = replace(model, jitter=Jitter(0.03, 0.1), complete=True)
+    objective = BoundObjective(model, table, rows.blocks(model.kernel, 17))
+    _, gradient = objective(table.start())
+    assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start())) < 1e-5
 
 
 @pytest.mark.parametrize("copies", [1, 3])
@@ -272,6 +308,15 @@ def test_a_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
     }
     found = bounds_of(model, rows, values)[1]
     assert found == pytest.approx(longdouble_upper_bound(model, rows, values), rel=1e-7)
+
+
+def test_errors_of_the_upper_bound_are_summed_row_by_row():
+    """Of rows that features explain to five digits: differences of sums of squares have few of e's left."""
+    model, rows, table = problem(n=120)
+    rows.residuals[:] = rows.features @ np.full((3, 2), 30.0) + 1e-5 * np.random.RandomState(1).randn(120, 2)
+    values = table.values_at_start() | {"noise": np.full(2, 1e-10), "signal": np.full(2, 1e-10)}
+    expected = longdouble_upper_bound(model, rows, values)
+    assert bounds_of(model, rows, values)[1] == pytest.approx(expected, rel=0.0, abs=1e-5)
 
 
 def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():

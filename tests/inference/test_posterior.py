@@ -8,6 +8,8 @@ import pytest
 
 from skevgp.inference.model import SparseModel
 from skevgp.inference.posterior import CoefficientPrior, Predictor
+from skevgp.inference.statistics import Whitening
+from skevgp.kernels.dot_product import DotProduct
 
 from ..oracle import problem, squared_exponential
 
@@ -61,12 +63,63 @@ def test_predictions_are_those_of_the_dense_gaussian(shared, p):
 
 
 @pytest.mark.parametrize("shared", [True, False])
+def test_novelty_is_what_is_left_of_the_variance_of_f_alone_at_most_all_of_it(shared):
+    predictor, *q, values, model = some_posterior(shared)
+    _, covariance = dense_moments(*q, values, model, X_NEW, np.zeros((11, P)))
+    share = np.einsum("nno->no", covariance) / values["signal"]
+    assert (share > 1.0).any()
+    assert (share < 1.0).any()
+    np.testing.assert_allclose(predictor.novelty(X_NEW, H_NEW), np.minimum(share, 1.0), rtol=1e-8)
+
+
+def test_novelty_where_f_is_known_without_data():
+    """A linear function is 0 at the origin; elsewhere its prior variance is |x|² s²."""
+    model, _, table = problem(d=1, m=1, p=0)
+    values = table.values_at_start() | {"hyperparameters": np.array([1e-170]), "inducing_points": np.array([[[2.0]]])}
+    model = SparseModel(DotProduct(), model.prior, "full", model.groups)
+    predictor = model.predictor(values, list(model.whitenings(values)), [np.ones(1)] * O, [np.full((1, 1), 0.5)] * O)
+    inputs = np.array([[0.0], [1e-3], [2.0], [-30.0]])
+    expected = np.repeat([[0.0], [0.25], [0.25], [0.25]], O, axis=1)
+    np.testing.assert_allclose(predictor.novelty(inputs, np.empty((4, 0))), expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("shared", [True, False])
 def test_the_covariances_diagonal_is_the_variance(shared):
     predictor = some_posterior(shared)[0]
     _, variance = predictor.predict(X_NEW, H_NEW, return_variance=True)
     _, covariance = predictor.covariance(X_NEW, H_NEW)
     np.testing.assert_allclose(np.einsum("nno->no", covariance), variance, rtol=1e-9)
     np.testing.assert_allclose(covariance, covariance.transpose(1, 0, 2), rtol=1e-12, atol=1e-13)
+
+
+def test_outputs_with_weights_of_their_own_are_independent():
+    predictor = some_posterior()[0]
+    _, covariance = predictor.covariance(X_NEW, H_NEW)
+    jointly = predictor.jointly(covariance, X_NEW, H_NEW).reshape(11, O, 11, O)
+    assert predictor.common(X_NEW, H_NEW).shape == (0, 11, O)
+    for i, j in np.ndindex(O, O):
+        np.testing.assert_array_equal(jointly[:, i, :, j], covariance[:, :, i] if i == j else 0.0)
+
+
+def test_each_output_sees_its_own_rows():
+    predictor = some_posterior(shared=False)[0]
+    inputs, features = (np.stack([rows, rows[::-1] + 0.5], axis=1) for rows in (X_NEW, H_NEW))
+    found = predictor.predict(inputs, features, return_variance=True)
+    for o in range(O):
+        alone = predictor.predict(inputs[:, o], features[:, o], return_variance=True)
+        for part, expected in zip(found, alone, strict=True):
+            np.testing.assert_allclose(part[:, o], expected[:, o], rtol=1e-12)
+
+
+def test_each_group_prepares_rows_for_its_own_kernel():
+    """Of which one is used around another centre: the same covariances, to rounding."""
+    predictor = some_posterior(shared=False)[0]
+    first, second = predictor.groups
+    kernel = second.kernel.centred(np.array([2.0, -3.0]))
+    elsewhere = replace(second, kernel=kernel, whitening=Whitening.of(kernel, second.hyperparameters, second.points))
+    found = replace(predictor, groups=(first, elsewhere)).predict(X_NEW, H_NEW, return_variance=True)
+    for part, expected in zip(found, predictor.predict(X_NEW, H_NEW, return_variance=True), strict=True):
+        np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-10)
 
 
 def test_no_variance_without_being_asked():
@@ -133,6 +186,7 @@ def test_predictors_of_single_outputs_are_joined_each_to_its_own(order):
     joined = Predictor.joined([parts[o] for o in order], [[o] for o in order], unit, offset, intercept)
     expected = Predictor.joined([whole], [[0, 1]], unit, offset, intercept)
     assert [group.outputs for group in joined.groups] == [[o] for o in order]
+    assert type(joined.groups) is tuple
     for group, of_whole in zip(joined.by_output, expected.by_output, strict=True):
         np.testing.assert_array_equal(group.points, of_whole.points)
     np.testing.assert_array_equal(joined.signal, expected.signal)
@@ -181,6 +235,8 @@ def test_so_many_rows_at_once_that_memory_stays_small():
     assert predictor.rows_at_once == 4096
     large = replace(predictor.groups[0], mean=np.zeros((100, 10_000)))
     assert replace(predictor, groups=(large,)).rows_at_once == 256
+    nothing = replace(predictor.groups[0], mean=np.zeros((1, 0)))
+    assert replace(predictor, groups=(nothing,)).rows_at_once == 4096
     middle = replace(predictor.groups[0], mean=np.zeros((1, 1000)))
     assert replace(predictor, groups=(middle, middle)).rows_at_once * 2000 <= 2**20
 

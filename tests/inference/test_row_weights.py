@@ -1,10 +1,12 @@
 """Rows that count w times, and whose noise variance is σ² v: against dense formulas and rows that are repeated."""
 
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 
+from skevgp._linalg import Jitter
 from skevgp.inference.bounds import bounds_at_optimum, features_alone_bound, upper_bound
 from skevgp.inference.exact import ExactModel
 from skevgp.inference.model import SparseModel
@@ -104,6 +106,43 @@ def test_what_a_jitter_leaves_counts_as_often_as_the_row_does(counts):
     assert group.whitening.jitter() > 0.0
     _, likelihood = dense(values | {"inducing_points": rows.inputs[np.newaxis, 1:]}, raw, model.prior)
     assert likelihood <= upper_bound([group]) + 1e-8 * abs(likelihood)
+
+
+def far_apart(counts):
+    """A model of rows without covariance, all of them points, with a large jitter; the first row lies far off."""
+    model, rows, table = problem(n=len(counts), p=0)
+    rows.inputs[:] = 100.0 * np.arange(len(counts))[:, np.newaxis]
+    rows.residuals[:] = 0.0
+    rows.residuals[0] = 20.0
+    model = replace(model, jitter=Jitter(0.1, well_conditioned=2.0), complete=True)
+    return model, weighted(rows, counts), table.values_at_start() | {"inducing_points": rows.inputs[np.newaxis]}
+
+
+@pytest.mark.parametrize(
+    ("often", "counts"), [(100.0, [100.0, *np.full(50, 0.01)]), (1.0, np.ones(20))], ids=["often", "once"]
+)
+def test_what_a_jitter_leaves_of_a_row_counts_as_often_as_the_row_may(often, counts):
+    """A trace of s² j so many times: by the formula of `upper_bound`, row by row."""
+    counts = np.array(counts)
+    model, raw, values = far_apart(counts)
+    (group,) = model.groups_on(values, blocks_of(raw, model.kernel))
+    expected = 0.0
+    for signal, noise, r in zip(values["signal"], values["noise"], raw.targets.T, strict=True):
+        q, t = counts * signal / 1.1, often * signal * 0.1
+        expected -= 0.5 * (counts.sum() * np.log(2.0 * np.pi * noise) + np.log1p(q / noise).sum())
+        expected -= 0.5 * (counts * r**2 / (noise + t + q)).sum()
+    assert group.whitening.jitter() == pytest.approx(0.1)
+    assert upper_bound([group]) == pytest.approx(expected, rel=1e-10)
+    assert dense(values, raw, model.prior)[1] < expected
+
+
+def test_what_a_jitter_leaves_of_rows_that_have_been_forgotten_in_part():
+    """The sums of rows that count once, a tenth of them."""
+    model, raw, values = far_apart(np.ones(20))
+    statistics = model.statistics(values, blocks_of(raw, model.kernel))[0].scaled(0.1)
+    rows = RawRows(*raw.parts[:3], np.full(20, 0.1), np.full(20, 0.1))
+    likelihood = dense(values, rows, model.prior)[1]
+    assert likelihood < model.upper_bound(values, [statistics])
 
 
 @pytest.mark.parametrize("name", [name for name in KERNELS if name != "ConstantKernel"])

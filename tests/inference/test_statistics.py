@@ -11,8 +11,10 @@ from skevgp.inference.statistics import (
     SufficientStatistics,
     Whitening,
     collect,
+    errors,
     pull_back,
 )
+from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
 
 from ..oracle import ArrayRows, central_differences, problem, relative_error, squared_exponential
@@ -84,6 +86,36 @@ def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
         assert (left >= 0.0).all()
 
 
+def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
+    """Of one point it is 1 - exp(-(x - z)² / ℓ²), here 1e-12 and more: right to a unit of 1, on average."""
+    x = np.linspace(1e-6, 1e-4, 2000)[:, np.newaxis]
+    kernel = SquaredExponential(1)
+    own, prepared = Whitening.of(kernel, np.ones(1), np.zeros((1, 1))), kernel.prepare(x)
+    shift = own.unexplained(prepared, own.project(prepared)[1]) + np.expm1(-(x[:, 0] ** 2))
+    assert abs(shift.mean()) < np.finfo(float).eps
+
+
+@pytest.mark.parametrize("n", [1, 7])
+def test_solved_rows_are_the_projected_ones(n):
+    own, prepared = whitening(), KERNEL.prepare(X[:n])
+    P = np.zeros((M + 1, n))
+    V = own.solve(prepared, out=P[:M])
+    np.testing.assert_allclose(P[:M], own.project(prepared)[1], rtol=1e-10, atol=1e-10)
+    assert np.shares_memory(V, P)
+    assert not P[M].any()
+
+
+@pytest.mark.parametrize(("kernel", "size"), [(SquaredExponential(3), 1.0), (DotProduct(), 1e3)], ids=["near 1", "1e6"])
+def test_of_most_rows_that_are_points_rounding_leaves_nothing_either(kernel, size):
+    """It would leave about a half of them something, whatever the variance is."""
+    nothing = []
+    for seed in range(100):
+        points = size * np.random.RandomState(seed).randn(3, 3)
+        own, prepared = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points), kernel.prepare(points)
+        nothing.append(own.unexplained(prepared, own.project(prepared)[1]) == 0.0)
+    assert np.mean(nothing) > 0.8
+
+
 def test_there_is_a_jitter_only_where_the_points_need_one():
     K = squared_exponential(Z, Z, LENGTHSCALES)
     np.testing.assert_array_equal(whitening().L, Whitening.of(KERNEL, LENGTHSCALES, Z, Jitter(0.1)).L)
@@ -93,6 +125,18 @@ def test_there_is_a_jitter_only_where_the_points_need_one():
     assert np.isfinite(own.L_inv).all()
     K = squared_exponential(twice, twice, LENGTHSCALES)
     np.testing.assert_allclose(own.L @ own.L.T, K + JITTER.size * np.eye(2 * M), atol=1e-14)
+
+
+def test_rounding_is_no_jitter_whatever_the_variance():
+    """Of points far from the origin, where a linear covariance is large."""
+    kernel = DotProduct()
+    for seed in range(20):
+        points = 1e3 * (np.eye(D) + 0.1 * np.random.RandomState(seed).randn(D, D))
+        own = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points)
+        assert own.jitter() == 0.0
+        jittered = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points, Jitter(1e-3, 2.0))
+        largest = np.diagonal(kernel.at(np.zeros(kernel.n_hyperparameters), points).matrix()).max()
+        assert jittered.jitter() == pytest.approx(1e-3 * largest, rel=1e-9)
 
 
 def test_gradients_in_the_factor_are_pulled_back():
@@ -207,6 +251,9 @@ def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
     found, residuals = pull_back(blocks(), own, outputs, collect(blocks(), own, outputs), gradient, weights)
     np.testing.assert_allclose(residuals.squares, np.sum(e**2, axis=0), rtol=1e-10)
     np.testing.assert_allclose(residuals.VE, V @ e, rtol=1e-8, atol=1e-10)
+    alone = errors(blocks(), own, outputs, weights)
+    np.testing.assert_allclose(alone.squares, residuals.squares, rtol=1e-12)
+    np.testing.assert_allclose(alone.VE, residuals.VE, rtol=1e-9, atol=1e-11)
     left = blocks(rows=ArrayRows(X, H, e))
     expected, _ = pull_back(left, own, outputs, collect(left, own, outputs), gradient, np.zeros((M + P, O)))
     np.testing.assert_allclose(flat(found), flat(expected), rtol=1e-9, atol=1e-9)
