@@ -12,11 +12,11 @@ from http.client import HTTPException
 from pathlib import Path, PurePosixPath
 from typing import Literal, overload
 from urllib.request import urlopen
-from uuid import uuid4
 
 import numpy as np
 from sklearn.utils import Bunch
 
+from .._files import replacing
 from .._validation import check_integer, check_real
 
 _ADDRESS = "http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz"
@@ -84,16 +84,6 @@ def _unpack(archive: bytes) -> dict[str, bytes]:
     return contents
 
 
-def _write(content: bytes, path: Path) -> None:
-    """All of it or nothing, whoever else writes it at the same time."""
-    part = path.with_name(f"{path.name}.{uuid4().hex}")
-    try:
-        part.write_bytes(content)
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
-
-
 def _fetch(folder: Path, n_retries: int, delay: float) -> dict[str, np.ndarray]:
     """Download the files, check them and keep them in a folder."""
     try:
@@ -107,7 +97,8 @@ def _fetch(folder: Path, n_retries: int, delay: float) -> dict[str, np.ndarray]:
         ) from problem
     folder.mkdir(exist_ok=True)
     for name, content in contents.items():
-        _write(content, folder / name)
+        with replacing(folder / name) as file:
+            file.write(content)
     return numbers
 
 

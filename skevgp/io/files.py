@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import platform
-import warnings
 from collections.abc import Iterator
 from importlib.util import find_spec
 from typing import IO, Any
@@ -17,13 +16,14 @@ from joblib import parallel_config
 from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
+from .._files import replacing
 from .._frames import FrameColumns
 from .._validation import check_fitted
 from .._version import __version__
-from ..exceptions import InconsistentVersionWarning, warn_user
+from ..exceptions import InconsistentVersionWarning, ignored, warn_user
 from ..rows.maps import take_rows
 from . import of_maps, of_models
-from .container import Container, replacing, write
+from .container import Container, write
 from .fields import MalformedError
 from .records import Record, by_name
 from .values import Reader, Writer, refusal
@@ -165,8 +165,7 @@ def load(path: str | os.PathLike[str]) -> Any:
 
 def _loaded(file: IO[bytes], path: str) -> Any:
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"), parallel_config("sequential"):
-            warnings.simplefilter("ignore")
+        with ignored(), np.errstate(all="ignore"), parallel_config("sequential"):
             model, made_with, tried = _read(file)
     except ImportError:
         raise
@@ -216,8 +215,7 @@ def _trial(model: Any) -> dict[str, Any] | None:
     """A few rows, and what is predicted of them; None for a model of which nobody knows what rows it takes."""
     rows = _rows_for(model)
     try:
-        with warnings.catch_warnings(), np.errstate(all="ignore"):
-            warnings.simplefilter("ignore")
+        with ignored(), np.errstate(all="ignore"):
             mean, std = _predicted(model, rows)
     except Exception:
         return None

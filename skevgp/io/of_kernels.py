@@ -6,16 +6,23 @@ from sklearn.gaussian_process import kernels as sk
 
 from ..kernels import constant, cosine, covariances, dot_product, profiles, stationary
 from ..kernels.parse import KernelSpec, Start, Starts
-from .fields import anything, array, flag, integer, made, nothing, one_of, real, row, several
+from .fields import Field, array, flag, integer, made, nothing, one_of, real, row, several
 from .records import Record, bare, plain
 
 _LENGTH = real(above=0.0) | array("d", above=0.0) | several(real(above=0.0)) | row(real(above=0.0))
+_END = real(least=0.0, finite=False)
+_LIST = Field(
+    "a list of two numbers from 0",
+    lambda v, sizes: type(v) is list and len(v) == 2 and all(_END.holds(e, {}) for e in v),
+)
+_PAIR = row(_END, _END) | _LIST
 _BOUNDS = (
     one_of("fixed")
-    | row(real(least=0.0), real(least=0.0, finite=False))
-    | several(anything)
-    | several(anything, tuple)
-    | array("...", least=0.0, finite=False)
+    | _PAIR
+    | several(_PAIR)
+    | several(_PAIR, tuple)
+    | array("d 2", least=0.0, finite=False)
+    | array("2", least=0.0, finite=False)
 )
 TREE, COVARIANCE = made(sk.Kernel), made(covariances.Covariance)
 _ROWS = made(covariances.CentredSquares)

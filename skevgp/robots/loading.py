@@ -17,6 +17,7 @@ import numpy as np
 
 from .._optional import require
 from .systems import GRAVITY, SYSTEMS, Layout, System
+from .urdf_file import text_for_pinocchio
 
 _COLLECTION = "example-robot-data"
 _MOVABLE = ("revolute", "continuous", "prismatic")
@@ -75,8 +76,9 @@ def load_robot(robot: Robot) -> Any:
     if isinstance(robot, (str, os.PathLike)):
         path = urdf_path(robot)
         pin = require("pinocchio", "Loading a robot")
+        text = text_for_pinocchio(path)
         try:
-            model = pin.buildModelFromUrdf(str(path))
+            model = pin.buildModelFromXML(text)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
         return _plain(model, f"The robot {str(robot)!r}")

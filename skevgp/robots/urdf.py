@@ -10,11 +10,11 @@ import os
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.parsers import expat
 from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from .._files import replacing
 from .inertia import (
     N_PARAMETERS,
     body_parameters,
@@ -23,28 +23,7 @@ from .inertia import (
     checked_links,
 )
 from .loading import Robot, load_robot, named_system, urdf_path
-
-_START_TAG = re.compile(rb"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\s*(/?)>""")
-_INERTIA = ("ixx", "ixy", "iyy", "ixz", "iyz", "izz")
-
-
-class _Element:
-    """Where the bytes of an element are, and its children."""
-
-    def __init__(self, tag: str, attributes: dict[str, str], data: bytes, start: int):
-        self.tag, self.attributes, self.start = tag, attributes, start
-        match = _START_TAG.match(data, start)
-        if match is None:
-            raise ValueError("its encoding is not one that has ASCII in it")
-        self.is_empty = bool(match[1])
-        self.inner = self.end = match.end()
-        self.children: list[_Element] = []
-
-    def all(self, tag: str) -> list[_Element]:
-        return [child for child in self.children if child.tag == tag]
-
-    def attribute_of(self, tag: str, name: str) -> str:
-        return next((child.attributes.get(name, "") for child in self.all(tag)), "")
+from .urdf_file import MOMENTS, Element, elements_of
 
 
 class _Edit(NamedTuple):
@@ -105,7 +84,7 @@ def write_urdf(
     """
     path = _file_of(source)
     data = path.read_bytes()
-    root = _parsed(data, path)  # first: Pinocchio's messages say less
+    root = elements_of(data, path)  # first: Pinocchio's messages say less
     names = list(load_robot(path).names)[1:]
     if not overwrite and Path(target).exists() and Path(target).samefile(path):
         raise ValueError(f"{str(path)!r} is the source; overwrite=True allows to overwrite it.")
@@ -125,43 +104,14 @@ def write_urdf(
         for other in _welded(child, fixed):
             edits += _moved(data, links[other], child)
         edits += _dynamics(data, joint, {key: numbers[index] for key, numbers in joint_numbers.items()})
-    Path(target).write_bytes(_edited(data, edits))
+    with replacing(target) as file:
+        file.write(_edited(data, edits))
 
 
 def _file_of(source: Robot) -> Path:
     if not isinstance(source, (str, os.PathLike)) or named_system(source) is not None:
         raise ValueError(f"source must be a URDF file, or the name of a robot that has one; got {source!r}.")
     return urdf_path(source)
-
-
-def _parsed(data: bytes, path: Path) -> _Element:
-    """The root of a file's elements."""
-    parser = expat.ParserCreate()
-    open_elements: list[_Element] = []
-    roots: list[_Element] = []
-
-    def start(tag: str, attributes: dict[str, str]) -> None:
-        element = _Element(tag, attributes, data, parser.CurrentByteIndex)
-        (open_elements[-1].children if open_elements else roots).append(element)
-        open_elements.append(element)
-
-    def end(_: str) -> None:
-        element = open_elements.pop()
-        if not element.is_empty:
-            element.end = data.index(b">", parser.CurrentByteIndex) + 1
-
-    def declared(*_: Any) -> None:
-        raise ValueError("it has a document type declaration, which is not read (it may declare entities)")
-
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.StartDoctypeDeclHandler = declared
-    try:
-        parser.Parse(data, True)
-        if roots[0].tag != "robot":
-            raise ValueError(f"its root is <{roots[0].tag}>, not <robot>")
-    except (expat.ExpatError, LookupError, ValueError) as error:
-        raise ValueError(f"The file {str(path)!r} is not a URDF that can be rewritten: {error}.") from error
-    return roots[0]
 
 
 def _numbers(parameters: np.ndarray, covariance: np.ndarray | None, names: list[str]) -> tuple[np.ndarray, list[Any]]:
@@ -177,7 +127,7 @@ def _numbers(parameters: np.ndarray, covariance: np.ndarray | None, names: list[
     return values, list(np.sqrt(np.maximum(variances, 0.0)))
 
 
-def _fixed_to(root: _Element) -> dict[str, list[str]]:
+def _fixed_to(root: Element) -> dict[str, list[str]]:
     """The links that are fixed to each link."""
     children: dict[str, list[str]] = {}
     for joint in root.all("joint"):
@@ -194,16 +144,16 @@ def _welded(link: str, fixed: dict[str, list[str]]) -> list[str]:
     return found[1:]
 
 
-def _inertial(data: bytes, link: _Element, body: np.ndarray, deviation: np.ndarray | None) -> list[_Edit]:
+def _inertial(data: bytes, link: Element, body: np.ndarray, deviation: np.ndarray | None) -> list[_Edit]:
     mass, centre, inertia = _texts(body, repr)
     lines = [
         f'<origin xyz={centre} rpy="0 0 0"/>',
         f"<mass value={mass}/>",
-        "<inertia " + " ".join(f"{name}={value}" for name, value in zip(_INERTIA, inertia, strict=True)) + "/>",
+        "<inertia " + " ".join(f"{name}={value}" for name, value in zip(MOMENTS, inertia, strict=True)) + "/>",
     ]
     if deviation is not None:
         mass, centre, inertia = _texts(deviation, "{:.3g}".format)
-        spread = " ".join(f"{name}={value}" for name, value in zip(_INERTIA, inertia, strict=True))
+        spread = " ".join(f"{name}={value}" for name, value in zip(MOMENTS, inertia, strict=True))
         lines.insert(0, f"<!-- standard deviations: mass={mass} xyz={centre} {spread} -->")
     return _replaced(data, link, "inertial", ["<inertial>", *[f"  {line}" for line in lines], "</inertial>"])
 
@@ -213,14 +163,14 @@ def _texts(body: np.ndarray, write: Any) -> tuple[str, str, list[str]]:
     return f'"{texts[0]}"', f'"{" ".join(texts[1:4])}"', [f'"{text}"' for text in texts[4:N_PARAMETERS]]
 
 
-def _moved(data: bytes, link: _Element, body: str) -> list[_Edit]:
+def _moved(data: bytes, link: Element, body: str) -> list[_Edit]:
     if not link.all("inertial"):
         return []
     called = re.sub("-(?=-)", "- ", body)  # two of them would end the comment
     return _replaced(data, link, "inertial", [f"<!-- The inertia of this link is part of that of {called}. -->"])
 
 
-def _dynamics(data: bytes, joint: _Element, numbers: dict[str, float]) -> list[_Edit]:
+def _dynamics(data: bytes, joint: Element, numbers: dict[str, float]) -> list[_Edit]:
     if not numbers:
         return []
     attributes = dict(next((element.attributes for element in joint.all("dynamics")), {}))
@@ -233,7 +183,7 @@ def _dynamics(data: bytes, joint: _Element, numbers: dict[str, float]) -> list[_
     return _replaced(data, joint, "dynamics", [f"{tag}>", f"  {comment}", "</dynamics>"])
 
 
-def _replaced(data: bytes, parent: _Element, tag: str, lines: list[str]) -> list[_Edit]:
+def _replaced(data: bytes, parent: Element, tag: str, lines: list[str]) -> list[_Edit]:
     """The first child of that tag is replaced, others are removed; without one the lines become the first child."""
     old = parent.all(tag)
     if old:

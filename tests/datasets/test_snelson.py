@@ -2,10 +2,10 @@ import io
 import re
 import tarfile
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from hashlib import sha256
 from http.server import BaseHTTPRequestHandler, HTTPServer
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -193,17 +193,25 @@ def test_a_link_is_no_file(fetch, serve):
         fetch()
 
 
-def test_a_write_that_fails_leaves_the_old_file(tmp_path, monkeypatch):
-    path = tmp_path / "train_inputs"
-    path.write_bytes(b"old")
+def test_a_full_disk_leaves_no_half_file(fetch, serve, home, monkeypatch):
+    serve(archive(GOOD))
+    monkeypatch.setattr("os.fsync", full_disk)
+    with pytest.raises(OSError, match="No space left"):
+        fetch()
+    assert list((home / "SPGP_dist").iterdir()) == []
 
-    def fail(*_arguments):
-        raise OSError("disk full")
 
-    monkeypatch.setattr(Path, "replace", fail)
-    with pytest.raises(OSError, match="disk full"):
-        snelson._write(b"new", path)
-    assert [file.read_bytes() for file in tmp_path.iterdir()] == [b"old"]
+def full_disk(*_):
+    raise OSError(28, "No space left on device")
+
+
+def test_several_fetch_at_once(serve, home):
+    serve(archive(GOOD))
+    with ThreadPoolExecutor(8) as pool:
+        found = list(pool.map(lambda _: fetch_snelson(home, return_X_y=True)[1], range(16)))
+    for target in found:
+        assert_array_equal(target, 6.0 * Y + 3.0 * X)
+    assert sorted(file.name for file in (home / "SPGP_dist").iterdir()) == sorted(FAKE)
 
 
 @pytest.fixture

@@ -92,6 +92,7 @@ def test_truth_values_are_0_or_1():
         (_twice([("model.json", b"1")], ("model.json", b"2")), "two members of the name 'model.json'"),
         (_all_at_one_place(written()), "two members|together are longer|is not|differ"),
     ],
+    ids=["compressed", "twice", "at one place"],  # bytes as names have the time in them
 )
 def test_tricks_of_zip_are_refused(data, message):
     with pytest.raises((MalformedError, zipfile.BadZipFile), match=message):

@@ -52,6 +52,11 @@ def edited(data, change):
         ("SquaredExponential", "n_columns", True, "must be an integer"),
         ("CentredSquares", "centre", {"tuple": [{"float": "nan"}, 1.0]}, "finite"),
         ("sklearn.RBF", "length_scale", -1.0, "above 0"),
+        ("sklearn.RBF", "length_scale_bounds", "free", "length_scale_bounds must be"),
+        ("sklearn.RBF", "length_scale_bounds", {"tuple": [-1.0, 1.0]}, "length_scale_bounds must be"),
+        ("sklearn.RBF", "length_scale_bounds", {"tuple": [1.0]}, "length_scale_bounds must be"),
+        ("sklearn.RBF", "length_scale_bounds", [["a", {"object": 0}]], "length_scale_bounds must be"),
+        ("sklearn.RBF", "length_scale_bounds", [[1.0, 2.0, 3.0]], "length_scale_bounds must be"),
         ("sklearn.Product", "k1", {"object": 10**6}, "refers to the object"),
     ],
 )

@@ -226,7 +226,7 @@ def test_a_model_of_a_system_has_the_layout_of_its_table(name):
 def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
     path = tmp_path / "bad.urdf"
     path.write_text("<robot><link></robot>")
-    with pytest.raises(ValueError, match=r"bad.urdf' is not a URDF that Pinocchio can read"):
+    with pytest.raises(ValueError, match=r"bad.urdf' is not a URDF that can be read"):
         load_robot(path)
 
 

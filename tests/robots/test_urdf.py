@@ -227,7 +227,7 @@ BOMB = "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(12))
 def test_what_is_no_urdf_is_named(content, message, tmp_path):
     source, target = tmp_path / "wrong.urdf", tmp_path / "new.urdf"
     source.write_bytes(content if isinstance(content, bytes) else content.encode())
-    with pytest.raises(ValueError, match=rf"wrong\.urdf' is not a URDF that can be rewritten: .*{message}"):
+    with pytest.raises(ValueError, match=rf"wrong\.urdf' is not a URDF that can be read: .*{message}"):
         write_urdf(source, target, np.ones((2, 10)))
     assert not target.exists()
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..._optional import require
 from .recording import Recording, Signals
+from .unpacking import Allowance, check_files, check_storages
 
 SUFFIXES = (".db3", ".mcap")
 _STATES, _TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
@@ -78,7 +79,9 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
     rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
     typesys = require("rosbags.typesys", "Reading rosbag2 files")
     try:
+        size = check_files(path)
         with rosbag2.Reader(path) as reader:
+            check_storages(reader, size)
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
             chosen = _topic(topics, topic)
             # The message types that ROS defines, not those that the file does, of which rosbags would make code.
@@ -86,7 +89,7 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
             connections = [connection for connection in reader.connections if connection.topic == chosen]
             found = [
                 (received, store.deserialize_cdr(data, topics[chosen]))
-                for _, received, data in reader.messages(connections=connections)
+                for _, received, data in Allowance(size).messages(reader.messages(connections=connections))
             ]
     except _TopicError:
         raise

@@ -290,7 +290,11 @@ def _recording(read: Recording, file: Path, keep: Keep | None, gains: ArrayLike,
     if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
         raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
     raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap)
-    done = process(raw, step, gap, how)
+    with np.errstate(all="ignore"):
+        done = process(raw, step, gap, how)
+    for name, signal in vars(done.signals).items():
+        if not np.isfinite(signal).all():
+            raise ValueError(f"its {name} overflows when it is filtered and differentiated.")
     return Bunch(
         filename=str(file),
         start=read.start,

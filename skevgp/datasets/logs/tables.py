@@ -15,6 +15,7 @@ import numpy as np
 
 from ..._validation import check_integer
 from .recording import Recording, Signals
+from .unpacking import Allowance
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".csv.gz", ".txt.gz", ".tsv.gz")
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -59,9 +60,13 @@ def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: st
     ValueError
         If there are no such columns, signals differ in their number of columns, or something is not a number.
     """
+    packed = path.suffix.lower() == ".gz"
     try:
+        if packed:
+            with gzip.open(path) as content:
+                Allowance(path.stat().st_size).take_all(content)
         # The signature of UTF-8, which spreadsheets write, is none of the first column's name.
-        with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rt", encoding="utf-8-sig") as lines:
+        with (gzip.open if packed else open)(path, "rt", encoding="utf-8-sig") as lines:
             found, values = _read(lines, columns)
     except (gzip.BadGzipFile, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise ValueError(f"it is no text, or its compression is broken ({error}).") from error

@@ -1,0 +1,36 @@
+"""Files that are written whole or not at all."""
+
+from __future__ import annotations
+
+import os
+import secrets
+import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO
+
+
+@contextmanager
+def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
+    """A new file that takes the place of another when all is written, and is gone if that fails.
+
+    Whoever reads at the same time sees the old one or the new one; of several who write, one is the last.
+    """
+    target = Path(os.path.realpath(path))
+    beside = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.tmp")
+    try:
+        with open(beside, "xb+") as file:
+            yield file
+            file.flush()
+            os.fsync(file.fileno())
+        if target.exists():
+            shutil.copymode(target, beside)
+        os.replace(beside, target)
+    except OSError as error:
+        if error.filename != str(beside) and error.filename != beside:
+            raise
+        # The user knows of one file.
+        raise OSError(error.errno, error.strerror, os.fspath(path)) from None
+    finally:
+        beside.unlink(missing_ok=True)

@@ -1,0 +1,140 @@
+"""What of a URDF file Pinocchio is given; `tests/long/hostile_files.py` damages such files thousands of times."""
+
+from itertools import pairwise
+
+import pinocchio
+import pytest
+
+from skevgp.robots import load_robot
+from skevgp.robots.loading import _collection
+from skevgp.robots.urdf_file import text_for_pinocchio
+
+from .test_urdf import ARM, BOMB
+
+LINK = '<link name="{}"/>'
+JOINT = """<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>
+<limit effort="1" velocity="1"/></joint>"""
+
+
+def joint(parent, child, kind="revolute", name=None):
+    return JOINT.format(parent=parent, child=child, kind=kind, name=name or f"to_{child}")
+
+
+def robot(links, *joints):
+    return f'<robot name="r">{"".join(map(LINK.format, links))}{"".join(joints)}</robot>'
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(text):
+        path = tmp_path / "arm.urdf"
+        path.write_bytes(text if isinstance(text, bytes) else text.encode())
+        return load_robot(path)
+
+    return load
+
+
+def test_of_all_robots_pinocchio_makes_the_same_model():
+    for path in _collection().values():
+        assert pinocchio.buildModelFromXML(text_for_pinocchio(path)) == pinocchio.buildModelFromUrdf(str(path)), path
+
+
+def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
+    path = tmp_path / "arm.urdf"
+    mesh = '<visual><geometry><mesh filename="package://../../etc/passwd"/></geometry></visual>'
+    path.write_text(ARM.replace('<link name="lower"/>', f'<link name="lower">{mesh}</link>'))
+    text = text_for_pinocchio(path)
+    assert not any(word in text for word in ("mesh", "passwd", "visual", "transmission", "colour", "<!--"))
+    assert pinocchio.buildModelFromXML(text) == pinocchio.buildModelFromUrdf(str(path))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        (
+            'mass value="2"',
+            'mass value="nan"',
+            r"value of <mass> of <link name='upper'> must be a finite number; it is",
+        ),
+        ('mass value="2"', 'mass value="1e999"', "must be a finite number; it is '1e999'"),
+        ('mass value="2"', 'mass value="0x10"', "must be a finite number"),
+        ('mass value="2"', 'mass value="1_0"', "must be a finite number"),
+        ('mass value="2"', 'mass value="٣"', "must be a finite number"),
+        ('<mass value="2"/>', "<mass/>", "<mass> of <link name='upper'> has no value"),
+        ('<mass value="2"/>', "", "<inertial> of <link name='upper'> has no mass"),
+        ('ixx="0.1" ixy="0.01"', 'ixx="0.1"', "<inertia> of <link name='upper'> has no ixy"),
+        ('xyz="0 0 0.3"', 'xyz="0 0"', "xyz of <origin> of <joint name='one'> must be 3 finite numbers; it is '0 0'"),
+        ('xyz="0 0 0.3"', 'xyz="0 0 inf"', "must be 3 finite numbers"),
+        ('damping="0.5"', 'damping=""', "damping of <dynamics> of <joint name='one'> must be a finite number"),
+        ('effort="3" velocity="4"', 'velocity="4"', "<limit> of <joint name='one'> has no effort"),
+        (
+            'type="prismatic"',
+            'type="spherical"',
+            "the joint 'two' is of the type 'spherical', which is none of revolute",
+        ),
+        ('type="prismatic"', "", "<joint name='two'> has no type"),
+        ('<child link="point"/>', '<child link="none"/>', "the joint 'tip' is at a link 'none', which is not there"),
+        ('<child link="point"/>', "<child/>", "<child> of <joint name='tip'> has no link"),
+        ('<child link="point"/>', "", "<joint name='tip'> has no child"),
+        ('<link name="point"/>', '<link name="base"/>', "two links of the name 'base'"),
+        ('<joint name="tip"', '<joint name="one"', "two joints of the name 'one'"),
+        ('<child link="point"/>', '<child link="upper"/>', "the link 'upper' is the child of two joints"),
+        ('<link name="point"/>', '<link name="point"/><link name="far"/>', "2 links that are no joint's child"),
+        ('<robot name="arm"', "<robot", "<robot> has no name"),
+    ],
+)
+def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
+    """Pinocchio itself would take a mass that is no number for 0."""
+    assert old in ARM
+    with pytest.raises(ValueError, match=rf"arm\.urdf' is not a URDF that can be read: .*{message}"):
+        load(ARM.replace(old, new, 1))
+
+
+def test_links_in_a_circle_are_told(load):
+    """Pinocchio leaves them out, and makes a robot of the rest."""
+    with pytest.raises(ValueError, match="it has links in a circle"):
+        load(robot("abcd", joint("a", "b"), joint("c", "d"), joint("d", "c")))
+
+
+def test_a_joint_without_limits_is_told(load):
+    text = robot("ab", joint("a", "b")).replace('<limit effort="1" velocity="1"/>', "")
+    with pytest.raises(ValueError, match="the joint 'to_b' has no <limit>, which a revolute one needs"):
+        load(text)
+    assert load(text.replace("revolute", "continuous")).nv == 1
+
+
+def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
+    """Pinocchio goes from joint to joint by recursion: one of 5000 ends the interpreter."""
+
+    def chain(n, kind):
+        names = [f"l{i}" for i in range(n)]
+        return robot(names, *[joint(*pair, kind) for pair in pairwise(names)])
+
+    assert load(chain(301, "revolute")).nv == 300
+    with pytest.raises(ValueError, match="it has 501 links in a row, more than 500"):
+        load(chain(501, "fixed"))
+    with pytest.raises(ValueError, match="it has 301 joints that move, more than 300"):
+        load(robot(["base", *map(str, range(301))], *[joint("base", str(i)) for i in range(301)]))
+
+
+@pytest.mark.parametrize("tail", [b"</x>" * 101, b""], ids=["closed", "open"])
+def test_what_is_nested_deeply_is_told(load, tail):
+    with pytest.raises(ValueError, match="or some 100 deep in each other"):
+        load(b'<robot name="r">' + b"<x>" * 101 + tail)
+
+
+def test_what_has_too_many_elements_is_told(load, monkeypatch):
+    monkeypatch.setattr("skevgp.robots.urdf_file._MOST_ELEMENTS", 20)
+    with pytest.raises(ValueError, match="it has more than 20 elements"):
+        load(ARM)
+
+
+@pytest.mark.parametrize(
+    "declared",
+    [f'<!DOCTYPE robot [<!ENTITY a0 "ha">{BOMB}]>', '<!DOCTYPE robot [<!ENTITY a12 SYSTEM "file:///etc/passwd">]>'],
+    ids=["bomb", "external"],
+)
+def test_entities_are_not_read(load, declared):
+    text = robot(["&a12;", "b"], joint("&a12;", "b"))
+    with pytest.raises(ValueError, match="it has a document type declaration, which is not read"):
+        load(declared + text)
