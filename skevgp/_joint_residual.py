@@ -12,6 +12,8 @@ from .fitting.advice import signal_gone
 from .identification.stiction import JointNoise, likeliest_noise, noise_at
 from .regressor import EVGPRegressor
 
+# What is left of a torque, squared: less is nothing, and no kernel's variance.
+_NOTHING = 1e-90
 # The kernel's limits, in standard deviations of residuals and of columns. A signal that is larger than what it was
 # fitted to, or changes within less of a position than was visited, is an excuse that holds for one trajectory only;
 # friction does change within a fraction of the speeds.
@@ -101,7 +103,7 @@ def fit_joint_residual(
     joint : JointResidual
     """
     size = float(np.mean(residual**2))
-    if size <= 1e-300:
+    if size <= _NOTHING:
         return JointResidual(None, noise)
     spread = x[rows].std(axis=0)
     spread = np.where(spread > 1e-9 * np.abs(x[rows]).max(axis=0), spread, 1.0)

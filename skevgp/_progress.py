@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from copy import copy
 from math import log
-from threading import Event, Lock
+from threading import Event, Lock, current_thread, main_thread
+from types import FrameType
 from typing import TextIO
 
 # Called once per iteration, with its number (from 1), the loss, and the columns of y that it is of.
@@ -24,7 +26,9 @@ class Monitor:
     """The one object that a fit hands down: it shows progress, and ends the fit upon Ctrl-C or when its time is over.
 
     An optimiser calls `iteration` once per iteration, and does its work inside `keeping_the_best`: Ctrl-C then ends the
-    work and sets `stopped`, here and in all monitors made from this one by `seen_as`, in whatever thread they are.
+    work and sets `stopped`, here and in all monitors made from this one by `seen_as`, in whatever thread they are. What
+    comes between and after is short: once there is something to keep, Ctrl-C waits for its end, and a second one does
+    not (`monitor_of`).
 
     Parameters
     ----------
@@ -49,6 +53,8 @@ class Monitor:
         self._end = None if max_time is None else clock() + max_time
         # Of all parts; that of the own part is over; that of some part was.
         self._stop, self._late, self._some_late = Event(), Event(), Event()
+        # Whether something may have been found, and how many `keeping_the_best` the main thread is inside of.
+        self._found, self._inside = Event(), [0]
         self._n_before, self._factor, self._shift = 0, 1.0, 0.0
         self._about, self._is_last = tuple[str, ...](), True
         self._outputs: Sequence[int] = range(0)
@@ -140,18 +146,39 @@ class Monitor:
         """Whether some part of the fit ended because its time was over."""
         return self._some_late.is_set()
 
+    @property
+    def interrupted(self) -> bool:
+        """Whether Ctrl-C, or who looks on, has ended the fit."""
+        return self._stop.is_set()
+
+    @property
+    def finishes(self) -> bool:
+        """Whether what was found would be lost if the main thread were interrupted now."""
+        return self._found.is_set() and self._inside[0] == 0
+
     def stop(self) -> None:
         """End all that is handed this monitor at its next iteration."""
         self._stop.set()
 
     @contextmanager
-    def keeping_the_best(self) -> Iterator[None]:
-        """What is done inside ends upon Ctrl-C, without an error: what it has found so far counts."""
+    def keeping_the_best(self, patient: bool = False) -> Iterator[None]:
+        """What is done inside ends upon Ctrl-C, without an error: what it has found so far counts.
+
+        Parameters
+        ----------
+        patient : bool, default=False
+            Whether it ends at the second one only, since what is found is not at hand yet.
+        """
+        own = not patient and current_thread() is main_thread()
+        self._inside[0] += own
         try:
             yield
         except KeyboardInterrupt:
             if not self._late.is_set():
                 self.stop()
+        finally:
+            self._found.set()
+            self._inside[0] -= own
 
 
 class _Way:
@@ -260,9 +287,31 @@ def _rounded(seconds: float) -> str:
 def monitor_of(verbose: int, callback: Report | None = None, max_time: float | None = None) -> Iterator[Monitor]:
     """The monitor of a fit that prints as ``verbose`` says, and calls callback(iteration, bound, outputs)."""
     progress = Progress(verbose) if verbose else None
+    report = callback and (lambda number, loss, outputs: callback(number, -loss, outputs))
+    monitor = Monitor(report, progress, max_time)
     try:
-        report = callback and (lambda number, loss, outputs: callback(number, -loss, outputs))
-        yield Monitor(report, progress, max_time)
+        with _waiting_for(monitor):
+            yield monitor
     finally:
         if progress is not None:
             progress.close()
+
+
+@contextmanager
+def _waiting_for(monitor: Monitor) -> Iterator[None]:
+    """Ctrl-C stops a monitor that finishes, and what it is handed to comes to its end."""
+    # Other threads get no Ctrl-C; whoever handles it in a way of their own goes on to do so.
+    if current_thread() is not main_thread() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+        yield
+        return
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if not monitor.finishes or monitor.interrupted:
+            signal.default_int_handler(number, frame)
+        monitor.stop()
+
+    signal.signal(signal.SIGINT, handle)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)

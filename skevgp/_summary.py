@@ -132,7 +132,8 @@ class ModelSummary:
                 labels = [name, *[""] * (len(wrapped) - 1)]
                 lines += [f"{label:{width}}{line}" for label, line in zip(labels, wrapped, strict=True)]
             parts.append("\n".join(lines))
-        table = list(self._weights())
+        # A column's name may have a line end in it.
+        table = [[" ".join(cell.split()) for cell in line] for line in self._weights()]
         if len(table) > 1:
             shown = table[: _LINES + 1]
             widths = [max(len(line[column]) for line in shown) for column in range(len(table[0]))]

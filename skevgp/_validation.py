@@ -94,18 +94,18 @@ def _are_numbers(column: Any) -> bool:
     return True
 
 
-def check_magnitude(values: np.ndarray, name: str) -> None:
+def check_magnitude(values: np.ndarray, name: str, limit: float = LARGEST) -> None:
     """Refuse finite numbers whose squares would overflow."""
     largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
-    if largest > LARGEST:
-        raise ValueError(f"{name} must not exceed {LARGEST:g} in size; its largest value is {largest:g}. Rescale it.")
+    if largest > limit:
+        raise ValueError(f"{name} must not exceed {limit:g} in size; its largest value is {largest:g}. Rescale it.")
 
 
-def check_not_vanishing(largest: np.ndarray, name: str) -> None:
+def check_not_vanishing(largest: np.ndarray, name: str, limit: float = SMALLEST) -> None:
     """Refuse columns, other than of zeros, whose squares would vanish, by their largest absolute values."""
-    if ((largest > 0.0) & (largest < SMALLEST)).any():
+    if ((largest > 0.0) & (largest < limit)).any():
         smallest = np.min(largest[largest > 0.0])
-        raise ValueError(f"{name} must be 0 or exceed {SMALLEST:g} in size; a column's largest value is {smallest:g}.")
+        raise ValueError(f"{name} must be 0 or exceed {limit:g} in size; a column's largest value is {smallest:g}.")
 
 
 def as_floats(values: Any, name: str) -> np.ndarray:

@@ -243,7 +243,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         scale, offset = self._scaling.y_scale, self._scaling.y_mean
         noise = self._noise if include_noise else np.zeros_like(self._noise)
         if return_cov:
-            functions = self._functions(X, self._weights)
+            functions = self._values_of(X, self._weights)
             mean = functions.mean(axis=0)
             deviations = np.moveaxis(functions - mean, 2, 0)  # (n_outputs, n_samples, rows)
             cov = np.moveaxis(deviations.transpose(0, 2, 1) @ deviations, 0, 2) / len(functions)
@@ -282,7 +282,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         X = self._validated(X)
         check_integer(n_samples, "n_samples", minimum=1)
         rng = np.random.default_rng(check_random_state(random_state).randint(2**31))
-        samples = self._functions(X, self._network.draw(self._theta, n_samples, rng))
+        samples = self._values_of(X, self._network.draw(self._theta, n_samples, rng))
         if include_noise:
             samples = samples + np.sqrt(self._noise) * rng.standard_normal(samples.shape)
         samples = np.moveaxis(samples * self._scaling.y_scale + self._scaling.y_mean, 0, 2)
@@ -321,11 +321,11 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
                 monitor=monitor.seen_as(shift=scaling.log_unit),
                 counts=counts,
             )
-        self._network, self._scaling, self._theta = network, scaling, training.theta
-        self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
-        self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
-        self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
-        self._set_attributes()
+            self._network, self._scaling, self._theta = network, scaling, training.theta
+            self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
+            self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
+            self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
+            self._set_attributes()
         return training.how_it_ended(max_iter, self.tol, monitor.stopped)
 
     def _intake(self, X: Any, y: Any, sample_weight: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
@@ -384,7 +384,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         size = max(1, _NUMBERS_AT_ONCE // (len(self._weights[0]) * max(w.shape[2] for w in self._weights)))
         return [slice(first, first + size) for first in range(0, n_rows, size)]
 
-    def _functions(self, X: np.ndarray, weights: list[np.ndarray]) -> np.ndarray:
+    def _values_of(self, X: np.ndarray, weights: list[np.ndarray]) -> np.ndarray:
         """Standardised outputs (n_draws, rows, n_outputs) without noise."""
         inputs = self._scaling.inputs(X)
         parts = [self._network.functions(self._theta, weights, inputs[rows]) for rows in self._blocks(len(X))]

@@ -20,8 +20,9 @@ from ._progress import monitor_of
 from ._sklearn import Interval, StrOptions, fit_context
 from ._theta import value_at
 from ._validation import unchanged_if_it_fails
+from .fitting.advice import interrupted
 from .fitting.exact import ExactFit, ExactOptions, fit_exact
-from .fitting.prior import prior_predictor
+from .fitting.start import prior_predictor
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS
@@ -151,7 +152,8 @@ class EGPRegressor(ExplicitGaussianProcess):
     >>> round(model.score(X, y), 2)
     0.96
 
-    Before a fit predictions are of the prior, where y counts as of size one:
+    Before a fit predictions are of the prior, where y counts as of size one (maps are fitted to the rows that are asked
+    for: with scalers among them, rows are relative to each other):
 
     >>> prior = EGPRegressor(PolynomialFeatures(1), coef_scale=[0.0, 2.0])
     >>> mean, std = prior.predict([[0.0], [3.0]], return_std=True)
@@ -281,7 +283,7 @@ class EGPRegressor(ExplicitGaussianProcess):
             self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
             self.loss_curve_ = self._fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
-        self._warn_of(self._fitted.messages)
+        self._warn_of((interrupted(self.n_iter_),) if monitor.interrupted else self._fitted.messages)
         return self
 
     def _exact_problem(self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None) -> Problem:

@@ -4,8 +4,13 @@ from __future__ import annotations
 
 import inspect
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from threading import RLock
 
 __all__ = ["DependentRowsWarning", "InconsistentVersionWarning"]
+
+_filters = RLock()
 
 
 class DependentRowsWarning(UserWarning):
@@ -54,3 +59,15 @@ def warn_user(message: str, category: type[Warning]) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("skevgp", "sklearn"):
         frame, level = frame.f_back, level + 1
     warnings.warn(message, category, stacklevel=level)
+
+
+@contextmanager
+def ignored(message: str = "", category: type[Warning] = Warning) -> Iterator[None]:
+    """Ignore warnings of a category whose text begins so (a regular expression).
+
+    Filters are the process's: two threads that changed them at once would each put back what it found, and leave those
+    of the other for ever. So it is one after the other.
+    """
+    with _filters, warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message, category)
+        yield

@@ -30,6 +30,8 @@ from .robots.loading import Robot
 _FAR = 4.0
 # Physics that leaves this share of a torque's variance explains hardly anything.
 _LITTLE = 0.5
+# Of torques: their variances, and ratios of these to what noise may be, are numbers.
+_SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
 # The largest speed below which rows count less for f_j: filters blur friction's sign, but f_j learns its average there.
 _SHARP = 0.01
 
@@ -201,7 +203,8 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
         X : array-like of shape (n_samples, 3 * n_joints)
             Rows [q, q̇, q̈] in the order of time: rad, rad/s, rad/s² (of prismatic joints m, ...).
         y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
-            Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents.
+            Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents. Up to 1e40, and the
+            largest of a column 0 or above 1e-105.
         groups : array-like of shape (n_samples,), default=None
             Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least
             three of them, none with half of the rows; of fewer, blocks of rows stand in.
@@ -254,8 +257,8 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
         self._one_dimensional = targets.ndim == 1
         targets = targets.reshape(len(targets), -1)
         check_magnitude(rows_x, "X")
-        check_magnitude(targets, "y")
-        check_not_vanishing(np.abs(targets).max(axis=0), "y")
+        check_magnitude(targets, "y", _LARGEST_TORQUE)
+        check_not_vanishing(np.abs(targets).max(axis=0), "y", _SMALLEST_TORQUE)
         self._map().fit(X)  # a frame's columns must be in the robot's order
         self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)

@@ -17,7 +17,7 @@ from ._sklearn import Interval, StrOptions, fit_context
 from ._sparse import SparseGaussianProcess
 from ._validation import check_integer, unchanged_if_it_fails
 from .exceptions import DependentRowsWarning, warn_user
-from .fitting.advice import DEPENDENT_ROWS
+from .fitting.advice import DEPENDENT_ROWS, interrupted
 from .outputs.fit import fit_outputs
 from .outputs.plan import Sharing
 from .outputs.sharing import with_groups
@@ -394,7 +394,7 @@ class EVGPRegressor(SparseGaussianProcess):
                 self._fitted = self._with_noisy_inputs(request, rng, monitor)
             self._set_attributes()
             self._set_weights(problem.data[-1])
-        self._warn_of(self._fitted.messages)
+        self._warn_of((interrupted(self.n_iter_),) if monitor.interrupted else self._fitted.messages)
         if self._fitted.dependent:
             warn_user(DEPENDENT_ROWS, DependentRowsWarning)
         return self

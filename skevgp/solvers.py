@@ -11,8 +11,9 @@ from ._linalg import NotPositiveDefiniteError
 from ._state import StatefulEstimator
 from ._validation import check_integer, check_real
 from .fitting.advice import how_it_ended
+from .fitting.rules import Rules
 from .fitting.sparse import SparseTask
-from .fitting.strategy import Attempt, Fit, Rules
+from .fitting.strategy import Attempt, Fit
 from .inference.objectives import BoundObjective, ElboObjective
 from .inference.posterior import CoefficientPrior
 from .optimizers.adam import adam
@@ -205,14 +206,14 @@ class Adam(StatefulEstimator):
     >>> from skevgp.datasets import make_toy
     >>> from skevgp.solvers import Adam
     >>> X, y = make_toy(random_state=0, return_X_y=True)
-    >>> model = EVGPRegressor(n_inducing=10, solver=Adam(batch_size=50), max_iter=500, random_state=0).fit(X, y)
+    >>> model = EVGPRegressor(n_inducing=10, solver=Adam(50), max_iter=500, noise_cv=None).fit(X, y)
     >>> model.get_params()["solver__batch_size"]
     50
     """
 
     default_max_iter: ClassVar[int] = 16_000
     # Its steps do not grow with the gradient: the noise starts nearer to the data's scatter, and points stay.
-    rules: ClassVar[Rules] = Rules(first_noise=1e-2)
+    rules: ClassVar[Rules] = Rules(first_noise=1e-2, widest_signal=None)
 
     def __init__(
         self,

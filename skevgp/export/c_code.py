@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from .._files import replacing
 from .package import casadi
 
 # CasADi explains each instruction, matrices and all.
@@ -148,21 +149,20 @@ def write_c(
     }
     definitions = [_definition(declared[own], part, results) for own, (part, results) in parts.items()]
     generated = _EXPLANATION.sub("", generator.dump())
-    source.write_text(_SOURCE.format(generated=generated, definitions="\n".join(definitions), **told), encoding="utf-8")
     names = "" if columns is None else f":\n   {', '.join(columns)}"
-    header.write_text(
-        _HEADER.format(
-            guard=_as_macro(header.stem),
-            n_features=function.numel_in(0),
-            n_outputs=function.numel_out(0),
-            columns=names.replace("/*", "/ *").replace("*/", "* /"),
-            of="that of y, with its noise" if include_noise else "without the noise of y",
-            stack=max(map(_stack, (part for part, _ in parts.values()))),
-            declarations="\n".join(f"{text};" for text in declared.values()),
-            **told,
-        ),
-        encoding="utf-8",
+    declarations = _HEADER.format(
+        guard=_as_macro(header.stem),
+        n_features=function.numel_in(0),
+        n_outputs=function.numel_out(0),
+        columns=names.replace("/*", "/ *").replace("*/", "* /"),
+        of="that of y, with its noise" if include_noise else "without the noise of y",
+        stack=max(map(_stack, (part for part, _ in parts.values()))),
+        declarations="\n".join(f"{text};" for text in declared.values()),
+        **told,
     )
+    with replacing(source) as code, replacing(header) as declaring:
+        code.write(_SOURCE.format(generated=generated, definitions="\n".join(definitions), **told).encode())
+        declaring.write(declarations.encode())
     return source, header
 
 

@@ -14,6 +14,8 @@ from ..metrics import calibration_error, interval_levels
 from ._style import axes_of, free_color
 
 _DIAGONAL = "as promised"
+# Of an artist's gid; the number of values follows.
+_BAND = "calibration band "
 
 
 class CalibrationDisplay:
@@ -21,7 +23,7 @@ class CalibrationDisplay:
 
     Below the diagonal intervals are too narrow, above it too wide. The band around it is where the curve of n
     independent values is at a probability in 95 of 100 cases, if standard deviations are right; rows of a trajectory
-    are fewer than they are many. Curves of several models can share axes.
+    are fewer than they are many. Curves of several models can share axes; the band is then that of the fewest values.
 
     Parameters
     ----------
@@ -231,10 +233,8 @@ class CalibrationDisplay:
             If matplotlib is not installed; the message gives the pip command.
         """
         ax = axes_of(ax)
+        self._plot_band(ax)
         if _DIAGONAL not in {line.get_label() for line in ax.lines}:
-            half = 1.96 * np.sqrt(self.nominal * (1.0 - self.nominal) / self.n_values)
-            low, high = (np.clip(self.nominal + sign * half, 0.0, 1.0) for sign in (-1.0, 1.0))
-            ax.fill_between(self.nominal, low, high, color="0.5", alpha=0.25, linewidth=0)
             ax.plot([0.0, 1.0], [0.0, 1.0], color="0.5", linewidth=1.0, linestyle="--", label=_DIAGONAL)
             ax.set(xlim=(0.0, 1.0), ylim=(0.0, 1.0), aspect="equal")
             ax.set_xlabel("probability of the interval")
@@ -248,3 +248,18 @@ class CalibrationDisplay:
             self.lines_ += ax.plot(self.nominal, curve, **options)
         self.ax_, self.figure_ = ax, ax.figure
         return self
+
+    def _plot_band(self, ax: Any) -> None:
+        """Where curves are by chance; the band of another display stays if its values are fewer."""
+        bands = {band: int(band.get_gid()[len(_BAND) :]) for band in ax.collections if _is_band(band)}
+        if min(bands.values(), default=self.n_values + 1) <= self.n_values:
+            return
+        for band in bands:
+            band.remove()
+        half = 1.96 * np.sqrt(self.nominal * (1.0 - self.nominal) / self.n_values)
+        low, high = (np.clip(self.nominal + sign * half, 0.0, 1.0) for sign in (-1.0, 1.0))
+        ax.fill_between(self.nominal, low, high, color="0.5", alpha=0.25, linewidth=0, gid=f"{_BAND}{self.n_values}")
+
+
+def _is_band(artist: Any) -> bool:
+    return (artist.get_gid() or "").startswith(_BAND)

@@ -15,8 +15,6 @@ from .derivatives import MappedRows, chained, mapped
 from .maps import maps_of
 
 _NONE = np.empty((0, 0))
-# As of `Whitening.unexplained`: what is left of a row that is an inducing point is rounding.
-_ROUNDED = 1.0 - 4.0 * np.finfo(float).eps
 
 
 class Model(Protocol):
@@ -239,15 +237,17 @@ class _Group:
         own = of_outputs(inputs, group.outputs)
         (o, k, size), m, n = group.root.shape, len(group.points), len(own)
         prepared, P = group.kernel.prepare(own), np.empty((size, n))
-        covariance = group.whitening.covariance
-        np.matmul(group.whitening.L_inv, covariance.cross(prepared), out=P[:m])
+        if return_variance:
+            group.whitening.solve(prepared, out=P[:m])
+        else:
+            np.matmul(group.whitening.L_inv, group.whitening.covariance.cross(prepared), out=P[:m])
         if size > m:
             P[m:] = of_outputs(features, group.outputs).T
         if not return_variance:
             return _Moments(self.product[:o] @ P, None, prepared, P, None)
-        found, V = self.product @ P, P[:m]
+        found = self.product @ P
         deviation = found[o:].reshape(o, k, n)
-        unexplained = np.maximum(covariance.diagonal(prepared) * _ROUNDED - np.einsum("mn,mn->n", V, V), 0.0)
+        unexplained = group.whitening.unexplained(prepared, P[:m])
         variance = np.einsum("okn,okn->on", deviation, deviation) + group.signal[:, np.newaxis] * unexplained
         return _Moments(found[:o], variance, prepared, P, deviation)
 

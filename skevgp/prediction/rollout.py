@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from inspect import signature
@@ -13,6 +12,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils import Bunch, check_random_state
 
 from .._validation import LARGEST, as_floats, check_fitted, check_integer
+from ..exceptions import ignored
 from .elementary import as_fitted, package_of
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).
@@ -212,10 +212,12 @@ class _OneStep:
 
     def _asked(self, method: Callable[..., Any], X: np.ndarray, **options: Any) -> Any:
         """What a method says of rows [z, u], whose columns have the names that the regressor was fitted to."""
-        with warnings.catch_warnings():
+        rows = as_fitted(self.regressor, X, self._package)
+        if rows is X and hasattr(self.regressor, "feature_names_in_"):
             # Without a package of data frames they have none.
-            warnings.filterwarnings("ignore", "X does not have valid feature names")
-            return method(as_fitted(self.regressor, X, self._package), **options)
+            with ignored("X does not have valid feature names"):
+                return method(rows, **options)
+        return method(rows, **options)
 
     def _checked(self, values: Any, n: int) -> np.ndarray:
         found = np.asarray(values, dtype=float).reshape(n, -1)

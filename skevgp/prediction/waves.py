@@ -27,7 +27,7 @@ from ..kernels.profiles import Exponential, ExpSineSquared, Matern, Matern12, Ma
 from ..kernels.stationary import Stationary
 
 # How much wider than by the spectral density frequencies are drawn too: one that falls fast, or with heavy tails.
-_WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(8)
+_WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(10)
 # Above this a rational quadratic is as a squared exponential, and its density's Bessel functions overflow.
 _LARGE_ALPHA = 50.0
 _NU: dict[type, float] = {Matern12: 0.5, Matern32: 1.5, Matern52: 2.5}
