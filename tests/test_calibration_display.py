@@ -89,6 +89,17 @@ def test_a_colour_may_be_given():
     assert CalibrationDisplay.from_predictions(Y, MEAN, STD, color="black").lines_[0].get_color() == "black"
 
 
+@pytest.mark.parametrize("first", [50, 400])
+def test_on_shared_axes_the_band_is_of_the_fewest_values(first):
+    ax = None
+    for n in (first, 100, 200):
+        ax = CalibrationDisplay.from_predictions(np.zeros(n), np.linspace(-1.0, 1.0, n), np.ones(n), ax=ax).ax_
+    (band,), fewest = ax.collections, min(first, 100)
+    corners = band.get_paths()[0].vertices
+    half = np.abs(corners[corners[:, 0] == 0.5, 1] - 0.5)
+    np.testing.assert_allclose(half.max(), 1.96 * 0.5 / np.sqrt(fewest))
+
+
 def test_the_band_holds_what_chance_does():
     display = CalibrationDisplay.from_predictions(Y, MEAN, STD, n_levels=11)
     corners = display.ax_.collections[0].get_paths()[0].vertices

@@ -307,3 +307,58 @@ def test_lengths_of_functions_are_counted():
         'def f(\n    a,\n):\n    """Of two\n\n    lines."""\n\n    async def g():\n        return 1\n\n    return g\n'
     )
     assert dict(lengths_of_functions(ast.parse(source))) == {"f": 8, "g": 2}
+
+
+_RUNS_CODE = {
+    *("eval", "exec", "compile", "__import__", "breakpoint"),
+    *("pickle", "cPickle", "dill", "cloudpickle", "marshal", "shelve", "subprocess", "ctypes", "runpy", "code"),
+    *("system", "popen", "spawn", "extractall", "unpickle"),
+}
+
+
+def what_runs_code(tree):
+    """Calls and imports by which what a file says could be run; and arrays that may hold pickles."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import | ast.ImportFrom):
+            names = [alias.name for alias in node.names] + (
+                [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            )
+            yield from (name for name in names if set(name.split(".")) & _RUNS_CODE)
+        elif isinstance(node, ast.Call):
+            called = node.func
+            if isinstance(called, ast.Name) and called.id in _RUNS_CODE:
+                yield called.id
+            # `re.compile` and a model's own `compile` make no code.
+            elif isinstance(called, ast.Attribute) and called.attr in _RUNS_CODE - {"compile"}:
+                yield called.attr
+            if ast.unparse(called) in ("np.load", "numpy.load", "joblib.load", "yaml.load"):
+                yield ast.unparse(called)
+            yield from ("allow_pickle" for word in node.keywords if word.arg == "allow_pickle" and word.value.value)
+
+
+@each_module
+def test_no_module_runs_what_a_file_says(module):
+    assert list(what_runs_code(parsed(module))) == []
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "eval(x)", "import pickle", "from os import system", "os.system(x)", "import yaml; yaml.load(x)",
+        "np.load(x)", "f(allow_pickle=True)", "from joblib.externals import cloudpickle", "archive.extractall()",
+    ],
+)  # fmt: skip
+def test_what_would_run_code_is_seen(source):
+    assert list(what_runs_code(ast.parse(source)))
+
+
+def test_only_data_sets_open_connections_and_each_has_a_checksum():
+    """What is downloaded is compared with SHA-256 before it is used."""
+    opening = [module for module in MODULES if "urlopen" in module.read_text(encoding="utf-8")]
+    assert [module.name for module in opening] == ["snelson.py"]
+    assert "sha256" in opening[0].read_text(encoding="utf-8")
+    known = {"urllib.request", "http.client", "socket", "ssl", "ftplib", "requests", "httpx", "aiohttp"}
+    for module in MODULES:
+        nodes = [node for node in ast.walk(parsed(module)) if isinstance(node, ast.Import | ast.ImportFrom)]
+        names = {alias.name for node in nodes for alias in node.names} | {getattr(node, "module", "") for node in nodes}
+        assert module in opening or not names & known, module

@@ -215,6 +215,26 @@ def test_an_optimizer_that_returns_nonsense_is_refused():
             EGPRegressor(optimizer=lambda objective, theta, bounds, answer=answer: (answer, 0.0)).fit(X, Y[:, 0])
 
 
+def test_an_optimizer_that_asks_for_nonsense_is_told_so():
+    def asks(objective, theta, bounds):
+        return objective(np.stack([theta, theta]))
+
+    with pytest.raises(ValueError, match=r"theta must be 4 numbers; got an array of shape \(2, 4\)"):
+        EGPRegressor(optimizer=asks).fit(X, Y[:, 0])
+
+
+def test_an_optimizer_has_the_widest_bounds():
+    def look(objective, theta, bounds):
+        seen.append(bounds - np.log(Y[:, 0].var()))
+        return theta, 0.0
+
+    seen = []
+    EGPRegressor(optimizer=look).fit(X, Y[:, 0])
+    # Of the signal, from each start.
+    assert all(np.log(9e3) < bounds[2, 1] < np.log(1.1e4) for bounds in seen)
+    np.testing.assert_array_equal(seen[0], seen[-1])
+
+
 def test_ctrl_c_keeps_the_best_that_an_optimizer_of_ones_own_has_seen():
     def interrupted(objective, theta, bounds):
         for shift in (0.0, 0.2, 5.0):

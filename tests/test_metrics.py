@@ -5,12 +5,16 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.integrate import quad
 from scipy.stats import norm
+from sklearn.gaussian_process import GaussianProcessRegressor
 
 from skevgp.metrics import (
     calibration_error,
     containing_ratios,
     crps,
     interval_levels,
+    neg_calibration_error,
+    neg_crps,
+    neg_nlpd,
     negative_log_predictive_density,
     prediction_error,
     std_norm,
@@ -55,6 +59,16 @@ def test_std_norm_row_by_row():
 def test_ratios_by_hand():
     ratios = containing_ratios([[1.0, -3.0], [0.0, 9.0]], np.zeros((2, 2)), [[1.0, 2.0], [1.0, 1.0]])
     assert_array_equal(ratios, [0.5, 0.75, 0.75])
+
+
+def test_one_two_and_three_deviations_are_what_the_paper_has():
+    assert_array_equal(containing_ratios([0.5, 1.5, 2.5, 3.5, 4.5], np.zeros(5), np.ones(5)), [0.2, 0.4, 0.6])
+
+
+def test_an_interval_without_width_holds_what_is_predicted_exactly():
+    found = containing_ratios([1.0, 2.0], [1.0, 2.5], [1.0, 1.0], k=0)
+    assert isinstance(found, np.ndarray)
+    assert_array_equal(found, [0.5])
 
 
 def test_the_edge_of_the_interval_is_inside():
@@ -155,8 +169,17 @@ def test_the_calibration_error_by_chance_is_as_the_docstring_says():
 
 
 def test_levels_are_those_of_intervals_that_just_hold_the_value():
-    levels = interval_levels([[0.0, 3.0], [1.0, 2.0]], [[0.0, 0.0], [1.0, 2.5]], [[0.0, 0.0], [1e-320, 1.0]])
-    assert_allclose(levels, [[0.0, 1.0], [0.0, 2 * norm.cdf(0.5) - 1]], rtol=1e-12)
+    y, mean = [[0.0, 3.0], [1.0, 2.0], [4.0, 0.0]], [[0.0, 0.0], [1.0, 2.5], [0.0, 0.0]]
+    levels = interval_levels(y, mean, [[0.0, 0.0], [1e-320, 1.0], [1e-320, 1.0]])
+    assert_allclose(levels, [[0.0, 1.0], [0.0, 2 * norm.cdf(0.5) - 1], [1.0, 0.0]], rtol=1e-12)
+
+
+def test_scorers_are_scores_of_which_more_is_better():
+    """Of a Gaussian process before its fit: mean 0, deviation 1."""
+    X, y = np.zeros((3, 1)), np.array([0.5, -1.0, 2.0])
+    pairs = [(neg_nlpd, negative_log_predictive_density), (neg_crps, crps), (neg_calibration_error, calibration_error)]
+    for scorer, score in pairs:
+        assert scorer(GaussianProcessRegressor(), X, y) == pytest.approx(-score(y, np.zeros(3), np.ones(3)))
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
@@ -209,6 +232,18 @@ def test_a_negative_standard_deviation_is_an_error(metric):
         metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])
 
 
+def test_std_norm_of_what_is_not_finite_names_it():
+    with pytest.raises(ValueError, match="Input std contains NaN"):
+        std_norm([1.0, np.nan])
+
+
+@pytest.mark.parametrize("metric", [*OF_PREDICTIONS, std_norm])
+def test_single_precision_is_taken_as_double(metric):
+    """Rounded when it was made, and no further."""
+    single = [part.astype(np.float32) for part in ((STD,) if metric is std_norm else arguments(metric))]
+    assert_array_equal(metric(*single), metric(*(part.astype(float) for part in single)))
+
+
 def test_std_norm_of_negative_values_is_an_error():
     with pytest.raises(ValueError, match=r"std must not be negative; its smallest value is -0\.5"):
         std_norm([1.0, -0.5])
@@ -235,7 +270,7 @@ def test_one_width_may_stand_alone():
     np.testing.assert_array_equal(containing_ratios([0.5, 1.5], [0.0, 0.0], [1.0, 1.0], k=1), [0.5])
 
 
-@pytest.mark.parametrize("k", [-1, [1, np.nan]])
+@pytest.mark.parametrize("k", [-1, [1, np.nan], [1, None]])
 def test_widths_must_not_be_negative(k):
     with pytest.raises(ValueError, match="k must be numbers that are not negative"):
         containing_ratios([0.5], [0.0], [1.0], k=k)

@@ -10,7 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
@@ -325,3 +325,19 @@ def test_alike_rows_teach_nothing_and_nobody_is_told_to_raise_n_inducing():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         EVGPRegressor(random_state=0).fit(np.ones((80, 2)), RNG.randn(80))
+
+
+@pytest.mark.parametrize("make", [EGPRegressor, lambda: EVGPRegressor(n_inducing=30, noise_cv=None, random_state=0)])
+def test_a_polynomial_asks_for_a_signal_far_above_its_scatter(make):
+    """A cubic is a long lengthscale and a high signal; a limit of ten times the scatter costs ten nats and more."""
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (60, 2))
+    y = (X**3 - X).sum(axis=1)
+    y = y / y.std() + 0.01 * rng.randn(60)
+    free = make().fit(X, y)
+    kernel = ConstantKernel(1.0, (1e-8, 1e2)) * RBF([1.0, 1.0], (1e-2, 1e4))
+    with pytest.warns(ConvergenceWarning, match="k1__constant_value is close to the specified upper bound 100"):
+        narrow = make().set_params(kernel=kernel).fit(X, y)
+    bound = "lower_bound_" if isinstance(free, EVGPRegressor) else "log_marginal_likelihood_value_"
+    assert free.kernel_.k1.constant_value > 200.0
+    assert getattr(free, bound) > getattr(narrow, bound) + 5.0

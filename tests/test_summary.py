@@ -272,3 +272,11 @@ def test_a_kernel_of_many_columns_takes_few_lines():
     said = str(EVGPRegressor(n_inducing=5, max_iter=2, tol=1e9).fit(X, X[:, 0]).summary()).splitlines()
     assert len(said) < 40
     assert sum("more lines: to_frame() has all" in line for line in said) == 2
+
+
+def test_a_line_end_in_a_name_of_a_column_makes_no_line():
+    x = np.linspace(0.0, 1.0, 30)
+    frame = pd.DataFrame({"a\nnoise std     0": x, "b\r\tc": x**2})
+    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=3, max_iter=0, noise_cv=None).fit(frame, np.sin(x))
+    lines = str(model.summary()).splitlines()
+    assert [line.split("  ")[0] for line in lines[-2:]] == ["a noise std 0", "b c"]

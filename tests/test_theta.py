@@ -284,3 +284,15 @@ def test_partial_fit_keeps_no_rows():
 def test_after_adam_q_is_at_its_optimum():
     model = EVGPRegressor(n_inducing=6, solver="adam", max_iter=50, random_state=0).fit(X, Y[:, 0])
     assert model.lower_bound(model.kernel_.theta) >= model.lower_bound_ - 1e-6
+
+
+def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
+    """Three points on a line, of a linear kernel: K is singular, and a diagonal q's bound has the logarithm of what a
+    jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
+    x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
+    kernel = ConstantKernel(1.0, "fixed") * DotProduct(1.0)
+    model = EVGPRegressor(kernel=kernel, inducing_init=x[6:], posterior="diagonal", noise_variance=0.1, max_iter=0)
+    model.fit(x, RNG.randn(9))
+    theta = model.kernel_.theta
+    slope = (model.lower_bound(theta + 0.01) - model.lower_bound(theta - 0.01)) / 0.02
+    assert model.lower_bound(theta, eval_gradient=True)[1] == pytest.approx(slope, abs=0.1)

@@ -21,8 +21,8 @@ def test_the_recipe_does_what_it_says():
         with contextlib.redirect_stdout(said):
             exec(code, names)
         assert said.getvalue() == expected
-    # What the adapter returns are the derivatives of what it predicts.
-    model, step = names["WithGradients"](), 1e-5
+    # What the adapter returns are the derivatives of what it predicts (of data without noise but for 1e-9 or so).
+    model, step = names["WithGradients"](), 1e-3
     X = np.random.RandomState(0).uniform(-1.0, 1.0, (20, 2))
     model.fit(X, np.sin(2.0 * X[:, 0]) + X[:, 1] ** 2 + 0.05 * X[:, 0] * X[:, 1])
     row = np.array([[0.3, 1.4]])
@@ -31,6 +31,6 @@ def test_the_recipe_does_what_it_says():
         (up, std_up), (down, std_down) = (
             model.predict(row + sign * step * np.eye(2)[[column]], return_std=True) for sign in (1.0, -1.0)
         )
-        assert slope[column] == pytest.approx((up[0] - down[0]) / (2 * step), rel=1e-4, abs=1e-6)
+        assert slope[column] == pytest.approx((up[0] - down[0]) / (2 * step), rel=1e-3, abs=1e-6)
         assert std_slope[column] == pytest.approx((std_up[0] - std_down[0]) / (2 * step), rel=1e-3, abs=1e-6)
     assert mean.shape == std.shape == (1,)

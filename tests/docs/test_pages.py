@@ -179,6 +179,17 @@ def test_the_best_are_bold_also_where_they_are_not_ours():
     assert bold
 
 
+def test_seconds_beside_much_other_work_are_shown_and_not_compared(monkeypatch):
+    common = {"dataset": "airfoil", "sharing": "none", "n_train": "90", "m": "9", "rmse": "0.5", "nlpd": "0.7"}
+    rows = [
+        {**common, "peer": peer, "seconds": seconds, "cpu_seconds": cpu, "load": load}
+        for peer, seconds, cpu, load in (("A", "2", "3", "1.0"), ("B", "1", "8", "9.0"), ("C", "4", "2", "3.0"))
+    ]
+    monkeypatch.setattr(comparison, "rows_of", lambda path: rows)
+    clocks = [line.split(" | ")[5:7] for line in comparison.peers().splitlines()[2:]]
+    assert clocks == [["**2.00**", "3.00"], ["(1.00)", "8.00"], ["4.00", "**2.00**"]]
+
+
 def test_the_gallery_is_in_an_order_that_knows_all_examples():
     from stories import ORDER, Order
 

@@ -14,7 +14,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 
 N_STEPS = 12
 QUICK = {"max_iter": 20, "tol": 1e6, "random_state": 0}
@@ -308,3 +308,16 @@ def test_a_system_that_runs_away_is_named(data):
     for method in ("sample", "mean", "linearized"):
         with pytest.raises(ValueError, match="States grow beyond 1e.100 at step"):
             rollout(model, Z0, np.zeros((60, 1)), method=method, n_samples=3, random_state=0)
+
+
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("residual", [False, True])
+def test_networks_are_followed(data, inputs, residual):
+    model = BayesianMLPRegressor((4,), max_iter=2, random_state=0)
+    model = (ResidualRegressor(model) if residual else model).fit(*data)
+    mean, std = model.predict(np.concatenate([Z0, inputs[0]])[np.newaxis], return_std=True)
+    for method in ("mean", "linearized"):
+        ahead = rollout(model, Z0, inputs, method=method)
+        np.testing.assert_allclose(ahead.mean[0], mean[0], rtol=1e-10)
+        np.testing.assert_allclose(ahead.std[0], std[0], rtol=1e-10)
+    assert rollout(model, Z0, inputs, n_samples=3, random_state=0).samples.shape == (3, N_STEPS, 2)

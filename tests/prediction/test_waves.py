@@ -48,7 +48,7 @@ def test_of_a_periodic_kernel_of_one_column():
 
 @pytest.mark.parametrize("name", KERNELS)
 def test_slopes_agree_with_differences(name):
-    functions, h = drawn(KERNELS[name], size=20), 1e-6
+    functions, h = drawn(KERNELS[name], size=20), 1e-8
     shifts = h * np.eye(2)
     expected = [(functions.value(X + step) - functions.value(X - step)) / (2.0 * h) for step in shifts]
     expected = np.stack(expected, axis=2)

@@ -52,7 +52,7 @@ def assert_same_model(actual, expected, rtol=1e-6):
 @pytest.fixture(scope="module")
 def cluster():
     with (
-        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None) as cluster,
+        distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0") as cluster,
         distributed.Client(cluster),
     ):
         yield cluster
@@ -176,6 +176,15 @@ def test_a_worker_that_dies_does_not_change_the_result(cluster):
     assert len(seen) > 4
     np.testing.assert_array_equal(survived.predict(X_NEW), expected.predict(X_NEW))
     assert survived.lower_bound_ == expected.lower_bound_
+
+
+def test_a_worker_that_dies_while_rows_are_predicted_does_not_change_the_bits(cluster):
+    fitted, client = model(max_iter=2, noise_cv=None).fit(X, Y), distributed.default_client()
+    (rows,) = chunked(np.tile(X, (50, 1)), rows=(1500,) * 20)
+    expected = fitted.predict(rows).compute()
+    future = client.compute(fitted.predict(rows))
+    os.kill(min(client.run(os.getpid).values()), signal.SIGKILL)
+    np.testing.assert_array_equal(future.result(timeout=300), expected)
 
 
 class Scratch(TransformerMixin, BaseEstimator):

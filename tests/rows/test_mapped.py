@@ -125,7 +125,7 @@ def test_pieces_in_threads_have_the_same_bits(in_pieces):
 def little_memory(monkeypatch):
     for name in ("rows.mapped.MAPPED_BYTES", "rows.blocks.CACHE_BYTES", "rows.blocks.KEEP_BYTES"):
         monkeypatch.setattr(f"skevgp.{name}", 2**20)
-    monkeypatch.setattr("skevgp.fitting.strategy.LARGEST_SAMPLE", 2**17)
+    monkeypatch.setattr("skevgp.fitting.rules.LARGEST_SAMPLE", 2**17)
 
 
 @pytest.mark.slow

@@ -1,0 +1,359 @@
+"""Bad input of all kinds, for every estimator; and a sample of `tests/long/torture.py`."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import polars as pl
+import pytest
+from scipy import sparse
+from sklearn.base import clone
+from sklearn.impute import SimpleImputer
+from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+
+from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp.features import InertiaForce
+from tests.long.torture import run
+from tests.nasty import BadMap, MapError
+
+RNG = np.random.RandomState(0)
+# Numbers that float32 holds.
+X = RNG.randint(-100, 100, (40, 3)) / 32.0
+Y = np.column_stack([np.sin(X[:, 0]) + 0.5 * X[:, 1], X[:, 2] ** 2]) + 0.01 * RNG.randn(40, 2)
+ESTIMATORS = {
+    "EVGPRegressor": EVGPRegressor(InertiaForce(), n_inducing=8, max_iter=5, random_state=0),
+    "EGPRegressor": EGPRegressor(InertiaForce(), max_iter=5),
+    "ResidualRegressor": ResidualRegressor(EVGPRegressor(n_inducing=8, max_iter=5, random_state=0)),
+    "BayesianMLPRegressor": BayesianMLPRegressor((4,), max_iter=2, random_state=0),
+    "InverseDynamics": InverseDynamics(n_inducing=5, max_iter=5, random_state=0),
+}
+pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+@pytest.fixture(params=ESTIMATORS)
+def estimator(request):
+    return clone(ESTIMATORS[request.param])
+
+
+# --- a sample of all of it ---------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("first", range(0, 80, 8))
+def test_whatever_comes_is_fitted_or_refused(first):
+    _, defects, _ = run(range(first, first + 8))
+    assert not defects
+
+
+# --- containers --------------------------------------------------------------------------------------------------
+
+
+def mapped(rows, path, dtype):
+    rows.astype(dtype).tofile(path)
+    return np.memmap(path, dtype=dtype, mode="r", shape=rows.shape)
+
+
+def read_only(rows):
+    rows = rows.copy()
+    rows.flags.writeable = False
+    return rows
+
+
+CONTAINERS = {
+    "float32": lambda rows, _: rows.astype(np.float32),
+    "longdouble": lambda rows, _: rows.astype(np.longdouble),
+    "object": lambda rows, _: rows.astype(object),
+    "list": lambda rows, _: rows.tolist(),
+    "Fortran order": lambda rows, _: np.asfortranarray(rows),
+    "strided": lambda rows, _: np.repeat(np.repeat(rows, 2, axis=0), 3, axis=1)[::2, ::3],
+    "backwards": lambda rows, _: np.ascontiguousarray(rows[::-1, ::-1])[::-1, ::-1],
+    "big-endian": lambda rows, _: rows.astype(">f8"),
+    "read-only": lambda rows, _: read_only(rows),
+    "read-only map of float64": lambda rows, path: mapped(rows, path, np.float64),
+    "read-only map of float32": lambda rows, path: mapped(rows, path, np.float32),
+}
+
+
+@pytest.mark.parametrize("container", CONTAINERS)
+def test_how_rows_are_held_does_not_matter(estimator, container, tmp_path):
+    rows = CONTAINERS[container](X, tmp_path / "rows.bin")
+    before = np.array(rows, dtype=float)
+    expected = clone(estimator).fit(X, Y).predict(X, return_std=True)
+    found = estimator.fit(rows, read_only(Y)).predict(rows, return_std=True)
+    for one, other in zip(found, expected, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-4)
+    np.testing.assert_array_equal(np.array(rows, dtype=float), before)
+
+
+def test_integers_are_numbers(estimator):
+    rows, y = np.round(8 * X).astype(np.int16), np.round(50 * Y).astype(np.int64)
+    expected = clone(estimator).fit(rows.astype(float), y.astype(float)).predict(rows.astype(float))
+    np.testing.assert_allclose(estimator.fit(rows, y).predict(rows), expected, rtol=1e-6, atol=1e-6)
+
+
+# --- what is refused ---------------------------------------------------------------------------------------------
+
+
+def with_one(rows, value):
+    rows = rows.copy()
+    rows[3, 1] = value
+    return rows
+
+
+BAD = {
+    "NaN": (with_one(X, np.nan), Y, ValueError, "^Input X contains NaN"),
+    "infinity": (with_one(X, np.inf), Y, ValueError, "^Input X contains infinity"),
+    "minus infinity": (with_one(X, -np.inf), Y, ValueError, "^Input X contains infinity"),
+    "huge": (with_one(X, -1e101), Y, ValueError, r"^X must not exceed 1e\+100 in size; its largest value is 1e\+101"),
+    "y with NaN": (X, with_one(Y, np.nan), ValueError, "^Input y contains NaN"),
+    "y with infinity": (X, with_one(Y, np.inf), ValueError, "^Input y contains infinity"),
+    "y huge": (
+        X,
+        with_one(Y, 1e101),
+        ValueError,
+        r"y must not exceed 1e\+[0-9]+ in size; its largest value is 1e\+101",
+    ),
+    "y nearly 0": (X, 1e-150 * Y, ValueError, "y must be 0 or exceed 1e-[0-9]+ in size; a column's largest value is"),
+    "y short": (X, Y[:-1], ValueError, r"inconsistent numbers of samples: \[40, 39\]"),
+    "y long": (X[:-1], Y, ValueError, r"inconsistent numbers of samples: \[39, 40\]"),
+    "no y": (X, None, ValueError, "requires y to be passed, but the target y is None"),
+    "y of three dimensions": (X, np.zeros((40, 2, 2)), ValueError, "Found array with dim 3"),
+    "y of words": (X, np.full((40, 2), "a"), ValueError, "could not convert string to float|must be real numbers"),
+    "y of complex numbers": (X, Y + 1j, ValueError, "[Cc]omplex data not supported|must be real numbers"),
+    "no rows": (X[:0], Y[:0], ValueError, r"^Found array with 0 sample\(s\)"),
+    "no columns": (X[:, :0], Y, ValueError, r"^Found array with 0 feature\(s\)"),
+    "one dimension": (X[:, 0], Y, ValueError, "^Expected 2D array, got 1D array instead"),
+    "three dimensions": (X[:, :, np.newaxis], Y, ValueError, "Found array with dim 3"),
+    "words": (np.full(X.shape, "a"), Y, ValueError, "could not convert string to float"),
+    "complex numbers": (X + 1j, Y, ValueError, "^Complex data not supported"),
+    "sparse matrix": (sparse.csr_matrix(X), Y, TypeError, "[Ss]parse data was passed"),
+    "sparse array": (sparse.coo_array(X), Y, TypeError, "[Ss]parse data was passed"),
+    "objects": (with_one(X.astype(object), {}), Y, TypeError, "float.* not 'dict'"),
+    "pandas with missing values": (pd.DataFrame(with_one(X, np.nan)), Y, ValueError, "contains NaN"),
+    "nullable pandas": (pd.DataFrame(with_one(X, np.nan), dtype="Float64"), Y, ValueError, "contains NaN"),
+    "polars with missing values": (
+        pl.DataFrame(X, schema=["a", "b", "c"]).with_columns(pl.lit(None).cast(pl.Float64).alias("a")),
+        Y,
+        ValueError,
+        "contains NaN",
+    ),
+}
+
+
+@pytest.mark.filterwarnings("ignore:Feature names only support names that are all strings")
+@pytest.mark.parametrize("name", BAD)
+def test_bad_rows_are_refused_by_every_estimator(estimator, name):
+    rows, y, kind, message = BAD[name]
+    if isinstance(estimator, ResidualRegressor):
+        if name == "y nearly 0":
+            rows = np.zeros_like(rows)  # what it fits is what y adds to columns of X
+        if hasattr(rows, "columns"):
+            message = "^The base columns of X must be finite; they contain NaN or infinity"
+    with pytest.raises(kind, match=message) as raised:
+        estimator.fit(rows, y)
+    assert raised.type is kind
+    assert not [attribute for attribute in vars(estimator) if attribute.endswith("_")]
+
+
+@pytest.mark.parametrize("name", [name for name in BAD if not name.startswith(("y", "no y"))])
+def test_a_fitted_model_refuses_bad_rows(estimator, name):
+    rows, _, kind, message = BAD[name]
+    if isinstance(rows, pl.DataFrame):
+        estimator.fit(pl.DataFrame(X, schema=rows.columns), Y)
+    else:
+        estimator.fit(X, Y)
+    with pytest.raises(kind, match=message.replace("^", "").replace("Input X", "X")) as raised:
+        estimator.predict(rows, return_std=True)
+    assert raised.type is kind
+
+
+@pytest.mark.parametrize(
+    ("scale", "message"),
+    [
+        (1e60, r"^y must not exceed 1e\+40 in size; its largest value is 4\.8e\+61\. Rescale it\."),
+        (1e-120, r"^y must be 0 or exceed 1e-105 in size; a column's largest value is 4\.8e-119"),
+    ],
+)
+def test_torques_of_no_robot_are_refused(scale, message):
+    y = scale * np.linspace(-48.0, 24.0, 40)
+    with pytest.raises(ValueError, match=message):
+        InverseDynamics(n_inducing=5, max_iter=1).fit(X, y)
+
+
+@pytest.mark.parametrize("scale", [1e-100, 1e-60, 1e-40, 1e35])
+def test_torques_of_any_size_between_are_not(scale):
+    y = scale * Y
+    mean, std = InverseDynamics(n_inducing=5, max_iter=2).fit(X, y).predict(X, return_std=True)
+    assert np.abs(mean - y).max() < 10.0 * np.abs(y).max()
+    assert (std > 0.0).all()
+
+
+@pytest.mark.parametrize("name", ["NaN", "huge", "y with NaN", "y short", "sparse matrix", "one dimension"])
+def test_bad_new_rows_are_not_folded_in(name):
+    rows, y, kind, message = BAD[name]
+    model = clone(ESTIMATORS["EVGPRegressor"]).fit(X, Y)
+    before = model.predict(X, return_std=True)
+    with pytest.raises(kind, match=message):
+        model.partial_fit(rows, y)
+    np.testing.assert_array_equal(model.predict(X, return_std=True), before)
+
+
+def test_missing_values_are_the_maps_to_fill():
+    rows = pd.DataFrame(with_one(X, np.nan), columns=["a", "b", "c"])
+    model = EVGPRegressor(kernel_map=SimpleImputer(), n_inducing=8, max_iter=5, random_state=0).fit(rows, Y)
+    assert np.isfinite(model.predict(rows)).all()
+
+
+# --- maps --------------------------------------------------------------------------------------------------------
+
+
+# In a fit a map of any width is a good one.
+@pytest.mark.parametrize(
+    ("how", "late"), [(how, late) for how in BadMap.messages for late in (False, True) if late or how != "width"]
+)
+@pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_maps_that_go_wrong_are_named(kind, argument, how, late):
+    """In a fit, or after it: the second call may be in either."""
+    model = kind(**{argument: BadMap(how, late)}, max_iter=2)
+    with pytest.raises(MapError if how == "raises" else ValueError, match=BadMap.messages[how]) as raised:
+        model.fit(X, Y).predict(X[:5], return_std=True)
+    if how != "raises":
+        assert f"{argument}=" in str(raised.value) or how == "width"
+
+
+class Breaks(StandardScaler):
+    """A map that goes wrong once it is told to."""
+
+    now = None
+
+    def transform(self, X):
+        values = super().transform(X)
+        return values if Breaks.now is None else Breaks.now(values)
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (lambda values: values[:, :2], r"same number of columns for all rows; they returned .*3.* and .*2"),
+        (
+            lambda values: np.hstack([values, values]),
+            r"same number of columns for all rows; they returned .*3.* and .*6",
+        ),
+        (lambda values: np.nan * values, "returned NaN or infinity"),
+        (lambda values: values[1:], "must return one row per row of X; for 4 rows it returned the shape"),
+        (lambda values: values[:, 0], "must return one row per row of X"),
+        (lambda values: 1e200 * values, r"must not exceed 1e\+100 in size"),
+    ],
+    ids=["narrow", "wide", "NaN", "rows", "1-D", "huge"],
+)
+def test_a_map_that_goes_wrong_after_the_fit_leaves_the_model_as_it_was(monkeypatch, kind, argument, broken, message):
+    model = kind(**{argument: Breaks()}, max_iter=2).fit(X, Y)
+    before = model.predict(X[:4], return_std=True)
+    monkeypatch.setattr(Breaks, "now", staticmethod(broken))
+    for call in (
+        model.predict,
+        model.sample_y,
+        *([] if kind is EGPRegressor else [lambda X: model.partial_fit(X, Y[:4])]),
+    ):
+        with pytest.raises(ValueError, match=message):
+            call(X[:4])
+    monkeypatch.undo()
+    np.testing.assert_array_equal(model.predict(X[:4], return_std=True), before)
+
+
+def test_a_slow_map_is_seen_by_each_row_a_few_times_only():
+    """However many iterations there are."""
+    rows = []
+
+    class Slow(PolynomialFeatures):
+        def transform(self, X):
+            rows.append(len(X))
+            return super().transform(X)
+
+    model = EVGPRegressor(Slow(), kernel_map=Slow(degree=1), n_inducing=8, random_state=0, max_iter=200).fit(X, Y)
+    assert model.n_iter_ > 20
+    assert sum(rows) <= 8 * len(X)
+
+
+# --- data --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("n", [1, 2, 3])
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(2)], ids=["plain", "features"])
+def test_hardly_any_rows(kind, n, feature_map):
+    model = kind(feature_map, max_iter=50, random_state=0).fit(X[:n], Y[:n])
+    mean, std = model.predict(X, return_std=True)
+    assert mean.shape == std.shape == Y.shape
+    assert np.isfinite(mean).all()
+    assert np.isfinite(std).all()
+    assert (std > 0.0).all()
+
+
+@pytest.mark.parametrize("d", [1, 500])
+def test_one_column_to_five_hundred(d):
+    rng = np.random.RandomState(0)
+    rows = rng.randn(60, d)
+    y = rows[:, 0] + 0.1 * rng.randn(60)
+    model = EVGPRegressor(n_inducing=20, max_iter=10, random_state=0).fit(rows, y)
+    mean, std = model.predict(rows, return_std=True)
+    assert np.corrcoef(mean, y)[0, 1] > 0.5
+    assert (std > 0.0).all()
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize("value", [0.0, 5.1, -1e8, 1e-12, 1e12])
+def test_a_constant_target_is_predicted(kind, value):
+    mean, std = kind(normalize_y=True, random_state=0).fit(X, np.full(40, value)).predict(X, return_std=True)
+    np.testing.assert_allclose(mean, value, rtol=1e-9, atol=1e-12)
+    assert (std > 0.0).all()
+    assert (std < 1e-3 * max(abs(value), 1.0)).all() if value else np.isfinite(std).all()
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize("offset", [0.0, 1e8])
+@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+def test_a_perfect_line_is_found_and_extrapolated(kind, scale, offset):
+    """With inputs of any scale, far from 0 compared with their scatter."""
+    rows = scale * (X + offset)
+    y = 3.0 + (X @ [2.0, -1.0, 0.5])
+    model = kind(StandardScaler(), random_state=0, normalize_y=True).fit(rows, y)
+    mean, std = model.predict(scale * (3.0 * X + offset), return_std=True)
+    # Rounding of the inputs at an offset.
+    atol = 1e-4 if offset == 0.0 else 1e-3
+    np.testing.assert_allclose(mean, 3.0 + 3.0 * (X @ [2.0, -1.0, 0.5]), atol=atol)
+    assert (std > 0.0).all()
+    assert (std < 0.1).all()
+
+
+@pytest.mark.parametrize("noise", [1e-8, 1e-4])
+def test_hardly_any_noise(noise):
+    x = np.linspace(0.0, 3.0, 60)[:, np.newaxis]
+    y = np.sin(2.0 * x[:, 0]) + noise * np.random.RandomState(0).randn(60)
+    model = EVGPRegressor(n_inducing=30, random_state=0).fit(x, y)
+    mean, std = model.predict(x, return_std=True)
+    assert np.abs(mean - y).max() < 1e-4 + 10.0 * noise
+    assert (std < 1e-3 + 10.0 * noise).all()
+
+
+def test_a_row_far_away_does_not_hide_the_others():
+    x = np.append(np.linspace(0.0, 3.0, 60), 1e6)[:, np.newaxis]
+    y = np.sin(2.0 * x[:, 0])
+    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=20, random_state=0).fit(x, y)
+    mean, std = model.predict(x, return_std=True)
+    assert np.isfinite(mean).all()
+    assert (std > 0.0).all()
+
+
+def test_what_features_explain_to_the_last_digit_is_not_told_to_be_far_from_its_mean():
+    """Their residuals scatter by rounding, which is little, but so is their mean."""
+    rng = np.random.RandomState(0)
+    rows = rng.randn(10, 5)
+    for normalize_y, told in ((True, False), (False, True)):
+        model = EVGPRegressor(PolynomialFeatures(2), normalize_y=normalize_y, random_state=0)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            model.fit(rows, 1e8 + rows[:, 0])
+        assert any("away from its prior mean" in str(each.message) for each in caught) == told
