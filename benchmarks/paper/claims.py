@@ -12,13 +12,11 @@ from harness import Row, figure_of, read, table
 from harness import column as of
 from paper import beta_report, learning_curves_report
 from paper.data_sets import is_angle
-from paper.results_table_report import MODELS, Groups, group
+from paper.models import SYSTEMS
+from paper.results_table_report import MODELS, NORMAL, Groups, group
 
-# A normal distribution's containing ratios, and the settings that each claim is looked at in.
-NORMAL = np.array([0.683, 0.954, 0.997])
+# That each claim is looked at in.
 SETTINGS = ("paper", "skevgp")
-# Systems of the paper; of the cartpole both that it may have.
-SYSTEMS = ("pendulum", "cartpole", "cartpole_damped", "acrobot", "iiwa14")
 EVGP = ("EVGP-IF", "EVGP-IFG")
 
 

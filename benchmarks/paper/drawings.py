@@ -287,7 +287,14 @@ def link(path: Path) -> None:
     u_x, u_y, u_z = rotation.T
     origin = np.zeros(3)
     figure, (axes, words) = pyplot().subplots(1, 2, figsize=(WIDTH, 3.6), width_ratios=(1.15, 1.0))
-    axes.plot(*(np.array([origin, 1.3 * u_y]) @ page).T, color="0.9", linewidth=34, solid_capstyle="round", zorder=0)
+    axes.plot(
+        *(np.array([origin, 1.3 * u_y]) @ page).T,
+        color="0.9",
+        linewidth=34,
+        solid_capstyle="round",
+        zorder=0,
+        clip_on=False,
+    )
     axes.plot(
         *(np.array([-0.16 * u_z, 0.16 * u_z]) @ page).T, color=PALE, linewidth=30, solid_capstyle="butt", zorder=1
     )

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from harness import WIDTH, Row, logarithmic, pyplot, save_picture
+from harness import WIDTH, Row, legend, logarithmic, pyplot, save_picture
 from harness import column as of
-from paper.models import PROMISED
-from paper.results_table_report import PAPER, STYLES, WRAPPED, group, marks, models_of, noisy
+from paper.results_table_report import PAPER, STYLES, WRAPPED, group, marks, models_of, noisy, reliability
 
 
 def plot(rows: list[Row], path: Path) -> None:
@@ -37,29 +36,18 @@ def plot(rows: list[Row], path: Path) -> None:
             reliability_panel(axes, own)
         else:
             errors_panel(axes, own, system, models, settings)
-        axes.set_title(system, fontsize=11)
-        axes.grid(alpha=0.3, axis="both" if noisy(rows) else "y")
-        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_title(system)
     for axes in grid.flat[len(systems) :]:
         axes.set_axis_off()
     for axes in grid[:, 0]:
-        axes.set_ylabel("share held" if noisy(rows) else "test Error (SI units)")
+        axes.set_ylabel("share held - promised" if noisy(rows) else "test Error (SI units)")
     notes = ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
     if noisy(rows):
         notes += [f"noise: {float(rows[0]['noise']):.0%} of each target's standard deviation; means over seeds"]
     else:
         notes += ["large: mean over data sets (hollow: a fit ended by a limit), small: each"]
         notes += ["a dash of the same colour: mean of the rows inside the training range"]
-    handles = {
-        label: handle for axes in grid.flat for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(
-        *(handles.values(), handles.keys()),
-        loc="outside upper center",
-        ncols=3 if n_columns > 1 else 2,
-        frameon=False,
-        title="\n".join(notes),
-    )
+    legend(figure, ncols=3 if n_columns > 1 else 2, title="\n".join(notes))
     save_picture(figure, path)
 
 
@@ -69,15 +57,18 @@ def errors_panel(
     """The Error of each model: a bar in the paper, a marker for each setting here."""
     papers, places = [PAPER[system][model].error for model in models], np.arange(len(models))
     axes.hlines(papers, places - 0.42, places + 0.42, color="black", linewidth=1.8, label="in the paper")
-    offsets = dict(zip(settings, 0.17 * (np.arange(len(settings)) - 0.5 * (len(settings) - 1)), strict=True))
+    offsets = dict(zip(settings, np.linspace(-0.4, 0.4, len(settings)), strict=True))
     for (model, setting), rows in own.items():
         values, (colour, marker) = of(rows, "error_mean"), STYLES[setting]
         place = models.index(model) + offsets[setting]
-        label = "ours: the paper's setting" if setting == "paper" else f"ours: {setting}"
         face = "white" if "*" in marks(rows) else colour
         axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
-        axes.plot(place, values.mean(), marker, color=colour, markerfacecolor=face, markersize=7, label=label)
+        axes.plot(place, values.mean(), marker, color=colour, markerfacecolor=face, markersize=7)
         axes.plot(place, of(rows, "error_inside").mean(), "_", color=colour, markersize=9)
+    for setting in settings:
+        colour, marker = STYLES[setting]
+        label = "ours: the paper's setting" if setting == "paper" else f"ours: {setting}"
+        axes.plot([], [], marker, color=colour, markersize=7, label=label)
     axes.set_xticks(range(len(models)), models, fontsize=9)
     axes.set_xlim(-0.5, len(models) - 0.5)
     axes.tick_params(axis="x", length=0)
@@ -86,10 +77,12 @@ def errors_panel(
 
 
 def reliability_panel(axes: Any, own: dict[tuple[str, str], list[Row]]) -> None:
-    """The share that intervals hold against the share they promise."""
-    axes.plot([0, 1], [0, 1], color="black", linewidth=1.2, label="as promised")
+    """How much more or less intervals hold than they promise."""
+    axes.axhline(0.0, color="black", linewidth=1.2, label="as promised")
     dashes = {"EVGP-IFG": "-", "EVGP-IF": "--", "RES-VGP": "-.", "VGP": (0, (1, 1)), "RES-DBNN": ":"}
     for (model, setting), rows in own.items():
-        held = [of(rows, f"within_{share}").mean() for share in PROMISED]
-        axes.plot(PROMISED, held, color=STYLES[setting][0], linestyle=dashes[model], label=f"{model}, {setting}")
-    axes.set(xlabel="share promised", xlim=(0, 1), ylim=(0, 1), aspect="equal")
+        promised, held = reliability(rows)
+        style = {"color": STYLES[setting][0], "linestyle": dashes[model], "marker": "."}
+        axes.plot(promised, held - promised, **style, label=f"{model}, {setting}")
+    low, high = axes.get_ylim()
+    axes.set(xlabel="share promised", xlim=(0, 1), ylim=(min(low, -0.05), max(high, 0.05)))

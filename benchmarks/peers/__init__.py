@@ -1,1 +1,1 @@
-"""skevgp against other libraries: scikit-learn's exact GP as rows grow, and sparse GPs of GPflow and GPyTorch."""
+"""skevgp against other libraries: scikit-learn's exact GP as rows grow, and sparse GPs of GPflow, GPJax, GPyTorch."""

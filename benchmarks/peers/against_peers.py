@@ -4,9 +4,11 @@ First every library has to agree with the others at fixed hyperparameters (`agre
 fit to a CSV (fits that are there already are not repeated), bound, RMSE and NLPD over time to a second one, draws a
 picture from both, and writes and prints a Markdown page: how long each took to reach the bound and the NLPD of GPflow's
 SGPR after its iterations, and means over seeds. Peers that are not installed are left out. GPflow needs another NumPy
-than skevgp: give the interpreter that has the peers (see requirements.txt).
+than skevgp and GPJax: give the interpreter that has the peers (see requirements.txt, requirements_jax.txt), in a run
+for each.
 
     python benchmarks/peers/against_peers.py --peer-python .peers/bin/python --data-folder ../uci
+    python benchmarks/peers/against_peers.py --peers "GPJax SGPR" --peer-python .peers_jax/bin/python
     python benchmarks/peers/against_peers.py --datasets cartpole --peers skevgp "GPflow SGPR" --redo
     python benchmarks/peers/against_peers.py --quick  # half a minute: small data, skevgp and scikit-learn
 
@@ -22,11 +24,15 @@ state is learned.
 The kernel is a squared exponential with a lengthscale per column, the prior mean 0; signal variance and noise are of
 each output, or shared as the peer does it: skevgp keeps them per output, the others share them too. skevgp has its
 defaults; the noise of the others starts at all of the variance (GPflow's own start), of systems at a hundredth, and
-they have 120 iterations of L-BFGS (GPflow; of the acrobot 200), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its
+they have 120 iterations of L-BFGS (GPflow, GPJax; of the acrobot 200), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its
 tutorial's 0.01 gets nowhere in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from
 5-fold cross-validation outside the clock. Each fit has a process of its own on two cores. The clock starts with the
-arrays in memory and the libraries imported, so that TensorFlow's tracing is part of a fit; it does not run while a fit
-is looked at. Of skevgp, what there was at an earlier time is what a fit returns that is ended then, with its time.
+arrays in memory and the libraries imported, so that TensorFlow's tracing and JAX's compilation are part of a fit; it
+does not run while a fit is looked at. Of skevgp, what there was at an earlier time is what a fit returns that is ended
+then, with its time.
+
+GPJax's L-BFGS is its `fit_lbfgs`: that of Optax, whose line search is another than SciPy's, with the whole fit compiled
+at once. It is in double precision, which JAX's own is not.
 """
 
 from __future__ import annotations
@@ -63,7 +69,7 @@ DEFAULTS: dict[str, dict[str, Any]] = {
         "datasets": list(DATASETS),
         "seeds": 1,
         "checkpoints": 12,
-        "peers": ["skevgp", "GPflow SGPR", "GPyTorch SGPR", "scikit-learn GPR", _TREES, _LINE],
+        "peers": ["skevgp", "GPflow SGPR", "GPyTorch SGPR", "GPJax SGPR", "scikit-learn GPR", _TREES, _LINE],
     },
     "splits": {
         "datasets": _TABLES,
@@ -238,7 +244,7 @@ def arguments() -> argparse.Namespace:
     said = "times before the end at which a fit of the first seed is looked at, 0 and more; default: 12"
     parser.add_argument("--checkpoints", type=int, help=said)
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
-    parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch")
+    parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch, or GPJax")
     parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
     options = parser.parse_args()
     name = "splits" if options.all_splits else "against_peers"

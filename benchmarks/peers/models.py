@@ -28,7 +28,7 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 import numpy as np
 
 from peers.jobs import Checkpoint, Fitted, Fixed, Job, Result, Said, Watch
-from peers.libraries import with_gpflow, with_gpytorch, with_skevgp, with_sklearn
+from peers.libraries import with_gpflow, with_gpjax, with_gpytorch, with_skevgp, with_sklearn
 
 # Of the times of two checkpoints.
 STEP = 1.4
@@ -72,12 +72,14 @@ class Peer:
 
 _SKEVGP = with_skevgp.MODULES, with_skevgp.fit, with_skevgp.at_fixed, with_skevgp.JITTER
 _GPFLOW = with_gpflow.at_fixed, with_gpflow.JITTER
+_GPJAX = with_gpjax.at_fixed, with_gpjax.JITTER
 _GPYTORCH = with_gpytorch.at_fixed, with_gpytorch.JITTER
 _GPR = with_sklearn.GPR_MODULES, with_sklearn.fit_gpr, with_sklearn.at_fixed, with_sklearn.JITTER
 PEERS = {
     "skevgp": Peer(*_SKEVGP, ("default", "none", "all"), own_rule=True),
     "skevgp, same limit": Peer(*_SKEVGP, ("default", "none")),
     "GPflow SGPR": Peer(with_gpflow.MODULES, with_gpflow.fit, *_GPFLOW, ("none", "all")),
+    "GPJax SGPR": Peer(with_gpjax.MODULES, with_gpjax.fit, *_GPJAX),
     "GPyTorch SGPR": Peer(with_gpytorch.MODULES, lambda job, watch: with_gpytorch.fit(job, watch, False), *_GPYTORCH),
     "GPyTorch SVGP": Peer(with_gpytorch.MODULES, lambda job, watch: with_gpytorch.fit(job, watch, True)),
     "scikit-learn GPR": Peer(*_GPR, ("none", "all"), points="rows"),
@@ -104,6 +106,8 @@ def run(peer: str, job: Job) -> Result:
             point = fitted.at(end.seconds / STEP ** (k + 1))
             if point.seconds == points[-1].seconds:  # there was nothing before
                 break
+            if point.seconds > points[-1].seconds:  # a fit of its own, which other work on the machine held up
+                continue
             points.append(point)
             predictions.append(point.predict(job.X_test))
     packages = [import_module(name.partition(".")[0]) for name in (*PEERS[peer].modules, "numpy")]

@@ -75,7 +75,7 @@ def run(cell: Cell) -> dict[str, Any]:
         import dask.array as da
         import distributed
 
-        cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=None)
+        cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
         client = distributed.Client(cluster)
         rows = max(min(CHUNK, n_rows // 4), 1)
         starts = range(0, n_rows, rows)
