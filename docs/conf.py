@@ -91,6 +91,7 @@ html_theme_options = {
     "pygments_light_style": "a11y-high-contrast-light",
     "pygments_dark_style": "a11y-high-contrast-dark",
 }
-# Pages on their own have nothing to list beside them.
+# Pages on their own have nothing to list beside them; results are wide, and stories are listed by their pictures.
 ALONE = ["index", "start", "which_model", "comparison", "reproduction", "tests", "changelog", "generated/source/*"]
+ALONE += ["benchmarks", "generated/results/*", "auto_examples/*"]
 html_sidebars = {page: [] for page in ALONE}

@@ -14,6 +14,7 @@ from tempfile import TemporaryDirectory
 from types import ModuleType
 from typing import Any
 
+import matplotlib.pyplot as plt
 from docutils import nodes
 from sphinx import addnodes
 from sphinx.application import Sphinx
@@ -29,8 +30,8 @@ RESULTS = ROOT / "benchmarks" / "results"
 GENERATED = DOCS / "generated"
 
 SOURCE_ROLE = re.compile(r"(?:\{src\}|:src:)`([^`]+)`")
-# [text](target) or ![text](target) with a target inside the repository.
-LINK = re.compile(r"(!?)\[([^\]]*)\]\((?!https?:|#)([^)#\s]+)(#[^)]*)?\)")
+# [text](target) or ![text](target) with a target inside the repository; "[-1, 1)" opens a bracket that is not a link's.
+LINK = re.compile(r"(!?)\[([^\[\]]*)\]\((?!https?:|#)([^)#\s]+)(#[^)]*)?\)")
 # Pages of the site that stand for files of the repository.
 PAGES = {"README.md": "/index", "REPRODUCTION.md": "/reproduction", "CHANGELOG.md": "/changelog"}
 # What public functions return, and users therefore meet.
@@ -88,18 +89,22 @@ def write_included(name: str) -> None:
 
 def write_results() -> None:
     """Write a page for each report of a benchmark, with its picture and a link to its numbers."""
+    titles: set[str] = set()
     for report in sorted(RESULTS.glob("*.md")):
         if "_quick" in report.stem:
             continue
         text = rewritten(report.read_text(encoding="utf-8"), RESULTS)
-        title = text.splitlines()[0].removeprefix("# ")
+        title, _, rest = text.removeprefix("# ").partition("\n")
+        if title in titles:  # of another run of the same benchmark
+            title = f"{title} ({report.stem})"
+        titles.add(title)
         added = []
         picture = report.with_suffix(".png")
         if picture.exists() and picture.name not in text:
             added.append(f"![{title}](/../benchmarks/results/{picture.name})")
         numbers = [file for file in sorted(RESULTS.glob(f"{report.stem}.csv*")) if file.is_file()]
         added += [f"{{download}}`{file.name} </../benchmarks/results/{file.name}>`: a row per run." for file in numbers]
-        write(GENERATED / "results" / report.name, "\n\n".join([text.rstrip(), *added]) + "\n")
+        write(GENERATED / "results" / report.name, "\n\n".join([f"# {title}\n{rest.rstrip()}", *added]) + "\n")
 
 
 def public_modules() -> list[tuple[str, ModuleType]]:
@@ -142,6 +147,7 @@ def write_pictures(page: Path) -> None:
     with TemporaryDirectory() as scratch:
         for _ in blocks.run(page, Path(scratch)):
             pass
+        plt.close("all")  # or the first story of the gallery would show them
         for picture in Path(scratch).glob("*.png"):
             shutil.copy(picture, folder)
     stamp.write_text(text, encoding="utf-8")

@@ -104,6 +104,16 @@ def test_text_and_its_ground_differ_in_the_dark(browser, address):
     assert light[0] - light[1] > 300.0
 
 
+def test_names_of_parameters_stand_on_one_line(browser, address):
+    opened(browser, address, "generated/api/skevgp.EGPRegressor.html")
+    names = browser.execute_script(
+        """return [...document.querySelectorAll('dl.field-list dt > strong')].filter(e => !e.textContent.includes(' '))
+             .map(e => [e.textContent, e.offsetHeight / parseFloat(getComputedStyle(e).fontSize)])"""
+    )
+    assert len(names) > 20
+    assert not [name for name, lines in names if lines > 2.2]
+
+
 def test_both_tabs_of_the_start_open(browser, address):
     opened(browser, address, "start.html")
     robot = browser.find_element(By.XPATH, "//label[contains(., 'A robot')]")
@@ -133,7 +143,7 @@ def test_no_formula_has_to_be_scrolled_at_a_desk(browser, address, page):
     wait = opened(browser, address, f"guide/{page.replace('.md', '.html')}")
     check_formulas(browser, wait)
     wide = browser.execute_script(
-        """return [...document.querySelectorAll('article div.math')].filter(e => e.scrollWidth > e.clientWidth + 1)
-             .map(e => e.id)"""
+        """return [...document.querySelectorAll('article :is(div.math, mjx-container[display])')]
+             .filter(e => e.scrollWidth > e.clientWidth + 1).map(e => e.closest('div.math')?.id ?? e.tagName)"""
     )
     assert wide == []
