@@ -13,6 +13,8 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
 
+from .alone import alone
+
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (120, 2))
 Y = np.column_stack([np.sin(3 * X[:, 0]) * X[:, 1], np.cos(2 * X[:, 1])]) + 0.01 * RNG.randn(120, 2)
@@ -341,3 +343,16 @@ def test_a_polynomial_asks_for_a_signal_far_above_its_scatter(make):
     bound = "lower_bound_" if isinstance(free, EVGPRegressor) else "log_marginal_likelihood_value_"
     assert free.kernel_.k1.constant_value > 200.0
     assert getattr(free, bound) > getattr(narrow, bound) + 5.0
+
+
+@pytest.mark.parametrize("shift", [0.0, 1e8])
+@pytest.mark.parametrize("noise", [1e-2, 1.0])
+def test_features_that_interpolate_do_not_hide_the_noise(noise, shift):
+    """What they leave over is rounding; the fit is still not below features with the noise that suits them best."""
+    rng = np.random.RandomState(0)
+    few = rng.randn(10, 5)
+    y = shift + few @ rng.randn(5) + noise * rng.randn(10)
+    fitted = model(feature_map=PolynomialFeatures(), coef_scale=1e3, normalize_y=True, n_inducing=10).fit(few, y)
+    assert fitted.lower_bound_ > alone(fitted, few, y) - 0.2
+    mean, std = fitted.predict(few, return_std=True)
+    assert (np.abs(y - mean) < 4 * std + 1e-9 * shift).all()

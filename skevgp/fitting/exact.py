@@ -337,6 +337,7 @@ def fit_exact(
         kernel.n_hyperparameters,
         variance,
         rows.mean_precision,
+        target_scatter=units.target_scatter,
     )
     if options.optimizer is not None:
         # It is the user's when to go where.

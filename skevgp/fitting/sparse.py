@@ -11,7 +11,7 @@ import numpy as np
 
 from .._progress import Monitor
 from ..calibration.folds import CrossValidation
-from ..inference.bounds import features_alone_bound
+from ..inference.bounds import features_alone
 from ..inference.model import SparseModel
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
@@ -127,10 +127,14 @@ class SparseTask:
         """Whether there are as many inducing points as rows; points that stay are all rows, some perhaps the same."""
         return self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
 
-    @cached_property
+    @property
     def alone(self) -> float:
         """The bound of the features without a Gaussian process."""
-        return features_alone_bound(self.blocks.linear, self.model.prior)
+        return self._alone[0]
+
+    @cached_property
+    def _alone(self) -> tuple[float, np.ndarray]:
+        return features_alone(self.blocks.linear, self.model.prior, self.table["noise"].value_limits()[:, 1])
 
     @property
     def n_inducing(self) -> int:
@@ -148,6 +152,7 @@ class SparseTask:
             self.solver.n_restarts,
             self.rows.scatter(),
             alone=self.alone,
+            noise_alone=self._alone[1],
             interpolates=self.interpolates,
             samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),

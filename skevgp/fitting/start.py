@@ -133,6 +133,7 @@ def starting_table(
     mean_variance: float = 1.0,
     precision: float = 1.0,
     n_kernels: int | None = None,
+    target_scatter: np.ndarray | float = 0.0,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -158,6 +159,8 @@ def starting_table(
         The mean of 1 / v over rows with noise variances σ² v.
     n_kernels : int, default=None
         How many sets of hyperparameters there are, if each group of outputs has its own.
+    target_scatter : ndarray of shape (o,), default=0.0
+        Variance of the targets, in squared target units: so high may the noise become where the features explain all.
 
     Returns
     -------
@@ -176,16 +179,11 @@ def starting_table(
         default = first
     if n_kernels is not None:
         default = np.broadcast_to(default, (n_kernels, default.shape[-1]))
-    signal = o / mean_variance
+    signal, highest = o / mean_variance, rules.highest_noise * precision * o
     return ParameterTable(
         [
             parameter_of(
-                starts.hyperparameters,
-                "hyperparameters",
-                default,
-                lower * typical,
-                upper * root_d * typical,
-                1.0,
+                starts.hyperparameters, "hyperparameters", default, lower * typical, upper * root_d * typical, 1.0
             ),
             parameter_of(
                 starts.signal,
@@ -201,8 +199,9 @@ def starting_table(
                 "noise",
                 rules.first_noise * scatter,
                 np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
-                rules.highest_noise * precision * o,
+                highest,
                 target_unit**2,
+                np.maximum(highest, target_scatter * precision),
             ),
             Parameter(
                 "inducing_points",

@@ -122,6 +122,8 @@ class Strategy:
         Variance of what the features leave over.
     alone : float
         The bound of the features without a Gaussian process.
+    noise_alone : ndarray of shape (o,), optional
+        The noise variances with which it is.
     interpolates : bool
         Whether there are as many inducing points as rows.
     samples : tuple of int
@@ -142,6 +144,7 @@ class Strategy:
     n_restarts: int
     scatter: np.ndarray
     alone: float = -np.inf
+    noise_alone: np.ndarray | None = None
     interpolates: bool = False
     samples: tuple[int, ...] = ()
     place: Callable[[Values], Values] | None = None
@@ -169,7 +172,10 @@ class Strategy:
         """Whether noise came to explain everything, or the kernel explains less than nothing would."""
         if (fit.values["noise"] > self.rules.collapsed * self.scatter).any():
             return True
-        # What has not ended yet may still be below.
+        return self._below(fit)
+
+    def _below(self, fit: Fit) -> bool:
+        """Whether it ended below the features alone; what has not ended yet may still rise."""
         return fit.n_rows is None and fit.converged and fit.bound < self.alone
 
     def _released(self, attempts: Attempts) -> Attempts:
@@ -244,6 +250,8 @@ class Strategy:
             if not self.collapsed(best):
                 break
             best = better(best, (yield start(moved(values, *factors))))
+        if self.noise_alone is not None and self._below(best):
+            best = better(best, (yield start(values | {"noise": self.noise_alone})))
         return best
 
 

@@ -137,11 +137,14 @@ class Units:
         The size of what the features alone leave over.
     prior : CoefficientPrior
         In the user's units.
+    target_scatter : ndarray of shape (o,)
+        The targets' variance, in squared target units.
     """
 
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
+    target_scatter: np.ndarray
 
     @classmethod
     def of(
@@ -153,7 +156,8 @@ class Units:
     ) -> Units:
         """The units of a training set, from its rows, its targets' moments, and the prior of its weights."""
         reference, left_over = features_alone(source, target_mean, prior)
-        return cls(target_mean, unit_of(left_over, targets.largest), replace(prior, reference=reference))
+        unit = unit_of(left_over, targets.largest)
+        return cls(target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2)
 
     def to_internal(self, raw: RawRows) -> RawRows:
         """The same inputs and features, and what the reference leaves of the targets, in its own units."""

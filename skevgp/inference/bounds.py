@@ -342,21 +342,50 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     return total + 0.5 * log_det
 
 
-def features_alone_bound(sums: LinearSums, prior: CoefficientPrior) -> float:
-    """The bound without a Gaussian process, all that the features leave over being noise; summed over outputs."""
+def features_alone(sums: LinearSums, prior: CoefficientPrior, highest: np.ndarray) -> tuple[float, np.ndarray]:
+    """The bound without a Gaussian process, all that the features leave over being noise; and how much that is.
+
+    As many features as rows leave nothing over, and the evidence is still the greatest with some noise (Rasmussen &
+    Williams 2006, eq. 2.30 for a linear model). From what they leave over at least the noise is made three times
+    larger, and again, while that raises the bound.
+
+    Parameters
+    ----------
+    sums : LinearSums
+    prior : CoefficientPrior
+    highest : ndarray of shape (o,)
+        Noise variances above these are not tried.
+
+    Returns
+    -------
+    bound : float
+        In nats, summed over outputs.
+    noise : ndarray of shape (o,)
+    """
     o, p = prior.scale.shape
     each = [sums.of(slice(index, index + 1)) for index in range(o)]
-    noise = [np.maximum(own.RR / own.n_rows, 1e-20) for own in each]  # of targets that they explain to the last digit
     VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
-    groups = [
-        Group(
-            slice(index, index + 1),
-            Whitening(None, VV, VV),
-            SufficientStatistics(own.n_rows, VV, VH, VR, own.HH, own.HR, own.RR, 0.0, own.log_variance, own.surplus),
-            np.ones(1),
-            noise[index],
-            prior.outputs(slice(index, index + 1)),
-        )
-        for index, own in enumerate(each)
-    ]
-    return sum(bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full"))
+
+    def bound(outputs: Sequence[int], noise: np.ndarray) -> float:
+        groups = []
+        for index, variance in zip(outputs, noise, strict=True):
+            output, own = slice(index, index + 1), each[index]
+            sums = VV, VH, VR, own.HH, own.HR, own.RR
+            statistics = SufficientStatistics(own.n_rows, *sums, 0.0, own.log_variance, own.surplus)
+            own_prior, whitening = prior.outputs(output), Whitening(None, VV, VV)
+            groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), own_prior))
+        return sum(found.value(found.residuals()) for found in bounds_at_optimum(groups, "full"))
+
+    # Targets may be explained to the last digit.
+    least = np.array([max(float(own.RR[0]) / own.n_rows, 1e-20) for own in each])
+    total, best = 0.0, least.copy()
+    for outputs in [list(range(o))] if prior.shared else [[index] for index in range(o)]:
+        own = least[outputs]
+        noise, value = own, bound(outputs, own)
+        while (noise < highest[outputs]).any():
+            more = np.minimum(3.0 * noise, np.maximum(highest[outputs], own))
+            if (raised := bound(outputs, more)) <= value:
+                break
+            noise, value = more, raised
+        best[outputs], total = noise, total + value
+    return total, best

@@ -160,6 +160,7 @@ def _table(
         variance,
         rows.mean_precision,
         n_kernels,
+        request.units.target_scatter[outputs],
     )
 
 

@@ -12,7 +12,7 @@ from skevgp.fitting.inducing import Placement
 from skevgp.fitting.learned import Learned
 from skevgp.fitting.sparse import SparseTask, grown
 from skevgp.fitting.strategy import Attempt, Fit, search
-from skevgp.inference.bounds import features_alone_bound
+from skevgp.inference.bounds import features_alone
 from skevgp.outputs.plan import plan
 from skevgp.rows.threads import BlockMap
 from skevgp.solvers import LBFGS, Adam
@@ -64,7 +64,9 @@ def test_the_strategy_knows_what_the_features_alone_explain():
     """And a fit that ended below that is tried from elsewhere."""
     task = task_of()
     own = task.strategy
-    assert own.alone == features_alone_bound(task.blocks.linear, task.model.prior)
+    bound, noise = features_alone(task.blocks.linear, task.model.prior, task.table["noise"].value_limits()[:, 1])
+    assert own.alone == bound
+    np.testing.assert_array_equal(own.noise_alone, noise)
     values = task.table.values_at_start()
     assert own.collapsed(Fit(values, own.alone - 1.0))
     assert not own.collapsed(Fit(values, own.alone + 1.0))

@@ -109,6 +109,17 @@ def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_e
     assert len(drive(below, (5.0, UNFINISHED))[0]) == 1
 
 
+def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
+    noise = np.array([3.0, 7.0])
+    own = strategy(alone=6.0, noise_alone=noise)
+    made, best = drive(own, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD), (6.5, GOOD))
+    np.testing.assert_array_equal(made[3].values["noise"], noise)
+    np.testing.assert_array_equal(made[3].values["hyperparameters"], made[0].values["hyperparameters"])
+    assert best.bound == 6.5
+    # What is not below them has nothing to gain there.
+    assert len(drive(own, (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
+
+
 @pytest.mark.parametrize("why", ["noise is fixed", "no iterations"])
 def test_other_starts_need_a_noise_that_moves(why):
     own = strategy(table=table(noise_fixed=True)) if why == "noise is fixed" else strategy(max_iter=0)
