@@ -76,7 +76,10 @@ def _looked_at(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same, and E(y - g)² (n, o)."""
     fast = CompiledPredictor(model, include_noise=False)
-    rows = model._numbers(given, reset=False)[0] if is_frame(given) else X
+    try:
+        rows = model._numbers(given, reset=False)[0] if is_frame(given) else X
+    except ValueError as error:
+        raise ValueError("input_noise needs an X of numbers, none of them missing: others have no slopes.") from error
     # Where y is what was added to columns of X, their noise is in y too.
     base = getattr(model, "_columns_changed", None)
     positions = np.arange(len(rows)) if chosen.positions is None else chosen.positions

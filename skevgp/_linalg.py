@@ -48,7 +48,9 @@ def cholesky_of_covariance(K: np.ndarray, jitter: Jitter) -> np.ndarray:
     return jittered_cholesky(K, jitter.size)
 
 
-def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX_JITTER) -> np.ndarray:
+def jittered_cholesky(
+    matrix: np.ndarray, jitter: float = 0.0, most: float = MAX_JITTER, sizes: np.ndarray | None = None
+) -> np.ndarray:
     """Lower Cholesky factor of a symmetric matrix plus the smallest multiple of its diagonal that makes it work.
 
     Parameters
@@ -60,6 +62,8 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX
         factorisation fails.
     most : float, default=1e-2
         The largest jitter that is tried.
+    sizes : ndarray of shape (n,), optional
+        What jitters are relative to, where it is not the diagonal: of a difference of two matrices, that of the first.
 
     Returns
     -------
@@ -76,8 +80,9 @@ def jittered_cholesky(matrix: np.ndarray, jitter: float = 0.0, most: float = MAX
         shifted = matrix.copy()
         if jitter > 0.0:
             # Where a covariance is 0 (a linear one at the origin), the jitter is that of a very small one.
-            sizes = diagonal if diagonal.all() else np.where(diagonal == 0.0, 1e-16 * diagonal.max(), diagonal)
-            diagonal_of(shifted)[...] += jitter * sizes
+            own = diagonal if sizes is None else sizes
+            own = own if own.all() else np.where(own == 0.0, 1e-16 * own.max(), own)
+            diagonal_of(shifted)[...] += jitter * own
         # The transpose of a C-contiguous matrix is what LAPACK reads without a copy: its upper factor is our lower.
         factor, info = lapack.dpotrf(shifted.T, lower=0, clean=1, overwrite_a=1)
         if info == 0 and (len(factor) == 0 or isfinite(factor[-1, -1])):

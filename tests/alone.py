@@ -62,22 +62,25 @@ def _best(H, rest, diagonal, weight, variance, limits):
     some = weight > 0
     H, rest, diagonal, weight, variance, root = (v[some] for v in (H, rest, diagonal, weight, variance, root))
     G, r = H * root[:, np.newaxis], rest * root
-    U, s, _ = np.linalg.svd(G, full_matrices=False)
+    U, s, Vt = np.linalg.svd(G, full_matrices=False)
     inside = U.T @ r
     outside = r - U @ inside
     outside -= U @ (U.T @ outside)
-    # What is left of the targets that is so little, sums of products do not tell from nothing.
-    floor = (1e-10 * np.abs(r).max(initial=0.0)) ** 2 / max(weight.sum(), 1.0)
+    # A direction in which the features hardly vary, sums of their products do not see.
+    hidden = _JITTER * np.max(s, initial=0.0) ** 2
+    seen = np.where(s**2 > hidden, s**2, 0.0)
+    # Nor do they tell from 0 what is so little beside the targets, or beside what features that cancel add up to.
+    explained = np.abs(G) @ np.abs(Vt.T @ np.divide(inside, s, where=seen > 0.0, out=np.zeros(len(s))))
+    floor = (1e-10 * max(np.abs(r).max(initial=0.0), explained.max(initial=0.0))) ** 2 / max(weight.sum(), 1.0)
     low, high = max(limits[0], floor), max(limits[1], floor)
     if limits[1] < floor:
         return -np.inf
     low = max(low, 1e-290)
     sigma2 = np.geomspace(low, max(high, low), 2000)[:, np.newaxis]
-    squares = ((inside**2) / (1.0 + s**2 / sigma2)).sum(axis=1) + outside @ outside
+    squares = ((inside**2) / (1.0 + seen / sigma2)).sum(axis=1) + outside @ outside
     trace = (weight / variance * diagonal).sum()
     # Of features that depend on each other: a direction in which they do not vary has the precision 1 of the prior,
     # which sums of products of the others, and the jitter of their Cholesky factor, hide.
-    hidden = _JITTER * np.max(s, initial=0.0) ** 2
     logs = np.log1p((s**2 + hidden) / sigma2).sum(axis=1) + (H.shape[1] - len(s)) * np.log1p(hidden / sigma2[:, 0])
     logs += weight.sum() * np.log(2 * np.pi * sigma2[:, 0])
     value = -0.5 * (logs + (weight * np.log(variance)).sum() + (squares + trace) / sigma2[:, 0])

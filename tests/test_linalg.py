@@ -47,6 +47,16 @@ def test_jitter_is_relative_to_the_diagonal():
     np.testing.assert_allclose(np.diag(L) ** 2, 1.01 * np.diag(A), rtol=1e-14)
 
 
+def test_jitter_of_a_difference_is_relative_to_what_it_is_of():
+    """Rounding of 1e8 leaves a matrix that is no covariance, with a diagonal from which none is seen."""
+    A, sizes = np.diag([1.0, -1e-7]), np.array([1e8, 1e8])
+    with pytest.raises(NotPositiveDefiniteError):
+        jittered_cholesky(A)
+    L = jittered_cholesky(A, sizes=sizes)
+    assert 0.0 < L[1, 1] ** 2 <= 1e-6
+    assert L[0, 0] == pytest.approx(1.0, abs=1e-6)
+
+
 def test_a_singular_matrix_gets_just_enough_jitter():
     A = np.ones((5, 5))
     L = jittered_cholesky(A)

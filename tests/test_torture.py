@@ -44,6 +44,13 @@ def test_whatever_comes_is_fitted_or_refused(first):
     assert not defects
 
 
+def test_what_was_a_defect_is_none_any_more():
+    """Found by longer searches."""
+    once = (25, 198, 296, 444, 460, 722, 1443, 2372, 2811, 3298, 3860, 4571, 1010265947)
+    _, defects, _ = run(once)
+    assert not defects
+
+
 # --- containers --------------------------------------------------------------------------------------------------
 
 

@@ -242,10 +242,9 @@ class LeftOut:
         rows, factor, prior = self.rows, self._factor(ratio), self.group.prior
         m, p = self._X.shape
         error = rows.residuals[:, output] - self._Z @ (factor * self._T[:, output])
-        variance = self._squares @ (1.0 / (self._at_zero + ratio * self._slope))
+        variance = rows.noise + self._squares @ _divided(ratio, self._at_zero + ratio * self._slope)
         if not self.group.complete:
-            variance += rows.unexplained
-        variance = rows.noise + ratio * variance
+            variance += ratio * rows.unexplained
         if p == 0:
             none = np.empty(0)
             return _AtRatio(ratio, known, error, variance, none, np.empty((len(error), 0)), none, none)
@@ -280,7 +279,7 @@ class LeftOut:
 
     def _factor(self, ratio: float) -> np.ndarray:
         """ρ D⁻¹."""
-        return ratio / (self._eigenvalues + (ratio / self._ratio) * (1.0 - self._eigenvalues))
+        return _divided(ratio, self._eigenvalues + (ratio / self._ratio) * (1.0 - self._eigenvalues))
 
     def _unexplained(self, factor: np.ndarray) -> np.ndarray:
         """M (p, p), with ``factor`` = ρ D⁻¹."""
@@ -312,3 +311,8 @@ def sums_of_others(each: Sequence[SufficientStatistics]) -> list[SufficientStati
     """
     before, after = list(accumulate(each[:-1])), list(accumulate(reversed(each[1:])))[::-1]
     return [after[0], *map(add, before, after[1:]), before[-1]]
+
+
+def _divided(ratio: float, D: np.ndarray) -> np.ndarray:
+    """ρ D⁻¹: nothing without a signal, where D is rounded to 0 either."""
+    return np.divide(ratio, D, out=np.zeros(D.shape), where=D > 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ from .advice import far_from_prior, how_it_ended, interrupted, learned_too_littl
 from .rules import Rules
 from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Strategy, drawn, search
-from .units import Units
+from .units import Units, likeliest_noise, may_hide_noise
 
 # (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
@@ -88,8 +89,23 @@ class ExactTask:
             self.options.max_iter,
             self.options.n_restarts,
             self.scatter,
+            *self._alone,
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
+        )
+
+    @cached_property
+    def _alone(self) -> tuple[float, np.ndarray | None]:
+        """The likelihood with as little signal as there may be, and the noise variances (o,) that it is highest for."""
+        noise, signal, prior = self.table["noise"], self.table["signal"], self.model.prior
+        unasked = self.options.optimizer is not None or self.options.max_iter == 0 or not noise.free.any()
+        if unasked or not may_hide_noise(prior, len(self.model.rows.inputs)):
+            return -np.inf, None
+        values = self.table.values_at_start()
+        values["signal"] = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
+        highest = noise.value_limits()[:, 1]
+        return likeliest_noise(
+            lambda noise: self.model.log_likelihoods(values | {"noise": noise}), self.scatter, highest, prior.shared
         )
 
     def minimise(self, attempt: Attempt) -> Fit:
@@ -200,11 +216,7 @@ class Unhindered:
 
         Less what the fit has gained by chance, on average half a nat for each parameter (Wilks 1938).
         """
-        try:
-            likelihood = sum(output.log_likelihood for output in self.model.outputs(values)[1])
-            likelihood += self.model.of_copies(values)
-        except NotPositiveDefiniteError:
-            return np.inf
+        likelihood = float(self.model.log_likelihoods(values).sum())
         nats = self.model.rows.total * self.model.rows.targets.shape[1]
         return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
 

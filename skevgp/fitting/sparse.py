@@ -11,7 +11,7 @@ import numpy as np
 
 from .._progress import Monitor
 from ..calibration.folds import CrossValidation
-from ..inference.bounds import features_alone
+from ..inference.bounds import bounds_alone
 from ..inference.model import SparseModel
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
@@ -22,9 +22,12 @@ from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .rules import Rules
 from .strategy import Attempt, Fit, Strategy, better, drawn, search
+from .units import likeliest_noise, may_hide_noise
 
 # By what factor inducing points become more, until that raises the bound by less than so many nats per row and output.
 _GROWTH, _GAIN = 1.5, 0.01
+# Of squared target units.
+_LEAST_NOISE = 1e-20
 # Points limit the kernel if it makes so many rows, a sample, less likely than their own kernel does, by so many nats
 # per row and output.
 _SAMPLE, _MISSED = 1000, 0.02
@@ -127,14 +130,29 @@ class SparseTask:
         """Whether there are as many inducing points as rows; points that stay are all rows, some perhaps the same."""
         return self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
 
-    @property
-    def alone(self) -> float:
-        """The bound of the features without a Gaussian process."""
-        return self._alone[0]
-
     @cached_property
-    def _alone(self) -> tuple[float, np.ndarray]:
-        return features_alone(self.blocks.linear, self.model.prior, self.table["noise"].value_limits()[:, 1])
+    def alone(self) -> float:
+        """The bound of the features without a Gaussian process, all that they leave over being noise."""
+        # Which may be nothing.
+        noise = np.maximum(self._squares / self.rows.total, _LEAST_NOISE)
+        return float(bounds_alone(self.blocks.linear, self.model.prior, noise, np.zeros(len(noise))).sum())
+
+    @property
+    def _squares(self) -> np.ndarray:
+        sums = self.blocks.linear
+        return np.array([float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(self.model.prior.scale))])
+
+    def _least_gain(self) -> tuple[float, np.ndarray]:
+        """The bound with as little signal as there may be, and the noise variances (o,) for which it is the highest."""
+        prior, sums, total = self.model.prior, self.blocks.linear, self.rows.total
+        values, signal = self.table.values_at_start(), self.table["signal"]
+        points, (kernel, hyperparameters) = values["inducing_points"][0], self.model.kernel_of(values, 0)
+        variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
+        little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
+        trace = little * variance * total * self.rows.mean_precision
+        least = np.maximum((self._squares + trace) / total, _LEAST_NOISE)
+        highest = self.table["noise"].value_limits()[:, 1] if may_hide_noise(prior, sums.length) else least
+        return likeliest_noise(lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared)
 
     @property
     def n_inducing(self) -> int:
@@ -145,14 +163,15 @@ class SparseTask:
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
         rules, anew = self.solver.rules, self.placement.anew
+        alone, noise_alone = self._least_gain()
         return Strategy(
             rules,
             self.table,
             self.max_iter,
             self.solver.n_restarts,
             self.rows.scatter(),
-            alone=self.alone,
-            noise_alone=self._alone[1],
+            alone=alone,
+            noise_alone=noise_alone,
             interpolates=self.interpolates,
             samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),

@@ -176,11 +176,19 @@ class Strategy:
 
     def _below(self, fit: Fit) -> bool:
         """Whether it ended below the features alone; what has not ended yet may still rise."""
-        return fit.n_rows is None and fit.converged and fit.bound < self.alone
+        ended = fit.converged or fit.n_iter < self.max_iter
+        return fit.n_rows is None and ended and fit.bound < self.alone
 
     def _released(self, attempts: Attempts) -> Attempts:
-        """Their best fit; one that ended at a limit goes on from there, where the table has a wider one."""
+        """Their best fit; one that ended at a limit goes on from there, where the table has a wider one.
+
+        One below the features alone is left for a fit from the noise that suits these.
+        """
         best = yield from attempts
+        if self.noise_alone is not None and self.max_iter > 0 and self.table["noise"].free.any() and self._below(best):
+            first = self.table.values_at_start()
+            little = np.minimum(first["signal"], self.noise_alone)
+            best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
         if best.n_iter < self.max_iter and self.table.holds(best.values):
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))
         return best
@@ -250,8 +258,6 @@ class Strategy:
             if not self.collapsed(best):
                 break
             best = better(best, (yield start(moved(values, *factors))))
-        if self.noise_alone is not None and self._below(best):
-            best = better(best, (yield start(values | {"noise": self.noise_alone})))
         return best
 
 

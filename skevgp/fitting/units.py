@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -105,6 +105,53 @@ class _Step:
     def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
         first = self.outputs[0]
         w[self.outputs] += cho_solve((self.root, True), self.counts @ from_data[self.outputs] - self.least * w[first])
+
+
+def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:
+    """Whether what the features leave over may be far below the noise.
+
+    As many features as rows leave nothing over, and weights far from their prior leave over less than its own would.
+    """
+    return 2 * prior.scale.shape[1] >= n_rows or float((prior.reference**2).sum(axis=1).max(initial=0.0)) > n_rows
+
+
+def likeliest_noise(
+    evidence: Callable[[np.ndarray], np.ndarray], least: np.ndarray, highest: np.ndarray, shared: bool
+) -> tuple[float, np.ndarray]:
+    """Which noise suits features best that leave over less: the evidence may be the greatest with more.
+
+    (Rasmussen & Williams 2006, eq. 2.30, for a linear model.) All decades are tried, since it may be flat over most of
+    them, then quarters of decades around the best.
+
+    Parameters
+    ----------
+    evidence : callable
+        Noise variances (o,) -> nats (o,) of each output.
+    least, highest : ndarray of shape (o,)
+        The first and the last that are tried; only the first if that is not the smaller one.
+    shared : bool
+        Whether all outputs are to have the same multiple of the least.
+
+    Returns
+    -------
+    value : float
+        The evidence, summed over outputs.
+    noise : ndarray of shape (o,)
+    """
+    best, value = least.copy(), np.full(len(least), -np.inf)
+    reach = np.log10(np.max(highest / least, initial=1.0))
+    for exponents in (np.append(np.arange(0.0, reach), reach), np.arange(-0.75, 1.0, 0.25)):
+        centre = best.copy()
+        for exponent in exponents:
+            noise = np.clip(centre * 10.0**exponent, least, np.maximum(least, highest))
+            found = evidence(noise)
+            if shared:
+                found = np.full(len(found), found.mean())
+            higher = found > value
+            best[higher], value[higher] = noise[higher], found[higher]
+        if (best == least).all():
+            break
+    return float(value.sum()), best
 
 
 def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:

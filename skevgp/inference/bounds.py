@@ -150,7 +150,7 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
     if not groups[0].prior.shared:
         return [[optimal_posterior(group, o) for o in range(len(group.noise))] for group in groups]
     p = groups[0].prior.scale.shape[1]
-    each, S, g_w = [], np.eye(p), -groups[0].prior.reference[0]
+    each, S, sizes, g_w = [], np.eye(p), np.ones(p), -groups[0].prior.reference[0]
     for group in groups:
         m = len(group.statistics.VV)
         for o, noise in enumerate(group.noise):
@@ -162,9 +162,11 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             D_root_inv = triangular_inverse(D_root)
             A, z = D_root_inv @ PP[:m, m:], D_root_inv @ g[:m]
             S += PP[m:, m:] - A.T @ A
+            sizes += diagonal_of(PP)[m:]
             g_w += g[m:] - A.T @ z
             each.append((PP, D_root, D_root_inv, A, z))
-    S_root = jittered_cholesky(S)
+    S_root = jittered_cholesky(S, sizes=sizes)
+    S = S_root @ S_root.T
     S_root_inv = triangular_inverse(S_root)
     w = S_root_inv.T @ (S_root_inv @ g_w)
     found = []
@@ -342,50 +344,30 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     return total + 0.5 * log_det
 
 
-def features_alone(sums: LinearSums, prior: CoefficientPrior, highest: np.ndarray) -> tuple[float, np.ndarray]:
-    """The bound without a Gaussian process, all that the features leave over being noise; and how much that is.
-
-    As many features as rows leave nothing over, and the evidence is still the greatest with some noise (Rasmussen &
-    Williams 2006, eq. 2.30 for a linear model). From what they leave over at least the noise is made three times
-    larger, and again, while that raises the bound.
+def bounds_alone(sums: LinearSums, prior: CoefficientPrior, noise: np.ndarray, trace: np.ndarray) -> np.ndarray:
+    """The bound (o,) of each output with q(f) at its prior, all that the features leave over being noise.
 
     Parameters
     ----------
     sums : LinearSums
     prior : CoefficientPrior
-    highest : ndarray of shape (o,)
-        Noise variances above these are not tried.
+    noise : ndarray of shape (o,)
+        Its variance.
+    trace : ndarray of shape (o,)
+        Σ ω k(x, x).
 
     Returns
     -------
-    bound : float
-        In nats, summed over outputs.
-    noise : ndarray of shape (o,)
+    bounds : ndarray of shape (o,)
+        In nats; where outputs share their weights, these are counted with the first.
     """
-    o, p = prior.scale.shape
-    each = [sums.of(slice(index, index + 1)) for index in range(o)]
+    p, groups = prior.scale.shape[1], []
     VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
-
-    def bound(outputs: Sequence[int], noise: np.ndarray) -> float:
-        groups = []
-        for index, variance in zip(outputs, noise, strict=True):
-            output, own = slice(index, index + 1), each[index]
-            sums = VV, VH, VR, own.HH, own.HR, own.RR
-            statistics = SufficientStatistics(own.n_rows, *sums, 0.0, own.log_variance, own.surplus)
-            own_prior, whitening = prior.outputs(output), Whitening(None, VV, VV)
-            groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), own_prior))
-        return sum(found.value(found.residuals()) for found in bounds_at_optimum(groups, "full"))
-
-    # Targets may be explained to the last digit.
-    least = np.array([max(float(own.RR[0]) / own.n_rows, 1e-20) for own in each])
-    total, best = 0.0, least.copy()
-    for outputs in [list(range(o))] if prior.shared else [[index] for index in range(o)]:
-        own = least[outputs]
-        noise, value = own, bound(outputs, own)
-        while (noise < highest[outputs]).any():
-            more = np.minimum(3.0 * noise, np.maximum(highest[outputs], own))
-            if (raised := bound(outputs, more)) <= value:
-                break
-            noise, value = more, raised
-        best[outputs], total = noise, total + value
-    return total, best
+    for index, (variance, left) in enumerate(zip(noise, trace, strict=True)):
+        output = slice(index, index + 1)
+        own = sums.of(output)
+        products = VV, VH, VR, own.HH, own.HR, own.RR
+        statistics = SufficientStatistics(own.n_rows, *products, float(left), own.log_variance, own.surplus)
+        whitening = Whitening(None, VV, VV)
+        groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), prior.outputs(output)))
+    return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full")])

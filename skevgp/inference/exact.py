@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
 from ..optimizers.parameters import Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI
@@ -189,10 +189,23 @@ class ExactModel:
             OutputGivenKernel.join(together)
         return covariances, outputs
 
+    def log_likelihoods(self, values: Values) -> np.ndarray:
+        """Of each output, (o,), with what its rows' counts add; -inf where it cannot be computed.
+
+        Shared weights are counted with the first.
+        """
+        try:
+            return np.array([output.log_likelihood for output in self.outputs(values)[1]]) + self._of_copies(values)
+        except NotPositiveDefiniteError:
+            return np.full(len(self.vague), -np.inf)
+
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
         """Summed over outputs, and its gradient in the logarithms of the values."""
         covariances, outputs = self.outputs(values)
-        total, gradient = self.of_copies(values), {name: np.zeros_like(value) for name, value in values.items()}
+        total, gradient = (
+            float(self._of_copies(values).sum()),
+            {name: np.zeros_like(value) for name, value in values.items()},
+        )
         K_bars = np.zeros((len(covariances), *outputs[0].L.shape))
         for index, output in enumerate(outputs):
             total += output.log_likelihood
@@ -208,13 +221,13 @@ class ExactModel:
         """Σ (w - 1)."""
         return self.rows.total - len(self.rows.inputs)
 
-    def of_copies(self, values: Values) -> float:
+    def _of_copies(self, values: Values) -> np.ndarray:
         """What rows that count w times add to the log likelihood of rows with the noise variance σ² v / w."""
         w, noise = self.rows.counts, values["noise"]
         if w is None or self.rows.precision is None:
-            return 0.0
+            return np.zeros(len(noise))
         constant = float((w - 1.0) @ (LOG_2PI + np.log(w / self.rows.precision)) + np.log(w).sum())
-        return -0.5 * (len(noise) * constant + self.n_copies * float(np.log(noise).sum()))
+        return -0.5 * (constant + self.n_copies * np.log(noise))
 
     def predictor(self, values: Values) -> Predictor:
         """In internal units; the rows are its inducing points."""

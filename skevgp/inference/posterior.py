@@ -337,7 +337,9 @@ def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndar
     """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
     m = len(L_inv)
     precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
-    return -np.log(precision), -np.log(np.diagonal(B)[m:])
+    # B is no less than I, whatever rounding says.
+    precision = np.maximum(precision, np.einsum("ji,ji->i", L_inv, L_inv))
+    return -np.log(precision), -np.log(np.maximum(np.diagonal(B)[m:], 1.0))
 
 
 def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
@@ -358,7 +360,8 @@ def diagonal_gap(
     """
     L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
     precision = L_inv.T @ B[:m, :m] @ L_inv
-    f_diagonal, coef_diagonal = np.diagonal(precision), np.diagonal(B)[m:]
+    f_diagonal = np.maximum(np.diagonal(precision), np.einsum("ji,ji->i", L_inv, L_inv))
+    coef_diagonal = np.maximum(np.diagonal(B)[m:], 1.0)
     gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
     B_bar = log_det_bar.copy()
     weighted = L_inv / f_diagonal

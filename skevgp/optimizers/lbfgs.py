@@ -85,8 +85,10 @@ class _Guarded:
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
         x = z * self.unit
         try:
-            loss, gradient = self._objective(x)
-            gradient = gradient * self.unit
+            # What overflows is far off, and told from what does not by its loss.
+            with np.errstate(over="ignore", invalid="ignore"):
+                loss, gradient = self._objective(x)
+                gradient = gradient * self.unit
         except NotPositiveDefiniteError:
             loss, gradient = np.nan, np.full_like(x, np.nan)
         far = _FAR * (1.0 + abs(self.loss))

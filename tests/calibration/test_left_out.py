@@ -189,3 +189,17 @@ def test_a_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
         error, variance = refitted(model, values, rows, [0], [1.0], [noise], np.isin(np.arange(200), fold))
         expected += np.sum(error**2 / variance)
     np.testing.assert_allclose(total, expected, rtol=1e-5)
+
+
+def test_without_a_signal_directions_that_rounding_lost_tell_nothing():
+    """0/0 of D⁻¹: what points that follow from each other have to say."""
+    model, rows, table = problem(n=20, m=6)
+    values = table.values_at_start()
+    (group, *_) = left_out(model, values, rows, parts(20, 2))
+    own = group[0]
+    found, spread = own.predicted(0, 0.0, 0.3)
+    own._eigenvalues[:2], own._at_zero[:2] = 0.0, 0.0
+    own._last.clear()
+    again, variance = own.predicted(0, 0.0, 0.3)
+    np.testing.assert_allclose(again, found, rtol=1e-12)
+    np.testing.assert_allclose(variance, spread, rtol=1e-12)

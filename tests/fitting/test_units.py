@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skevgp.fitting.units import features_alone, unit_of
+from skevgp.fitting.units import features_alone, likeliest_noise, may_hide_noise, unit_of
 from skevgp.inference.posterior import CoefficientPrior
 from skevgp.rows.source import LocalSource
 
@@ -54,3 +54,45 @@ def test_units_survive_extreme_scales():
 
 def test_the_unit_is_not_below_the_rounding_of_the_target():
     assert unit_of(np.full(1, 1e-20), np.full(1, 1e5))[0] == pytest.approx(1e-9)
+
+
+def test_features_may_hide_the_noise_where_they_are_many_or_weights_far_from_their_prior():
+    def prior(p, reference):
+        return CoefficientPrior(np.zeros((1, p)), np.ones((1, p)), np.full((1, p), reference))
+
+    assert not may_hide_noise(prior(4, 1.0), 9)
+    assert may_hide_noise(prior(5, 1.0), 9)
+    assert may_hide_noise(prior(1, 4.0), 9)
+    assert not may_hide_noise(prior(0, 0.0), 9)
+
+
+def evidence_of(asked, peaks, plateau=0.0):
+    """Of two outputs, highest at their peaks; flat below, but for rounding."""
+
+    def evidence(noise):
+        asked.append(noise)
+        return np.where(noise < 1e-3 * peaks, plateau + 1e-12 * np.sin(noise), -(np.log10(noise / peaks) ** 2))
+
+    return evidence
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_the_likeliest_noise_is_found_beyond_where_the_evidence_is_flat(shared):
+    peaks, asked = np.array([3e-2, 3e-2 if shared else 5.0]), []
+    least, highest = np.full(2, 1e-14), np.full(2, 1e2)
+    value, noise = likeliest_noise(evidence_of(asked, peaks, -20.0), least, highest, shared)
+    # To an eighth of a decade.
+    assert (np.abs(np.log10(noise / peaks)) < 0.126).all()
+    assert value > -2 * 0.126**2
+    assert all(((tried >= least) & (tried <= highest)).all() for tried in asked)
+    assert len(asked) < 30
+
+
+def test_where_the_least_noise_is_the_likeliest_or_the_only_one_it_is_that():
+    peaks, least, asked = np.array([1e-2, 1e-3]), np.array([1e-2, 1e-3]), []
+    value, noise = likeliest_noise(evidence_of(asked, peaks), least, np.full(2, 1e2), False)
+    np.testing.assert_array_equal(noise, least)
+    assert value == pytest.approx(0.0, abs=1e-9)
+    asked.clear()
+    np.testing.assert_array_equal(likeliest_noise(evidence_of(asked, 1e3 * peaks), least, least, False)[1], least)
+    assert len(asked) == 1

@@ -7,9 +7,10 @@ import numpy as np
 import pytest
 
 from skevgp.inference.model import SparseModel
-from skevgp.inference.posterior import CoefficientPrior, Predictor
+from skevgp.inference.posterior import CoefficientPrior, Predictor, diagonal_gap, log_variances
 from skevgp.inference.statistics import Whitening
 from skevgp.kernels.dot_product import DotProduct
+from skevgp.kernels.stationary import SquaredExponential
 
 from ..oracle import problem, squared_exponential
 
@@ -282,3 +283,16 @@ def test_outputs_and_units_of_a_prior():
         scaled.roots() @ scaled.roots().transpose(0, 2, 1),
         ROOT @ ROOT.transpose(0, 2, 1) * np.array([100.0, 0.01])[:, np.newaxis, np.newaxis],
     )
+
+
+def test_a_precision_that_rounding_made_negative_counts_as_that_of_the_prior():
+    """q of independent values: B is no less than I."""
+    own = Whitening.of(SquaredExponential(1), np.ones(1), np.linspace(0, 1e-4, 4)[:, np.newaxis])
+    B = np.diag([1.0, -3.0, 2.0, 1.0, -5.0])
+    log_f, log_w = log_variances(B, own.L_inv)
+    assert (-log_f >= np.log((own.L_inv**2).sum(axis=0)) - 1e-9).all()
+    np.testing.assert_array_equal(log_w, [0.0])
+    gap, B_bar, L_bar = diagonal_gap(B, 0.0, np.zeros((5, 5)), own)
+    assert np.isfinite(gap)
+    assert np.isfinite(B_bar).all()
+    assert np.isfinite(L_bar).all()

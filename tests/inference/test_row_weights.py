@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skevgp._linalg import Jitter
-from skevgp.inference.bounds import bounds_at_optimum, features_alone, upper_bound
+from skevgp.inference.bounds import bounds_alone, bounds_at_optimum, upper_bound
 from skevgp.inference.exact import ExactModel
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective, ElboObjective, evaluate
@@ -89,7 +89,7 @@ def test_a_row_that_counts_twice_is_there_twice(family):
         blocks = blocks_of(raw, model.kernel)
         value, gradient = BoundObjective(model, table, blocks)(table.start())
         (group,) = model.groups_on(table.values_at_start(), blocks)
-        alone, _ = features_alone(blocks.linear, model.prior, np.full(model.prior.scale.shape[0], 1e2))
+        (alone,) = bounds_alone(blocks.linear, model.prior, np.array([0.2]), np.zeros(1))
         results.append([value, alone, upper_bound([group], blocks), *gradient])
     np.testing.assert_allclose(*results, rtol=1e-9)
 

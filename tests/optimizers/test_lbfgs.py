@@ -41,7 +41,7 @@ def test_lbfgs_with_no_iterations_keeps_the_start():
     assert minimum.loss == rosenbrock(minimum.x)[0]
 
 
-@pytest.mark.parametrize("failure", ["raise", "nan", "infinite gradient"])
+@pytest.mark.parametrize("failure", ["raise", "overflow", "nan", "infinite gradient"])
 def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
     """A logarithmic barrier whose line searches step over the wall."""
     pull, outside = np.array([10.0, -30.0]), []
@@ -51,6 +51,8 @@ def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
             outside.append(x)
             if failure == "raise":
                 raise NotPositiveDefiniteError("far out")
+            if failure == "overflow":
+                return float(np.full(2, 1e200) @ np.full(2, 1e200)), np.full(2, 1e200) ** 2
             return (np.nan, np.zeros(2)) if failure == "nan" else (-1e9, np.full(2, np.inf))
         return -np.log(1.0 - x**2).sum() - pull @ x, 2.0 * x / (1.0 - x**2) - pull
 
