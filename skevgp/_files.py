@@ -6,7 +6,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
@@ -18,7 +18,12 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     Whoever reads at the same time sees the old one or the new one; of several who write, one is the last.
     """
     target = Path(os.path.realpath(path))
-    beside = target.with_name(f".{target.name[:200]}.{secrets.token_hex(4)}.tmp")
+    if target.exists() and not target.is_file():
+        # A pipe or a device stays what it is.
+        with open(path, "wb") as file:
+            yield file
+        return
+    beside = target.with_name(f".{secrets.token_hex(8)}.tmp")
     try:
         with open(beside, "xb+") as file:
             yield file
@@ -33,4 +38,5 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
         # The user knows of one file.
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
-        beside.unlink(missing_ok=True)
+        with suppress(OSError):
+            beside.unlink(missing_ok=True)

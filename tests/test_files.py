@@ -1,6 +1,7 @@
 """Files that are written whole or not at all: where the disk is full, and where there is no file to write."""
 
 import os
+from threading import Thread
 
 import numpy as np
 import pytest
@@ -53,6 +54,27 @@ def test_a_folder_that_is_not_there_is_told_by_the_path_that_was_given(model, tm
     path = tmp_path / "none" / "model.skevgp"
     with pytest.raises(FileNotFoundError, match=rf"No such file or directory: '{path}'$"):
         save(model, path)
+
+
+def test_a_pipe_stays_one(tmp_path):
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    read = []
+    reader = Thread(target=lambda: read.append(path.read_bytes()))
+    reader.start()
+    with replacing(path) as file:
+        file.write(b"through it")
+    reader.join()
+    assert read == [b"through it"]
+    assert path.is_fifo()
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_names_of_long_letters_are_names(tmp_path):
+    path = tmp_path / ("漢" * 84)
+    with replacing(path) as file:
+        file.write(b"x")
+    assert path.read_bytes() == b"x"
 
 
 def test_long_names_are_names(tmp_path):

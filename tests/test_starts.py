@@ -317,6 +317,20 @@ def test_a_warm_start_that_leads_nowhere_is_left():
     assert warm.lower_bound_ > cold.lower_bound_ - 0.02 * abs(cold.lower_bound_)
 
 
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_points_that_went_far_do_not_end_a_warm_start():
+    """Of a polynomial some lie many ranges away; of the same rows a fit goes on where it was."""
+    rng = np.random.RandomState(3)
+    X = rng.uniform(-3, 3, (120, 2))
+    y = X[:, 0] ** 3 + 2 * X[:, 1] ** 2 + 1e-3 * rng.randn(120)
+    m = EVGPRegressor(warm_start=True, max_iter=40, random_state=0, noise_cv=None).fit(X, y)
+    points, first = m.inducing_points_, m.lower_bound_
+    assert (np.abs(points) > 9.0).any()
+    m.fit(X, y)
+    assert m.lower_bound_ >= first - 1e-6 * abs(first)
+    assert np.abs(m.inducing_points_ - points).max() < np.abs(points).max()
+
+
 def test_given_points_win_over_those_of_a_warm_start():
     m = model(warm_start=True, max_iter=0, inducing_init=X[:5]).fit(X, Y)
     m.set_params(inducing_init=X[5:10]).fit(X, Y)

@@ -353,7 +353,7 @@ def fit_exact(
     )
     if options.optimizer is not None:
         # It is the user's when to go where.
-        table = table.widened()
+        table = table.widened({own.name for own in table.parameters})
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor, units))

@@ -151,7 +151,7 @@ class SparseTask:
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
         trace = little * variance * total * self.rows.mean_precision
         least = np.maximum((self._squares + trace) / total, _LEAST_NOISE)
-        highest = self.table["noise"].value_limits()[:, 1] if may_hide_noise(prior, sums.length) else least
+        highest = self.table["noise"].value_limits()[:, 1]
         return likeliest_noise(lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared)
 
     @property
@@ -163,7 +163,8 @@ class SparseTask:
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
         rules, anew = self.solver.rules, self.placement.anew
-        alone, noise_alone = self._least_gain()
+        hidden = may_hide_noise(self.model.prior, self.blocks.linear.length)
+        alone, noise_alone = self._least_gain() if hidden else (self.alone, None)
         return Strategy(
             rules,
             self.table,

@@ -133,7 +133,7 @@ def starting_table(
     mean_variance: float = 1.0,
     precision: float = 1.0,
     n_kernels: int | None = None,
-    target_scatter: np.ndarray | float = 0.0,
+    target_scatter: np.ndarray | None = None,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -159,7 +159,7 @@ def starting_table(
         The mean of 1 / v over rows with noise variances σ² v.
     n_kernels : int, default=None
         How many sets of hyperparameters there are, if each group of outputs has its own.
-    target_scatter : ndarray of shape (o,), default=0.0
+    target_scatter : ndarray of shape (o,), optional
         Variance of the targets, in squared target units: so high may the noise become where the features explain all.
 
     Returns
@@ -201,7 +201,7 @@ def starting_table(
                 np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
                 highest,
                 target_unit**2,
-                np.maximum(highest, target_scatter * precision),
+                None if target_scatter is None else np.maximum(highest, target_scatter * precision),
             ),
             Parameter(
                 "inducing_points",

@@ -9,7 +9,7 @@ prevents, and the test that fails without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Protocol
 
 import numpy as np
@@ -39,6 +39,8 @@ class Fit:
         If q is not at its optimum for the values.
     n_rows : int, optional
         Of the sample that it is a fit to; None means all rows.
+    widened : tuple of str
+        Parameters that had their widest limits.
     """
 
     values: Values
@@ -48,6 +50,7 @@ class Fit:
     message: str = ""
     predictor: Predictor | None = None
     n_rows: int | None = None
+    widened: tuple[str, ...] = ()
 
     @property
     def n_iter(self) -> int:
@@ -189,7 +192,7 @@ class Strategy:
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
-        if best.n_iter < self.max_iter and self.table.holds(best.values):
+        if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))
         return best
 
@@ -310,11 +313,12 @@ def search(task: Task) -> Fit:
         If there is none yet.
     """
     best: Fit | None = None
-    attempts = task.strategy.attempts()
+    strategy = task.strategy
+    attempts = strategy.attempts()
     with task.monitor.keeping_the_best(patient=True):
         attempt: Attempt | None = next(attempts)
         while attempt is not None:
-            fit = task.minimise(attempt)
+            fit = replace(task.minimise(attempt), widened=strategy.table.held(attempt.values))
             best = better(best, fit)
             attempt = None if task.monitor.stopped else _after(attempts, fit)
     if best is None:

@@ -184,14 +184,14 @@ class Units:
         The size of what the features alone leave over.
     prior : CoefficientPrior
         In the user's units.
-    target_scatter : ndarray of shape (o,)
-        The targets' variance, in squared target units.
+    target_scatter : ndarray of shape (o,), optional
+        The targets' variance, in squared target units; not known of a model from a file.
     """
 
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
-    target_scatter: np.ndarray
+    target_scatter: np.ndarray | None = None
 
     @classmethod
     def of(

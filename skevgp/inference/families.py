@@ -155,7 +155,8 @@ def _add_covariance(
         Tr(S) - log|S|.
     """
     m, s = len(group.whitening.L), np.sqrt(group.signal[o])
-    terms.value += 0.5 * (float(rows.sum()) + penalty)
+    # The trace of a product of two covariances, whatever rounding says.
+    terms.value += 0.5 * (max(float(rows.sum()), 0.0) + penalty)
     terms.VV += (0.5 * group.signal[o] / group.noise[o]) * S_v[:, :m]
     terms.VH += (s / group.noise[o]) * S_v[:, m:] * group.prior.scale[o]
     terms.log_signal[o] = 0.5 * rows[:m].sum()

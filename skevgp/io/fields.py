@@ -76,7 +76,7 @@ def array(axes: str, kinds: str = "f", *, least: float = -np.inf, above: float =
         if value.dtype.kind != "f":
             return True
         good = np.isfinite(value).all() if finite else not np.isnan(value).any() or least == above == -np.inf
-        return bool(good and (value >= least).all() and ((value > above).all() or above == -np.inf))
+        return bool(good and not (value < least).any() and ((value > above).all() or above == -np.inf))
 
     return Field(told + (", all finite" if finite and "f" in kinds else ""), holds)
 

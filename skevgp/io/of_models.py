@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from typing import Any
 
@@ -122,16 +123,21 @@ _FITS = [
         shared=flag,
     ),
     plain(Units, target_mean=array("o"), target_unit=array("o", above=0.0), prior=_PRIOR),
-    plain(
-        Parameter,
-        name=text,
-        start=array("..."),
-        transform=one_of("identity", "log"),
-        lower=_LIMIT,
-        upper=_LIMIT,
-        unit=_LIMIT,
-        origin=_LIMIT,
-        fixed=flag | array("...", "b"),
+    replace(
+        plain(
+            Parameter,
+            name=text,
+            start=array("..."),
+            transform=one_of("identity", "log"),
+            lower=_LIMIT,
+            upper=_LIMIT,
+            unit=_LIMIT,
+            origin=_LIMIT,
+            fixed=flag | array("...", "b"),
+            widest=_LIMIT | nothing,
+        ),
+        # There was none before 0.2.
+        may_lack=frozenset({"widest"}),
     ),
     _TABLE,
     plain(Jitter, size=real(least=0.0), well_conditioned=real(least=0.0)),
@@ -301,7 +307,8 @@ _OF_SPARSE = {
     "inducing_points_": array("m d") | array("o m d") | _LISTS,
     "sharing_": several(several(integer(0))),
     "n_parameters_": integer(0),
-    "weights_": array("n", least=0.0) | array("n o", least=0.0),
+    # NaN where a row does not count.
+    "weights_": array("n", finite=False) | array("n o", finite=False),
 }
 
 _ESTIMATORS = [

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -108,7 +108,7 @@ class ParameterTable:
 
         Upper limits where these start become the widest.
         """
-        table = self.widened() if self.holds(values) else self
+        table = self.widened(self.held(values))
         return ParameterTable(
             [
                 replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
@@ -118,19 +118,23 @@ class ParameterTable:
             ]
         )
 
-    def holds(self, values: Values) -> bool:
-        """Whether free ones of the values are at an upper limit that is not the widest, or above."""
-        return any(
-            own.widest is not None
+    def held(self, values: Values) -> tuple[str, ...]:
+        """Parameters of which free values are at an upper limit that is not the widest, or above."""
+        return tuple(
+            own.name
+            for own in self.parameters
+            if own.widest is not None
             and _shape(values, own.name) == own.start.shape
             and (np.ravel(values[own.name] >= (1.0 - _AT_LIMIT) * own.upper) & own.free).any()
-            for own in self.parameters
         )
 
-    def widened(self) -> ParameterTable:
-        """The same table with the widest limits."""
+    def widened(self, names: Iterable[str]) -> ParameterTable:
+        """The same table with the widest limits of some parameters."""
         return ParameterTable(
-            [own if own.widest is None else replace(own, upper=own.widest, widest=None) for own in self.parameters]
+            [
+                replace(own, upper=own.widest, widest=None) if own.widest is not None and own.name in names else own
+                for own in self.parameters
+            ]
         )
 
     def with_start(self, name: str, start: np.ndarray) -> ParameterTable:

@@ -160,7 +160,7 @@ def _table(
         variance,
         rows.mean_precision,
         n_kernels,
-        request.units.target_scatter[outputs],
+        None if request.units.target_scatter is None else request.units.target_scatter[outputs],
     )
 
 

@@ -64,13 +64,24 @@ def test_the_strategy_knows_what_the_features_alone_explain():
     """And a fit that ended below that is tried from elsewhere."""
     task = task_of()
     own = task.strategy
-    sums, noise, none = task.blocks.linear, own.noise_alone, np.zeros(len(own.noise_alone))
-    # The signal can be 1e-8 of the unit.
-    np.testing.assert_allclose(own.alone, bounds_alone(sums, task.model.prior, noise, none).sum(), rtol=1e-6)
-    np.testing.assert_allclose(own.alone, task.alone, rtol=1e-6)
+    r = task.rows.some(np.arange(len(task.rows))).targets
+    alone = bounds_alone(task.blocks.linear, task.model.prior, np.mean(r**2, axis=0), np.zeros(r.shape[1])).sum()
+    assert own.alone == task.alone == pytest.approx(alone, rel=1e-10)
+    assert own.noise_alone is None
     values = task.table.values_at_start()
     assert own.collapsed(Fit(values, own.alone - 1.0))
     assert not own.collapsed(Fit(values, own.alone + 1.0))
+
+
+def test_where_features_may_hide_the_noise_it_is_known_which_suits_them(monkeypatch):
+    """With the signal at its lower limit, 1e-8 of the unit."""
+    monkeypatch.setattr("skevgp.fitting.sparse.may_hide_noise", lambda prior, n_rows: True)
+    task = task_of()
+    own = task.strategy
+    trace = np.full(len(own.noise_alone), 1e-8 * len(task.rows))
+    alone = bounds_alone(task.blocks.linear, task.model.prior, own.noise_alone, trace).sum()
+    assert own.alone == pytest.approx(alone, rel=1e-9)
+    assert own.alone >= task.alone - 1e-6 * abs(task.alone)
 
 
 @pytest.mark.parametrize(("n_inducing", "interpolates"), [(N - 1, False), (N, True), (2 * N, True)])

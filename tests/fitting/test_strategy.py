@@ -103,6 +103,13 @@ def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
     assert len(drive(strategy(table=wide), (5.0, inside))[0]) == 1
 
 
+def test_a_fit_that_had_the_widest_limit_does_not_go_on_for_being_above_the_other():
+    wide = table(widest_signal=1e5)
+    warm = wide.values_at_start() | {"signal": np.array([2e3, 1.0])}
+    own = strategy(table=wide, warm=warm)
+    assert len(drive(own, (5.0, {"signal": [3e3, 1.0], "n_iter": 50}))[0]) == 1
+
+
 def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
     below = strategy(alone=6.0)
     assert len(drive(below, (5.0, GOOD), (8.0, GOOD))[0]) == 2

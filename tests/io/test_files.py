@@ -370,6 +370,44 @@ def test_a_model_that_predicts_something_else_is_refused(path):
         load(path)
 
 
+def test_a_std_that_is_rounding_may_be_rounded_otherwise(path):
+    """Where there is no noise, it is one thousandth of a thousandth of what y is; the mean counts."""
+    rows = np.linspace(-1.0, 1.0, 30)[:, np.newaxis]
+    model = EGPRegressor().fit(rows, 1e3 * rows[:, 0] ** 3)
+    save(model, path)
+    members = dict(members_of(path.read_bytes()))
+    _, std = model.predict(rows[:4], return_std=True)
+    assert std.max() < 1e-3
+    numbers = [
+        name for name in members if name != "model.json" and np.array_equal(np.frombuffer(members[name][128:]), std)
+    ]
+    assert numbers
+    for name in numbers:
+        members[name] = members[name][:128] + (2.0 * std).tobytes()
+    path.write_bytes(zipped(members.items()))
+    np.testing.assert_array_equal(load(path).predict(rows), model.predict(rows))
+
+
+def test_weights_of_rows_that_do_not_count_are_kept(path):
+    rows = np.random.RandomState(0).randn(30, 2)
+    model = EVGPRegressor(n_inducing=5, noise="student-t", max_iter=5, tol=1e6)
+    model.fit(rows, rows[:, 0], sample_weight=np.r_[0.0, np.ones(29)])
+    save(model, path)
+    assert np.isnan(model.weights_[0])
+    np.testing.assert_array_equal(load(path).weights_, model.weights_)
+
+
+def test_limits_of_the_kernel_are_those_of_the_fit(path):
+    """The widest of them too."""
+    rows = np.random.RandomState(0).uniform(-2, 2, (40, 1))
+    model = EVGPRegressor(n_inducing=10, random_state=0).fit(rows, rows[:, 0] ** 3)
+    save(model, path)
+    again = load(path)
+    np.testing.assert_array_equal(again.kernel_.bounds, model.kernel_.bounds)
+    table, own = (one._fitted.learned[0].table for one in (again, model))
+    np.testing.assert_array_equal(table["signal"].value_limits(), own["signal"].value_limits())
+
+
 def _is_mean(content):
     values = np.frombuffer(content[128:])
     mean = fitted("plain")._predictor.groups[0].mean

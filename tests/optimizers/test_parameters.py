@@ -71,7 +71,18 @@ def test_a_start_at_an_upper_limit_or_above_has_the_widest(signal, upper):
 
 def test_what_is_fixed_is_held_by_no_limit():
     fixed = ParameterTable([Parameter("signal", np.ones(1), "log", 1e-3, 10.0, widest=1e3, fixed=True)])
-    assert not fixed.holds({"signal": np.array([10.0])})
+    assert not fixed.held({"signal": np.array([10.0])})
+
+
+def test_only_what_is_held_gets_its_widest_limit():
+    two = ParameterTable(
+        [Parameter(name, np.ones(1), "log", 1e-3, 10.0, widest=1e3) for name in ("signal", "noise")]
+        + [Parameter("length", np.ones(1), "log", 1e-3, 10.0)]
+    )
+    values = {"signal": np.array([10.0]), "noise": np.array([2.0]), "length": np.array([10.0])}
+    assert two.held(values) == ("signal",)
+    np.testing.assert_allclose(two.started_at(values).limits()[1], np.log([1e3, 10.0, 10.0]))
+    np.testing.assert_allclose(two.widened(["noise"]).limits()[1], np.log([10.0, 1e3, 10.0]))
 
 
 def test_a_table_where_all_is_fixed_has_no_coordinates():
