@@ -213,7 +213,7 @@ class Adam(StatefulEstimator):
 
     default_max_iter: ClassVar[int] = 16_000
     # Its steps do not grow with the gradient: the noise starts nearer to the data's scatter, and points stay.
-    rules: ClassVar[Rules] = Rules(first_noise=1e-2, widest_signal=None)
+    rules: ClassVar[Rules] = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 
     def __init__(
         self,

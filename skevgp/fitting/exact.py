@@ -103,9 +103,9 @@ class ExactTask:
             return -np.inf, None
         values = self.table.values_at_start()
         values["signal"] = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
-        highest = noise.value_limits()[:, 1]
+        least, highest = noise.value_limits().T
         return likeliest_noise(
-            lambda noise: self.model.log_likelihoods(values | {"noise": noise}), self.scatter, highest, prior.shared
+            lambda noise: self.model.log_likelihoods(values | {"noise": noise}), least, highest, prior.shared
         )
 
     def minimise(self, attempt: Attempt) -> Fit:

@@ -41,6 +41,8 @@ class Rules:
         An output counts as not learned when noise comes to explain this share of what the features leave over.
     other_starts : tuple of (float, float)
         Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
+    last_start : bool
+        Whether a fit that has ended below the features alone starts at last from the noise that suits these.
     much_noise : float, optional
         A start from a noise so many times higher comes after the first, where it costs little: on a sample of the rows,
         or with as many inducing points as rows. The kernel may then explain every row by itself, and a low noise lead
@@ -68,6 +70,7 @@ class Rules:
     jitter: Jitter = JITTER
     collapsed: float = 0.9
     other_starts: tuple[tuple[float, float], ...] = ()
+    last_start: bool = True
     much_noise: float | None = None
     stage: int | None = None
     sample: tuple[int, int] | None = None

@@ -142,16 +142,17 @@ class SparseTask:
         sums = self.blocks.linear
         return np.array([float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(self.model.prior.scale))])
 
-    def _least_gain(self) -> tuple[float, np.ndarray]:
+    def _with_little_signal(self) -> tuple[float, np.ndarray]:
         """The bound with as little signal as there may be, and the noise variances (o,) for which it is the highest."""
-        prior, sums, total = self.model.prior, self.blocks.linear, self.rows.total
+        prior, sums = self.model.prior, self.blocks.linear
         values, signal = self.table.values_at_start(), self.table["signal"]
         points, (kernel, hyperparameters) = values["inducing_points"][0], self.model.kernel_of(values, 0)
         variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
-        trace = little * variance * total * self.rows.mean_precision
-        least = np.maximum((self._squares + trace) / total, _LEAST_NOISE)
-        highest = self.table["noise"].value_limits()[:, 1]
+        trace = little * variance * self.rows.total * self.rows.mean_precision
+        least = highest = np.maximum((self._squares + trace) / self.rows.total, _LEAST_NOISE)
+        if may_hide_noise(prior, sums.length):
+            least, highest = self.table["noise"].value_limits().T
         return likeliest_noise(lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared)
 
     @property
@@ -163,8 +164,7 @@ class SparseTask:
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
         rules, anew = self.solver.rules, self.placement.anew
-        hidden = may_hide_noise(self.model.prior, self.blocks.linear.length)
-        alone, noise_alone = self._least_gain() if hidden else (self.alone, None)
+        alone, noise_alone = self._with_little_signal()
         return Strategy(
             rules,
             self.table,

@@ -188,7 +188,8 @@ class Strategy:
         One below the features alone is left for a fit from the noise that suits these.
         """
         best = yield from attempts
-        if self.noise_alone is not None and self.max_iter > 0 and self.table["noise"].free.any() and self._below(best):
+        may_start = self.max_iter > 0 and self.table["noise"].free.any() and self.rules.last_start
+        if self.noise_alone is not None and may_start and self._below(best):
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))

@@ -123,6 +123,8 @@ def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
     np.testing.assert_array_equal(made[3].values["noise"], noise)
     np.testing.assert_array_equal(made[3].values["hyperparameters"], made[0].values["hyperparameters"])
     assert best.bound == 6.5
+    plain = strategy(alone=6.0, noise_alone=noise, rules=replace(RULES, last_start=False))
+    assert len(drive(plain, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD))[0]) == 3
     # What is not below them has nothing to gain there.
     assert len(drive(own, (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
 
