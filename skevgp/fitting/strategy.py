@@ -100,6 +100,9 @@ class Attempt:
         return [] if self.after is None else self.after.loss_curve
 
 
+# Of the noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
+_LITTLE = 1e-4
+
 # Yields starts, is sent how the fit from each ended, and returns the best of these.
 Attempts = Generator[Attempt, Fit, Fit]
 
@@ -191,7 +194,7 @@ class Strategy:
         may_start = self.max_iter > 0 and self.table["noise"].free.any() and self.rules.last_start
         if self.noise_alone is not None and may_start and self._below(best):
             first = self.table.values_at_start()
-            little = np.minimum(first["signal"], self.noise_alone)
+            little = np.minimum(first["signal"], _LITTLE * self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))
