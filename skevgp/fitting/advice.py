@@ -130,7 +130,7 @@ def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str
     n = len(each.inputs)
     K = np.abs(kernel.at(np.log(hyperparameters), np.vstack([each.inputs, other.inputs])).matrix())
     variance = np.diagonal(K)
-    correlated = np.diagonal(K[:n, n:]) >= _WHITE * np.sqrt(variance[:n] * variance[n:])
+    correlated = np.diagonal(K[:n, n:]) >= _WHITE * np.sqrt(variance[:n]) * np.sqrt(variance[n:])
     if correlated.mean() > _WHITE_SHARE or not alike_neighbours(rows).any():
         return ""
     return (

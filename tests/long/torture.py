@@ -56,6 +56,9 @@ def run_case(case):
         except Exception as error:
             outcome = _refusal(case, error)
     for each in told:
+        # StandardScaler's weighted variance of a constant column may be rounded below 0.
+        if "sklearn" in each.filename and "in sqrt" in str(each.message):
+            continue
         if not issubclass(each.category, KNOWN) and not any(words in str(each.message) for words in KNOWN_WORDS):
             raise DefectError(f"warned {each.category.__name__}: {each.message} ({each.filename}:{each.lineno})")
     return outcome
