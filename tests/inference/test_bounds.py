@@ -185,6 +185,20 @@ def test_outputs_that_share_their_weights_have_one_evidence():
     assert bounds.sum() == pytest.approx(expected, rel=1e-10)
 
 
+def test_weights_that_outputs_share_are_known_where_rounding_hides_what_the_points_leave_of_them():
+    """The feature lies in the span of the points, with 1e16 times the noise: I + Σ(F - EᵀD⁻¹E) is not positive."""
+    model, rows, table = problem(p=1)
+    values = table.values_at_start() | {"noise": np.full(2, 1e-16)}
+    prior = CoefficientPrior(np.zeros((2, 1)), np.full((2, 1), 1e9), np.zeros((2, 1)), shared=True)
+    (group,) = replace(model, prior=prior).groups_on(values, rows.blocks(model.kernel, 60))
+    VV, w = group.statistics.VV, np.linspace(-1.0, 1.0, len(group.statistics.VV))
+    inside = replace(group.statistics, VH=(VV @ w)[:, np.newaxis], HH=np.array([[w @ VV @ w * (1.0 - 1e-12)]]))
+    for q in optimal_posteriors([replace(group, statistics=inside)])[0]:
+        assert np.isfinite(q.mean).all()
+        assert np.isfinite(q.root_inv).all()
+        assert (np.diagonal(q.root) > 0.0).all()
+
+
 @pytest.mark.parametrize("shared", SHARED)
 def test_the_papers_family_has_the_lower_bound(shared):
     bounds = {}

@@ -285,14 +285,23 @@ def test_outputs_and_units_of_a_prior():
     )
 
 
+def test_a_prior_in_other_units():
+    prior = CoefficientPrior(np.ones((2, 3)), np.full((2, 3), 2.0), np.full((2, 3), 5.0))
+    scaled = prior.scaled(np.array([10.0, 0.1]))
+    np.testing.assert_allclose(scaled.mean[:, 0], [10.0, 0.1])
+    np.testing.assert_allclose(scaled.scale[:, 0], [20.0, 0.2])
+    np.testing.assert_array_equal(scaled.reference, prior.reference)
+
+
 def test_a_precision_that_rounding_made_negative_counts_as_that_of_the_prior():
     """q of independent values: B is no less than I."""
     own = Whitening.of(SquaredExponential(1), np.ones(1), np.linspace(0, 1e-4, 4)[:, np.newaxis])
-    B = np.diag([1.0, -3.0, 2.0, 1.0, -5.0])
+    B = np.diag([1.0, -3e30, 2.0, 1.0, -5.0])
     log_f, log_w = log_variances(B, own.L_inv)
     assert (-log_f >= np.log((own.L_inv**2).sum(axis=0)) - 1e-9).all()
     np.testing.assert_array_equal(log_w, [0.0])
     gap, B_bar, L_bar = diagonal_gap(B, 0.0, np.zeros((5, 5)), own)
+    assert gap == pytest.approx(-0.5 * (log_f.sum() + log_w.sum()) + np.log(np.diagonal(own.L)).sum(), rel=1e-9)
     assert np.isfinite(gap)
     assert np.isfinite(B_bar).all()
     assert np.isfinite(L_bar).all()

@@ -243,6 +243,34 @@ def test_the_second_pass_is_the_gradient_of_the_first(size):
     assert relative_error(flat(found), central_differences(value, THETA)) < 1e-7
 
 
+def test_a_jitter_moves_with_the_diagonal():
+    """Of a kernel whose diagonal depends on its hyperparameters and points; at the origin of one it is 0."""
+    kernel, points = DotProduct(), Z.copy()
+    points[0] = 0.0
+    jitter, weights = Jitter(0.3, 2.0), np.tril(np.random.RandomState(2).randn(M, M))
+
+    def whitened(theta):
+        own = theta[kernel.n_hyperparameters :].reshape(M, D)
+        return Whitening.of(kernel, np.exp(theta[: kernel.n_hyperparameters]), own, jitter)
+
+    theta = np.append(np.full(kernel.n_hyperparameters, -0.3), points)
+    own = whitened(theta)
+    found = own.pull_back(own.covariance.start_pullback(), weights)
+    expected = central_differences(lambda at: float(np.vdot(whitened(at).L, weights)), theta)
+    assert relative_error(flat(found), expected) < 1e-7
+    assert Whitening.of(KERNEL, LENGTHSCALES, np.empty((0, D))).jitter() == 0.0
+
+
+def test_errors_without_features_have_no_sums_over_them():
+    """And with them the sums are as long as these are many."""
+    own = whitening()
+    left = errors(blocks(), own, slice(0, O), RNG.randn(M + P, O))
+    assert left.VE.shape == (M, O)
+    assert left.HE.shape == (P, O)
+    none = errors(blocks(rows=ArrayRows(X, np.empty((N, 0)), R)), own, slice(0, O), RNG.randn(M, O))
+    assert none.HE.shape == (0, O)
+
+
 def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     weights = RNG.randn(M + P, O)
