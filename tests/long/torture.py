@@ -29,6 +29,8 @@ OUTCOMES = ("fitted", "below, and told", "refused", "defect")
 # L-BFGS stops where it gains less than 0.0015 % of what it has gained, and 0.01 nats; rounding at offsets of 1e8.
 SLACK, SHARE = 0.1, 1e-4
 
+# In sums of products other rows are lost beside one that counts so many times more.
+RANGE = 1e14
 # Frames that may speak for the library: a message from elsewhere is not one that names an argument.
 SPEAKERS = ("skevgp", "sklearn", "tests.nasty")
 # Warnings that users are to see.
@@ -159,7 +161,7 @@ def _check_bound(case, model, told):
             and model.noise == "gaussian"
             and model.input_noise is None
         )
-    if not comparable or model._fitted.units.prior.shared or len(model.loss_curve_) == 0:
+    if not comparable or model._fitted.units.prior.shared or len(model.loss_curve_) == 0 or _weighs(case) > RANGE:
         return "fitted"
     # What noise_cv does afterwards is not for the bound's sake.
     reached, floor = -model.loss_curve_[-1], alone(model, case.X, case.y, **_weights(case))
@@ -168,6 +170,13 @@ def _check_bound(case, model, told):
     if any("still rising" in str(each.message) or "rounding errors" in str(each.message) for each in told):
         return "below, and told"
     raise DefectError(f"the bound {reached:.3f} is below {floor:.3f}, that of features and noise alone")
+
+
+def _weighs(case):
+    """How many times more the row counts that counts the most than that which counts the least."""
+    weight, variance = (np.asarray(case.fit.get(name, 1.0)) for name in ("sample_weight", "relative_variance"))
+    precision = weight / variance
+    return precision.max() / precision[precision > 0.0].min()
 
 
 def _weights(case):
