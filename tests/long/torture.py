@@ -30,7 +30,7 @@ OUTCOMES = ("fitted", "below, and told", "refused", "defect")
 SLACK, SHARE = 0.1, 1e-4
 
 # In sums of products other rows are lost beside one that counts so many times more.
-RANGE = 1e14
+RANGE = 1e12
 # Frames that may speak for the library: a message from elsewhere is not one that names an argument.
 SPEAKERS = ("skevgp", "sklearn", "tests.nasty")
 # Warnings that users are to see.
@@ -163,8 +163,8 @@ def _check_bound(case, model, told):
         )
     if not comparable or model._fitted.units.prior.shared or len(model.loss_curve_) == 0 or _weighs(case) > RANGE:
         return "fitted"
-    # What noise_cv does afterwards is not for the bound's sake.
-    reached, floor = -model.loss_curve_[-1], alone(model, case.X, case.y, **_weights(case))
+    # What noise_cv does afterwards is not for the bound's sake; nor is each iterate the best point of its line search.
+    reached, floor = max(bound, -model.loss_curve_[-1]), alone(model, case.X, case.y, **_weights(case))
     if reached >= floor - SLACK - SHARE * abs(floor):
         return "fitted"
     if any("still rising" in str(each.message) or "rounding errors" in str(each.message) for each in told):
