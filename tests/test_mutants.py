@@ -1,4 +1,4 @@
-"""The driver of the mutation tests: `tests/long/mutants.py` runs them, which takes an hour."""
+"""The driver of the mutation tests: `tests/long/mutants.py` runs them, which takes half an hour."""
 
 import pytest
 

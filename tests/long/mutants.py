@@ -1,6 +1,6 @@
 """Mutation testing of the mathematics: small changes to the source, each of which some test must see.
 
-    python -m tests.long.mutants                 # the modules of `TESTS`; about an hour and a half
+    python -m tests.long.mutants                 # the modules of `TESTS`; about half an hour
     python -m tests.long.mutants inference/bounds.py --again
 
 A mutant is one edit (`_Edits`). It is made in a process of its own, a fork of one that has imported the other packages,
