@@ -151,6 +151,7 @@ def _check_bound(case, model, told):
         if np.isnan(model.upper_bound_) or (
             isinstance(model.solver, str | type(None))
             and model.solver == "lbfgs"
+            and _weighs(case) <= RANGE
             and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3
         ):
             raise DefectError(f"the upper bound {model.upper_bound_} is below the lower one {bound}")
