@@ -31,9 +31,12 @@ def exact_of(model):
 
 
 def assert_in_order(*values):
-    """But for rounding, and for a jitter: 1e-12 of the signal for each of 24 rows, over a noise of 1e-3 or more."""
+    """But for a jitter, 1e-12 of the signal for each of 24 rows over a noise of 1e-3 or more, and for rounding.
+
+    With points that are all the same it is 1e-16 over the jitter's root, 1e-10 of V, times signal over noise.
+    """
     for lower, higher in pairwise(values):
-        assert lower <= higher + 1e-7 * max(abs(lower), abs(higher), 1.0)
+        assert lower <= higher + 1e-6 * max(abs(lower), abs(higher), 1.0)
 
 
 @given(fixed_cases(exact=False))
@@ -88,7 +91,8 @@ def test_the_bound_of_other_kernels(case, draws):
         return
     ways = 1e-5 * np.eye(theta.size).reshape(-1, *theta.shape)
     slopes = [(model.lower_bound(theta + way) - model.lower_bound(theta - way)) / 2e-5 for way in ways]
-    np.testing.assert_allclose(np.ravel(gradient), slopes, rtol=1e-3, atol=1e-3 + 1e-6 * abs(value))
+    # Rounding of such points again, 1e-10 of the bound, over a way of 1e-5.
+    np.testing.assert_allclose(np.ravel(gradient), slopes, rtol=1e-3, atol=1e-3 + 1e-5 * abs(value))
 
 
 @given(data(fewest_rows=2), st.data())
