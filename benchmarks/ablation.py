@@ -109,6 +109,7 @@ def changes() -> list[Change]:
         *_of("rules", "first_noise", 1e-2, 1e-3, 1e-5, 1e-6),
         *_of("rules", "signal_limits", (1e-8, 1e8), (1e-3, 1e1)),
         *_of("rules", "widest_signal", None, 1e6),
+        *_of("rules", "last_start", False),
         *_of("rules", "lowest_noise", 1e-8, 1e-12),
         *_of("rules", "jitter.well_conditioned", 0.0, np.inf),
         *_of("rules", "jitter.size", 1e-8, 1e-10, 1e-14),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ from .advice import far_from_prior, how_it_ended, interrupted, learned_too_littl
 from .rules import Rules
 from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Strategy, drawn, search
-from .units import Units, likeliest_noise, may_hide_noise
+from .units import Units, may_hide_noise, noise_of_most_evidence
 
 # (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
@@ -83,19 +82,20 @@ class ExactTask:
     @property
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
+        alone, noise_alone = self._with_little_signal()
         return Strategy(
             self.options.rules,
             self.table,
             self.options.max_iter,
             self.options.n_restarts,
             self.scatter,
-            *self._alone,
+            alone,
+            noise_alone,
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
         )
 
-    @cached_property
-    def _alone(self) -> tuple[float, np.ndarray | None]:
+    def _with_little_signal(self) -> tuple[float, np.ndarray | None]:
         """The likelihood with as little signal as there may be, and the noise variances (o,) that it is highest for."""
         noise, signal, prior = self.table["noise"], self.table["signal"], self.model.prior
         unasked = self.options.optimizer is not None or self.options.max_iter == 0 or not noise.free.any()
@@ -104,7 +104,7 @@ class ExactTask:
         values = self.table.values_at_start()
         values["signal"] = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
         least, highest = noise.value_limits().T
-        return likeliest_noise(
+        return noise_of_most_evidence(
             lambda noise: self.model.log_likelihoods(values | {"noise": noise}), least, highest, prior.shared
         )
 
@@ -353,7 +353,7 @@ def fit_exact(
     )
     if options.optimizer is not None:
         # It is the user's when to go where.
-        table = table.widened({own.name for own in table.parameters})
+        table = table.widened(("signal", "noise"))
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
     best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor, units))

@@ -23,7 +23,8 @@ class Rules:
         Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
         outweighs the noise.
     highest_noise : float
-        Its upper limit, in units of the variance that the features leave over.
+        Its upper limit, in units of the variance that the features leave over; of a fit that starts there or above,
+        the targets' variance if that is more.
     lengthscale : float
         Where lengthscales start, in standard deviations of their column, times √d: rows are then neither all alike nor
         all strangers, whatever the number of columns.

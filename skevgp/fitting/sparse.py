@@ -21,13 +21,12 @@ from .advice import learned_too_little
 from .exact import ExactOptions, Unhindered
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .rules import Rules
+from .start import LOWEST_NOISE
 from .strategy import Attempt, Fit, Strategy, better, drawn, search
-from .units import likeliest_noise, may_hide_noise
+from .units import may_hide_noise, noise_of_most_evidence
 
 # By what factor inducing points become more, until that raises the bound by less than so many nats per row and output.
 _GROWTH, _GAIN = 1.5, 0.01
-# Of squared target units.
-_LEAST_NOISE = 1e-20
 # Points limit the kernel if it makes so many rows, a sample, less likely than their own kernel does, by so many nats
 # per row and output.
 _SAMPLE, _MISSED = 1000, 0.02
@@ -133,14 +132,14 @@ class SparseTask:
     @cached_property
     def alone(self) -> float:
         """The bound of the features without a Gaussian process, all that they leave over being noise."""
-        # Which may be nothing.
-        noise = np.maximum(self._squares / self.rows.total, _LEAST_NOISE)
-        return float(bounds_alone(self.blocks.linear, self.model.prior, noise, np.zeros(len(noise))).sum())
+        none = np.zeros(len(self.model.prior.scale))
+        return float(bounds_alone(self.blocks.linear, self.model.prior, self._left_over(none), none).sum())
 
-    @property
-    def _squares(self) -> np.ndarray:
+    def _left_over(self, trace: np.ndarray) -> np.ndarray:
+        """The noise variances (o,) that the features leave over, which may be nothing, and a trace of f's prior."""
         sums = self.blocks.linear
-        return np.array([float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(self.model.prior.scale))])
+        squares = [float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(trace))]
+        return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE)
 
     def _with_little_signal(self) -> tuple[float, np.ndarray]:
         """The bound with as little signal as there may be, and the noise variances (o,) for which it is the highest."""
@@ -150,10 +149,12 @@ class SparseTask:
         variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
         trace = little * variance * self.rows.total * self.rows.mean_precision
-        least = highest = np.maximum((self._squares + trace) / self.rows.total, _LEAST_NOISE)
-        if may_hide_noise(prior, sums.length):
+        least = highest = self._left_over(trace)
+        if self.max_iter > 0 and may_hide_noise(prior, sums.length):
             least, highest = self.table["noise"].value_limits().T
-        return likeliest_noise(lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared)
+        return noise_of_most_evidence(
+            lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared
+        )
 
     @property
     def n_inducing(self) -> int:

@@ -17,7 +17,7 @@ from .rules import Rules
 from .units import SMALLEST_UNIT
 
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
-_LOWEST_NOISE = 1e-20
+LOWEST_NOISE = 1e-20
 _NEIGHBOUR_SAMPLE = 2000
 
 
@@ -198,7 +198,7 @@ def starting_table(
                 starts.noise,
                 "noise",
                 rules.first_noise * scatter,
-                np.maximum(rules.lowest_noise * scatter, _LOWEST_NOISE),
+                np.maximum(rules.lowest_noise * scatter, LOWEST_NOISE),
                 highest,
                 target_unit**2,
                 None if target_scatter is None else np.maximum(highest, target_scatter * precision),

@@ -19,6 +19,9 @@ from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
 from .rules import Rules
 
+# Of the noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
+_LITTLE = 1e-4
+
 
 @dataclass(frozen=True)
 class Fit:
@@ -99,9 +102,6 @@ class Attempt:
         """Of the iterations before its first."""
         return [] if self.after is None else self.after.loss_curve
 
-
-# Of the noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
-_LITTLE = 1e-4
 
 # Yields starts, is sent how the fit from each ended, and returns the best of these.
 Attempts = Generator[Attempt, Fit, Fit]

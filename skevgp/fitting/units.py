@@ -115,7 +115,7 @@ def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:
     return 2 * prior.scale.shape[1] >= n_rows or float((prior.reference**2).sum(axis=1).max(initial=0.0)) > n_rows
 
 
-def likeliest_noise(
+def noise_of_most_evidence(
     evidence: Callable[[np.ndarray], np.ndarray], least: np.ndarray, highest: np.ndarray, shared: bool
 ) -> tuple[float, np.ndarray]:
     """Which noise suits features best that leave over less: the evidence may be the greatest with more.

@@ -166,6 +166,7 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             g_w += g[m:] - A.T @ z
             each.append((PP, D_root, D_root_inv, A, z))
     S_root = jittered_cholesky(S, sizes=sizes)
+    # With the jitter, if it needed one.
     S = S_root @ S_root.T
     S_root_inv = triangular_inverse(S_root)
     w = S_root_inv.T @ (S_root_inv @ g_w)

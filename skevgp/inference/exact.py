@@ -202,10 +202,8 @@ class ExactModel:
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
         """Summed over outputs, and its gradient in the logarithms of the values."""
         covariances, outputs = self.outputs(values)
-        total, gradient = (
-            float(self._of_copies(values).sum()),
-            {name: np.zeros_like(value) for name, value in values.items()},
-        )
+        total = float(self._of_copies(values).sum())
+        gradient = {name: np.zeros_like(value) for name, value in values.items()}
         K_bars = np.zeros((len(covariances), *outputs[0].L.shape))
         for index, output in enumerate(outputs):
             total += output.log_likelihood

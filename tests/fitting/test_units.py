@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skevgp.fitting.units import features_alone, likeliest_noise, may_hide_noise, unit_of
+from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.inference.posterior import CoefficientPrior
 from skevgp.rows.source import LocalSource
 
@@ -80,7 +80,7 @@ def evidence_of(asked, peaks, plateau=0.0):
 def test_the_likeliest_noise_is_found_beyond_where_the_evidence_is_flat(shared):
     peaks, asked = np.array([3e-2, 3e-2 if shared else 5.0]), []
     least, highest = np.full(2, 1e-14), np.full(2, 1e2)
-    value, noise = likeliest_noise(evidence_of(asked, peaks, -20.0), least, highest, shared)
+    value, noise = noise_of_most_evidence(evidence_of(asked, peaks, -20.0), least, highest, shared)
     # To an eighth of a decade.
     assert (np.abs(np.log10(noise / peaks)) < 0.126).all()
     assert value > -2 * 0.126**2
@@ -90,9 +90,11 @@ def test_the_likeliest_noise_is_found_beyond_where_the_evidence_is_flat(shared):
 
 def test_where_the_least_noise_is_the_likeliest_or_the_only_one_it_is_that():
     peaks, least, asked = np.array([1e-2, 1e-3]), np.array([1e-2, 1e-3]), []
-    value, noise = likeliest_noise(evidence_of(asked, peaks), least, np.full(2, 1e2), False)
+    value, noise = noise_of_most_evidence(evidence_of(asked, peaks), least, np.full(2, 1e2), False)
     np.testing.assert_array_equal(noise, least)
     assert value == pytest.approx(0.0, abs=1e-9)
     asked.clear()
-    np.testing.assert_array_equal(likeliest_noise(evidence_of(asked, 1e3 * peaks), least, least, False)[1], least)
+    np.testing.assert_array_equal(
+        noise_of_most_evidence(evidence_of(asked, 1e3 * peaks), least, least, False)[1], least
+    )
     assert len(asked) == 1
