@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve
+from scipy.linalg import pinvh
 
-from .._linalg import diagonal_of, jittered_cholesky
+from .._linalg import NotPositiveDefiniteError, diagonal_of
 from ..inference.posterior import CoefficientPrior, Predictor
 from ..rows.internal import Rows
 from ..rows.source import Columns, Moments, RawRows, Source, times_weights
@@ -91,7 +91,7 @@ class _Step:
     outputs: list[int]
     least: float
     counts: np.ndarray
-    root: np.ndarray
+    covariance: np.ndarray
 
     @classmethod
     def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
@@ -100,11 +100,16 @@ class _Step:
         counts = least / noise
         precision = np.einsum("o,oij->ij", counts, products[outputs])
         diagonal_of(precision)[...] += least
-        return cls(outputs, least, counts, jittered_cholesky(precision))
+        if not np.isfinite(precision).all():
+            raise NotPositiveDefiniteError("sums over the rows are not finite")
+        # Of a direction that rounding hides in the sums a step would be anything: there w stays where it is.
+        root = np.sqrt(diagonal_of(precision))
+        sizes = np.multiply.outer(root, root)
+        return cls(outputs, least, counts, pinvh(precision / sizes) / sizes)
 
     def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
         first = self.outputs[0]
-        w[self.outputs] += cho_solve((self.root, True), self.counts @ from_data[self.outputs] - self.least * w[first])
+        w[self.outputs] += self.covariance @ (self.counts @ from_data[self.outputs] - self.least * w[first])
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:

@@ -47,6 +47,17 @@ def test_duplicate_features_share_their_weight():
     np.testing.assert_allclose(w, [[1.0, 1.0]], rtol=1e-4)
 
 
+def test_features_equal_up_to_rounding_do_not_cancel_with_huge_weights():
+    rng = np.random.RandomState(0)
+    h = rng.randn(100, 1)
+    H = np.hstack([np.ones((100, 1)), h, h + 1e-8 * rng.randn(100, 1)])
+    r = np.hstack([np.full((100, 1), 5.1), h + 0.1 * rng.randn(100, 1)])
+    w = weights_alone(H, r, np.full((2, 3), 50.0))
+    # Nothing is left of a constant but rounding.
+    assert np.abs(r - H @ (50.0 * w).T)[:, 0].max() <= 1e-13
+    assert np.abs(w).max() <= 1.0
+
+
 def test_units_survive_extreme_scales():
     values = np.array([1e-120, 1e100, 0.0])
     np.testing.assert_array_equal(unit_of(values, values), [1e-120, 1e100, 1.0])
