@@ -23,6 +23,8 @@ from .prediction.compiled import CompiledPredictor
 _SETTLED, _TURNS = 0.05, 5
 # Of an output's mean squared error, what at least is its own.
 _LEAST = 1e-4
+# Variances below are rounded to 0 somewhere.
+_SMALLEST = 1e-290
 # Rows whose slopes are found at once.
 _ROWS_AT_ONCE = 256
 
@@ -36,6 +38,8 @@ class Model(Protocol):
     _predictor: Predictor
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]: ...
+
+    def _inputs_and_features(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]: ...
 
 
 def input_covariance(input_noise: ArrayLike, n_features: int) -> np.ndarray:
@@ -87,6 +91,8 @@ def _looked_at(
     for first in range(0, len(positions), _ROWS_AT_ONCE):
         own = positions[first : first + _ROWS_AT_ONCE]
         some = np.asarray(rows[own], dtype=np.float64)
+        # A map that goes wrong only now is named; what is compiled checks nothing.
+        model._inputs_and_features(given, rows, own)
         slopes = fast.value_and_jacobian(some)[1].reshape(len(some), -1, some.shape[1])
         if base is not None:
             slopes[:, np.arange(len(base)), base] += 1.0
@@ -118,8 +124,10 @@ def _own_variance(squares: np.ndarray, by_inputs: np.ndarray, counts: np.ndarray
         each = np.exp(log_variance) * variance + by_inputs
         return float(counts @ (np.log(each) + squares / each) / counts.sum())
 
-    limits = np.log(whole * _LEAST), np.log(whole)
-    return float(np.exp(minimize_scalar(loss, bounds=limits, method="bounded").x)) if whole > 0.0 else 0.0
+    if whole <= _SMALLEST:
+        return _SMALLEST
+    limits = np.log(max(whole * _LEAST, _SMALLEST)), np.log(whole)
+    return float(np.exp(minimize_scalar(loss, bounds=limits, method="bounded").x))
 
 
 def fit_to_noisy_inputs(
@@ -151,10 +159,9 @@ def fit_to_noisy_inputs(
     for _ in range(_TURNS):
         model._predictor = fitted.predictor()
         by_inputs, squares = _looked_at(model, given, X, y, chosen, covariance)
-        least = np.finfo(float).tiny
         weights = _weights(chosen, len(by_inputs))
         each = zip(squares.T, by_inputs.T, strict=True)
-        own = np.array([max(_own_variance(*of_output, *weights), least) for of_output in each])
+        own = np.array([_own_variance(*of_output, *weights) for of_output in each])
         if before is not None and (np.abs(np.log(own / before)) < _SETTLED).all():
             break
         before = own

@@ -200,7 +200,7 @@ class Intake(StatefulEstimator):
         check_magnitude(X, "X")
         return X, target if target.dtype.kind == "f" else np.asarray(target, dtype=np.float64)
 
-    def _inputs_and_features(self, given: Any, X: Any, rows: slice) -> tuple[np.ndarray, np.ndarray]:
+    def _inputs_and_features(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""
         array = take_rows(X, rows)
         given = array if given is X else take_rows(given, rows)

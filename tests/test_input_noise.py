@@ -10,6 +10,7 @@ from sklearn.preprocessing import FunctionTransformer, StandardScaler
 from skevgp import EVGPRegressor, ResidualRegressor
 from skevgp._input_noise import variance_by_inputs
 from skevgp.metrics import containing_ratios, prediction_error
+from tests.nasty import BadMap
 
 
 def waves(n, x_noise, y_noise, seed=0):
@@ -163,3 +164,22 @@ def test_known_differences_between_rows_noise_are_beside_that_of_inputs():
     )
     model.fit(X, y, relative_variance=v)
     assert model.noise_variance_ == pytest.approx(0.0025, rel=0.25)
+
+
+@pytest.mark.parametrize(("how", "message"), [(how, text) for how, text in BadMap.messages.items() if how != "raises"])
+def test_a_map_that_goes_wrong_on_the_way_is_named(how, message):
+    X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
+    model = EVGPRegressor(BadMap(how=how, late=True), input_noise=0.1, n_inducing=3, max_iter=5)
+    with pytest.raises(ValueError, match=f"feature_map.*{message}"):
+        model.fit(X, X[:, 0])
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-135])
+def test_so_little_noise_that_it_is_rounded_to_nothing(unit):
+    X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
+    y = unit * (X[:, 0] + np.sin(9.0 * X[:, 0]))
+    model = EVGPRegressor(input_noise=1e-3, n_inducing=10, max_iter=20, random_state=0).fit(X, y)
+    mean, std = model.predict(X, return_std=True)
+    assert np.isfinite(mean).all()
+    assert (std > 0.0).all()
+    np.testing.assert_allclose(mean / unit, y / unit, atol=0.3)

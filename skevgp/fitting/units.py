@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import pinvh
+from scipy.linalg import cho_solve, eigh
 
-from .._linalg import NotPositiveDefiniteError, diagonal_of
+from .._linalg import diagonal_of, jittered_cholesky
 from ..inference.posterior import CoefficientPrior, Predictor
 from ..rows.internal import Rows
 from ..rows.source import Columns, Moments, RawRows, Source, times_weights
@@ -17,6 +17,8 @@ from ..rows.threads import BlockMap
 
 # So that the lowest noise variance in the user's units is not rounded to 0.
 SMALLEST_UNIT = 1e-140
+# Of a feature's size: less of it than this beside the others, sums over the targets do not see.
+_SEEN = 1e-6
 
 
 @dataclass(frozen=True)
@@ -79,7 +81,7 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
         steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
         for _ in range(3):
             for step in steps:
-                step.take(w, np.einsum("oij,oi->oj", roots, HL))
+                step.take(w, np.einsum("oij,oi->oj", roots, HL), cold=not w[step.outputs].any())
             HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
     return w, np.sqrt(squares / total_precision)
 
@@ -91,7 +93,8 @@ class _Step:
     outputs: list[int]
     least: float
     counts: np.ndarray
-    covariance: np.ndarray
+    precision: np.ndarray
+    root: np.ndarray
 
     @classmethod
     def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
@@ -100,16 +103,24 @@ class _Step:
         counts = least / noise
         precision = np.einsum("o,oij->ij", counts, products[outputs])
         diagonal_of(precision)[...] += least
-        if not np.isfinite(precision).all():
-            raise NotPositiveDefiniteError("sums over the rows are not finite")
-        # Of a direction that rounding hides in the sums a step would be anything: there w stays where it is.
-        root = np.sqrt(diagonal_of(precision))
-        sizes = np.multiply.outer(root, root)
-        return cls(outputs, least, counts, pinvh(precision / sizes) / sizes)
+        return cls(outputs, least, counts, precision, jittered_cholesky(precision))
 
-    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
+    def take(self, w: np.ndarray, from_data: np.ndarray, cold: bool) -> None:
+        """From w, which is 0 if cold.
+
+        Sums over targets from which nothing has been subtracted have rounding errors that nearly dependent features
+        would blow up to weights that cancel. The first step keeps out of such directions; those after it, of what is
+        then left over, do not.
+        """
         first = self.outputs[0]
-        w[self.outputs] += self.covariance @ (self.counts @ from_data[self.outputs] - self.least * w[first])
+        wanted = self.counts @ from_data[self.outputs] - self.least * w[first]
+        sizes = np.sqrt(diagonal_of(self.precision))
+        if not cold or (diagonal_of(self.root) >= _SEEN * sizes).all():
+            w[self.outputs] += cho_solve((self.root, True), wanted)
+            return
+        values, vectors = eigh(self.precision / np.multiply.outer(sizes, sizes))
+        seen = values > _SEEN**2 * values[-1]
+        w[self.outputs] += vectors[:, seen] @ (vectors[:, seen].T @ (wanted / sizes) / values[seen]) / sizes
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:

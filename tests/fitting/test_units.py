@@ -58,6 +58,17 @@ def test_features_equal_up_to_rounding_do_not_cancel_with_huge_weights():
     assert np.abs(w).max() <= 1.0
 
 
+@pytest.mark.parametrize("noise", [1e-2, 1e-5])
+def test_features_that_nearly_depend_on_each_other_still_explain_what_they_can(noise):
+    rng = np.random.RandomState(0)
+    U, V = (np.linalg.qr(rng.randn(n, 30))[0] for n in (200, 30))
+    H = (U * np.logspace(0, -7.3, 30)) @ V
+    r = U @ rng.randn(30, 1) + noise * rng.randn(200, 1)
+    w = weights_alone(H, r, np.full((1, 30), 1e8))
+    rest = r - U @ (U.T @ r)
+    assert np.sum((r - H @ (1e8 * w).T) ** 2) <= 1.01 * np.sum(rest**2)
+
+
 def test_units_survive_extreme_scales():
     values = np.array([1e-120, 1e100, 0.0])
     np.testing.assert_array_equal(unit_of(values, values), [1e-120, 1e100, 1.0])
