@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.linalg import eigh
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 
@@ -104,7 +105,7 @@ def resolve_coef_prior(
         raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
     if (correlation == _independent(shape)).all():
         return CoefPrior(mean.astype(float), scale.astype(float), None)
-    eigenvalues, vectors = np.linalg.eigh(correlation)
+    eigenvalues, vectors = eigh(correlation)
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, np.newaxis]
     return CoefPrior(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
 

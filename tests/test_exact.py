@@ -454,3 +454,12 @@ def test_points_at_all_rows_give_the_exact_likelihood(noise):
     both = EGPRegressor(kernel=exact.kernel_ + WhiteKernel(noise, "fixed"), max_iter=0)
     all_rows = np.vstack([x, x_new])
     assert bound < both.fit(all_rows, all_rows[:, 0] * np.sin(all_rows[:, 0])).log_marginal_likelihood_value_
+
+
+def test_a_fixed_noise_far_below_the_targets_has_a_finite_likelihood():
+    X = np.linspace(0.0, 1.0, 5)[:, np.newaxis]
+    model = EGPRegressor(kernel=ConstantKernel(1.0, "fixed") * RBF(1.0, "fixed") + WhiteKernel(1e-6))
+    with pytest.warns(ConvergenceWarning, match="close to the specified upper bound"):
+        model.fit(X, 1e79 * np.sin(9.0 * X[:, 0]))
+    assert np.isfinite(model.log_marginal_likelihood_value_)
+    assert np.isfinite(model.predict(X)).all()

@@ -370,3 +370,15 @@ def test_features_that_interpolate_do_not_hide_the_noise(noise, shift):
     assert fitted.lower_bound_ > alone(fitted, few, y) - 0.2
     mean, std = fitted.predict(few, return_std=True)
     assert (np.abs(y - mean) < 4 * std + 1e-9 * shift).all()
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("max_iter", [20, 200])
+def test_many_more_features_than_rows_find_a_noise_that_rounding_does_not_outweigh(max_iter, seed):
+    """Whether the fits before have ended or not."""
+    rng = np.random.RandomState(seed)
+    few, y = rng.randn(5, 60), rng.randn(5)
+    fitted = model(feature_map=PolynomialFeatures(degree=1), normalize_y=True, n_inducing=5, max_iter=max_iter)
+    fitted.fit(few, y)
+    # No more than that either: there is nothing else to learn.
+    assert fitted.lower_bound_ == pytest.approx(alone(fitted, few, y), abs=0.2)

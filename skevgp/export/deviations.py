@@ -10,6 +10,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import eigh
 
 from ..inference.posterior import PredictorGroup
 
@@ -64,7 +65,7 @@ def _common_eigenvectors(roots: list[np.ndarray], group: PredictorGroup) -> tupl
     variances = np.array([np.einsum("ij,ij->j", own @ V, own @ V) for own in roots])
     best, least = (np.eye(len(L)), np.full((len(roots), len(L)), np.nan)), (len(roots), np.inf)
     for covariance in covariances:
-        _, U = np.linalg.eigh(covariance)
+        _, U = eigh(covariance)
         squares = np.einsum("oij,ij->oj", covariances @ U, U).clip(0.0)
         excess = (np.abs(variances - squares @ (U.T @ V) ** 2) / allowed).max(axis=1)
         kept = excess <= 1.0

@@ -82,15 +82,14 @@ class ExactTask:
     @property
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
-        alone, noise_alone = self._with_little_signal()
         return Strategy(
             self.options.rules,
             self.table,
             self.options.max_iter,
             self.options.n_restarts,
             self.scatter,
-            alone,
-            noise_alone,
+            *self._with_little_signal(),
+            noise_hidden=True,
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
         )

@@ -32,6 +32,8 @@ _GROWTH, _GAIN = 1.5, 0.01
 _SAMPLE, _MISSED = 1000, 0.02
 # On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
 _ITERATIONS, _COARSE = 60, 2e-4
+# Of the sum of squares that features may explain a priori: a noise variance that its rounding errors do not outweigh.
+_ROUNDING = 1e-14
 
 
 class Solver(Protocol):
@@ -141,6 +143,10 @@ class SparseTask:
         squares = [float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(trace))]
         return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE)
 
+    @cached_property
+    def _may_hide_noise(self) -> bool:
+        return may_hide_noise(self.model.prior, self.blocks.linear.length)
+
     def _with_little_signal(self) -> tuple[float, np.ndarray]:
         """The bound with as little signal as there may be, and the noise variances (o,) for which it is the highest."""
         prior, sums = self.model.prior, self.blocks.linear
@@ -150,8 +156,11 @@ class SparseTask:
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
         trace = little * variance * self.rows.total * self.rows.mean_precision
         least = highest = self._left_over(trace)
-        if self.max_iter > 0 and may_hide_noise(prior, sums.length):
-            least, highest = self.table["noise"].value_limits().T
+        if self.max_iter > 0 and self._may_hide_noise:
+            lowest, highest = self.table["noise"].value_limits().T
+            # Below, the evidence is that of rounding errors.
+            explained = [prior.scale[o] ** 2 @ np.diagonal(sums.of(slice(o, o + 1)).HH) for o in range(len(lowest))]
+            least = np.maximum(lowest, _ROUNDING * np.array(explained))
         return noise_of_most_evidence(
             lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared
         )
@@ -174,6 +183,7 @@ class SparseTask:
             self.rows.scatter(),
             alone=alone,
             noise_alone=noise_alone,
+            noise_hidden=self._may_hide_noise,
             interpolates=self.interpolates,
             samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),

@@ -130,6 +130,8 @@ class Strategy:
         The bound of the features without a Gaussian process.
     noise_alone : ndarray of shape (o,), optional
         The noise variances with which it is.
+    noise_hidden : bool
+        Whether it may be far above what the features leave over, from where no fit climbs to it.
     interpolates : bool
         Whether there are as many inducing points as rows.
     samples : tuple of int
@@ -151,6 +153,7 @@ class Strategy:
     scatter: np.ndarray
     alone: float = -np.inf
     noise_alone: np.ndarray | None = None
+    noise_hidden: bool = False
     interpolates: bool = False
     samples: tuple[int, ...] = ()
     place: Callable[[Values], Values] | None = None
@@ -180,9 +183,9 @@ class Strategy:
             return True
         return self._below(fit)
 
-    def _below(self, fit: Fit) -> bool:
-        """Whether it ended below the features alone; what has not ended yet may still rise."""
-        ended = fit.converged or fit.n_iter < self.max_iter
+    def _below(self, fit: Fit, hopeless: bool = False) -> bool:
+        """Whether it ended below the features alone; what has not ended yet may still rise, unless that is hopeless."""
+        ended = hopeless or fit.converged or fit.n_iter < self.max_iter
         return fit.n_rows is None and ended and fit.bound < self.alone
 
     def _released(self, attempts: Attempts) -> Attempts:
@@ -192,7 +195,7 @@ class Strategy:
         """
         best = yield from attempts
         may_start = self.max_iter > 0 and self.table["noise"].free.any() and self.rules.last_start
-        if self.noise_alone is not None and may_start and self._below(best):
+        if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], _LITTLE * self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.linalg import eigh
 
 from .rows_of_logs import correlation_time
 from .stiction import JointNoise, likeliest_noise
@@ -335,7 +336,8 @@ def _solve(B: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """
     precision = np.eye(B.shape[1]) + B.T @ B
     scale = np.sqrt(np.diag(precision))
-    eigenvalues, vectors = np.linalg.eigh(precision / np.outer(scale, scale))
+    # SciPy's method: NumPy's, dividing and conquering, fails to converge on some finite matrices.
+    eigenvalues, vectors = eigh(precision / np.outer(scale, scale))
     root = vectors / np.sqrt(np.maximum(eigenvalues, _SINGULAR)) / scale[:, np.newaxis]
     return root @ (root.T @ (B.T @ errors)), root @ root.T
 
@@ -356,5 +358,5 @@ def _root(covariance: np.ndarray) -> np.ndarray:
     """C with C Cᵀ = covariance, which may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
-    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(unit, unit))
+    eigenvalues, vectors = eigh(covariance / np.outer(unit, unit))
     return scale[:, np.newaxis] * vectors * np.sqrt(np.maximum(eigenvalues, 0.0))

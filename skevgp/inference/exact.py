@@ -93,7 +93,9 @@ class OutputGivenKernel:
         # [W; D] w = [z; -D w₀] by least squares.
         Q, R = np.linalg.qr(np.vstack([*(own.W for own in outputs), np.diag(proper.astype(float))]))
         R_inv = lapack.dtrtri(R)[0] if len(R) else R
-        w = R_inv @ (Q.T @ np.concatenate([*(own.z for own in outputs), np.where(proper, -reference, 0.0)]))
+        wanted = Q.T @ np.concatenate([*(own.z for own in outputs), np.where(proper, -reference, 0.0)])
+        # Not by the inverse: what it loses, features of 1e16 times the noise would multiply.
+        w = lapack.dtrtrs(R, wanted)[0] if len(R) else wanted
         for own in outputs:
             own.R, own.R_inv, own.w, own.is_first = R, R_inv, w, own is outputs[0]
             own.left_over = own.z - own.W @ w
@@ -117,18 +119,18 @@ class OutputGivenKernel:
         (α = (s² L Lᵀ)⁻¹ (r - H C w); P is the inverse of y's covariance, of this output's rows, or for vague weights
         its limit.)
         """
-        n, s = len(self.L), np.sqrt(self.signal)
-        alpha = self.L_inv.T @ self.left_over / s
+        # α and P in units of 1/s and 1/s²: in their own α² may overflow.
+        alpha, n = self.L_inv.T @ self.left_over, len(self.L)
         WR = self.W @ self.R_inv
         from_weights = self.L_inv.T @ WR
-        P = (symmetric_inverse(self.L_inv) - from_weights @ from_weights.T) / self.signal
+        P = symmetric_inverse(self.L_inv) - from_weights @ from_weights.T
         in_noise = alpha**2 - diagonal_of(P)
         squares = float(self.left_over @ self.left_over)
         explained = float(np.vdot(WR, WR))
-        noise_bar = 0.5 * self.noise * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
+        noise_bar = 0.5 * self.ratio * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
         P *= -1.0
         P += np.multiply.outer(alpha, alpha)
-        P *= 0.5 * self.signal
+        P *= 0.5
         return P, 0.5 * (squares - n + explained) - noise_bar, noise_bar
 
     def posterior(self) -> tuple[np.ndarray, np.ndarray]:

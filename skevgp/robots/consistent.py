@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import solve_triangular
+from scipy.linalg import eigh, solve_triangular
 
 from .._validation import check_real
 from .inertia import (
@@ -146,7 +146,7 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
     """F with F Fᵀ = covariance up to a common scale, without directions that are rounding only."""
     deviations = np.sqrt(np.diag(covariance))
     inverse = np.divide(1.0, deviations, out=np.zeros_like(deviations), where=deviations > 0.0)
-    values, vectors = np.linalg.eigh(covariance * np.outer(inverse, inverse))
+    values, vectors = eigh(covariance * np.outer(inverse, inverse))
     known = values > len(values) * np.finfo(np.float64).eps * values[-1]
     factor = deviations[:, None] * vectors[:, known] * np.sqrt(values[known])
     return factor / (deviations.max() or 1.0)

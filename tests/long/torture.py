@@ -31,8 +31,8 @@ SLACK, SHARE = 0.1, 1e-4
 
 # In sums of products other rows are lost beside one that counts so many times more.
 RANGE = 1e12
-# What a precision of which rounding leaves nothing but its order of magnitude may add to a bound.
-_DEPENDENT = 2.0
+# What a feature may add to a bound, and to what is left over, if rounding leaves of its precision but the order.
+_DEPENDENT, _LEFT_OVER = 2.0, 1e-3
 # Frames that may speak for the library: a message from elsewhere is not one that names an argument.
 SPEAKERS = ("skevgp", "sklearn", "tests.nasty")
 # Warnings that users are to see.
@@ -154,7 +154,7 @@ def _check_bound(case, model, told):
             isinstance(model.solver, str | type(None))
             and model.solver == "lbfgs"
             and _weighs(case) <= RANGE
-            and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3 - _hidden_nats(model, case.X)
+            and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3 - _hidden_nats(model, bound, case.X)
         ):
             raise DefectError(f"the upper bound {model.upper_bound_} is below the lower one {bound}")
         comparable = (
@@ -182,9 +182,9 @@ def _weighs(case):
     return precision.max() / precision[precision > 0.0].min()
 
 
-def _hidden_nats(model, X):
+def _hidden_nats(model, bound, X):
     """What rounding, and a jitter of K, may add to a bound where there is next to no noise."""
-    nats = _DEPENDENT * _dependent(model, X)
+    nats = (_DEPENDENT + _LEFT_OVER * abs(bound)) * _dependent(model, X)
     for one in model._fitted.learned:
         if one.model.complete:
             # The eigenvalues of what a jitter j leaves of K are no larger than j times the rows that are the same.
