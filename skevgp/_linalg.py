@@ -85,7 +85,7 @@ def jittered_cholesky(
             diagonal_of(shifted)[...] += jitter * own
         # The transpose of a C-contiguous matrix is what LAPACK reads without a copy: its upper factor is our lower.
         factor, info = lapack.dpotrf(shifted.T, lower=0, clean=1, overwrite_a=1)
-        if info == 0 and (len(factor) == 0 or isfinite(factor[-1, -1])):
+        if info == 0 and isfinite(factor.trace()):
             return factor.T
         if not np.isfinite(matrix).all():
             raise NotPositiveDefiniteError("the matrix is not finite")

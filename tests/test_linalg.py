@@ -106,7 +106,15 @@ def test_a_covariance_that_is_none_raises_a_named_error():
 # --- errors -------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("bad", [np.array([[1.0, 2.0], [2.0, 1.0]]), np.full((2, 2), np.nan), np.array([[np.inf]])])
+@pytest.mark.parametrize(
+    "bad",
+    [
+        np.array([[1.0, 2.0], [2.0, 1.0]]),
+        np.full((2, 2), np.nan),
+        np.array([[np.inf]]),
+        np.array([[np.inf, np.inf], [np.inf, 6e307]]),
+    ],
+)
 def test_hopeless_matrices_raise_a_named_error(bad):
     with pytest.raises(NotPositiveDefiniteError, match="not positive definite|not finite"):
         jittered_cholesky(bad)

@@ -372,6 +372,15 @@ def test_features_that_interpolate_do_not_hide_the_noise(noise, shift):
     assert (np.abs(y - mean) < 4 * std + 1e-9 * shift).all()
 
 
+def test_one_large_feature_among_more_than_there_are_rows_hides_no_noise():
+    rng = np.random.RandomState(1)
+    few = rng.randn(40, 45)
+    y = few[:, :3] @ rng.randn(3) + 0.3 * rng.randn(40)
+    scale = np.append(1e8, np.full(45, 0.3))[np.newaxis]
+    fitted = model(feature_map=PolynomialFeatures(degree=1), coef_scale=scale, n_inducing=8).fit(few, y)
+    assert fitted.lower_bound_ > alone(fitted, few, y) - 0.2
+
+
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("max_iter", [20, 200])
 def test_many_more_features_than_rows_find_a_noise_that_rounding_does_not_outweigh(max_iter, seed):

@@ -32,8 +32,8 @@ _GROWTH, _GAIN = 1.5, 0.01
 _SAMPLE, _MISSED = 1000, 0.02
 # On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
 _ITERATIONS, _COARSE = 60, 2e-4
-# Of the sum of squares that features may explain a priori: a noise variance that its rounding errors do not outweigh.
-_ROUNDING = 1e-14
+# Of a priori sums of squares: noise variances below are rounding errors beside them.
+_ROUNDING = 1e-13
 
 
 class Solver(Protocol):
@@ -158,9 +158,10 @@ class SparseTask:
         least = highest = self._left_over(trace)
         if self.max_iter > 0 and self._may_hide_noise:
             lowest, highest = self.table["noise"].value_limits().T
-            # Below, the evidence is that of rounding errors.
-            explained = [prior.scale[o] ** 2 @ np.diagonal(sums.of(slice(o, o + 1)).HH) for o in range(len(lowest))]
-            least = np.maximum(lowest, _ROUNDING * np.array(explained))
+            # Directions that the rows do not see have a precision of 1, beside which their features are large.
+            sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1)).HH) for o, scale in enumerate(prior.scale)]
+            unseen = [np.sort(own)[: max(len(own) - sums.length, 0)].sum() for own in sizes]
+            least = np.maximum(lowest, _ROUNDING * np.array(unseen))
         return noise_of_most_evidence(
             lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared
         )

@@ -194,7 +194,8 @@ class Strategy:
         One below the features alone is left for a fit from the noise that suits these.
         """
         best = yield from attempts
-        may_start = self.max_iter > 0 and self.table["noise"].free.any() and self.rules.last_start
+        free = self.table["noise"].free.any() or self.table["signal"].free.any()
+        may_start = self.max_iter > 0 and free and self.rules.last_start
         if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], _LITTLE * self.noise_alone)

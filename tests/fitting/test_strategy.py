@@ -126,6 +126,13 @@ def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
     assert best.bound == 6.5
     plain = strategy(alone=6.0, noise_alone=noise, rules=replace(RULES, last_start=False))
     assert len(drive(plain, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD))[0]) == 3
+    fixed = strategy(alone=6.0, noise_alone=noise, table=table(noise_fixed=True))
+    made, _ = drive(fixed, (5.0, GOOD), (6.5, GOOD))
+    assert (made[1].values["signal"] < 1e-3 * noise).all()
+    # What has not ended may still rise, unless the noise is hidden.
+    hidden = strategy(alone=6.0, noise_alone=noise, noise_hidden=True)
+    assert len(drive(replace(hidden, noise_hidden=False), (5.0, UNFINISHED))[0]) == 1
+    assert len(drive(hidden, (5.0, UNFINISHED), (6.5, GOOD))[0]) == 2
     # What is not below them has nothing to gain there.
     assert len(drive(own, (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
 

@@ -153,7 +153,7 @@ def _check_bound(case, model, told):
         if np.isnan(model.upper_bound_) or (
             isinstance(model.solver, str | type(None))
             and model.solver == "lbfgs"
-            and _weighs(case) <= RANGE
+            and _weighs(case, model) <= RANGE
             and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3 - _hidden_nats(model, bound, case.X)
         ):
             raise DefectError(f"the upper bound {model.upper_bound_} is below the lower one {bound}")
@@ -164,7 +164,12 @@ def _check_bound(case, model, told):
             and model.noise == "gaussian"
             and model.input_noise is None
         )
-    if not comparable or model._fitted.units.prior.shared or len(model.loss_curve_) == 0 or _weighs(case) > RANGE:
+    if (
+        not comparable
+        or model._fitted.units.prior.shared
+        or len(model.loss_curve_) == 0
+        or _weighs(case, model) > RANGE
+    ):
         return "fitted"
     # What noise_cv does afterwards is not for the bound's sake; nor is each iterate the best point of its line search.
     reached, floor = max(bound, -model.loss_curve_[-1]), alone(model, case.X, case.y, **_weights(case))
@@ -175,11 +180,14 @@ def _check_bound(case, model, told):
     raise DefectError(f"the bound {reached:.3f} is below {floor:.3f}, that of features and noise alone")
 
 
-def _weighs(case):
-    """How many times more the row counts that counts the most than that which counts the least."""
+def _weighs(case, model):
+    """How many times more the row counts that counts the most than that which counts the least; of shared weights, the
+    rows of all outputs.
+    """
     weight, variance = (np.asarray(case.fit.get(name, 1.0)) for name in ("sample_weight", "relative_variance"))
     precision = weight / variance
-    return precision.max() / precision[precision > 0.0].min()
+    noise = model.noise_variance_ if model._fitted.units.prior.shared else 1.0
+    return precision.max() / precision[precision > 0.0].min() * np.max(noise) / np.min(noise)
 
 
 def _hidden_nats(model, bound, X):
