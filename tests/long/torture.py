@@ -172,7 +172,7 @@ def _check_bound(case, model, told):
     ):
         return "fitted"
     # What noise_cv does afterwards is not for the bound's sake; nor is each iterate the best point of its line search.
-    reached, floor = max(bound, -model.loss_curve_[-1]), alone(model, case.X, case.y, **_weights(case))
+    reached, floor = max([bound, *(-model.loss_curve_[-1:])]), alone(model, case.X, case.y, **_weights(case))
     if reached >= floor - SLACK - SHARE * abs(floor):
         return "fitted"
     if any("still rising" in str(each.message) or "rounding errors" in str(each.message) for each in told):
