@@ -574,6 +574,8 @@ def _spoil(rng, case, d):
             frame.iloc[where] = np.nan
         filled = [SimpleImputer(keep_empty_features=True)]
         model.set_params(kernel_map=make_pipeline(*filled), feature_map=None, coef_mean="auto", coef_scale="auto")
+        # What it was to be refused for may have been these.
+        case.must = case.must and model.share_coef is not True
         model.set_params(share_coef="auto", kernel=None)
         case.X, case.rows, case.more = frame, frame, None
         # Columns of one row may be all that is known of one.

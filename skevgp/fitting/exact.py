@@ -23,7 +23,7 @@ from .advice import far_from_prior, how_it_ended, interrupted, learned_too_littl
 from .rules import Rules
 from .start import centred_kernels, checked_variance, starting_table
 from .strategy import Attempt, Fit, Strategy, drawn, search
-from .units import Units, may_hide_noise, noise_of_most_evidence
+from .units import Units, check_independent, may_hide_noise, noise_of_most_evidence
 
 # (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
@@ -89,23 +89,27 @@ class ExactTask:
             self.options.n_restarts,
             self.scatter,
             *self._with_little_signal(),
-            noise_hidden=True,
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
         )
 
-    def _with_little_signal(self) -> tuple[float, np.ndarray | None]:
-        """The likelihood with as little signal as there may be, and the noise variances (o,) that it is highest for."""
-        noise, signal, prior = self.table["noise"], self.table["signal"], self.model.prior
-        unasked = self.options.optimizer is not None or self.options.max_iter == 0 or not noise.free.any()
-        if unasked or not may_hide_noise(prior, len(self.model.rows.inputs)):
-            return -np.inf, None
-        values = self.table.values_at_start()
+    def _with_little_signal(self) -> tuple[float, np.ndarray | None, bool]:
+        """The likelihood with as little signal as there may be, the noise variances (o,) that it is highest for, and
+        whether features may hide these.
+        """
+        signal, rows, prior = self.table["signal"], self.model.rows, self.model.prior
+        if self.options.optimizer is not None or self.options.max_iter == 0:
+            return -np.inf, None, False
+        values, hidden = self.table.values_at_start(), may_hide_noise(prior, len(rows.inputs))
         values["signal"] = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
-        least, highest = noise.value_limits().T
-        return noise_of_most_evidence(
-            lambda noise: self.model.log_likelihoods(values | {"noise": noise}), least, highest, prior.shared
-        )
+        least, highest = self.table["noise"].value_limits().T
+        if not hidden:
+            least = highest = np.clip(np.average(rows.targets**2, axis=0, weights=rows.precision), least, highest)
+
+        def evidence(noise: np.ndarray) -> np.ndarray:
+            return self.model.log_likelihoods(values | {"noise": noise})
+
+        return *noise_of_most_evidence(evidence, least, highest, prior.shared), hidden
 
     def minimise(self, attempt: Attempt) -> Fit:
         """L-BFGS on the log marginal likelihood per row."""
@@ -332,7 +336,7 @@ def fit_exact(
     """
     n, starts = len(rows), spec.starts
     everything = rows.some(np.arange(n))
-    _check_independent(everything.features, vague, units.prior.shared)
+    check_independent(everything.features, vague, units.prior.shared)
     kernel, *others = kernels = centred_kernels(spec.covariance, rows.inputs)
     first, variance = starts.hyperparameters.value, 1.0
     if first is not None:
@@ -379,21 +383,3 @@ def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
     if model.prior.shared:
         n_vague[1:] = 0
     return (model.rows.total - n_vague) * np.log(units.target_unit)
-
-
-def _check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> None:
-    """Refuse features whose vague weights the rows cannot tell apart."""
-    if features.ndim == 3 and not shared:
-        for output, own in enumerate(vague):
-            _check_independent(features[:, output], own[np.newaxis], shared)
-        return
-    features = features.reshape(np.prod(features.shape[:-1]), features.shape[-1])
-    size = np.sqrt(np.sum(features**2, axis=0))
-    scaled = features / np.where(size > 0.0, size, 1.0)
-    for mask in np.unique(vague, axis=0):
-        rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
-        if rank < mask.sum():
-            raise ValueError(
-                f"coef_scale=inf needs features that are linearly independent on the rows of X: {mask.sum()} features "
-                f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
-            )

@@ -19,6 +19,8 @@ from ..inference.posterior import Predictor
 from ..optimizers.parameters import ParameterTable, Values
 from .rules import Rules
 
+# Nats: by less than this, a white kernel and noise are below each other by rounding.
+_WORTH = 0.01
 # Of the noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
 _LITTLE = 1e-4
 
@@ -196,7 +198,8 @@ class Strategy:
         best = yield from attempts
         free = self.table["noise"].free.any() or self.table["signal"].free.any()
         may_start = self.max_iter > 0 and free and self.rules.last_start
-        if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
+        worth = best.bound < self.alone - _WORTH
+        if self.noise_alone is not None and may_start and worth and self._below(best, hopeless=self.noise_hidden):
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], _LITTLE * self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))

@@ -170,6 +170,37 @@ def noise_of_most_evidence(
     return float(value.sum()), best
 
 
+def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> None:
+    """Refuse features whose vague weights the rows cannot tell apart.
+
+    Parameters
+    ----------
+    features : ndarray of shape (n, p) or (n, o, p)
+    vague : ndarray of shape (o, p)
+        Weights with an infinite prior scale.
+    shared : bool
+        Whether outputs share their weights.
+
+    Raises
+    ------
+    ValueError
+    """
+    if features.ndim == 3 and not shared:
+        for output, own in enumerate(vague):
+            check_independent(features[:, output], own[np.newaxis], shared)
+        return
+    features = features.reshape(np.prod(features.shape[:-1]), features.shape[-1])
+    size = np.sqrt(np.sum(features**2, axis=0))
+    scaled = features / np.where(size > 0.0, size, 1.0)
+    for mask in np.unique(vague, axis=0):
+        rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
+        if rank < mask.sum():
+            raise ValueError(
+                f"coef_scale=inf needs features that are linearly independent on the rows of X: {mask.sum()} features "
+                f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
+            )
+
+
 def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
     """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
 

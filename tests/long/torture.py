@@ -32,7 +32,7 @@ SLACK, SHARE = 0.1, 1e-4
 # In sums of products other rows are lost beside one that counts so many times more.
 RANGE = 1e12
 # What a feature may add to a bound, and to what is left over, if rounding leaves of its precision but the order.
-_DEPENDENT, _LEFT_OVER = 2.0, 1e-3
+_DEPENDENT, _LEFT_OVER = 2.0, 0.02
 # Frames that may speak for the library: a message from elsewhere is not one that names an argument.
 SPEAKERS = ("skevgp", "sklearn", "tests.nasty")
 # Warnings that users are to see.
