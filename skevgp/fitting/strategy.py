@@ -188,7 +188,7 @@ class Strategy:
     def _below(self, fit: Fit, hopeless: bool = False) -> bool:
         """Whether it ended below the features alone; what has not ended yet may still rise, unless that is hopeless."""
         ended = hopeless or fit.converged or fit.n_iter < self.max_iter
-        return fit.n_rows is None and ended and fit.bound < self.alone
+        return fit.n_rows is None and ended and fit.bound < self.alone - _WORTH
 
     def _released(self, attempts: Attempts) -> Attempts:
         """Their best fit; one that ended at a limit goes on from there, where the table has a wider one.
@@ -198,8 +198,7 @@ class Strategy:
         best = yield from attempts
         free = self.table["noise"].free.any() or self.table["signal"].free.any()
         may_start = self.max_iter > 0 and free and self.rules.last_start
-        worth = best.bound < self.alone - _WORTH
-        if self.noise_alone is not None and may_start and worth and self._below(best, hopeless=self.noise_hidden):
+        if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], _LITTLE * self.noise_alone)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
