@@ -105,7 +105,7 @@ def resolve_coef_prior(
         raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
     if (correlation == _independent(shape)).all():
         return CoefPrior(mean.astype(float), scale.astype(float), None)
-    eigenvalues, vectors = eigh(correlation)
+    eigenvalues, vectors = (np.array(each) for each in zip(*map(eigh, correlation), strict=True))
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, np.newaxis]
     return CoefPrior(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
 
