@@ -164,12 +164,8 @@ def _check_bound(case, model, told):
             and model.noise == "gaussian"
             and model.input_noise is None
         )
-    if (
-        not comparable
-        or model._fitted.units.prior.shared
-        or len(model.loss_curve_) == 0
-        or _weighs(case, model) > RANGE
-    ):
+    shared, asked = model._fitted.units.prior.shared, model.max_iter != 0
+    if not (comparable and asked) or shared or _weighs(case, model) > RANGE:
         return "fitted"
     # What noise_cv does afterwards is not for the bound's sake; nor is each iterate the best point of its line search.
     reached, floor = max([bound, *(-model.loss_curve_[-1:])]), alone(model, case.X, case.y, **_weights(case))
