@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.linalg import cho_solve, eigh
+from scipy.linalg import svd
 
-from .._linalg import diagonal_of, jittered_cholesky
+from .._linalg import diagonal_of, jittered_cholesky, triangular_inverse
 from ..inference.posterior import CoefficientPrior, Predictor
 from ..rows.internal import Rows
 from ..rows.source import Columns, Moments, RawRows, Source, times_weights
@@ -17,16 +17,28 @@ from ..rows.threads import BlockMap
 
 # So that the lowest noise variance in the user's units is not rounded to 0.
 SMALLEST_UNIT = 1e-140
-# Of a feature's size: less of it than this beside the others, sums over the targets do not see.
+# Of a feature's size: where it adds less than this to the others, sums of products leave few of its digits.
 _SEEN = 1e-6
+# Where it adds less than this, refinement would not converge.
+_ROUNDING = 1e-12
+
+
+def _products(raw: RawRows, basis: np.ndarray | None = None) -> np.ndarray:
+    """HᵀH of rows times the basis (k, p, p), k = 1 or o: (p, p), or (o, p, p) of features for each output.
+
+    Where rows have weights, each product has the factor ω; so it has below.
+    """
+    H = raw.features if raw.features.ndim == 2 else raw.features.transpose(1, 0, 2)
+    if basis is not None:
+        H = H @ (basis[0] if H.ndim == 2 else basis)
+    HW = np.swapaxes(H, -1, -2)
+    HW = HW if raw.precision is None else HW * raw.precision
+    return HW @ H
 
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; if asked for, HᵀH, Σ ω and Σ w too.
-
-    Where rows have weights, each product has the factor ω. HᵀH is (p, p), or (o, p, p) of features for each output.
-    """
+    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; if asked for, HᵀH, Σ ω and Σ w too."""
 
     target_mean: np.ndarray
     coef: np.ndarray
@@ -40,19 +52,51 @@ class _LeftOver:
             weighted, precision = left_over * raw.precision[:, np.newaxis], float(raw.precision.sum())
         HL = weighted.T @ H if H.ndim == 2 else np.einsum("no,nop->op", weighted, H)
         sums = HL, np.einsum("no,no->o", weighted, left_over)
-        if not self.with_products:
-            return sums
-        by_output = H if H.ndim == 2 else H.transpose(1, 0, 2)
-        HW = np.swapaxes(by_output, -1, -2)
-        HW = HW if raw.precision is None else HW * raw.precision
-        return (*sums, HW @ by_output, precision, raw.total)
+        return (*sums, _products(raw), precision, raw.total) if self.with_products else sums
+
+
+@dataclass(frozen=True)
+class _ProductsIn:
+    """Rows -> HᵀH in a basis, alone in a tuple."""
+
+    basis: np.ndarray
+
+    def __call__(self, raw: RawRows) -> tuple[np.ndarray]:
+        return (_products(raw, self.basis),)
+
+
+def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
+    """Upper R (k, p, p) with RᵀR = HᵀH, of features (k = 1), or of those for each output (k = o).
+
+    Where features nearly depend on each other, as powers of a column far from 0 do, their sums of products are those of
+    the basis R⁻¹ too: an R of these puts back the digits that the first one lacks (shifted Cholesky QR; Fukaya,
+    Kannan, Nakatsukasa, Yamamoto, Yanagisawa 2020).
+    """
+    R, lower, sizes = _triangles_of(HH)
+    if all((diagonal_of(L) >= _SEEN).all() for L in lower):
+        return R
+    basis = np.array([triangular_inverse(L).T for L in lower])
+    (again,) = source.sum(_ProductsIn(basis / np.where(sizes > 0.0, sizes, 1.0)[:, :, np.newaxis]))
+    return _triangles_of(again)[0] @ R
+
+
+def _triangles_of(products: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
+    """Upper factors (k, p, p) of HᵀH, the lower ones of H with columns of size 1, and these columns' sizes (k, p)."""
+    products = products if products.ndim == 3 else products[np.newaxis]
+    sizes = np.sqrt(np.einsum("kii->ki", products))
+    by = np.where(sizes > 0.0, sizes, 1.0)
+    lower = []
+    for each in products / (by[:, :, np.newaxis] * by[:, np.newaxis]):
+        diagonal_of(each)[...] = 1.0
+        lower.append(jittered_cholesky(each))
+    return np.array([L.T for L in lower]) * sizes[:, np.newaxis], lower, sizes
 
 
 def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
     """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
 
     The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
-    the rounding of the normal equations.
+    the rounding of sums over targets.
 
     Parameters
     ----------
@@ -71,56 +115,52 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
     (o, p), roots = prior.scale.shape, prior.roots()
     w = np.zeros((o, p))
     HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
-    products = np.swapaxes(roots, 1, 2) @ HH @ roots
     everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
     together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
+    triangles = _triangles(source, HH) @ roots if together else roots
     # Where outputs share their weights, what each leaves over decides how much it counts.
     shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
     for share in shares if together else ():
         noise = share * squares / n_rows
-        steps = [_Step.of(outputs, noise[outputs], products) for outputs in together if noise[outputs].any()]
+        steps = [_Step.of(outputs, noise[outputs], triangles) for outputs in together if noise[outputs].any()]
         for _ in range(3):
             for step in steps:
-                step.take(w, np.einsum("oij,oi->oj", roots, HL), cold=not w[step.outputs].any())
+                step.take(w, np.einsum("oij,oi->oj", roots, HL))
             HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
     return w, np.sqrt(squares / total_precision)
 
 
 @dataclass(frozen=True)
 class _Step:
-    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one."""
+    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one.
+
+    ``root`` is a B (p, k) with B Bᵀ the inverse of the precision of w, but for directions that rounding hides.
+    """
 
     outputs: list[int]
     least: float
     counts: np.ndarray
-    precision: np.ndarray
     root: np.ndarray
 
     @classmethod
-    def of(cls, outputs: list[int], noise: np.ndarray, products: np.ndarray) -> _Step:
+    def of(cls, outputs: list[int], noise: np.ndarray, triangles: np.ndarray) -> _Step:
+        """From the R C (o, p, p) of all outputs: the precision is not formed, which would square its condition."""
         noise = np.maximum(noise, 1e-16 * noise.max())
         least = float(noise.min())
-        counts = least / noise
-        precision = np.einsum("o,oij->ij", counts, products[outputs])
-        diagonal_of(precision)[...] += least
-        return cls(outputs, least, counts, precision, jittered_cholesky(precision))
+        counts, p = least / noise, triangles.shape[-1]
+        rows = np.sqrt(counts)[:, np.newaxis, np.newaxis] * triangles[outputs]
+        upper = np.linalg.qr(np.concatenate([rows.reshape(-1, p), np.sqrt(least) * np.eye(p)]), mode="r")
+        sizes = np.abs(upper).max(axis=0)
+        if (np.abs(diagonal_of(upper)) >= _SEEN * sizes).all():
+            return cls(outputs, least, counts, triangular_inverse(upper.T).T)
+        _, values, vectors = svd(upper / sizes, lapack_driver="gesvd")
+        seen = values >= _ROUNDING * values[0]
+        return cls(outputs, least, counts, (vectors[seen] / values[seen, np.newaxis] / sizes).T)
 
-    def take(self, w: np.ndarray, from_data: np.ndarray, cold: bool) -> None:
-        """From w, which is 0 if cold.
-
-        Sums over targets from which nothing has been subtracted have rounding errors that nearly dependent features
-        would blow up to weights that cancel. The first step keeps out of such directions; those after it, of what is
-        then left over, do not.
-        """
-        first = self.outputs[0]
-        wanted = self.counts @ from_data[self.outputs] - self.least * w[first]
-        sizes = np.sqrt(diagonal_of(self.precision))
-        if not cold or (diagonal_of(self.root) >= _SEEN * sizes).all():
-            w[self.outputs] += cho_solve((self.root, True), wanted)
-            return
-        values, vectors = eigh(self.precision / np.multiply.outer(sizes, sizes))
-        seen = values > _SEEN**2 * values[-1]
-        w[self.outputs] += vectors[:, seen] @ (vectors[:, seen].T @ (wanted / sizes) / values[seen]) / sizes
+    def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
+        """From w, with Cᵀ Hᵀ l of what it leaves over."""
+        wanted = self.counts @ from_data[self.outputs] - self.least * w[self.outputs[0]]
+        w[self.outputs] += self.root @ (self.root.T @ wanted)
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:

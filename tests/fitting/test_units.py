@@ -3,7 +3,7 @@ import pytest
 
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.inference.posterior import CoefficientPrior
-from skevgp.rows.source import LocalSource
+from skevgp.rows.source import LocalSource, RawRows
 
 
 def weights_alone(H, r, scale):
@@ -67,6 +67,33 @@ def test_features_that_nearly_depend_on_each_other_still_explain_what_they_can(n
     w = weights_alone(H, r, np.full((1, 30), 1e8))
     rest = r - U @ (U.T @ r)
     assert np.sum((r - H @ (1e8 * w).T) ** 2) <= 1.01 * np.sum(rest**2)
+
+
+def powers_far_from_zero(n):
+    """1, x and x² of x about 1e8, a feature that is always 0, and what a line through these x is."""
+    x = 1e8 + np.random.RandomState(0).randn(n)
+    return np.column_stack([np.ones(n), x, np.zeros(n), x**2]), x - 1e8
+
+
+@pytest.mark.parametrize("scale", [1.0, 1e8])
+def test_powers_of_a_column_far_from_zero_explain_what_the_column_does(scale):
+    H, line = powers_far_from_zero(100)
+    y = np.column_stack([line, 2.0 - line])
+    w = weights_alone(H, y, np.full((2, 4), scale))
+    # Beside the 1e-8 that a target of 1 keeps of a weight of 1 on a feature of 1e8.
+    assert np.abs(y - H @ (scale * w).T).max() <= 1e-6
+    assert np.abs(w[:, 2]).max() <= 1e-12
+
+
+@pytest.mark.parametrize("weights", [None, np.random.RandomState(2).uniform(0.5, 2.0, 100)])
+def test_so_do_powers_that_are_features_of_one_output_only(weights):
+    H, line = powers_far_from_zero(100)
+    own = np.stack([H, np.random.RandomState(1).randn(*H.shape)], axis=1)
+    y = np.column_stack([line, own[:, 1].sum(axis=1)])
+    rows = RawRows(np.zeros((100, 1)), own, y, weights, weights)
+    none = np.zeros((2, 4))
+    left_over = features_alone(LocalSource.holding(rows), np.zeros(2), CoefficientPrior(none, none + 1.0, none))[1]
+    assert left_over.max() <= 1e-6
 
 
 def test_units_survive_extreme_scales():
