@@ -35,6 +35,8 @@ from .rows.source import LocalSource, Moments, Source, moments_of_rows
 
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
 _VAGUE = 1e3
+# What features may add, in units of what they leave: its square, by the least noise variance, has to be finite.
+_LARGEST_SPREAD = 1e130
 
 
 @dataclass(frozen=True)
@@ -129,6 +131,9 @@ class Intake(StatefulEstimator):
         prior, vague = self._prior(given, features, targets, allow_vague)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
         units = Units.of(source, targets, target_mean, prior)
+        with np.errstate(over="ignore"):
+            spread = prior.scale * features.largest / units.target_unit[:, np.newaxis]
+        check_magnitude(spread, "coef_scale times features, in units of what these leave of y,", _LARGEST_SPREAD)
         self._spec, self._row_shapes = spec, (inputs.mean.shape, features.mean.shape)
         groups = None if groups is None else chosen.labels_of(groups)
         return Problem((given, X, y, chosen), source, units, spec, vague, n_columns, per_output, groups)

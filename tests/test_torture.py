@@ -46,8 +46,8 @@ def test_whatever_comes_is_fitted_or_refused(first):
 
 def test_what_was_a_defect_is_none_any_more():
     """Found by longer searches."""
-    once = (25, 198, 296, 444, 460, 722, 1443, 2372, 2811, 3298, 3860, 4571)
-    later = (49499150, 508113, 524561, 524792, 528175, 528248, 601365, 603127, 1010265947)
+    once = (25, 198, 296, 444, 460, 722, 1443, 2372, 2811, 3298, 3860, 4571, 508113, 524561, 524792, 528175, 528248)
+    later = (601365, 603127, 900591, 1000450, 2000708, 2002349, 49499150, 1010265947)
     _, defects, _ = run(once + later)
     assert not defects
 
@@ -193,6 +193,15 @@ def test_torques_of_any_size_between_are_not(scale):
     mean, std = InverseDynamics(n_inducing=5, max_iter=2).fit(X, y).predict(X, return_std=True)
     assert np.abs(mean - y).max() < 10.0 * np.abs(y).max()
     assert (std > 0.0).all()
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
+    message = r"^coef_scale times features, in units of what these leave of y, must not exceed 1e\+130 in size; "
+    model = kind(PolynomialFeatures(), coef_scale=1e8, max_iter=5)
+    with pytest.raises(ValueError, match=message):
+        model.fit(1e12 * X, 1e-110 * Y)
+    assert np.isfinite(model.fit(1e12 * X, 1e-80 * Y).predict(1e12 * X, return_std=True)).all()
 
 
 @pytest.mark.parametrize("name", ["NaN", "huge", "y with NaN", "y short", "sparse matrix", "one dimension"])

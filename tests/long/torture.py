@@ -18,6 +18,7 @@ import warnings
 from collections import Counter
 
 import numpy as np
+from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -154,7 +155,7 @@ def _check_bound(case, model, told):
             isinstance(model.solver, str | type(None))
             and model.solver == "lbfgs"
             and _weighs(case, model) <= RANGE
-            and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3 - _hidden_nats(model, bound, case.X)
+            and model.upper_bound_ < bound - 1e-5 * abs(bound) - 1e-3 - _hidden_nats(model, bound, case.X, case.y)
         ):
             raise DefectError(f"the upper bound {model.upper_bound_} is below the lower one {bound}")
         comparable = (
@@ -169,7 +170,11 @@ def _check_bound(case, model, told):
         return "fitted"
     # What noise_cv does afterwards is not for the bound's sake; nor is each iterate the best point of its line search.
     reached, floor = max([bound, *(-model.loss_curve_[-1:])]), alone(model, case.X, case.y, **_weights(case))
-    if reached >= floor - SLACK - SHARE * abs(floor):
+    least = floor - SLACK - SHARE * abs(floor)
+    if reached < least and not len(model.loss_curve_) and getattr(model, "noise_cv", None) is not None:
+        # It ended where it started, and left no curve.
+        reached = clone(model).set_params(noise_cv=None).fit(case.X, case.y, **case.fit).lower_bound_
+    if reached >= least:
         return "fitted"
     if any("still rising" in str(each.message) or "rounding errors" in str(each.message) for each in told):
         return "below, and told"
@@ -186,9 +191,12 @@ def _weighs(case, model):
     return precision.max() / precision[precision > 0.0].min() * np.max(noise) / np.min(noise)
 
 
-def _hidden_nats(model, bound, X):
+def _hidden_nats(model, bound, X, y):
     """What rounding, and a jitter of K, may add to a bound where there is next to no noise."""
     nats = (_DEPENDENT + _LEFT_OVER * abs(bound)) * _dependent(model, X)
+    y = np.asarray(y, dtype=float).reshape(len(X), -1)
+    # Targets are known to their last digit, and what is left over of them no better.
+    nats += 0.5 * np.sum((np.finfo(float).eps * y) ** 2 / model.noise_variance_)
     for one in model._fitted.learned:
         if one.model.complete:
             # The eigenvalues of what a jitter j leaves of K are no larger than j times the rows that are the same.
