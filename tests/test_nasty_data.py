@@ -155,6 +155,17 @@ def test_a_wave_far_from_zero_is_learned(offset):
     assert EVGPRegressor(n_inducing=20, random_state=0).fit(X, y).score(X, y) > 0.98
 
 
+@pytest.mark.parametrize("scale", [1.0, 1e8])
+def test_powers_of_columns_far_from_zero_explain_a_line(scale):
+    rng = np.random.RandomState(0)
+    X = 1e8 + rng.randn(30, 5)
+    line = (X - 1e8).sum(axis=1)
+    model = EVGPRegressor(PolynomialFeatures(), coef_scale=scale, random_state=0).fit(X, line + 1e-8 * rng.randn(30))
+    # The weights of 20 products of 1e16, which add up to a line of size 1, leave 1e-7 of it.
+    assert np.abs(model.predict(X) - line).max() <= 1e-5
+    assert model.noise_variance_ <= 1e-10
+
+
 def test_rows_that_differ_by_rounding_share_inducing_points():
     rng = np.random.RandomState(0)
     X = np.repeat([[0.0], [1.0], [2.0]], 20, axis=0) + 1e-14 * rng.randn(60, 1)
