@@ -82,6 +82,7 @@ class ExactTask:
     @property
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
+        precision = self.model.rows.precision
         return Strategy(
             self.options.rules,
             self.table,
@@ -89,6 +90,7 @@ class ExactTask:
             self.options.n_restarts,
             self.scatter,
             *self._with_little_signal(),
+            mean_precision=1.0 if precision is None else float(precision.sum() / self.model.rows.total),
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
         )

@@ -185,6 +185,7 @@ class SparseTask:
             alone=alone,
             noise_alone=noise_alone,
             noise_hidden=self._may_hide_noise,
+            mean_precision=self.rows.mean_precision,
             interpolates=self.interpolates,
             samples=self.samples,
             place=None if anew is None else partial(self._placed, placement=anew),

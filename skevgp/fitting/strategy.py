@@ -21,7 +21,7 @@ from .rules import Rules
 
 # Nats: by less than this, a white kernel and noise are below each other by rounding.
 _WORTH = 0.01
-# Of the noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
+# Of a row's noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
 _LITTLE = 1e-4
 
 
@@ -134,6 +134,8 @@ class Strategy:
         The noise variances with which it is.
     noise_hidden : bool
         Whether it may be far above what the features leave over, from where no fit climbs to it.
+    mean_precision : float
+        Of the rows, where a row with the noise variance itself has 1.
     interpolates : bool
         Whether there are as many inducing points as rows.
     samples : tuple of int
@@ -156,6 +158,7 @@ class Strategy:
     alone: float = -np.inf
     noise_alone: np.ndarray | None = None
     noise_hidden: bool = False
+    mean_precision: float = 1.0
     interpolates: bool = False
     samples: tuple[int, ...] = ()
     place: Callable[[Values], Values] | None = None
@@ -200,7 +203,7 @@ class Strategy:
         may_start = self.max_iter > 0 and free and self.rules.last_start
         if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
             first = self.table.values_at_start()
-            little = np.minimum(first["signal"], _LITTLE * self.noise_alone)
+            little = np.minimum(first["signal"], _LITTLE * self.noise_alone / self.mean_precision)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))

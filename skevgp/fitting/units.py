@@ -149,7 +149,7 @@ class _Step:
         least = float(noise.min())
         counts, p = least / noise, triangles.shape[-1]
         rows = np.sqrt(counts)[:, np.newaxis, np.newaxis] * triangles[outputs]
-        upper = np.linalg.qr(np.concatenate([rows.reshape(-1, p), np.sqrt(least) * np.eye(p)]), mode="r")
+        upper = np.linalg.qr(np.concatenate([rows.reshape(-1, p), np.sqrt(least) * np.eye(p)])).R
         sizes = np.abs(upper).max(axis=0)
         if (np.abs(diagonal_of(upper)) >= _SEEN * sizes).all():
             return cls(outputs, least, counts, triangular_inverse(upper.T).T)

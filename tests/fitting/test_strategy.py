@@ -124,6 +124,9 @@ def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
     np.testing.assert_array_equal(made[3].values["hyperparameters"], made[0].values["hyperparameters"])
     assert (made[3].values["signal"] < 1e-3 * noise).all()
     assert best.bound == 6.5
+    # So little signal is little for the rows whose noise is the least, too.
+    made, _ = drive(replace(own, mean_precision=1e4), (5.0, GOOD), (4.0, GOOD), (3.0, GOOD), (6.5, GOOD))
+    assert (made[3].values["signal"] < 1e-7 * noise).all()
     plain = strategy(alone=6.0, noise_alone=noise, rules=replace(RULES, last_start=False))
     assert len(drive(plain, (5.0, GOOD), (4.0, GOOD), (3.0, GOOD))[0]) == 3
     fixed = strategy(alone=6.0, noise_alone=noise, table=table(noise_fixed=True))
