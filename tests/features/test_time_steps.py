@@ -366,8 +366,12 @@ class TestLogs:
         assert physics[1] < 0.6 * plain[1]
 
     def test_what_short_steps_tell_holds_for_long_ones(self):
-        physics, plain = errors(*log(8, 25, 0, longest=0.02), *log(20, 50, 1, shortest=0.04)[:2])
-        assert (physics < 0.7 * plain).all()
+        """Of three logs: what a kernel alone says of longer steps is chance, and for one log it may be good."""
+        ratios = []
+        for seed in (0, 10, 20):
+            physics, plain = errors(*log(8, 25, seed, longest=0.02), *log(20, 50, seed + 1, shortest=0.04)[:2])
+            ratios.append(physics / plain)
+        assert (np.median(ratios, axis=0) < 0.7).all()
 
     def test_weights_are_physics_within_their_std_and_what_eulers_rule_neglects(self):
         """What it neglects is ½ Δt times the rate of the rates: 19.62 of the angle's, 4 of the torque's."""
