@@ -79,10 +79,10 @@ def errors_panel(
 def reliability_panel(axes: Any, own: dict[tuple[str, str], list[Row]]) -> None:
     """How much more or less intervals hold than they promise."""
     axes.axhline(0.0, color="black", linewidth=1.2, label="as promised")
-    dashes = {"EVGP-IFG": "-", "EVGP-IF": "--", "RES-VGP": "-.", "VGP": (0, (1, 1)), "RES-DBNN": ":"}
+    lines = {"EVGP-IFG": "o-", "EVGP-IF": "^--", "RES-VGP": "s-.", "VGP": "v:", "RES-DBNN": "x:"}
     for (model, setting), rows in own.items():
         promised, held = reliability(rows)
-        style = {"color": STYLES[setting][0], "linestyle": dashes[model], "marker": "."}
-        axes.plot(promised, held - promised, **style, label=f"{model}, {setting}")
+        style = {"color": STYLES[setting][0], "markersize": 4}
+        axes.plot(promised, held - promised, lines[model], **style, label=f"{model}, {setting}")
     low, high = axes.get_ylim()
     axes.set(xlabel="share promised", xlim=(0, 1), ylim=(min(low, -0.05), max(high, 0.05)))
