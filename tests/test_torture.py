@@ -48,7 +48,8 @@ def test_what_was_a_defect_is_none_any_more():
     """Found by longer searches."""
     once = (25, 198, 296, 444, 460, 722, 1443, 2372, 2811, 3298, 3860, 4571, 508113, 524561, 524792, 528175, 528248)
     later = (601365, 603127, 900591, 1000450, 2000708, 2002349, 32001940, 32003684, 49499150, 1010265947)
-    _, defects, _ = run(once + later)
+    latest = (42000097, 42001009, 42001934)
+    _, defects, _ = run(once + later + latest)
     assert not defects
 
 

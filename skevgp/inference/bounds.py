@@ -284,7 +284,7 @@ class BoundAtOptimum:
         VE = statistics.VR - statistics.VV @ f - statistics.VH @ b
         HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
         squares = statistics.RR - ((statistics.VR + VE) * f).sum(axis=0) - ((statistics.HR + HE) * b).sum(axis=0)
-        return Residuals(np.maximum(squares, 0.0), VE)
+        return Residuals(np.maximum(squares, 0.0), VE, HE)
 
     def left_over(self, blocks: Blocks | None) -> Residuals:
         """The same from the rows, where no digits cancel; from the statistics if these are all there is."""
@@ -302,6 +302,34 @@ class BoundAtOptimum:
         return self.value(residuals), {"signal": signal, "noise": noise}
 
 
+def unsolved(group: Group, posteriors: Sequence[WhitenedPosterior], left: Residuals) -> list[np.ndarray]:
+    """What each mean, by the errors that it leaves, is short of as the solution of B mean = g: g - B mean (m + p,).
+
+    As σ⁻² Pᵀe - mean - (0, w₀) it keeps the digits that B, g and their solution have lost (Higham 2002, section 12.1).
+    """
+    PE, m, found = np.concatenate([left.VE, left.HE]), len(left.VE), []
+    for o, q in enumerate(posteriors):
+        prior = q.mean.copy()
+        prior[m:] += group.prior.reference[o]
+        prior[q.n_own :] = 0.0
+        found.append(group.pulled_back(o, PE[:, o]) / group.noise[o] - prior)
+    return found
+
+
+def shortfall(bounds: Sequence[BoundAtOptimum], left: Sequence[Residuals]) -> float:
+    """By how much rounding keeps the bounds' means from their least squares, in nats: ½ ρᵀB⁻¹ρ, with ρ = g - B mean."""
+    nats, of_weights = 0.0, []
+    for bound, own in zip(bounds, left, strict=True):
+        for q, rest in zip(bound.posteriors, unsolved(bound.group, bound.posteriors, own), strict=True):
+            half, m = q.root_inv @ rest, len(own.VE)
+            nats += 0.5 * float(half[:m] @ half[:m])
+            of_weights.append(half[m:])
+    # Weights that outputs share have the sum of what these say.
+    if bounds[0].group.prior.shared:
+        of_weights = [np.sum(of_weights, axis=0)]
+    return nats + 0.5 * float(sum(half @ half for half in of_weights))
+
+
 def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
     """No less than the log marginal likelihood at these parameters, summed over outputs, whatever q is.
 
@@ -312,6 +340,7 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
 
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
+    An ω that rounding keeps from there makes a bound lower, so what it is short of is added.
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
     j, and a row that comes or counts often makes that so many times larger. (Where outputs share their weights, y, σ²
     and t are those of all outputs, one after the other.)
@@ -339,7 +368,8 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
     # The likelihood with this noise and without a trace term, but for its determinant.
     bounds = bounds_at_optimum(wide, "full")
-    total = sum(bound.value(bound.left_over(blocks)) for bound in bounds)
+    left = [bound.left_over(blocks) for bound in bounds]
+    total = sum(bound.value(own) for bound, own in zip(bounds, left, strict=True)) + shortfall(bounds, left)
     log_det = log_ratio + sum(q.log_det for bound in bounds for q in bound.posteriors)
     log_det -= sum(q.log_det for own in optimal_posteriors(groups) for q in own)
     return total + 0.5 * log_det

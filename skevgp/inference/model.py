@@ -17,6 +17,7 @@ from .bounds import (
     WhitenedPosterior,
     bounds_at_optimum,
     optimal_posteriors,
+    unsolved,
     upper_bound,
 )
 from .posterior import CoefficientPrior, Predictor, PredictorGroup, diagonal_root, log_variances
@@ -206,16 +207,13 @@ def _refined(group: Group, posteriors: list[WhitenedPosterior], blocks: Blocks) 
     """One step of iterative refinement of the means, by errors summed row by row: a pass.
 
     B mean = g loses digits in directions of which the rows say little: there B is about 1, and its rounding errors are
-    a share of its trace. What is left of it, σ⁻² Pᵀe - mean - (0, w₀), does not (Higham 2002, section 12.1). Where
-    errors of B are above `_REFINABLE` a step need not lead nearer, and is not taken.
+    a share of its trace. What is `unsolved` does not. Where errors of B are above `_REFINABLE` a step need not lead
+    nearer, and is not taken.
     """
     weights = np.column_stack([group.weights_of(o, q.mean) for o, q in enumerate(posteriors)])
     left, found = errors(blocks, group.whitening, group.outputs, weights), []
-    PE, m = np.concatenate([left.VE, left.HE]), len(left.VE)
-    for o, q in enumerate(posteriors):
-        still = group.pulled_back(o, PE[:, o]) / group.noise[o] - q.mean
-        still[m:] -= group.prior.reference[o]
-        step = q.root_inv.T @ (q.root_inv @ still)
+    for q, rest in zip(posteriors, unsolved(group, posteriors, left), strict=True):
+        step = q.root_inv.T @ (q.root_inv @ rest)
         refinable = np.finfo(float).eps * np.trace(q.B) < _REFINABLE
         found.append(replace(q, mean=q.mean + step) if refinable else q)
     return found

@@ -227,7 +227,7 @@ class Residuals:
     VE : ndarray of shape (m, o)
         V e of each output.
     HE : ndarray of shape (p, o), optional
-        Hᵀe, where `errors` are all that was asked for.
+        Hᵀe, where no gradient was asked for.
     """
 
     squares: np.ndarray

@@ -8,7 +8,15 @@ from autograd import grad
 from skevgp._linalg import Jitter, NotPositiveDefiniteError
 from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
-from skevgp.inference.bounds import BoundAtOptimum, bounds_alone, optimal_posteriors, upper_bound
+from skevgp.inference.bounds import (
+    BoundAtOptimum,
+    bounds_alone,
+    bounds_at_optimum,
+    optimal_posteriors,
+    shortfall,
+    unsolved,
+    upper_bound,
+)
 from skevgp.inference.model import SparseModel
 from skevgp.inference.objectives import BoundObjective
 from skevgp.inference.posterior import CoefficientPrior
@@ -346,6 +354,32 @@ def test_errors_of_the_upper_bound_are_summed_row_by_row():
     values = table.values_at_start() | {"noise": np.full(2, 1e-10), "signal": np.full(2, 1e-10)}
     expected = longdouble_upper_bound(model, rows, values)
     assert bounds_of(model, rows, values)[1] == pytest.approx(expected, rel=0.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("from_rows", [True, False])
+@pytest.mark.parametrize("weights_are_shared", [False, True])
+def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(weights_are_shared, from_rows):
+    """The bound is quadratic in the mean."""
+    model, rows, table = problem(shared=False)
+    alike = {name: getattr(model.prior, name)[:1].repeat(2, axis=0) for name in ("mean", "scale", "reference")}
+    model = replace(model, prior=replace(model.prior, shared=weights_are_shared, **alike))
+    values, blocks = table.values_at_start(), rows.blocks(model.kernel, 17)
+    groups = list(model.groups_of(values, model.statistics(values, blocks)))
+    best = sum(bound.value(bound.left_over(blocks)) for bound in bounds_at_optimum(groups, "full"))
+    rng, bounds = np.random.RandomState(0), []
+    off_w = 0.1 * rng.randn(model.prior.scale.shape[1])
+    for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
+        offs = [np.concatenate([0.1 * rng.randn(len(q.mean) - len(off_w)), off_w]) for q in posteriors]
+        moved = [replace(q, mean=q.mean + off) for q, off in zip(posteriors, offs, strict=True)]
+        bounds.append(BoundAtOptimum(group, "full", moved))
+        if not weights_are_shared:
+            rest = unsolved(group, moved, bounds[-1].left_over(blocks))
+            for q, off, found in zip(moved, offs, rest, strict=True):
+                np.testing.assert_allclose(found, -q.B @ off, rtol=1e-8, atol=1e-8)
+    left = [bound.left_over(blocks if from_rows else None) for bound in bounds]
+    value = sum(bound.value(own) for bound, own in zip(bounds, left, strict=True))
+    assert value < best - 0.1
+    assert value + shortfall(bounds, left) == pytest.approx(best, rel=1e-9)
 
 
 def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():
