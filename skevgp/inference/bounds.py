@@ -231,8 +231,7 @@ class BoundAtOptimum:
     """
 
     def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior] | None = None):
-        if posteriors is None:
-            (posteriors,) = optimal_posteriors([group])
+        posteriors = optimal_posteriors([group])[0] if posteriors is None else posteriors
         statistics, scales, noise = group.statistics, group.scales, group.noise
         joint, m = statistics.joint, len(statistics.VV)
         self.group, self.posteriors = group, posteriors
@@ -309,8 +308,7 @@ def unsolved(group: Group, posteriors: Sequence[WhitenedPosterior], left: Residu
     """
     PE, m, found = np.concatenate([left.VE, left.HE]), len(left.VE), []
     for o, q in enumerate(posteriors):
-        prior = q.mean.copy()
-        prior[m:] += group.prior.reference[o]
+        prior = q.mean + np.concatenate([np.zeros(m), group.prior.reference[o]])
         prior[q.n_own :] = 0.0
         found.append(group.pulled_back(o, PE[:, o]) / group.noise[o] - prior)
     return found
@@ -318,16 +316,14 @@ def unsolved(group: Group, posteriors: Sequence[WhitenedPosterior], left: Residu
 
 def shortfall(bounds: Sequence[BoundAtOptimum], left: Sequence[Residuals]) -> float:
     """By how much rounding keeps the bounds' means from their least squares, in nats: ½ ρᵀB⁻¹ρ, with ρ = g - B mean."""
-    nats, of_weights = 0.0, []
+    halves = []
     for bound, own in zip(bounds, left, strict=True):
         for q, rest in zip(bound.posteriors, unsolved(bound.group, bound.posteriors, own), strict=True):
-            half, m = q.root_inv @ rest, len(own.VE)
-            nats += 0.5 * float(half[:m] @ half[:m])
-            of_weights.append(half[m:])
+            halves.append(np.split(q.root_inv @ rest, [len(own.VE)]))
+    of_v, of_w = zip(*halves, strict=True)
     # Weights that outputs share have the sum of what these say.
-    if bounds[0].group.prior.shared:
-        of_weights = [np.sum(of_weights, axis=0)]
-    return nats + 0.5 * float(sum(half @ half for half in of_weights))
+    of_w = (np.sum(of_w, axis=0),) if bounds[0].group.prior.shared else of_w
+    return 0.5 * float(sum(half @ half for half in (*of_v, *of_w)))
 
 
 def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
