@@ -271,3 +271,23 @@ def test_rows_that_are_equal_but_for_rounding_are_duplicates(posterior, n_induci
     for found, expected in zip(near.predict(new, return_std=True), same.predict(new, return_std=True), strict=True):
         np.testing.assert_allclose(found, expected, atol=1e-8)
     assert near.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-6)
+
+
+DEPENDENT = {
+    "sum": lambda X: [X, X.sum(axis=1)],
+    "other units": lambda X: [X, 3.7 * X, 1e-3 * X],
+    "copies and zeros": lambda X: [X, X, 0.0 * X],
+}
+
+
+@pytest.mark.parametrize("coef_scale", [1e3, 1e7, 1e9])
+@pytest.mark.parametrize("name", DEPENDENT)
+def test_features_that_depend_on_each_other_share_what_they_explain(name, coef_scale):
+    """Of all weights that explain it the prior takes the smallest, however wide it is; rounding is not one of them."""
+    rng = np.random.RandomState(0)
+    X = rng.randn(60, 2)
+    y = X @ [1.0, 2.0] + 0.5 + 0.1 * rng.randn(60)
+    features = FunctionTransformer(lambda X: np.column_stack([*DEPENDENT[name](X), np.ones(len(X))]))
+    model = EVGPRegressor(features, coef_scale=coef_scale, n_inducing=5, max_iter=0).fit(X, y)
+    expected = np.linalg.lstsq(features.transform(X), y, rcond=1e-10)[0]
+    np.testing.assert_allclose(model._fitted.units.prior.offset[0], expected, atol=1e-4)

@@ -135,12 +135,15 @@ class _Step:
     """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one.
 
     ``root`` is a B (p, k) with B Bᵀ the inverse of the precision of w, but for directions that rounding hides.
+    ``told`` (p, p), where features nearly depend on each other, takes from Cᵀ Hᵀ l what is rounding: that in directions
+    in which they do not vary, where the prior decides.
     """
 
     outputs: list[int]
     least: float
     counts: np.ndarray
     root: np.ndarray
+    told: np.ndarray | None = None
 
     @classmethod
     def of(cls, outputs: list[int], noise: np.ndarray, triangles: np.ndarray) -> _Step:
@@ -148,19 +151,29 @@ class _Step:
         noise = np.maximum(noise, 1e-16 * noise.max())
         least = float(noise.min())
         counts, p = least / noise, triangles.shape[-1]
-        rows = np.sqrt(counts)[:, np.newaxis, np.newaxis] * triangles[outputs]
-        upper = np.linalg.qr(np.concatenate([rows.reshape(-1, p), np.sqrt(least) * np.eye(p)])).R
+        rows = (np.sqrt(counts)[:, np.newaxis, np.newaxis] * triangles[outputs]).reshape(-1, p)
+        upper = np.linalg.qr(np.concatenate([rows, np.sqrt(least) * np.eye(p)])).R
         sizes = np.abs(upper).max(axis=0)
         if (np.abs(diagonal_of(upper)) >= _SEEN * sizes).all():
             return cls(outputs, least, counts, triangular_inverse(upper.T).T)
-        _, values, vectors = svd(upper / sizes, lapack_driver="gesvd")
-        seen = values >= _ROUNDING * values[0]
-        return cls(outputs, least, counts, (vectors[seen] / values[seen, np.newaxis] / sizes).T)
+        values, vectors = _varying(upper / sizes)
+        root = (vectors / values[:, np.newaxis] / sizes).T
+        _, vectors = _varying(rows / sizes)
+        return cls(outputs, least, counts, root, (vectors * sizes).T @ (vectors / sizes))
 
     def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
         """From w, with Cᵀ Hᵀ l of what it leaves over."""
-        wanted = self.counts @ from_data[self.outputs] - self.least * w[self.outputs[0]]
+        wanted = self.counts @ from_data[self.outputs]
+        wanted = wanted if self.told is None else self.told @ wanted
+        wanted -= self.least * w[self.outputs[0]]
         w[self.outputs] += self.root @ (self.root.T @ wanted)
+
+
+def _varying(upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Singular values (k,) above rounding, and their right vectors (k, p)."""
+    _, values, vectors = svd(upper, full_matrices=False, lapack_driver="gesvd")
+    kept = values >= _ROUNDING * values[0]
+    return values[kept], vectors[kept]
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:

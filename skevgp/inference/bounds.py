@@ -336,7 +336,7 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
 
     (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
     The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
-    An ω that rounding keeps from there makes a bound lower, so what it is short of is added.
+    An ω that rounding keeps from there makes it lower: what that costs is added. (log|B| is good to what sums hold.)
     Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
     j, and a row that comes or counts often makes that so many times larger. (Where outputs share their weights, y, σ²
     and t are those of all outputs, one after the other.)
