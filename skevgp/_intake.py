@@ -133,7 +133,11 @@ class Intake(StatefulEstimator):
         units = Units.of(source, targets, target_mean, prior)
         with np.errstate(over="ignore"):
             spread = prior.scale * features.largest / units.target_unit[:, np.newaxis]
-        check_magnitude(spread, "coef_scale times features, in units of what these leave of y,", _LARGEST_SPREAD)
+        check_magnitude(
+            spread,
+            "the prior standard deviation of coef_ times features, in units of what these leave of y,",
+            _LARGEST_SPREAD,
+        )
         self._spec, self._row_shapes = spec, (inputs.mean.shape, features.mean.shape)
         groups = None if groups is None else chosen.labels_of(groups)
         return Problem((given, X, y, chosen), source, units, spec, vague, n_columns, per_output, groups)

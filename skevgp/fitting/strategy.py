@@ -21,7 +21,7 @@ from .rules import Rules
 
 # Nats: by less than this, a white kernel and noise are below each other by rounding.
 _WORTH = 0.01
-# Of a row's noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
+# Of a mean row's noise: so little signal costs next to nothing, and is still told by the gradient whether to grow.
 _LITTLE = 1e-4
 
 
@@ -196,12 +196,15 @@ class Strategy:
     def _released(self, attempts: Attempts) -> Attempts:
         """Their best fit; one that ended at a limit goes on from there, where the table has a wider one.
 
-        One below the features alone is left for a fit from the noise that suits these.
+        One below the features alone, or maybe below, is left for a fit from the noise that suits these.
         """
         best = yield from attempts
         free = self.table["noise"].free.any() or self.table["signal"].free.any()
         may_start = self.max_iter > 0 and free and self.rules.last_start
-        if self.noise_alone is not None and may_start and self._below(best, hopeless=self.noise_hidden):
+        # Of a signal that stays, what the features alone reach depends on where the kernel ends, which is not known.
+        unknown = self.noise_hidden and not self.table["signal"].free.all()
+        doubtful = unknown or self._below(best, hopeless=self.noise_hidden)
+        if self.noise_alone is not None and may_start and doubtful:
             first = self.table.values_at_start()
             little = np.minimum(first["signal"], _LITTLE * self.noise_alone / self.mean_precision)
             best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))

@@ -70,7 +70,8 @@ def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
 
     Where features nearly depend on each other, as powers of a column far from 0 do, their sums of products are those of
     the basis R⁻¹ too: an R of these puts back the digits that the first one lacks (shifted Cholesky QR; Fukaya,
-    Kannan, Nakatsukasa, Yamamoto, Yanagisawa 2020).
+    Kannan, Nakatsukasa, Yamamoto, Yanagisawa 2020; without their third factor, which makes Q orthogonal to the last
+    digit: Q is not used).
     """
     R, lower, sizes = _triangles_of(HH)
     if all((diagonal_of(L) >= _SEEN).all() for L in lower):
@@ -117,10 +118,11 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
     HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
     everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
     together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
-    triangles = _triangles(source, HH) @ roots if together else roots
+    if not together:
+        return w, np.sqrt(squares / total_precision)
+    triangles = _triangles(source, HH) @ roots
     # Where outputs share their weights, what each leaves over decides how much it counts.
-    shares = (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0)
-    for share in shares if together else ():
+    for share in (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0):
         noise = share * squares / n_rows
         steps = [_Step.of(outputs, noise[outputs], triangles) for outputs in together if noise[outputs].any()]
         for _ in range(3):
