@@ -198,7 +198,8 @@ def test_torques_of_any_size_between_are_not(scale):
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
 def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
-    message = r"^the prior standard deviation of coef_ times features, in units of what these leave of y, must not exceed 1e\+130 in size; "
+    spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
+    message = rf"^{spread} must not exceed 1e\+130 in size; "
     model = kind(PolynomialFeatures(), coef_scale=1e8, max_iter=5)
     with pytest.raises(ValueError, match=message):
         model.fit(1e12 * X, 1e-110 * Y)
