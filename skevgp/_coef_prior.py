@@ -97,7 +97,10 @@ def resolve_coef_prior(
     if coef_cov is not None:
         scale, correlation = _of_covariance(coef_cov, "coef_cov", shape)
     finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
-    for name, values in (("coef_mean", mean), ("coef_scale", finite)):
+    scale_name = "coef_scale"
+    if scale is auto_scale:
+        scale_name = "coef_scale='auto', the feature map's or 10 std(y) / rms of a feature,"
+    for name, values in (("coef_mean", mean), (scale_name, finite)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
         check_magnitude(values, name)

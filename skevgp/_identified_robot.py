@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch
 from sklearn.utils.metaestimators import available_if
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from ._joint_residual import JointResidual
 from ._payload import find_payload, payload_prior
 from ._torque_regression import TorqueRegression
-from ._validation import check_integer, check_magnitude, check_real
+from ._validation import check_integer, check_magnitude, check_real, validate_numbers
 from .identification.weights import Known
 from .robots import (
     body_parameters,
@@ -263,7 +263,7 @@ class IdentifiedRobot(TorqueRegression):
         """
         check_is_fitted(self)
         n_outputs = len(self._joints)
-        rows_x, targets = validate_data(self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, reset=False)
+        rows_x, targets = validate_numbers(self, X, y, reset=False, dtype=np.float64)
         targets = np.asarray(targets, dtype=np.float64).reshape(len(rows_x), -1)
         if targets.shape[1] != n_outputs:
             raise ValueError(f"y has {targets.shape[1]} columns; the robot has {n_outputs} joints.")

@@ -23,11 +23,13 @@ from ._validation import (
     checked_groups,
     is_frame,
     validate_frame,
+    validate_numbers,
     words_of,
 )
 from .fitting.units import Units
 from .inference.posterior import CoefficientPrior
 from .kernels.parse import KernelSpec, parse_kernel
+from .rows.chosen import Chosen
 from .rows.dask import DaskSource, aligned, dask_example, fit_map_to_chunks, is_dask
 from .rows.mapped import MappedRows, RowShapes, check_shapes, map_rows
 from .rows.maps import example_of, fit_map, take_rows
@@ -112,6 +114,11 @@ class Intake(StatefulEstimator):
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
+        check_not_vanishing(features.largest, "What feature_map returns")
+        if isinstance(chosen, Chosen) and chosen.precision is not None:
+            root = np.sqrt(chosen.precision.max())
+            for largest, name in ((targets.largest, "y"), (features.largest, "what feature_map returns")):
+                check_magnitude(root * largest, f"√(sample_weight / relative_variance) times {name}", _LARGEST_SPREAD)
         per_output = inputs.mean.ndim == 2 or features.mean.ndim == 2
         for name, moments in (("kernel_map", inputs), ("feature_map", features)):
             if moments.mean.ndim == 2 and len(moments.mean) != len(targets.mean):
@@ -191,9 +198,8 @@ class Intake(StatefulEstimator):
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]:
         """X and y as arrays of numbers: what the kernel sees without a map, and what derivatives are in."""
-        options = {"multi_output": True, "y_numeric": True} if y else {}
         try:
-            validated = validate_data(self, X, *y, reset=reset, dtype=FLOATS, **options)
+            validated = validate_numbers(self, X, *y, reset=reset, dtype=FLOATS)
         except ValueError as error:
             if is_frame(X) and (words := words_of(X)):
                 if (self.kernel_map if reset else self.kernel_map_) is None:
@@ -207,7 +213,7 @@ class Intake(StatefulEstimator):
             raise
         X, target = validated if y else (validated, np.empty(0))
         check_magnitude(X, "X")
-        return X, target if target.dtype.kind == "f" else np.asarray(target, dtype=np.float64)
+        return X, target
 
     def _inputs_and_features(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of rows."""

@@ -8,6 +8,7 @@ from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
+from scipy.sparse import issparse
 from sklearn.exceptions import NotFittedError
 from sklearn.utils import check_array, check_consistent_length
 from sklearn.utils.validation import check_is_fitted, validate_data
@@ -79,6 +80,31 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
     return target
 
 
+def validate_numbers(estimator: Any, X: Any, *y: Any, reset: bool, dtype: Any, ensure_min_samples: int = 1) -> Any:
+    """scikit-learn's `validate_data` of rows, and of targets of any width, which become floats; errors name which."""
+    if y and issparse(y[0]):
+        raise TypeError(f"y must be a dense array; got a sparse matrix of the shape {y[0].shape}. Use y.toarray().")
+    given = dict(zip(("X", "y"), (X, *y), strict=False))
+    for name, values in given.items():
+        if np.ma.is_masked(values):
+            raise ValueError(f"{name} must have no masked values: leave these rows out, or impute them.")
+        if getattr(getattr(values, "dtype", None), "kind", "") in ("M", "m"):
+            as_floats(values, name)
+    options: dict[str, Any] = {"reset": reset, "dtype": dtype, "ensure_min_samples": ensure_min_samples}
+    if y:
+        options |= {"multi_output": True, "y_numeric": True}
+    try:
+        validated = validate_data(estimator, X, *y, **options)
+    except ValueError as error:
+        if "could not convert" in str(error):
+            for name, values in given.items():
+                as_floats(values, name)
+        raise
+    if not y or validated[1].dtype.kind == "f":
+        return validated
+    return validated[0], as_floats(validated[1], "y")
+
+
 def words_of(frame: Any) -> list[Any]:
     """The names of the columns of a data frame that are not numbers."""
     names = frame.column_names if hasattr(type(frame), "column_names") else frame.columns  # the first is pyarrow's
@@ -106,6 +132,12 @@ def check_not_vanishing(largest: np.ndarray, name: str, limit: float = SMALLEST)
     if ((largest > 0.0) & (largest < limit)).any():
         smallest = np.min(largest[largest > 0.0])
         raise ValueError(f"{name} must be 0 or exceed {limit:g} in size; a column's largest value is {smallest:g}.")
+
+
+def check_size(values: np.ndarray, name: str) -> None:
+    """Refuse columns of numbers, (n, columns), whose squares would overflow or vanish."""
+    check_magnitude(values, name)
+    check_not_vanishing(np.abs(values).max(axis=0), name)
 
 
 def as_floats(values: Any, name: str) -> np.ndarray:

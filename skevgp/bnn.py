@@ -11,14 +11,22 @@ from numpy.typing import ArrayLike
 from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from ._progress import monitor_of
 from ._row_weights import chosen_rows
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._state import StatefulEstimator
-from ._validation import as_floats, check_integer, check_magnitude, check_not_vanishing, is_plain, unchanged_if_it_fails
+from ._validation import (
+    as_floats,
+    check_integer,
+    check_magnitude,
+    check_size,
+    is_plain,
+    unchanged_if_it_fails,
+    validate_numbers,
+)
 from .exceptions import warn_user
 from .network.model import VariationalNetwork
 from .network.training import Scaling, train
@@ -330,13 +338,12 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     def _intake(self, X: Any, y: Any, sample_weight: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
         """Inputs (n, d) and targets (n, o) of the rows that count, and how often they do."""
-        X, y = validate_data(self, X, y, multi_output=True, y_numeric=True, dtype=np.float64)
+        X, y = validate_numbers(self, X, y, reset=True, dtype=np.float64)
         targets = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
         chosen: Chosen = chosen_rows(X, targets, sample_weight)
         X, targets = rows_of(X, chosen.positions), rows_of(targets, chosen.positions)
         for values, name in ((X, "X"), (targets, "y")):
-            check_magnitude(values, name)
-            check_not_vanishing(np.abs(values).max(axis=0), name)
+            check_size(values, name)
         return X, targets, chosen.counts
 
     def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
@@ -349,8 +356,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         scales = as_floats(self.prior_scale, "prior_scale")
         if scales.ndim > 1 or (scales.ndim == 1 and len(scales) != len(sizes) - 1):
             raise ValueError(
-                f"prior_scale must be a number or one for each of the {len(sizes) - 1} layers of weights; "
-                f"got {self.prior_scale!r}."
+                f"prior_scale must be a number or {len(sizes) - 1}, one a layer; got {self.prior_scale!r}."
             )
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
@@ -362,8 +368,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self.coefs_std_ = [np.exp(layer.log_std) for layer in layers]
         self.intercepts_ = [layer.bias for layer in layers]
         self.X_mean_ = self._scaling.x_mean.copy()
-        noise = np.exp(log_noise)
-        self.noise_variance_ = float(noise[0]) if len(noise) == 1 else noise
+        self.noise_variance_ = np.exp(log_noise) if len(log_noise) > 1 else float(np.exp(log_noise[0]))
         self.n_parameters_ = self._network.n_parameters
 
     @property
@@ -376,7 +381,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     def _validated(self, X: Any) -> np.ndarray:
         check_is_fitted(self)
         if not is_plain(self, X):
-            X = validate_data(self, X, reset=False, dtype=np.float64)
+            X = validate_numbers(self, X, reset=False, dtype=np.float64)
             check_magnitude(X, "X")
         return X
 

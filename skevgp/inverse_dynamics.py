@@ -11,14 +11,14 @@ from numpy.typing import ArrayLike
 from sklearn.base import RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Tags, check_random_state
-from sklearn.utils.validation import check_is_fitted, validate_data
+from sklearn.utils.validation import check_is_fitted
 
 from ._identified_robot import IdentifiedRobot
 from ._joint_residual import JointResidual, fit_joint_residual
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._summary import ModelSummary, Summarised, of_inverse_dynamics
-from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails
+from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails, validate_numbers
 from .exceptions import warn_user
 from .features import RigidBodyRegressor
 from .identification.stiction import likeliest_noise
@@ -250,9 +250,7 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
 
     def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> None:
         rows_x: np.ndarray
-        rows_x, targets = validate_data(
-            self, X, y, dtype=np.float64, multi_output=True, y_numeric=True, ensure_min_samples=2
-        )
+        rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
         self._one_dimensional = targets.ndim == 1
         targets = targets.reshape(len(targets), -1)
@@ -346,7 +344,7 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
             Their standard deviations; only with ``return_std``.
         """
         check_is_fitted(self)
-        rows: np.ndarray = validate_data(self, X, dtype=np.float64, reset=False)
+        rows: np.ndarray = validate_numbers(self, X, reset=False, dtype=np.float64)
         check_magnitude(rows, "X")
         n_outputs = len(self._joints)
         features = self._features(rows, n_outputs)

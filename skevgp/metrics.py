@@ -10,6 +10,7 @@ from scipy.special import ndtr
 from sklearn.utils import check_array, check_consistent_length
 
 from ._scorers import make_std_scorer
+from ._validation import as_floats
 
 __all__ = [
     "calibration_error",
@@ -136,7 +137,7 @@ def containing_ratios(
     """
     y_true, y_pred, std = _matrices(y_true=y_true, y_pred=y_pred, std=std)
     error, std = np.abs(y_true - y_pred), _positive(std, "std")
-    widths = np.atleast_1d(np.asarray(k, dtype=float))
+    widths = np.atleast_1d(as_floats(k, "k"))
     if not (widths >= 0).all():
         raise ValueError(f"k must be numbers that are not negative; got {k!r}.")
     return np.array([np.mean(error <= width * std) for width in widths])

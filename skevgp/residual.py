@@ -16,7 +16,7 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._residual_control import ResidualForControl, columns_of, regressor_has
 from ._sklearn import HasMethods, fit_context
-from ._validation import FLOATS, as_floats, is_frame, unchanged_if_it_fails, validate_frame
+from ._validation import FLOATS, is_frame, unchanged_if_it_fails, validate_frame, validate_numbers
 from .rows.dask import aligned, as_rows, is_dask
 
 
@@ -212,8 +212,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
             validate_data(self, X, reset=first, skip_check_array=True)
             X, y = aligned(X, y)
         else:
-            X, y = validate_data(self, X, y, reset=first, multi_output=True, y_numeric=True, dtype=FLOATS)
-            y = y if y.dtype.kind == "f" else as_floats(y, "y")
+            X, y = validate_numbers(self, X, y, reset=first, dtype=FLOATS)
         n_outputs = 1 if y.ndim == 1 else y.shape[1]
         if not first and n_outputs != len(self.base_):
             raise ValueError(f"y has {n_outputs} outputs, but the model has {len(self.base_)}.")
@@ -238,7 +237,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         if is_dask(X):
             validate_data(self, X, reset=False, skip_check_array=True)
             return as_rows(X, "X", known=False)
-        return validate_data(self, X, reset=False, dtype=FLOATS)
+        return validate_numbers(self, X, reset=False, dtype=FLOATS)
 
     def _base(self, n_outputs: int) -> np.ndarray:
         """The index of the column from which each output starts."""

@@ -320,7 +320,7 @@ def test_targets_without_noise_and_rows_on_top_of_each_other():
         ({"hidden_layer_sizes": [[3]]}, "hidden_layer_sizes"),
         ({"hidden_layer_sizes": 0}, "hidden_layer_sizes"),
         ({"prior_scale": 0.0}, "prior_scale"),
-        ({"prior_scale": [1.0]}, "each of the 2 layers"),
+        ({"prior_scale": [1.0]}, "or 2, one a layer"),
         ({"prior_scale": [1.0, -1.0]}, "from 1e-30 to 1e30"),
         ({"prior_scale": [1.0, np.nan]}, "from 1e-30 to 1e30"),
         ({"prior_scale": np.inf}, "prior_scale"),

@@ -133,6 +133,21 @@ def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
     assert m.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-3)
 
 
+def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrated_against_the_others():
+    """What suits each given the others as fitted, suits none once all have moved: a noise 1e5 times too large."""
+    rng = np.random.RandomState(0)
+
+    def targets(X):
+        waves = np.column_stack([np.sin(2 * X[:, 0]) + X[:, 1], np.cos(X[:, 1]), X[:, 2] ** 2])
+        return waves + np.array([0.1, 0.1, 0.01]) * rng.randn(len(X), 3)
+
+    X, X_new = rng.uniform(-2, 2, (60, 3)), rng.uniform(-2, 2, (300, 3))
+    Y, Y_new = targets(X), targets(X_new)
+    arguments = {"feature_map": PolynomialFeatures(4), "share_coef": True, "max_iter": 200}
+    plain, calibrated = (model(noise_cv=noise_cv, **arguments).fit(X, Y) for noise_cv in (None, 5))
+    assert nlpd(calibrated, X_new, Y_new) < nlpd(plain, X_new, Y_new) + 1.0
+
+
 def test_what_the_user_fixes_stays():
     kernel = ConstantKernel() * RBF([1.0, 1.0]) + WhiteKernel(0.3, "fixed")
     plain, noise_fixed = (fitted(None, kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))

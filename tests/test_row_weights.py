@@ -97,6 +97,19 @@ def test_the_unit_of_the_relative_variance_is_the_noises():
         assert value_of(one) == pytest.approx(value_of(other), abs=0.1)
 
 
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_a_variance_that_all_rows_have_is_only_a_unit(kind):
+    """Far beyond what the least noise in units of the targets would allow."""
+    rng = np.random.RandomState(0)
+    rows = rng.randn(40, 2)
+    y = rows @ [1.0, 2.0] + 0.1 * rng.randn(40)
+    models = [
+        kind(PolynomialFeatures(1)).fit(rows, y, relative_variance=np.full(40, v)) for v in (1.0, 1e-100, 1e24, 1e100)
+    ]
+    bounds = [getattr(m, "lower_bound_" if kind is EVGPRegressor else "log_marginal_likelihood_value_") for m in models]
+    np.testing.assert_allclose(bounds, bounds[0], atol=0.1)
+
+
 def test_known_noise_is_the_alpha_of_scikit_learn():
     kernel = ConstantKernel(1.7) * RBF([0.8, 1.3])
     exact = GaussianProcessRegressor(kernel, alpha=0.1 * NOISE, optimizer=None).fit(X, Y[:, 0])

@@ -9,7 +9,7 @@ import pytest
 from scipy import sparse
 from sklearn.base import clone
 from sklearn.impute import SimpleImputer
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import InertiaForce
@@ -102,6 +102,10 @@ def test_integers_are_numbers(estimator):
 # --- what is refused ---------------------------------------------------------------------------------------------
 
 
+# Each is allowed by itself.
+EXTREME = {"sample_weight": np.full(40, 1e100), "relative_variance": np.full(40, 1e-100)}
+
+
 def with_one(rows, value):
     rows = rows.copy()
     rows[3, 1] = value
@@ -126,13 +130,28 @@ BAD = {
     "y long": (X[:-1], Y, ValueError, r"inconsistent numbers of samples: \[39, 40\]"),
     "no y": (X, None, ValueError, "requires y to be passed, but the target y is None"),
     "y of three dimensions": (X, np.zeros((40, 2, 2)), ValueError, "Found array with dim 3"),
-    "y of words": (X, np.full((40, 2), "a"), ValueError, "could not convert string to float|must be real numbers"),
+    "y of words": (X, np.full((40, 2), "a"), ValueError, "y must be real numbers"),
+    "y of dates": (
+        X,
+        np.full((40, 2), "2026-01-01", "M8[D]"),
+        ValueError,
+        "y must be real numbers; got the type datetime",
+    ),
+    "y sparse": (
+        X,
+        sparse.csr_matrix(Y),
+        TypeError,
+        r"^y must be a dense array; got a sparse matrix of the shape \(40, 2\)",
+    ),
+    "y masked": (X, np.ma.masked_greater(Y, 0.5), ValueError, "^y must have no masked values"),
     "y of complex numbers": (X, Y + 1j, ValueError, "[Cc]omplex data not supported|must be real numbers"),
     "no rows": (X[:0], Y[:0], ValueError, r"^Found array with 0 sample\(s\)"),
     "no columns": (X[:, :0], Y, ValueError, r"^Found array with 0 feature\(s\)"),
     "one dimension": (X[:, 0], Y, ValueError, "^Expected 2D array, got 1D array instead"),
     "three dimensions": (X[:, :, np.newaxis], Y, ValueError, "Found array with dim 3"),
-    "words": (np.full(X.shape, "a"), Y, ValueError, "could not convert string to float"),
+    "words": (np.full(X.shape, "a"), Y, ValueError, "X must be real numbers; got the type"),
+    "dates": (np.full(X.shape, "2026-01-01", "M8[D]"), Y, ValueError, "X must be real numbers; got the type datetime"),
+    "masked": (np.ma.masked_greater(X, 0.5), Y, ValueError, "X must have no masked values"),
     "complex numbers": (X + 1j, Y, ValueError, "^Complex data not supported"),
     "sparse matrix": (sparse.csr_matrix(X), Y, TypeError, "[Ss]parse data was passed"),
     "sparse array": (sparse.coo_array(X), Y, TypeError, "[Ss]parse data was passed"),
@@ -204,6 +223,32 @@ def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(
     with pytest.raises(ValueError, match=message):
         model.fit(1e12 * X, 1e-110 * Y)
     assert np.isfinite(model.fit(1e12 * X, 1e-80 * Y).predict(1e12 * X, return_std=True)).all()
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize(
+    ("factor", "weights", "message"),
+    [
+        (1e-150, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
+        (1e-165, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
+        (1e-120, {}, r"^coef_scale='auto', the feature map's or .*, must not exceed 1e\+100 in size"),
+        (
+            1e60,
+            EXTREME,
+            r"^√\(sample_weight / relative_variance\) times what feature_map returns must not exceed 1e\+130",
+        ),
+    ],
+)
+def test_features_of_sizes_whose_squares_vanish_or_overflow_are_refused(kind, factor, weights, message):
+    with pytest.raises(ValueError, match=message):
+        kind(FunctionTransformer(lambda X: factor * X)).fit(X, Y, **weights)
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_targets_whose_weighted_squares_overflow_are_refused(kind):
+    message = r"^√\(sample_weight / relative_variance\) times y must not exceed 1e\+130 in size"
+    with pytest.raises(ValueError, match=message):
+        kind().fit(X, 1e98 * Y, **EXTREME)
 
 
 @pytest.mark.parametrize("name", ["NaN", "huge", "y with NaN", "y short", "sparse matrix", "one dimension"])

@@ -125,6 +125,12 @@ def _by_folds(
     first = limits if by.groups is None else limits.with_signal_above(values["signal"])
     searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
+    if model.prior.shared:
+        # Each was found with the others as fitted: all at once they may contradict each other on the weights.
+        signal, noise = np.array(found).T
+        moved = _searches(model, values | {"signal": signal, "noise": noise}, folds, rows, first, lowest)
+        if sum(map(Search.loss_as_given, moved)) > sum(map(Search.loss_as_given, searches)):
+            found = list(zip(values["signal"].tolist(), values["noise"].tolist(), strict=True))
     gone, dependent = 0, False
     if by.groups is not None:
         explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()

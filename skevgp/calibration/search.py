@@ -12,7 +12,7 @@ from scipy.stats import t as student_t
 from ..optimizers.parameters import ParameterTable, Values
 from .left_out import LeftOut, Weights
 
-# The noise is never this low.
+# In place of squares that vanish.
 _LOWEST = 1e-20
 # Ratios s²/σ² that are tried are powers of 2: these many doublings away first, then in steps of so many, and no further
 # than so many from where the bound is highest.
@@ -97,6 +97,11 @@ class Search:
         density, _ = self._means(signal / noise, np.array([noise]))
         return float(density[0])
 
+    def loss_as_given(self) -> float:
+        """What is to be low, in nats per row, where the search begins."""
+        signal, noise = (self._at_bound(name) for name in ("signal", "noise"))
+        return float(self._losses(signal / noise, np.array([noise]))[0])
+
     def without_signal(self) -> float:
         """The same of the features alone, with a noise as large as what they leave over."""
         _, squares = self._means(0.0, self._at_bound("noise") * np.ones(1))
@@ -175,7 +180,7 @@ class Search:
             return (self._at_bound(name),) * 2
         low, high = getattr(self.limits, name)[self.output]
         if name == "noise":
-            low = max(low, min(self.lowest, high), _LOWEST)
+            low = max(low, min(self.lowest, high))
         return float(low), float(high)
 
     def _at_ratio(self, ratio: float) -> tuple[float, float]:

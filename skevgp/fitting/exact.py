@@ -82,36 +82,41 @@ class ExactTask:
     @property
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
-        precision = self.model.rows.precision
+        precision, signal = self.model.rows.precision, self.table["signal"]
+        alone, noise_alone, most_alone, hidden = -np.inf, None, -np.inf, False
+        if self.options.optimizer is None and self.options.max_iter > 0:
+            hidden = may_hide_noise(self.model.prior, len(self.model.rows.inputs))
+            little = np.where(signal.free, signal.value_limits()[:, 0], signal.start)
+            alone, noise_alone = self._best_with(little, hidden)
+            if hidden and not signal.free.all():
+                # What a signal that stays costs depends on where the kernel ends.
+                most_alone, _ = self._best_with(signal.value_limits()[:, 0], hidden)
         return Strategy(
             self.options.rules,
             self.table,
             self.options.max_iter,
             self.options.n_restarts,
             self.scatter,
-            *self._with_little_signal(),
+            alone=alone,
+            noise_alone=noise_alone,
+            most_alone=most_alone,
+            noise_hidden=hidden,
             mean_precision=1.0 if precision is None else float(precision.sum() / self.model.rows.total),
             interpolates=True,
             restart=lambda: drawn(self.table, self.options.rules, self.rng),
         )
 
-    def _with_little_signal(self) -> tuple[float, np.ndarray | None, bool]:
-        """The likelihood with as little signal as there may be, the noise variances (o,) that it is highest for, and
-        whether features may hide these.
-        """
-        signal, rows, prior = self.table["signal"], self.model.rows, self.model.prior
-        if self.options.optimizer is not None or self.options.max_iter == 0:
-            return -np.inf, None, False
-        values, hidden = self.table.values_at_start(), may_hide_noise(prior, len(rows.inputs))
-        values["signal"] = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
+    def _best_with(self, signal: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
+        """The likelihood with such a signal (o,), and the noise variances (o,), perhaps hidden, with the highest."""
+        rows, values = self.model.rows, self.table.values_at_start()
         least, highest = self.table["noise"].value_limits().T
         if not hidden:
             least = highest = np.clip(np.average(rows.targets**2, axis=0, weights=rows.precision), least, highest)
 
         def evidence(noise: np.ndarray) -> np.ndarray:
-            return self.model.log_likelihoods(values | {"noise": noise})
+            return self.model.log_likelihoods(values | {"signal": signal, "noise": noise})
 
-        return *noise_of_most_evidence(evidence, least, highest, prior.shared), hidden
+        return noise_of_most_evidence(evidence, least, highest, self.model.prior.shared)
 
     def minimise(self, attempt: Attempt) -> Fit:
         """L-BFGS on the log marginal likelihood per row."""

@@ -141,20 +141,23 @@ class SparseTask:
         """The noise variances (o,) that the features leave over, which may be nothing, and a trace of f's prior."""
         sums = self.blocks.linear
         squares = [float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(trace))]
-        return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE)
+        return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE * self.rows.mean_precision)
 
     @cached_property
     def _may_hide_noise(self) -> bool:
         return may_hide_noise(self.model.prior, self.blocks.linear.length)
 
-    def _with_little_signal(self) -> tuple[float, np.ndarray]:
-        """The bound with as little signal as there may be, and the noise variances (o,) for which it is the highest."""
-        prior, sums = self.model.prior, self.blocks.linear
+    def _least_trace(self) -> np.ndarray:
+        """The trace (o,) of f's prior with as little signal as may be, and the kernel where it starts."""
         values, signal = self.table.values_at_start(), self.table["signal"]
         points, (kernel, hyperparameters) = values["inducing_points"][0], self.model.kernel_of(values, 0)
         variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
         little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
-        trace = little * variance * self.rows.total * self.rows.mean_precision
+        return little * variance * self.rows.total * self.rows.mean_precision
+
+    def _best_alone(self, trace: np.ndarray) -> tuple[float, np.ndarray]:
+        """The bound with q(f) at its prior, which has such a trace, and the noise variances (o,) with the highest."""
+        prior, sums = self.model.prior, self.blocks.linear
         least = highest = self._left_over(trace)
         if self.max_iter > 0 and self._may_hide_noise:
             lowest, highest = self.table["noise"].value_limits().T
@@ -175,7 +178,10 @@ class SparseTask:
     def strategy(self) -> Strategy:
         """From where the model is fitted."""
         rules, anew = self.solver.rules, self.placement.anew
-        alone, noise_alone = self._with_little_signal()
+        trace = self._least_trace()
+        alone, noise_alone = self._best_alone(trace)
+        # The trace of a signal that stays depends on where the kernel ends.
+        is_open = self._may_hide_noise and not self.table["signal"].free.all()
         return Strategy(
             rules,
             self.table,
@@ -184,6 +190,7 @@ class SparseTask:
             self.rows.scatter(),
             alone=alone,
             noise_alone=noise_alone,
+            most_alone=self._best_alone(np.zeros(len(trace)))[0] if is_open else -np.inf,
             noise_hidden=self._may_hide_noise,
             mean_precision=self.rows.mean_precision,
             interpolates=self.interpolates,

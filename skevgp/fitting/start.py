@@ -198,7 +198,7 @@ def starting_table(
                 starts.noise,
                 "noise",
                 rules.first_noise * scatter,
-                np.maximum(rules.lowest_noise * scatter, LOWEST_NOISE),
+                np.maximum(rules.lowest_noise * scatter, LOWEST_NOISE * precision),
                 highest,
                 target_unit**2,
                 None if target_scatter is None else np.maximum(highest, target_scatter * precision),

@@ -132,6 +132,8 @@ class Strategy:
         The bound of the features without a Gaussian process.
     noise_alone : ndarray of shape (o,), optional
         The noise variances with which it is.
+    most_alone : float
+        What it may be, and not more, where a kernel whose signal is fixed ends: that is known only then.
     noise_hidden : bool
         Whether it may be far above what the features leave over, from where no fit climbs to it.
     mean_precision : float
@@ -157,6 +159,7 @@ class Strategy:
     scatter: np.ndarray
     alone: float = -np.inf
     noise_alone: np.ndarray | None = None
+    most_alone: float = -np.inf
     noise_hidden: bool = False
     mean_precision: float = 1.0
     interpolates: bool = False
@@ -170,17 +173,19 @@ class Strategy:
         """One start after the other; those from another fit come first, and cold ones only if these lead nowhere."""
         first = self.table.values_at_start()
         if self.warm is None:
-            yield from self._released(self._climbing(first))
+            best = yield from self._released(self._climbing(first))
         else:
             # Inducing points that another fit moved have found their places.
             moved_before = self.placed or not np.array_equal(self.warm["inducing_points"], first["inducing_points"])
             again = self._once if moved_before else self._climbing
-            fit = yield from self._released(again(first | self.warm))
-            if self.max_iter > 0 and self.collapsed(fit):
-                yield from self._released(self._climbing(first))
+            best = yield from self._released(again(first | self.warm))
+            if self.max_iter > 0 and self.collapsed(best):
+                best = better(best, (yield from self._released(self._climbing(first))))
         if self.restart is not None and self.max_iter > 0 and self.table.size > 0:
             for _ in range(self.n_restarts):
-                yield from self._released(self._climbing(self.restart()))
+                best = better(best, (yield from self._released(self._climbing(self.restart()))))
+        if self._is_doubtful(best):
+            yield from self._released(self._from_features_alone(first))
 
     def collapsed(self, fit: Fit) -> bool:
         """Whether noise came to explain everything, or the kernel explains less than nothing would."""
@@ -193,21 +198,23 @@ class Strategy:
         ended = hopeless or fit.converged or fit.n_iter < self.max_iter
         return fit.n_rows is None and ended and fit.bound < self.alone - _WORTH
 
-    def _released(self, attempts: Attempts) -> Attempts:
-        """Their best fit; one that ended at a limit goes on from there, where the table has a wider one.
-
-        One below the features alone, or maybe below, is left for a fit from the noise that suits these.
-        """
-        best = yield from attempts
+    def _is_doubtful(self, best: Fit) -> bool:
+        """Whether it ended below the features alone, or maybe did, and a fit could start from there."""
         free = self.table["noise"].free.any() or self.table["signal"].free.any()
-        may_start = self.max_iter > 0 and free and self.rules.last_start
-        # Of a signal that stays, what the features alone reach depends on where the kernel ends, which is not known.
-        unknown = self.noise_hidden and not self.table["signal"].free.all()
-        doubtful = unknown or self._below(best, hopeless=self.noise_hidden)
-        if self.noise_alone is not None and may_start and doubtful:
-            first = self.table.values_at_start()
-            little = np.minimum(first["signal"], _LITTLE * self.noise_alone / self.mean_precision)
-            best = better(best, (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter)))
+        if self.noise_alone is None or self.max_iter == 0 or not free or not self.rules.last_start:
+            return False
+        maybe_below = best.n_rows is None and best.bound < self.most_alone - _WORTH
+        return maybe_below or self._below(best, hopeless=self.noise_hidden)
+
+    def _from_features_alone(self, first: Values) -> Attempts:
+        """A fit with little signal, from the noise that suits the features alone."""
+        assert self.noise_alone is not None
+        little = np.minimum(first["signal"], _LITTLE * self.noise_alone / self.mean_precision)
+        return (yield Attempt(first | {"signal": little, "noise": self.noise_alone}, self.max_iter))
+
+    def _released(self, attempts: Attempts) -> Attempts:
+        """Their best fit; one that ended at a limit goes on from there, where the table has a wider one."""
+        best = yield from attempts
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
             best = better(best, (yield Attempt(best.values, self.max_iter, best)))
         return best
@@ -273,9 +280,12 @@ class Strategy:
             return best
         if much is not None:
             best = better(best, (yield start(moved(values, 1.0, much), cold=n_rows is None)))
+        tried = (1.0, much) if n_rows is None else None
         for factors in self.rules.other_starts:
             if not self.collapsed(best):
                 break
+            if factors == tried:
+                continue
             best = better(best, (yield start(moved(values, *factors))))
         return best
 

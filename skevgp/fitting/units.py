@@ -173,7 +173,11 @@ class _Step:
 
 def _varying(upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Singular values (k,) above rounding, and their right vectors (k, p)."""
-    _, values, vectors = svd(upper, full_matrices=False, lapack_driver="gesvd")
+    try:
+        _, values, vectors = svd(upper, full_matrices=False)
+    except np.linalg.LinAlgError:
+        # The faster method by halves does not always converge.
+        _, values, vectors = svd(upper, full_matrices=False, lapack_driver="gesvd")
     kept = values >= _ROUNDING * values[0]
     return values[kept], vectors[kept]
 

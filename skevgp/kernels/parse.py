@@ -356,7 +356,12 @@ def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
         raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
     if hyperparameter.fixed:
         return Start(value, np.column_stack([value, value]), np.ones(len(value), dtype=bool))
-    bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
+    try:
+        bounds = np.broadcast_to(np.atleast_2d(hyperparameter.bounds), (len(value), 2)).astype(float)
+    except ValueError as error:
+        raise ValueError(
+            f"kernel: {hyperparameter.name}_bounds must be 'fixed' or pairs of numbers; got {hyperparameter.bounds!r}."
+        ) from error
     if not ((bounds[:, 0] > 0.0) & (bounds[:, 0] <= bounds[:, 1])).all():
         raise ValueError(
             f"kernel: {hyperparameter.name}_bounds must be above 0, the lower ones first; got {bounds.tolist()}."

@@ -127,9 +127,10 @@ class Moments:
         average = values.mean(axis=0) if weights is None else np.tensordot(weights, values, 1) / n
         mean = np.where(lowest == highest, lowest, average)
         squares = (values - mean) ** 2
-        return cls(
-            n, mean, np.sum(squares, axis=0) if weights is None else np.tensordot(weights, squares, 1), lowest, highest
-        )
+        # What is too large for it is refused by its size.
+        with np.errstate(over="ignore"):
+            total = np.sum(squares, axis=0) if weights is None else np.tensordot(weights, squares, 1)
+        return cls(n, mean, total, lowest, highest)
 
     def __add__(self, other: Self) -> Self:
         n, difference = self.n + other.n, other.mean - self.mean

@@ -15,11 +15,11 @@ RULES = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_no
 PLACES = np.arange(4.0).reshape(1, 2, 2)
 
 
-def table(noise_fixed=False, kernel_fixed=False, signal_fixed=False, widest_signal=None):
+def table(noise_fixed=False, kernel_fixed=False, widest_signal=None):
     return ParameterTable(
         [
             Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
-            Parameter("signal", np.ones(2), "log", 1e-3, 1e3, fixed=signal_fixed, widest=widest_signal),
+            Parameter("signal", np.ones(2), "log", 1e-3, 1e3, widest=widest_signal),
             Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
             Parameter("inducing_points", PLACES),
         ]
@@ -136,13 +136,28 @@ def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
     hidden = strategy(alone=6.0, noise_alone=noise, noise_hidden=True)
     assert len(drive(replace(hidden, noise_hidden=False), (5.0, UNFINISHED))[0]) == 1
     assert len(drive(hidden, (5.0, UNFINISHED), (6.5, GOOD))[0]) == 2
-    # Of a signal that stays they are not known well enough to tell.
-    stays = replace(hidden, table=table(signal_fixed=True))
-    assert len(drive(stays, (7.0, GOOD), (6.5, GOOD))[0]) == 2
-    assert len(drive(replace(stays, noise_hidden=False), (7.0, GOOD))[0]) == 1
+    # Where the kernel ends elsewhere it may be more, but not more than so much.
+    unknown = replace(hidden, most_alone=8.0)
+    assert len(drive(unknown, (7.0, GOOD), (6.5, GOOD))[0]) == 2
+    assert len(drive(unknown, (8.0, GOOD))[0]) == 1
     assert len(drive(hidden, (7.0, GOOD))[0]) == 1
     # What is not below them has nothing to gain there.
     assert len(drive(own, (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
+
+
+def test_the_last_start_comes_once_after_restarts():
+    noise = np.array([3.0, 7.0])
+    own = strategy(alone=6.0, noise_alone=noise, n_restarts=2, restart=lambda: table().values_at_start())
+    below = [(bound, GOOD) for bound in (5.0, 4.0, 3.0)]
+    made, best = drive(own, *below, *below, *below, (6.5, GOOD))
+    assert [bool((attempt.values["noise"] == noise).all()) for attempt in made] == [False] * 9 + [True]
+    assert best.bound == 6.5
+
+
+def test_the_same_start_is_not_taken_twice():
+    own = strategy(interpolates=True, rules=replace(RULES, other_starts=((1.0, RULES.much_noise), (2.0, 100.0))))
+    made, _ = drive(own, (5.0, COLLAPSED), (6.0, COLLAPSED), (4.0, COLLAPSED))
+    assert len({float(attempt.values["noise"][0]) for attempt in made}) == len(made) == 3
 
 
 @pytest.mark.parametrize("why", ["noise is fixed", "no iterations"])

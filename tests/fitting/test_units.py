@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+import scipy.linalg
 
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.inference.posterior import CoefficientPrior
@@ -94,6 +95,25 @@ def test_so_do_powers_that_are_features_of_one_output_only(weights):
     none = np.zeros((2, 4))
     left_over = features_alone(LocalSource.holding(rows), np.zeros(2), CoefficientPrior(none, none + 1.0, none))[1]
     assert left_over.max() <= 1e-6
+
+
+def test_a_decomposition_that_does_not_converge_is_tried_by_another_method(monkeypatch):
+    rng = np.random.RandomState(0)
+    H = rng.randn(60, 3)
+    H = np.column_stack([H, H[:, 0] + 1e-9 * rng.randn(60)])
+    r, scale = H @ np.ones((4, 1)) + rng.randn(60, 1), np.ones((1, 4))
+    expected = weights_alone(H, r, scale)
+    tried = []
+
+    def by_halves_never(matrix, full_matrices, lapack_driver="gesdd"):
+        tried.append(lapack_driver)
+        if lapack_driver == "gesdd":
+            raise np.linalg.LinAlgError("SVD did not converge")
+        return scipy.linalg.svd(matrix, full_matrices=full_matrices, lapack_driver=lapack_driver)
+
+    monkeypatch.setattr("skevgp.fitting.units.svd", by_halves_never)
+    np.testing.assert_allclose(weights_alone(H, r, scale), expected, atol=1e-6)
+    assert set(tried) == {"gesdd", "gesvd"}
 
 
 def test_units_survive_extreme_scales():

@@ -382,6 +382,25 @@ def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(
     assert value + shortfall(bounds, left) == pytest.approx(best, rel=1e-9)
 
 
+def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
+    """Means that something moved: the sum of squares that they leave is not the least, which the bound is made of."""
+    model, rows, table = problem()
+    values = table.values_at_start()
+    blocks = rows.blocks(model.kernel, 17)
+    groups = list(model.groups_of(values, model.statistics(values, blocks)))
+    expected = upper_bound(groups, blocks)
+
+    def moved(groups, family):
+        posteriors = optimal_posteriors(groups)
+        return [
+            BoundAtOptimum(group, family, [replace(q, mean=q.mean + 0.1) for q in own])
+            for group, own in zip(groups, posteriors, strict=True)
+        ]
+
+    monkeypatch.setattr("skevgp.inference.bounds.bounds_at_optimum", moved)
+    assert upper_bound(groups, blocks) == pytest.approx(expected, rel=1e-9)
+
+
 def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():
     model, rows, table = problem()
     values = table.values_at_start()

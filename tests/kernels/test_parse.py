@@ -143,6 +143,7 @@ def test_what_is_not_a_kernel_is_a_type_error(kernel):
         (RBF() + ConstantKernel(0.0), "constant_value must be between"),
         (RBF(1.0, (10.0, 0.1)), "length_scale_bounds must be above 0, the lower ones first"),
         (RBF(1.0, (np.nan, 10.0)), "length_scale_bounds must be above 0"),
+        (RBF(1.0, "fix"), "length_scale_bounds must be 'fixed' or pairs of numbers; got .*fix"),
         (RBF() + WhiteKernel(1.0, (-1.0, 10.0)), "noise_level_bounds must be above 0"),
         (ExpSineSquared(1.0, 1.0, (1.0, 2.0), (0.0, 2.0)), "periodicity_bounds must be above 0"),
     ],
