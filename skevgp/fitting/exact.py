@@ -366,7 +366,7 @@ def fit_exact(
         table = table.widened(("signal", "noise"))
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
-    best = search(ExactTask(model, table, rows.scatter(), options, rng, monitor, units))
+    best = search(ExactTask(model.with_fewer_features(), table, rows.scatter(), options, rng, monitor, units))
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     advice = [best.message, far_from_prior(proper, rows)]
     if options.max_iter > 0:

@@ -23,7 +23,7 @@ noise variance σ² v / w, but for what w copies of it have beside exp(-½ w e²
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -163,6 +163,24 @@ class ExactModel:
     vague: np.ndarray
     rows: RawRows
     kernels: tuple[Kernel, ...] | None = None
+
+    def with_fewer_features(self) -> ExactModel:
+        """The same likelihood with no more features than rows n, where there are more.
+
+        Of H C = Rᵀ Qᵀ rows see Qᵀ w ~ N(-Qᵀ w₀, I) alone, and no other direction of w has a likelihood: Rᵀ (n, n) takes
+        the place of H. Not where outputs share their weights, or some are vague.
+        """
+        (o, p), n = self.prior.scale.shape, len(self.rows.inputs)
+        if p <= n or self.prior.shared or self.vague.any():
+            return self
+        features, reference = np.empty((n, o, n)), np.empty((o, n))
+        for index, root in enumerate(self.prior.roots()):
+            own = self.rows.of(slice(index, index + 1)).features
+            Q, R = np.linalg.qr((own @ root).T)
+            features[:, index], reference[index] = R.T, Q.T @ self.prior.reference[index]
+        prior = CoefficientPrior(np.zeros((o, n)), np.ones((o, n)), reference)
+        rows = replace(self.rows, features=features)
+        return replace(self, prior=prior, vague=np.zeros((o, n), dtype=bool), rows=rows)
 
     def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
         """The covariance of the rows, of all outputs or of each, and each output given it."""

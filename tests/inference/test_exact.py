@@ -1,5 +1,7 @@
 """The exact model against dense formulas that share nothing with it."""
 
+from dataclasses import replace
+
 import autograd
 import autograd.numpy as anp
 import numpy as np
@@ -143,6 +145,30 @@ def test_the_posterior_is_that_of_a_dense_gaussian_of_values_and_weights(vague):
         expected_cov = within - k.T @ np.linalg.solve(K_y, k) + left.T @ np.linalg.solve(A, left)
         np.testing.assert_allclose(covariance[:, :, o], expected_cov, rtol=1e-8, atol=1e-10)
         np.testing.assert_allclose(variance[:, o], np.diag(expected_cov), rtol=1e-8)
+
+
+@pytest.mark.parametrize("correlated", [False, True])
+def test_more_features_than_rows_have_the_likelihood_of_as_many_as_rows(correlated):
+    model, _ = problem(np.zeros((O, 40), dtype=bool), p=40)
+    if correlated:
+        root = 0.3 * np.random.RandomState(3).randn(O, 40, 40)
+        model = replace(model, prior=replace(model.prior, root=root))
+    precision = np.random.RandomState(4).uniform(0.5, 2.0, N)
+    for own in (model, replace(model, rows=replace(model.rows, precision=precision, counts=np.ones(N)))):
+        fewer = own.with_fewer_features()
+        assert fewer.rows.features.shape == (N, O, N)
+        (value, gradient), (expected, expected_gradient) = (each.log_likelihood(VALUES) for each in (fewer, own))
+        assert value == pytest.approx(expected, rel=1e-10)
+        for name, of_values in expected_gradient.items():
+            np.testing.assert_allclose(gradient[name], of_values, rtol=1e-8, atol=1e-9)
+
+
+def test_of_no_more_features_than_rows_or_vague_or_shared_ones_all_are_kept():
+    few, _ = problem(VAGUE["proper"])
+    vague, _ = problem(np.arange(O * 40).reshape(O, 40) == 0, p=40)
+    many, _ = problem(np.zeros((O, 40), dtype=bool), p=40)
+    for model in (few, vague, replace(many, prior=replace(many.prior, shared=True))):
+        assert model.with_fewer_features() is model
 
 
 def test_without_features_it_is_a_gaussian_process():
