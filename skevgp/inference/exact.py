@@ -174,10 +174,10 @@ class ExactModel:
         if p <= n or self.prior.shared or self.vague.any():
             return self
         features, reference = np.empty((n, o, n)), np.empty((o, n))
-        for index, root in enumerate(self.prior.roots()):
-            own = self.rows.of(slice(index, index + 1)).features
-            Q, R = np.linalg.qr((own @ root).T)
-            features[:, index], reference[index] = R.T, Q.T @ self.prior.reference[index]
+        for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
+            H = self.rows.of(slice(index, index + 1)).features
+            Q, R = np.linalg.qr((H * scale if self.prior.root is None else H @ self.prior.root[index]).T)
+            features[:, index], reference[index] = R.T, Q.T @ w0
         prior = CoefficientPrior(np.zeros((o, n)), np.ones((o, n)), reference)
         rows = replace(self.rows, features=features)
         return replace(self, prior=prior, vague=np.zeros((o, n), dtype=bool), rows=rows)
