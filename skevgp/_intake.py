@@ -37,6 +37,8 @@ from .rows.source import LocalSource, Moments, Source, moments_of_rows
 
 # In place of an infinite prior scale, where any that does not matter will do: so many times what could explain y alone.
 _VAGUE = 1e3
+# Of the largest feature: one that is smaller tells nothing beside it.
+_NEGLIGIBLE = 1e-80
 # What features may add, in units of what they leave: its square, by the least noise variance, has to be finite.
 _LARGEST_SPREAD = 1e130
 
@@ -114,7 +116,7 @@ class Intake(StatefulEstimator):
         inputs, features, targets = source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
         check_not_vanishing(inputs.largest, "X, as the kernel sees it,")
-        check_not_vanishing(features.largest, "What feature_map returns")
+        check_not_vanishing(features.largest.max(initial=0.0), "What feature_map returns")
         if isinstance(chosen, Chosen) and chosen.precision is not None:
             root = np.sqrt(chosen.precision.max())
             for largest, name in ((targets.largest, "y"), (features.largest, "what feature_map returns")):
@@ -159,7 +161,9 @@ class Intake(StatefulEstimator):
         elif shared and self.feature_map_ is None:
             raise ValueError("share_coef=True needs a feature_map: without one there are no weights to share.")
         shared = shared and o > 1 and self.feature_map_ is not None
-        wide = wide_scale(features.rms, np.sqrt(targets.variance), targets.largest, shared)
+        # Bumps far from all rows, say, are as good as 0.
+        size = np.where(features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0), features.rms, 0.0)
+        wide = wide_scale(size, np.sqrt(targets.variance), targets.largest, shared)
         mean, scale, root = resolve_coef_prior(
             self.coef_mean,
             self.coef_scale,
@@ -171,7 +175,7 @@ class Intake(StatefulEstimator):
             allow_vague=allow_vague,
         )
         vague = np.isinf(scale)
-        unit = _VAGUE * wide_scale(features.rms, targets.largest, targets.largest, shared)
+        unit = _VAGUE * wide_scale(size, targets.largest, targets.largest, shared)
         scale = np.where(vague, unit, scale)
         if shared:
             mean, scale = (np.repeat(values, o, axis=0) for values in (mean, scale))
@@ -200,7 +204,7 @@ class Intake(StatefulEstimator):
         """X and y as arrays of numbers: what the kernel sees without a map, and what derivatives are in."""
         try:
             validated = validate_numbers(self, X, *y, reset=reset, dtype=FLOATS)
-        except ValueError as error:
+        except (ValueError, np.exceptions.DTypePromotionError) as error:
             if is_frame(X) and (words := words_of(X)):
                 if (self.kernel_map if reset else self.kernel_map_) is None:
                     reason = (

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 from sklearn.exceptions import NotFittedError
-from sklearn.utils import check_array, check_consistent_length
+from sklearn.utils import assert_all_finite, check_array, check_consistent_length
 from sklearn.utils.validation import check_is_fitted, validate_data
 
 from ._sklearn import safe_indexing
@@ -75,6 +75,7 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
     validate_data(estimator, X, *y, reset=reset, skip_check_array=True)
     if not y:
         return np.empty(0)
+    _check_kind(y[0], "y")
     target = check_array(as_floats(y[0], "y"), ensure_2d=False, input_name="y", estimator=estimator)
     check_consistent_length(X, target)
     return target
@@ -82,27 +83,39 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
 
 def validate_numbers(estimator: Any, X: Any, *y: Any, reset: bool, dtype: Any, ensure_min_samples: int = 1) -> Any:
     """scikit-learn's `validate_data` of rows, and of targets of any width, which become floats; errors name which."""
-    if y and issparse(y[0]):
-        raise TypeError(f"y must be a dense array; got a sparse matrix of the shape {y[0].shape}. Use y.toarray().")
     given = dict(zip(("X", "y"), (X, *y), strict=False))
     for name, values in given.items():
-        if np.ma.is_masked(values):
-            raise ValueError(f"{name} must have no masked values: leave these rows out, or impute them.")
-        if getattr(getattr(values, "dtype", None), "kind", "") in ("M", "m"):
-            as_floats(values, name)
+        _check_kind(values, name)
     options: dict[str, Any] = {"reset": reset, "dtype": dtype, "ensure_min_samples": ensure_min_samples}
     if y:
         options |= {"multi_output": True, "y_numeric": True}
     try:
         validated = validate_data(estimator, X, *y, **options)
-    except ValueError as error:
-        if "could not convert" in str(error):
+    except (ValueError, np.exceptions.DTypePromotionError) as error:
+        if "could not convert" in str(error) or not isinstance(error, ValueError):
             for name, values in given.items():
-                as_floats(values, name)
+                try:
+                    np.asarray(values, dtype=np.float64)
+                except (TypeError, ValueError) as reason:
+                    raise ValueError(f"{name} must be real numbers: {reason}.") from error
         raise
-    if not y or validated[1].dtype.kind == "f":
+    if not y:
         return validated
-    return validated[0], as_floats(validated[1], "y")
+    target = validated[1] if validated[1].dtype.kind == "f" else as_floats(validated[1], "y")
+    # Before it made floats of objects, None may have been among them.
+    assert_all_finite(target, input_name="y", estimator_name=type(estimator).__name__)
+    return validated[0], target
+
+
+def _check_kind(values: Any, name: str) -> None:
+    """Refuse what would be taken for other numbers than it is, and targets in a sparse matrix."""
+    if name == "y" and issparse(values):
+        raise TypeError(f"y must be a dense array; got a sparse matrix of the shape {values.shape}. Use y.toarray().")
+    if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
+        raise ValueError(f"{name} must have no masked values: leave these rows out, or impute them.")
+    types = getattr(values, "dtypes", None) if is_frame(values) else [getattr(values, "dtype", None)]
+    if types is not None and all(getattr(own, "kind", "") in ("M", "m") for own in types):
+        raise ValueError(f"{name} must be real numbers; got dates or times.")
 
 
 def words_of(frame: Any) -> list[Any]:
@@ -114,10 +127,11 @@ def words_of(frame: Any) -> list[Any]:
 
 def _are_numbers(column: Any) -> bool:
     try:
-        np.asarray(column, dtype=np.float64)
+        array = np.asarray(column)
+        array.astype(np.float64)
     except (TypeError, ValueError):
         return False
-    return True
+    return array.dtype.kind not in ("M", "m")
 
 
 def check_magnitude(values: np.ndarray, name: str, limit: float = LARGEST) -> None:

@@ -187,7 +187,7 @@ GOOD = np.random.RandomState(0).randn(20, 3)
         (np.ones(5), np.ones(5), "Expected 2D array"),
         (np.ones((5, 2)), np.ones(4), "inconsistent numbers of samples"),
         (np.ones((5, 2)), None, "requires y to be passed"),
-        (np.array([["a"], ["b"]]), np.ones(2), "X must be real numbers; got the type"),
+        (np.array([["a"], ["b"]]), np.ones(2), "X must be real numbers: could not convert"),
     ],
 )
 def test_bad_data(X, y, message):

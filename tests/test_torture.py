@@ -131,11 +131,12 @@ BAD = {
     "no y": (X, None, ValueError, "requires y to be passed, but the target y is None"),
     "y of three dimensions": (X, np.zeros((40, 2, 2)), ValueError, "Found array with dim 3"),
     "y of words": (X, np.full((40, 2), "a"), ValueError, "y must be real numbers"),
+    "y with None": (X, np.where(Y > 1.5, None, Y), ValueError, "Input y contains NaN"),
     "y of dates": (
         X,
         np.full((40, 2), "2026-01-01", "M8[D]"),
         ValueError,
-        "y must be real numbers; got the type datetime",
+        "y must be real numbers; got dates or times",
     ),
     "y sparse": (
         X,
@@ -149,8 +150,8 @@ BAD = {
     "no columns": (X[:, :0], Y, ValueError, r"^Found array with 0 feature\(s\)"),
     "one dimension": (X[:, 0], Y, ValueError, "^Expected 2D array, got 1D array instead"),
     "three dimensions": (X[:, :, np.newaxis], Y, ValueError, "Found array with dim 3"),
-    "words": (np.full(X.shape, "a"), Y, ValueError, "X must be real numbers; got the type"),
-    "dates": (np.full(X.shape, "2026-01-01", "M8[D]"), Y, ValueError, "X must be real numbers; got the type datetime"),
+    "words": (np.full(X.shape, "a"), Y, ValueError, "X must be real numbers: could not convert"),
+    "dates": (np.full(X.shape, "2026-01-01", "M8[D]"), Y, ValueError, "X must be real numbers; got dates or times"),
     "masked": (np.ma.masked_greater(X, 0.5), Y, ValueError, "X must have no masked values"),
     "complex numbers": (X + 1j, Y, ValueError, "^Complex data not supported"),
     "sparse matrix": (sparse.csr_matrix(X), Y, TypeError, "[Ss]parse data was passed"),
@@ -242,6 +243,37 @@ def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(
 def test_features_of_sizes_whose_squares_vanish_or_overflow_are_refused(kind, factor, weights, message):
     with pytest.raises(ValueError, match=message):
         kind(FunctionTransformer(lambda X: factor * X)).fit(X, Y, **weights)
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+@pytest.mark.parametrize("coef_scale", [1.0, "auto"])
+def test_bumps_so_far_from_all_rows_that_their_squares_vanish_do_no_harm(kind, coef_scale):
+    rng, centres = np.random.RandomState(0), np.linspace(0.0, 1.0, 50)
+    rows = rng.uniform(0.0, 0.4, (40, 1))
+    y = np.sin(9.0 * rows[:, 0]) + 0.05 * rng.randn(40)
+    bumps = FunctionTransformer(lambda X: np.exp(-0.5 * ((X - centres) / 0.02) ** 2))
+    assert kind(bumps, coef_scale=coef_scale).fit(rows, y).score(rows, y) > 0.9
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor, BayesianMLPRegressor])
+def test_frames_with_dates_are_refused_and_any_name_is_allowed(kind):
+    dates = pd.date_range("2026-01-01", periods=len(X))
+    for frame in (pd.DataFrame({"a": dates}), pd.DataFrame({"a": dates, "b": X[:, 0]})):
+        with pytest.raises(ValueError, match=r"X must be real numbers|The columns \['a'\] of X are not numbers"):
+            kind().fit(frame, Y)
+    kind(max_iter=2).fit(pd.DataFrame({"_mask": X[:, 0], "b": X[:, 1]}), Y)
+
+
+@pytest.mark.parametrize(
+    ("y", "error", "message"),
+    [
+        (sparse.csr_matrix(Y), TypeError, "^y must be a dense array"),
+        (np.ma.masked_greater(Y, 0.5), ValueError, "^y must have no masked values"),
+    ],
+)
+def test_targets_beside_a_frame_for_a_kernel_map_are_looked_at_too(y, error, message):
+    with pytest.raises(error, match=message):
+        EVGPRegressor(kernel_map=FunctionTransformer(np.asarray)).fit(pd.DataFrame(X, columns=list("abc")), y)
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])

@@ -25,7 +25,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
-from ..inference.bounds import bounds_at_optimum
+from ..inference.bounds import bounds_at_optimum, projected
 from ..inference.model import SparseModel
 from ..inference.statistics import SufficientStatistics, collect
 from ..optimizers.parameters import ParameterTable, Values
@@ -125,12 +125,6 @@ def _by_folds(
     first = limits if by.groups is None else limits.with_signal_above(values["signal"])
     searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
-    if model.prior.shared:
-        # Each was found with the others as fitted: all at once they may contradict each other on the weights.
-        signal, noise = np.array(found).T
-        moved = _searches(model, values | {"signal": signal, "noise": noise}, folds, rows, first, lowest)
-        if sum(map(Search.loss_as_given, moved)) > sum(map(Search.loss_as_given, searches)):
-            found = list(zip(values["signal"].tolist(), values["noise"].tolist(), strict=True))
     gone, dependent = 0, False
     if by.groups is not None:
         explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
@@ -178,6 +172,11 @@ def _left_over(model: SparseModel, values: Values, statistics: list[SufficientSt
         n_rows = group.statistics.n_rows
         # Rows less the trace of I - B⁻¹, the weights that they determine.
         freedom = [n_rows - len(q.B) + np.vdot(q.root_inv, q.root_inv) for q in bound.posteriors]
+        if group.prior.shared:
+            # Other outputs determine them, too: the trace of σ⁻² Pᵀ P B⁻¹.
+            for o, q in enumerate(bound.posteriors):
+                own = q.root_inv @ projected(group, o)[0] @ q.root_inv.T
+                freedom[o] = n_rows - own.trace() / group.noise[o]
         found[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
     return found
 

@@ -97,11 +97,6 @@ class Search:
         density, _ = self._means(signal / noise, np.array([noise]))
         return float(density[0])
 
-    def loss_as_given(self) -> float:
-        """What is to be low, in nats per row, where the search begins."""
-        signal, noise = (self._at_bound(name) for name in ("signal", "noise"))
-        return float(self._losses(signal / noise, np.array([noise]))[0])
-
     def without_signal(self) -> float:
         """The same of the features alone, with a noise as large as what they leave over."""
         _, squares = self._means(0.0, self._at_bound("noise") * np.ones(1))

@@ -90,7 +90,9 @@ class ExactTask:
             alone, noise_alone = self._best_with(little, hidden)
             if hidden and not signal.free.all():
                 # What a signal that stays costs depends on where the kernel ends.
-                most_alone, _ = self._best_with(signal.value_limits()[:, 0], hidden)
+                first = self.table.values_at_start()
+                variance = max(float(np.mean(at.matrix().diagonal())) for at in self.model.outputs(first)[0])
+                most_alone, _ = self._best_with(0.0 * little + self.options.rules.signal_limits[0] / variance, hidden)
         return Strategy(
             self.options.rules,
             self.table,

@@ -176,8 +176,11 @@ class ExactModel:
         features, reference = np.empty((n, o, n)), np.empty((o, n))
         for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
             H = self.rows.of(slice(index, index + 1)).features
-            Q, R = np.linalg.qr((H * scale if self.prior.root is None else H @ self.prior.root[index]).T)
-            features[:, index], reference[index] = R.T, Q.T @ w0
+            A = (H * scale if self.prior.root is None else H @ self.prior.root[index]).T
+            # The large rows first: so each keeps its own digits (Higham 2002, section 19.4).
+            order = np.argsort(-np.abs(A).max(axis=1))
+            Q, R = np.linalg.qr(A[order])
+            features[:, index], reference[index] = R.T, Q.T @ w0[order]
         prior = CoefficientPrior(np.zeros((o, n)), np.ones((o, n)), reference)
         rows = replace(self.rows, features=features)
         return replace(self, prior=prior, vague=np.zeros((o, n), dtype=bool), rows=rows)

@@ -6,6 +6,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp._progress import Monitor
+from skevgp.fitting import exact
 from skevgp.fitting.exact import ExactOptions, fit_exact, log_units_of_contrasts
 from skevgp.kernels.parse import parse_kernel
 from skevgp.solvers import LBFGS
@@ -82,6 +83,19 @@ def test_a_noise_that_nobody_gave_starts_low_and_as_a_share_of_what_the_features
     done = fitted(kernel=None)
     scatter = done.units.rows(source_of()).scatter()
     np.testing.assert_allclose(done.table["noise"].start, LBFGS.rules.first_noise * scatter)
+
+
+@pytest.mark.parametrize("bounds", ["fixed", (1e-5, 1e5)])
+def test_of_a_signal_that_stays_features_may_alone_be_likelier_than_with_it(bounds, monkeypatch):
+    """As likely as without a Gaussian process: where the kernel ends is not known before."""
+    tasks, search = [], exact.search
+    monkeypatch.setattr(exact, "may_hide_noise", lambda prior, n_rows: True)
+    monkeypatch.setattr(exact, "search", lambda task: tasks.append(task) or search(task))
+    noise = np.random.RandomState(1).randn(N, O)
+    fitted(kernel=ConstantKernel(4.0, bounds) * RBF([1.0, 1.0]), Y=noise, max_iter=2)
+    strategy = tasks[0].strategy
+    assert strategy.noise_hidden
+    assert (strategy.most_alone > strategy.alone) == (bounds == "fixed")
 
 
 def test_restarts_keep_the_likeliest():

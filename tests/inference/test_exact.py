@@ -163,6 +163,14 @@ def test_more_features_than_rows_have_the_likelihood_of_as_many_as_rows(correlat
             np.testing.assert_allclose(gradient[name], of_values, rtol=1e-8, atol=1e-9)
 
 
+@pytest.mark.parametrize("size", [1e9, 1e14])
+def test_a_wide_prior_of_the_last_of_many_features_costs_no_digits(size):
+    model, _ = problem(np.zeros((O, 40), dtype=bool), p=40)
+    model.prior.scale[:, -1] = size
+    expected = model.log_likelihoods(VALUES)
+    np.testing.assert_allclose(model.with_fewer_features().log_likelihoods(VALUES), expected, rtol=1e-8)
+
+
 def test_of_no_more_features_than_rows_or_vague_or_shared_ones_all_are_kept():
     few, _ = problem(VAGUE["proper"])
     vague, _ = problem(np.arange(O * 40).reshape(O, 40) == 0, p=40)
