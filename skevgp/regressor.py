@@ -185,8 +185,8 @@ class EVGPRegressor(SparseGaussianProcess):
         ordinary row, near 0 for one that is doubted; NaN for one of weight 0. After `partial_fit`, of the new rows.
     lower_bound_, upper_bound_ : float
         On the log marginal likelihood at the fitted parameters; nats, summed over outputs; good to a few nats where
-        features are alike to 1e-9. Where they agree, points cost nothing. The upper one (Titsias 2014) is loose with
-        many rows. With ``noise_cv`` the lower one is below that of the last iteration: noise and signal have moved.
+        features are alike to 1e-9. Where they agree, points cost nothing. The upper one (Titsias 2014) holds for either
+        posterior, loose with many rows. With ``noise_cv`` the lower one is below the last iteration's: noise has moved.
     loss_curve_ : ndarray of shape (n_iter,)
         Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
         sample of the rows: the sample's, times the number of rows over its size).
