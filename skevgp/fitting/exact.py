@@ -29,6 +29,8 @@ from .units import Units, check_independent, may_hide_noise, noise_of_most_evide
 Optimizer = Callable[..., tuple[np.ndarray, float]]
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
+# A signal that is as good as none, as a share of one that the user fixes.
+_NO_SIGNAL = 1e-12
 
 
 @dataclass(frozen=True)
@@ -90,9 +92,7 @@ class ExactTask:
             alone, noise_alone = self._best_with(little, hidden)
             if hidden and not signal.free.all():
                 # What a signal that stays costs depends on where the kernel ends.
-                first = self.table.values_at_start()
-                variance = max(float(np.mean(at.matrix().diagonal())) for at in self.model.outputs(first)[0])
-                most_alone, _ = self._best_with(0.0 * little + self.options.rules.signal_limits[0] / variance, hidden)
+                most_alone, _ = self._best_with(_NO_SIGNAL * signal.start, hidden)
         return Strategy(
             self.options.rules,
             self.table,
