@@ -123,6 +123,19 @@ def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray) -> np.ndar
     return out
 
 
+def times_lower(A: np.ndarray, L: np.ndarray, transposed: bool = False) -> np.ndarray:
+    """A L, or A Lᵀ, for a lower triangular L: half the work of a product that multiplies zeros too.
+
+    (Matrices that are C-contiguous are read as their transposes, without a copy; so is the product.)
+    """
+    return blas.dtrmm(1.0, L.T, A.T, trans_a=int(transposed)).T if A.size else A.copy()
+
+
+def lower_transposed_times(L: np.ndarray, B: np.ndarray) -> np.ndarray:
+    """Lᵀ B for a lower triangular L, as of `times_lower`."""
+    return blas.dtrmm(1.0, L.T, B.T, side=1, trans_a=1).T if B.size else B.copy()
+
+
 def triangular_solve(L: np.ndarray, B: np.ndarray) -> None:
     """Put L⁻¹ B in the place of B, for a lower triangular L and a C-contiguous B."""
     # BLAS reads and writes transposes without a copy: X Lᵀ = Bᵀ.
@@ -137,21 +150,24 @@ def symmetric_inverse(L_inv: np.ndarray) -> np.ndarray:
     return L_inv.T @ L_inv
 
 
-def cholesky_pullback(L: np.ndarray, L_inv: np.ndarray, L_bar: np.ndarray) -> np.ndarray:
+def cholesky_pullback(L_inv: np.ndarray, factor_bar: np.ndarray) -> np.ndarray:
     """Pull a gradient back through L = cholesky(K): K̄ = ½ L⁻ᵀ S L⁻¹, where S is symmetric and below its diagonal Lᵀ L̄.
 
     (Murray 2016, "Differentiation of the Cholesky decomposition", equation 10, symmetrised.)
 
     Parameters
     ----------
-    L, L_inv, L_bar : ndarray of shape (n, n)
-        The factor, its inverse, and the gradient of a scalar in the factor; of ``L_bar`` the lower triangle counts.
+    L_inv : ndarray of shape (n, n)
+        The factor's inverse.
+    factor_bar : ndarray of shape (n, n)
+        Lᵀ L̄, with L̄ the gradient of a scalar in the factor; the lower triangle counts. (It takes nothing from above
+        the diagonal of L̄; where L̄ is L⁻ᵀ times something, that something is it.)
 
     Returns
     -------
     K_bar : ndarray of shape (n, n)
         Symmetric: d scalar = sum(K_bar * dK) for symmetric dK.
     """
-    # The lower triangle of Lᵀ L̄ takes nothing from above the diagonal of L̄, and BLAS reads no other to make S.
-    S_L_inv = blas.dsymm(1.0, (L.T @ L_bar).T, L_inv, lower=0)
-    return 0.5 * (L_inv.T @ S_L_inv)
+    half = 0.5 * np.tril(factor_bar)
+    diagonal_of(half)[...] *= 0.5
+    return lower_transposed_times(L_inv, times_lower(half + half.T, L_inv))

@@ -10,7 +10,9 @@ from skevgp._linalg import (
     cholesky_pullback,
     diagonal_of,
     jittered_cholesky,
+    lower_transposed_times,
     symmetric_inverse,
+    times_lower,
     triangular_inverse,
     triangular_product,
     triangular_solve,
@@ -164,7 +166,24 @@ def test_the_factors_pull_back_agrees_with_autograd():
     L = np.linalg.cholesky(A)
     above = np.triu(np.full((4, 4), 1e3), 1)
     for L_bar in (weights, weights + above):
-        np.testing.assert_allclose(cholesky_pullback(L, triangular_inverse(L), L_bar), expected, rtol=1e-9, atol=1e-15)
+        found = cholesky_pullback(triangular_inverse(L), L.T @ L_bar)
+        np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-15)
+        np.testing.assert_array_equal(cholesky_pullback(triangular_inverse(L), L.T @ L_bar + above), found)
+
+
+@pytest.mark.parametrize("order", ["C", "F"])
+@pytest.mark.parametrize("shape", [(0, 0), (0, 3), (1, 1), (2, 5), (7, 5)])
+def test_products_with_a_lower_triangle(shape, order):
+    """What lies above the diagonal is not read."""
+    rng = np.random.RandomState(0)
+    A, L = np.array(rng.randn(*shape), order=order), np.tril(rng.randn(shape[1], shape[1]))
+    given, dirty = A.copy(), L + np.triu(np.full(L.shape, 1e3), 1)
+    for transposed, expected in ((False, A @ L), (True, A @ L.T)):
+        found = times_lower(A, dirty, transposed)
+        assert found.shape == expected.shape
+        np.testing.assert_allclose(found, expected, rtol=1e-13, atol=1e-14)
+    np.testing.assert_allclose(lower_transposed_times(dirty, A.T), L.T @ A.T, rtol=1e-13, atol=1e-14)
+    np.testing.assert_array_equal(A, given)
 
 
 @pytest.mark.parametrize("m", [0, 1, 47, 48, 49, 130])

@@ -239,17 +239,17 @@ class BoundAtOptimum:
         self.weights = (scales * mean).T
         if group.prior.root is not None:
             self.weights[m:] = group.prior.times(mean[:, m:]).T
-        joint_bar, L_bar = np.zeros(joint.shape), np.zeros((m, m))
+        joint_bar, factor_bar = np.zeros(joint.shape), np.zeros((m, m))
         # Of each output: log|B| (and twice the gap), and derivatives of the bound in log s² and log 1/σ² by way of B.
         log_det, from_signal, from_noise = np.empty((3, len(noise)))
         for o, q in enumerate(posteriors):
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
             if family == "diagonal":
-                gap, gap_B_bar, gap_L_bar = diagonal_gap(q.B, log_det[o], B_bar, group.whitening)
+                gap, gap_B_bar, gap_factor_bar = diagonal_gap(q.B, log_det[o], B_bar, group.whitening)
                 log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
-                L_bar -= gap_L_bar
+                factor_bar -= gap_factor_bar
             if group.prior.root is None:
                 B_bar *= np.multiply.outer(scales[o] / noise[o], scales[o])
             else:
@@ -262,7 +262,7 @@ class BoundAtOptimum:
             2.0 * joint_bar[:m, m:],
             self.weights[:m] / noise,
             0.0 if group.complete else unexplained_bar.sum(),
-            L_bar,
+            factor_bar,
         )
         unexplained = unexplained_bar * statistics.unexplained
         mean[:, m:] += group.prior.reference

@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
+from .._linalg import diagonal_of, jittered_cholesky, symmetric_inverse, times_lower, triangular_inverse
 from ..optimizers.parameters import Parameter, Values
 from .bounds import Group, WhitenedPosterior, projected
 from .posterior import diagonal_root, log_variances
@@ -29,7 +29,8 @@ class SpreadTerms:
         The sum over outputs of ½ [Tr((I + σ⁻² PᵀP) S) - log|S|].
     VV : ndarray of shape (m, m)
     VH : ndarray of shape (m, p)
-    L : ndarray of shape (m, m)
+    factor : ndarray of shape (m, m)
+        As of `StatisticsGradient`.
     log_signal, log_noise : ndarray of shape (o,)
     spread : ndarray of shape (o, k)
         In the coordinates of the parameter ``spread``; of width 0 if there is none.
@@ -38,15 +39,15 @@ class SpreadTerms:
     value: float
     VV: np.ndarray
     VH: np.ndarray
-    L: np.ndarray
+    factor: np.ndarray
     log_signal: np.ndarray
     log_noise: np.ndarray
     spread: np.ndarray
 
     @classmethod
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
-        VV, VH, L = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
-        return cls(0.0, VV, VH, L, np.zeros(o), np.zeros(o), np.zeros((o, k)))
+        VV, VH, factor = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
+        return cls(0.0, VV, VH, factor, np.zeros(o), np.zeros(o), np.zeros((o, k)))
 
 
 class Family(Protocol):
@@ -103,7 +104,7 @@ class DiagonalFamily:
         variance = np.exp(log_variance)
         d = variance[:, :m]
         ratio = (group.signal / group.noise)[:, np.newaxis]
-        VVL = statistics.VV @ L_inv
+        VVL = times_lower(statistics.VV, L_inv)
         # Tr(PᵀP S) / σ² is the sum of these over the variances.
         from_data = np.empty_like(variance)
         from_data[:, :m] = np.einsum("ij,ij->j", L_inv, VVL) * ratio
@@ -112,16 +113,16 @@ class DiagonalFamily:
         from_prior = variance.copy()
         from_prior[:, :m] *= np.einsum("ij,ij->j", L_inv, L_inv)
         weighted, total = (ratio * d).sum(axis=0), d.sum(axis=0)
-        LD = L_inv * weighted
-        L_bar = -(L_inv.T @ (VVL * weighted + L_inv * total) @ L_inv.T)
-        diagonal = np.diagonal(group.whitening.L)
-        diagonal_of(L_bar)[...] += len(d) / diagonal
-        value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * np.log(diagonal).sum()
+        LD = L_inv * np.sqrt(weighted)
+        factor_bar = -times_lower(VVL * weighted + L_inv * total, L_inv, transposed=True)
+        diagonal_of(factor_bar)[...] += len(d)
+        half_log_det = np.log(np.diagonal(group.whitening.L)).sum()
+        value = 0.5 * (from_data.sum() + from_prior.sum() - log_variance.sum()) + len(d) * half_log_det
         return SpreadTerms(
             float(value),
-            0.5 * LD @ L_inv.T,
+            0.5 * (LD @ LD.T),
             np.zeros_like(statistics.VH),
-            L_bar,
+            factor_bar,
             0.5 * from_data[:, :m].sum(axis=1),
             -0.5 * from_data.sum(axis=1),
             0.5 * (from_data + from_prior - 1.0),

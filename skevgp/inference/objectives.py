@@ -211,7 +211,7 @@ class _ElboTerms:
             self._spread.VH,
             -f / group.noise,
             0.0 if group.complete else 0.5 * self._ratio.sum(),
-            self._spread.L,
+            self._spread.factor,
         )
 
     def finish(self, residuals: Residuals) -> tuple[float, Values]:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._linalg import diagonal_of
+from .._linalg import diagonal_of, times_lower
 from ..rows.source import Columns, of_outputs, times_weights
 from .statistics import Kernel, Whitening
 
@@ -354,19 +354,18 @@ def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np
 def diagonal_gap(
     B: np.ndarray, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
 ) -> tuple[float, np.ndarray, np.ndarray]:
-    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (the lower triangle) in L; ``log_det_bar`` is -½ B⁻¹.
+    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (as Lᵀ L̄) in L; ``log_det_bar`` is -½ B⁻¹.
 
     In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
     """
     L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    precision = L_inv.T @ B[:m, :m] @ L_inv
-    f_diagonal = np.maximum(np.diagonal(precision), np.einsum("ji,ji->i", L_inv, L_inv))
+    BL = times_lower(B[:m, :m], L_inv)
+    f_diagonal = np.maximum(np.einsum("ji,ji->i", L_inv, BL), np.einsum("ji,ji->i", L_inv, L_inv))
     coef_diagonal = np.maximum(np.diagonal(B)[m:], 1.0)
     gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
     B_bar = log_det_bar.copy()
-    weighted = L_inv / f_diagonal
-    B_bar[:m, :m] += 0.5 * weighted @ L_inv.T
+    B_bar[:m, :m] += 0.5 * times_lower(L_inv / f_diagonal, L_inv, transposed=True)
     diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
-    L_bar = -(weighted @ precision).T
-    diagonal_of(L_bar)[...] += 1.0 / np.diagonal(L)
-    return float(gap), B_bar, L_bar
+    factor_bar = -times_lower(BL / f_diagonal, L_inv, transposed=True)
+    diagonal_of(factor_bar)[...] += 1.0
+    return float(gap), B_bar, factor_bar

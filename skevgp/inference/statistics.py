@@ -20,6 +20,7 @@ from .._linalg import (
     cholesky_of_covariance,
     cholesky_pullback,
     diagonal_of,
+    lower_transposed_times,
     triangular_inverse,
     triangular_product,
     triangular_solve,
@@ -137,9 +138,9 @@ class Whitening:
         np.putmask(left, left < _ROUNDING * variance, 0.0)
         return left
 
-    def pull_back(self, rows_bar: Any, L_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients in the hyperparameters (their logarithms) and X_m, given those in the rows (`pull_back`) and L."""
-        K_bar = cholesky_pullback(self.L, self.L_inv, L_bar)
+    def pull_back(self, rows_bar: Any, factor_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradients in the hyperparameters (their logarithms) and X_m, of those in the rows (`pull_back`) and Lᵀ L̄."""
+        K_bar = cholesky_pullback(self.L_inv, factor_bar)
         # A jitter is a share of the diagonal, and moves with it. (The bound of a diagonal q has its logarithm.)
         added, diagonal = self._added()
         diagonal_of(K_bar)[...] *= 1.0 + np.divide(added, diagonal, out=np.zeros_like(added), where=diagonal > 0.0)
@@ -204,16 +205,16 @@ class SufficientStatistics:
 
 @dataclass(frozen=True)
 class StatisticsGradient:
-    """Gradients of a scalar in the statistics of these names, and in L, of which the lower triangle counts.
+    """Gradients of a scalar in the statistics of these names.
 
-    ``VE`` multiplies V e, not V r.
+    ``VE`` multiplies V e, not V r; ``factor`` is Lᵀ L̄, with L̄ the gradient in L itself, as of `cholesky_pullback`.
     """
 
     VV: np.ndarray
     VH: np.ndarray
     VE: np.ndarray
     unexplained: float
-    L: np.ndarray
+    factor: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -360,8 +361,8 @@ def pull_back(
     """Second pass over the rows: gradients of a scalar in the statistics -> in the hyperparameters and X_m.
 
     With Ḡ the given gradients, V̄ = (Ḡ_VV + Ḡ_VVᵀ - 2 ḡ_unexplained I) V + Ḡ_VH Hᵀ + Ḡ_VE eᵀ, Ū = L⁻ᵀ V̄ and
-    L̄ = Ḡ_L - tril(L⁻ᵀ V̄ Vᵀ), where V̄ Vᵀ comes from the sums. (The clipping of the unexplained variance acts only at
-    the level of rounding and is left out.)
+    L̄ = Ḡ_L - tril(L⁻ᵀ V̄ Vᵀ), so that Lᵀ L̄ = Lᵀ Ḡ_L - V̄ Vᵀ (in the lower triangle), where V̄ Vᵀ comes from the sums.
+    (The clipping of the unexplained variance acts only at the level of rounding and is left out.)
 
     Parameters
     ----------
@@ -379,11 +380,10 @@ def pull_back(
         In the logarithms of the hyperparameters, and in X_m.
     residuals : Residuals
     """
-    L_inv = whitening.L_inv
     symmetric = gradient.VV + gradient.VV.T
     diagonal_of(symmetric)[...] -= 2.0 * gradient.unexplained
-    back = L_inv.T @ np.hstack([symmetric, gradient.VH, gradient.VE])
+    back = lower_transposed_times(whitening.L_inv, np.hstack([symmetric, gradient.VH, gradient.VE]))
     second = _SecondPass(whitening, outputs, back, gradient.unexplained, weights)
     rows_bar, squares, VE = blocks.sum(second)
     VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
-    return whitening.pull_back(rows_bar, gradient.L - L_inv.T @ VbarV), Residuals(squares, VE)
+    return whitening.pull_back(rows_bar, gradient.factor - VbarV), Residuals(squares, VE)

@@ -142,19 +142,18 @@ def test_rounding_is_no_jitter_whatever_the_variance():
 def test_gradients_in_the_factor_are_pulled_back():
     weights = np.tril(RNG.randn(M, M))
     own = whitening()
-    found = own.pull_back(own.covariance.start_pullback(), weights)
+    found = own.pull_back(own.covariance.start_pullback(), own.L.T @ weights)
     expected = central_differences(lambda theta: np.vdot(weights, whitening(theta).L), THETA)
     assert relative_error(np.concatenate([part.ravel() for part in found]), expected) < 1e-7
 
 
 def test_gradients_in_whitened_rows_are_pulled_back():
-    """Of <W, V>: Ū = L⁻ᵀ W, and L̄ = -tril(Ū Vᵀ)."""
+    """Of <W, V>: Ū = L⁻ᵀ W, and L̄ = -tril(Ū Vᵀ), so that Lᵀ L̄ is -W Vᵀ."""
     weights, prepared = RNG.randn(M, N), KERNEL.prepare(X)
     own = whitening()
     U, V = own.project(prepared)
     U_bar = own.L_inv.T @ weights
-    L_bar = -np.tril(U_bar @ V.T)
-    found = own.pull_back(own.covariance.cross_pullback(prepared, U, U_bar, 0.0), L_bar)
+    found = own.pull_back(own.covariance.cross_pullback(prepared, U, U_bar, 0.0), -weights @ V.T)
     expected = central_differences(lambda theta: np.vdot(weights, whitening(theta).project(prepared)[1]), THETA)
     assert relative_error(np.concatenate([part.ravel() for part in found]), expected) < 1e-7
 
@@ -213,16 +212,20 @@ def test_summing_whitened_rows_keeps_digits_that_whitening_the_sums_would_lose()
 # --- the second pass -----------------------------------------------------------------------------------------------
 
 
+# Of `scalar` in L, where it is `whitening()`'s.
+L_BAR = np.tril(np.random.RandomState(5).randn(M, M))
+
+
 def some_gradient(outputs=O, seed=1):
     rng = np.random.RandomState(seed)
-    VV = rng.randn(M, M)
-    return StatisticsGradient(VV, rng.randn(M, P), rng.randn(M, outputs), float(rng.randn()), np.tril(rng.randn(M, M)))
+    of_sums = rng.randn(M, M), rng.randn(M, P), rng.randn(M, outputs), float(rng.randn())
+    return StatisticsGradient(*of_sums, whitening().L.T @ L_BAR)
 
 
 def scalar(statistics, own, gradient):
     """What has these gradients where the mean of q is 0, so that e = r."""
     parts = [(getattr(gradient, name), getattr(statistics, name)) for name in ("VV", "VH")]
-    parts += [(gradient.VE, statistics.VR), (gradient.L, own.L)]
+    parts += [(gradient.VE, statistics.VR), (L_BAR, own.L)]
     return sum(np.vdot(*part) for part in parts) + gradient.unexplained * statistics.unexplained
 
 
@@ -255,7 +258,7 @@ def test_a_jitter_moves_with_the_diagonal():
 
     theta = np.append(np.full(kernel.n_hyperparameters, -0.3), points)
     own = whitened(theta)
-    found = own.pull_back(own.covariance.start_pullback(), weights)
+    found = own.pull_back(own.covariance.start_pullback(), own.L.T @ weights)
     expected = central_differences(lambda at: float(np.vdot(whitened(at).L, weights)), theta)
     assert relative_error(flat(found), expected) < 1e-7
     assert Whitening.of(KERNEL, LENGTHSCALES, np.empty((0, D))).jitter() == 0.0
