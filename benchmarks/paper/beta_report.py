@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -152,7 +152,7 @@ def verdict(rows: list[Row]) -> str:
             gone = b[1].mean() > -0.1 * abs(b[0].mean())
             said = (
                 f"with IF {'significantly negative in every seed' if negative else 'not negative throughout'} "
-                f"({b[0].mean():+.3f}), with IFG {'not' if gone else 'still'} negative beyond a tenth of that "
+                f"({b[0].mean():+.3f}), with IFG {'not ' if gone else ''}negative beyond a tenth of the size of that "
                 f"({b[1].mean():+.3f})"
             )
             shown = "as in the paper" if negative and gone else "**not** as in the paper"
@@ -185,7 +185,31 @@ def explanation(rows: list[Row]) -> str:
             f"process given; the full posterior's, which knows that they can stand in for each other, is {ratio:.0f} "
             "times as large (median over weights; kernels and noise of the fits differ too)."
         )
+    scattered = {
+        setting: scatter(own for its, _, own in groups(rows) if its == setting) for setting in settings_of(rows)
+    }
+    if all(np.isfinite(list(scattered.values()))):
+        times = ", ".join(f"{ratio:.3g} in {SETTINGS[setting]}" for setting, ratio in scattered.items())
+        said += (
+            " Between seeds, that is between data sets, the standard deviation of a weight is so many times that of "
+            f"its posterior, which is given one kernel (median over weights): {times}."
+        )
     return said
+
+
+def settings_of(rows: list[Row]) -> list[str]:
+    """In the order of `SETTINGS`."""
+    return [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
+
+
+def scatter(parts: Iterable[list[Row]]) -> float:
+    """The standard deviation between seeds over the posterior's own, the median over weights; NaN of one seed."""
+    ratios = []
+    for own in parts:
+        mean, std = matrix(own, "mean"), matrix(own, "std").mean(axis=0)
+        if len(mean) > 1:
+            ratios.append((mean.std(axis=0, ddof=1) / std).ravel())
+    return float(np.median(np.concatenate(ratios))) if ratios else np.nan
 
 
 def entry(rows: list[Row], output: str, feature: str, value: str) -> np.ndarray:
@@ -211,7 +235,7 @@ def picture_of(output: Path, system: str) -> Path:
 
 def panels_of(rows: list[Row]) -> list[tuple[str, str, str]]:
     """Lines of the picture: title, setting and column of the CSV. The first two are the same in all settings."""
-    settings = [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
+    settings = settings_of(rows)
     first = settings[0]
     # Of many settings, standard deviations are shown for the two that differ most.
     posteriors = settings if len(settings) < 3 else [settings[0], settings[-1]]

@@ -96,6 +96,20 @@ def test_the_papers_observation_is_looked_for(plain, gravity, seen):
     assert "(dq2, q2): **not** as in the paper" in said[1]
 
 
+def test_weights_scatter_between_seeds_as_a_multiple_of_their_posterior():
+    from paper import beta_report
+
+    rows = fits({})
+    for row in rows:
+        row["mean"] = str(0.03 * int(row["seed"]))  # ±0.015 around the mean: a standard deviation of 0.0212 of two
+    assert beta_report.scatter(own for *_, own in beta_report.groups(rows)) == pytest.approx(0.03 / np.sqrt(2.0) / 0.01)
+    assert "posterior, which is given one kernel (median over weights): 2.12 in paper's setting." in (
+        beta_report.explanation(rows)
+    )
+    of_one_seed = [row for row in rows if row["seed"] == "0"]
+    assert "given one kernel" not in beta_report.explanation(of_one_seed)
+
+
 def test_the_picture_has_prior_least_squares_and_posterior_of_each_model_and_colour_bars(drawn, tmp_path):
     from paper import beta_report
 
