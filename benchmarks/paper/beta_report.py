@@ -242,7 +242,7 @@ def panels_of(rows: list[Row]) -> list[tuple[str, str, str]]:
     return [
         ("Prior mean", first, "prior_mean"),
         ("Least squares, features alone", first, "least_squares"),
-        *((f"Posterior mean b, {SETTINGS[setting]}", setting, "mean") for setting in settings),
+        *((f"b, {SETTINGS[setting]}", setting, "mean") for setting in settings),
         *((f"Posterior std, {SETTINGS[setting]}", setting, "std") for setting in posteriors),
     ]
 
@@ -296,8 +296,8 @@ def plot(rows: list[Row], path: Path) -> None:
     said = f"means over {n_seeds} seeds" if n_seeds > 1 else "one seed"
     if is_written(rows):
         said += ", ± standard deviation between seeds" * (n_seeds > 1) + "; framed: what would imitate gravity"
-    steps = textwrap.fill(f"iterations: {iterations(rows)}", 120)
-    figure.suptitle(f"{rows[0]['system']}: {said}\n{steps}")
+    lines = f"{rows[0]['system']}: {said}", f"b: posterior mean; iterations: {iterations(rows)}"
+    figure.suptitle("\n".join(textwrap.fill(line, 100) for line in lines))
     save_picture(figure, path)
 
 

@@ -120,7 +120,7 @@ def test_the_picture_has_prior_least_squares_and_posterior_of_each_model_and_col
             row["mean"] = str(float(row["mean"]) - 0.2)
     (figure,) = drawn(beta_report.plot, rows, tmp_path / "b.png")
     maps = [axes for axes in figure.axes if axes.images]
-    said = ("prior mean", "least squares, features alone", "posterior mean b, paper's setting")
+    said = ("prior mean", "least squares, features alone", "b, paper's setting")
     titles = [f"{model}: {what}" for what in said for model in ("EVGP-IF", "EVGP-IFG")]
     assert [axes.get_title() for axes in maps[:6]] == titles
     assert len(maps) == 8  # and standard deviations
