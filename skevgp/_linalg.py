@@ -124,15 +124,16 @@ def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray) -> np.ndar
 
 
 def times_lower(A: np.ndarray, L: np.ndarray, transposed: bool = False) -> np.ndarray:
-    """A L, or A Lᵀ, for a lower triangular L: half the work of a product that multiplies zeros too.
+    """A L, or A Lᵀ, (k, n), for A (k, n) and a lower triangular L (n, n): half the work of a product with zeros.
 
-    (Matrices that are C-contiguous are read as their transposes, without a copy; so is the product.)
+    (BLAS reads C-contiguous matrices as their transposes, without a copy. For m-sized products, not for blocks of rows
+    in threads: see `triangular_product`.)
     """
     return blas.dtrmm(1.0, L.T, A.T, trans_a=int(transposed)).T if A.size else A.copy()
 
 
 def lower_transposed_times(L: np.ndarray, B: np.ndarray) -> np.ndarray:
-    """Lᵀ B for a lower triangular L, as of `times_lower`."""
+    """Lᵀ B (n, k), for a lower triangular L (n, n) and B (n, k), as `times_lower`."""
     return blas.dtrmm(1.0, L.T, B.T, side=1, trans_a=1).T if B.size else B.copy()
 
 

@@ -10,8 +10,8 @@ the weights of positions on velocities turn negative to imitate it), and a pictu
     python benchmarks/paper/beta.py --settings paper --max-iter 2000    # Adam's steps in place of 16000
 
 Settings as in results_table.py: "paper" (Adam, diagonal posterior, inducing points per output), "author" and
-"author-100" (from where the author's library starts) and "skevgp" (its defaults). A fit of the acrobot takes 40 s of
-one core per 1000 iterations in the paper's setting, 100 to 200 s in skevgp's.
+"author-100" (from where the author's library starts) and "skevgp" (its defaults). A fit of the acrobot takes 2 to 6
+minutes of one core in settings of Adam, half a minute in skevgp's.
 """
 
 from __future__ import annotations

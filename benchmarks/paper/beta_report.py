@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import textwrap
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,14 @@ WRITTEN = 12
 
 def groups(rows: list[Row]) -> Iterator[tuple[str, str, list[Row]]]:
     """Of one system: setting, model, rows."""
-    for setting, model in sorted({(row["setting"], row["model"]) for row in rows}):
-        yield setting, model, [row for row in rows if (row["setting"], row["model"]) == (setting, model)]
+    for setting in settings_of(rows):
+        for model in sorted({row["model"] for row in rows if row["setting"] == setting}):
+            yield setting, model, [row for row in rows if (row["setting"], row["model"]) == (setting, model)]
+
+
+def settings_of(rows: list[Row]) -> list[str]:
+    """In the order of `SETTINGS`."""
+    return [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
 
 
 def names(rows: list[Row], what: str) -> list[str]:
@@ -141,7 +147,7 @@ def verdict(rows: list[Row]) -> str:
     """Whether the paper's observation holds, for each setting and joint."""
     sentences = []
     found = {(setting, model): own for setting, model, own in groups(rows)}
-    for setting in sorted({setting for setting, _ in found}):
+    for setting in settings_of(rows):
         plain, gravity = (found.get((setting, model)) for model in ("EVGP-IF", "EVGP-IFG"))
         if plain is None or gravity is None:
             continue
@@ -185,10 +191,8 @@ def explanation(rows: list[Row]) -> str:
             f"process given; the full posterior's, which knows that they can stand in for each other, is {ratio:.0f} "
             "times as large (median over weights; kernels and noise of the fits differ too)."
         )
-    scattered = {
-        setting: scatter(own for its, _, own in groups(rows) if its == setting) for setting in settings_of(rows)
-    }
-    if all(np.isfinite(list(scattered.values()))):
+    scattered = {setting: scatter([row for row in rows if row["setting"] == setting]) for setting in settings_of(rows)}
+    if np.isfinite(list(scattered.values())).all():
         times = ", ".join(f"{ratio:.3g} in {SETTINGS[setting]}" for setting, ratio in scattered.items())
         said += (
             " Between seeds, that is between data sets, the standard deviation of a weight is so many times that of "
@@ -197,18 +201,10 @@ def explanation(rows: list[Row]) -> str:
     return said
 
 
-def settings_of(rows: list[Row]) -> list[str]:
-    """In the order of `SETTINGS`."""
-    return [setting for setting in SETTINGS if any(row["setting"] == setting for row in rows)]
-
-
-def scatter(parts: Iterable[list[Row]]) -> float:
+def scatter(rows: list[Row]) -> float:
     """The standard deviation between seeds over the posterior's own, the median over weights; NaN of one seed."""
-    ratios = []
-    for own in parts:
-        mean, std = matrix(own, "mean"), matrix(own, "std").mean(axis=0)
-        if len(mean) > 1:
-            ratios.append((mean.std(axis=0, ddof=1) / std).ravel())
+    found = [(matrix(own, "mean"), matrix(own, "std")) for *_, own in groups(rows)]
+    ratios = [(mean.std(axis=0, ddof=1) / std.mean(axis=0)).ravel() for mean, std in found if len(mean) > 1]
     return float(np.median(np.concatenate(ratios))) if ratios else np.nan
 
 
@@ -220,7 +216,7 @@ def entry(rows: list[Row], output: str, feature: str, value: str) -> np.ndarray:
 def iterations(rows: list[Row]) -> str:
     """Of each setting, and the limit if there was one."""
     said = []
-    for setting in sorted({row["setting"] for row in rows}):
+    for setting in settings_of(rows):
         own = [row for row in rows if row["setting"] == setting]
         most = " to ".join(dict.fromkeys(str(f(column(own, "n_iter").astype(int))) for f in (np.min, np.max)))
         limits = sorted({row["max_iter"] for row in own} - {""}, key=int)

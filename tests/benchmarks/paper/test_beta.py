@@ -102,7 +102,7 @@ def test_weights_scatter_between_seeds_as_a_multiple_of_their_posterior():
     rows = fits({})
     for row in rows:
         row["mean"] = str(0.03 * int(row["seed"]))  # ±0.015 around the mean: a standard deviation of 0.0212 of two
-    assert beta_report.scatter(own for *_, own in beta_report.groups(rows)) == pytest.approx(0.03 / np.sqrt(2.0) / 0.01)
+    assert beta_report.scatter(rows) == pytest.approx(0.03 / np.sqrt(2.0) / 0.01)
     assert "posterior, which is given one kernel (median over weights): 2.12 in paper's setting." in (
         beta_report.explanation(rows)
     )
