@@ -116,9 +116,14 @@ def published(case: str, model: str) -> Result:
     return PAPER[case.removesuffix(WRAPPED)][model]
 
 
+def cut_short(row: Row) -> bool:
+    """Whether a fit went all the iterations that ``--max-iter`` left it; Adam's then end as if there were no more."""
+    return row["max_iter"] == row["n_iter"]
+
+
 def marks(own: list[Row], n_seeds: int = 4) -> str:
     """What a reader must know of a cell: fits that ended by a limit (*), or fewer seeds."""
-    limited = any(row["converged"] == "False" or row["max_iter"] for row in own)
+    limited = any(row["converged"] == "False" or cut_short(row) for row in own)
     return ("\\*" if limited else "") + (f" ({len(own)})" if len(own) != n_seeds else "")
 
 
@@ -192,9 +197,9 @@ def limits(groups: Groups) -> Iterator[str]:
     ]
     yield f"Fits that ended with a ConvergenceWarning: {', '.join(stopped) or 'none'}."
     limited = [
-        f"{' '.join(key)} ({', '.join(sorted({row['max_iter'] for row in own} - {''}, key=int))})"
+        f"{' '.join(key)} ({', '.join(sorted({row['max_iter'] for row in own if cut_short(row)}, key=int))})"
         for key, own in groups.items()
-        if any(row["max_iter"] for row in own)
+        if any(map(cut_short, own))
     ]
     yield f"Iterations were limited by `--max-iter` in: {', '.join(limited) or 'none'}."
     if any(key[1:] == ("VGP", "skevgp-angles") for key in groups):

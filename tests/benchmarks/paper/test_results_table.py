@@ -198,8 +198,9 @@ def test_the_likelier_cartpole_is_the_one_with_the_papers_errors():
 def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
     from paper.results_table_report import both
 
-    row = {"error_mean": "0.2", "error_inside": "0.1", "converged": "True", "max_iter": ""}
+    row = {"error_mean": "0.2", "error_inside": "0.1", "converged": "True", "max_iter": "", "n_iter": "60"}
     assert both([row] * 4) == "0.200 / 0.100"
     assert both([row]) == "0.200 / 0.100 (1)"
     assert both([row] * 3 + [{**row, "converged": "False"}]) == "0.200 / 0.100\\*"
     assert both([{**row, "max_iter": "60"}] * 4) == "0.200 / 0.100\\*"
+    assert both([{**row, "max_iter": "5000"}] * 4) == "0.200 / 0.100"
