@@ -24,6 +24,7 @@ import harness
 from harness import Row, figure_of
 from harness import column as of
 from paper import cartpole, claims, results_table_report
+from paper import unfinished as fits_to_come
 from paper.results_table_report import WRAPPED, Groups
 
 TEMPLATE = Path(__file__).with_name("reproduction.md.in")
@@ -80,6 +81,11 @@ def errors(results: Results) -> str:
 def which_cartpole(results: Results) -> str:
     """Each reading of the cartpole beside the paper."""
     return "\n\n".join(list(results_table_report.which_cartpole(results.table))[1:])
+
+
+def unfinished(results: Results) -> str:
+    """Fits that are missing or ended by a limit."""
+    return fits_to_come.paragraph(results.rows("results_table"), results.rows("learning_curves"))
 
 
 def outside(results: Results) -> str:
@@ -154,7 +160,7 @@ def variant(results: Results, name: str, model: str, which: str = "error_mean") 
 FILLERS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
-        *(errors, which_cartpole, outside, claims_table, tried, calibration),
+        *(errors, unfinished, which_cartpole, outside, claims_table, tried, calibration),
         *(error, spread, paper, held, n_parameters, variant),
     )
 }

@@ -101,3 +101,65 @@ def test_the_readme_has_the_same_errors():
             assert text == f"{np.mean(values):.{len(text) - 2}f}"
             compared += 1
     assert compared == 8
+
+
+def test_what_is_still_to_be_run_is_counted_and_timed():
+    from paper import unfinished
+    from paper.models import MODELS, SETTINGS, SYSTEMS, has
+
+    def fit(system, model, setting, seed, angles="raw", **changes):
+        return {
+            **{"system": system, "model": model, "setting": setting, "seed": str(seed), "angles": angles},
+            **{"converged": "True", "max_iter": "", "n_iter": "500", "fit_seconds": "36", **changes},
+        }
+
+    table = [
+        fit(system, model, setting, seed, angles)
+        for system in SYSTEMS
+        for model in MODELS
+        for setting in SETTINGS
+        for angles in ("raw", "wrapped")
+        for seed in range(4)
+        if has(system, model, setting, angles)
+    ]
+    curves = [
+        fit(system, model, setting, seed, n_trajectories=str(n))
+        for setting, systems in unfinished.CURVES.items()
+        for system in systems
+        for model in MODELS
+        for n in unfinished.N_TRAJECTORIES[system]
+        for seed in range(4)
+    ]
+
+    def said(rows, more=curves):
+        lines = unfinished.paragraph(rows, more).splitlines()[2:]
+        return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+    assert said(table)[-1][1] == "0"
+
+    def without(rows, keys, changes=None):
+        """What has these, missing or with changes."""
+        kept = [row for row in rows if not keys.items() <= row.items()]
+        return kept + [{**row, **changes} for row in rows if changes and keys.items() <= row.items()]
+
+    cell = {"system": "acrobot", "model": "VGP", "setting": "paper", "angles": "raw"}
+    missing = without(table, {**cell, "seed": "3"})
+    assert said(missing) == [["Table 4: acrobot, paper", "VGP 1", "0.1"], ["all", "1", "0.1"]]
+    # Adam's with a twentieth of its steps would take twenty times as long; those of RES-VGP tell it, too.
+    cut = without(table, cell, {"max_iter": "800", "n_iter": "800", "fit_seconds": "360"})
+    assert said(cut)[0] == ["Table 4: acrobot, paper", "VGP 4", "8.0"]
+    assert said(without(table, cell))[0] == ["Table 4: acrobot, paper", "VGP 4", "0.1"]
+    # Nobody knows of a fit by L-BFGS that a limit ended, if there is no other.
+    own = {"system": "iiwa14", "setting": "skevgp-nominal"}
+    limited = [{**row, "converged": "False"} if row["setting"] == "skevgp-nominal" else row for row in table]
+    assert said(limited)[0] == ["Table 4: iiwa14, skevgp-nominal", "EVGP-IF 4, EVGP-IFG 4", "0.1"]
+    alone = [row for row in limited if row["system"] != "iiwa14" or own.items() <= row.items()]
+    assert "and more" in said(alone)[-1][2]
+    # A network's fit, and one by L-BFGS, to half of the rows takes half of the time.
+    fewer = without(curves, {"system": "cartpole", "model": "VGP", "setting": "skevgp", "n_trajectories": "24"})
+    slow = without(table, {"system": "cartpole", "model": "VGP", "setting": "skevgp"}, {"fit_seconds": "3600"})
+    assert said(slow, fewer) == [["Figure 6: cartpole, skevgp", "VGP 4", "2.0"], ["all", "4", "2.0"]]
+    # All steps from the author's starts are an end; half of them are not.
+    authors = {"system": "pendulum", "model": "VGP", "setting": "author"}
+    assert said(without(table, authors, {"converged": "False"}))[-1][1] == "0"
+    assert said(without(table, authors, {"max_iter": "500"}))[-1][1] == "4"
