@@ -20,7 +20,7 @@ arm whose masses, centres of mass and inertias are wrong by up to 20 % as furthe
 normal prior on its weights in the paper's setting, and one that shrinks with the width of a layer in the others.
 
 In the settings of Adam a fit of a GP takes up to 5 minutes of one core for the pendulum and the cartpole, 2 to 16 for
-the acrobot, and 2 (EVGP) to 8 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.
+the acrobot, and 2 (EVGP) to 3 hours (VGP) for iiwa14; in the others seconds to minutes, and for iiwa14 up to an hour.
 A network takes seconds, for iiwa14 minutes.
 """
 
