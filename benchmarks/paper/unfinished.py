@@ -45,7 +45,7 @@ def asked_for(system: str, setting: str, angles: str) -> bool:
 
 
 def ended(row: Row) -> bool:
-    """Whether a fit ended by itself; with the author's fixed step none does, and all steps are its end."""
+    """Whether a fit ended by itself; with the author's fixed step none comes to rest, and where it stopped counts."""
     if row["setting"] in AUTHORS_SCALE:
         return not row["max_iter"]
     return row["converged"] == "True" and not cut_short(row)
@@ -100,9 +100,10 @@ def of_learning_curves(rows: list[Row], whole: list[Row]) -> Iterator[Lack]:
             for n_trajectories in N_TRAJECTORIES[system]:
                 cell = {"system": system, "model": model, "setting": setting, "n_trajectories": str(n_trajectories)}
                 n = N_SEEDS - sum(ended(row) for row in rows if cell.items() <= row.items())
-                share = 1.0 if adams(model, setting) else n_trajectories / max(N_TRAJECTORIES[system])
-                n_fits += n
-                seconds += n and n * share * time_of_one(whole, system, model, setting, "raw")
+                if n:
+                    share = 1.0 if adams(model, setting) else n_trajectories / max(N_TRAJECTORIES[system])
+                    n_fits += n
+                    seconds += n * share * time_of_one(whole, system, model, setting, "raw")
             if n_fits:
                 yield Lack(f"Figure 6: {system}, {setting}", model, n_fits, seconds)
 

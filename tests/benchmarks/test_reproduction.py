@@ -159,7 +159,7 @@ def test_what_is_still_to_be_run_is_counted_and_timed():
     fewer = without(curves, {"system": "cartpole", "model": "VGP", "setting": "skevgp", "n_trajectories": "24"})
     slow = without(table, {"system": "cartpole", "model": "VGP", "setting": "skevgp"}, {"fit_seconds": "3600"})
     assert said(slow, fewer) == [["Figure 6: cartpole, skevgp", "VGP 4", "2.0"], ["all", "4", "2.0"]]
-    # All steps from the author's starts are an end; half of them are not.
+    # From the author's starts a fit stops where it does; by --max-iter it is cut short.
     authors = {"system": "pendulum", "model": "VGP", "setting": "author"}
     assert said(without(table, authors, {"converged": "False"}))[-1][1] == "0"
     assert said(without(table, authors, {"max_iter": "500"}))[-1][1] == "4"
