@@ -53,12 +53,11 @@ class Curve:
         """The fewest rows with at most this Error."""
         return next((str(size) for size, own in zip(self.n_rows, self.mean, strict=True) if own <= error), "—")
 
-    def doubling(self) -> str:
-        """What share of the Error a doubling of the rows leaves, by the last three sizes; in italics if most of it."""
+    def doubling(self) -> float:
+        """What share of the Error a doubling of the rows leaves, by the last three sizes; NaN of one size."""
         if len(self.n_rows) < 2:
-            return ""
-        ratio = 2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(self.mean[-3:]), 1)[0]
-        return f"*{ratio:.2f}*" if ratio > PLATEAU else f"{ratio:.2f}"
+            return np.nan
+        return float(2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(self.mean[-3:]), 1)[0])
 
 
 Curves = dict[str, dict[str, Curve]]  # of a setting: system -> model -> curve
@@ -182,7 +181,7 @@ def claims(curves: Curves) -> Iterator[str]:
     yield table(
         ["system", *names],
         [
-            [system, *(models[name].doubling() if name in models else "" for name in names)]
+            [system, *(share_left(models[name].doubling()) if name in models else "" for name in names)]
             for system, models in curves.items()
         ],
     )
@@ -207,6 +206,11 @@ def claims(curves: Curves) -> Iterator[str]:
         if ifg > other
     ]
     yield f"**IFG is below IF.** Not so: {', '.join(above) or 'nowhere'}."
+
+
+def share_left(ratio: float) -> str:
+    """In italics if it is most."""
+    return "" if np.isnan(ratio) else f"*{ratio:.2f}*" if ratio > PLATEAU else f"{ratio:.2f}"
 
 
 def common(*curves: Curve) -> tuple[np.ndarray, ...]:

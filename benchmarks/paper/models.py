@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import time
 import warnings
 from collections.abc import Callable
@@ -36,6 +37,9 @@ AUTHORS_SCALE = {"author": 1.0, "author-100": 100.0}
 ADAM = ("paper", *AUTHORS_SCALE)
 # How wrong the nominal arm is, relative.
 NOMINAL_ERROR = 0.2
+# What convergence warnings say of a search that did not end by itself, and of what it found.
+ENDED_EARLY = re.compile("still (rising|fell)|stopped after|diverged|bound below the first|interrupted|not stay finite")
+NOTHING_LEARNED = re.compile(r"of (\d+) of \d+ outputs fitted together, though|became white noise")
 # Trajectories of a quick run.
 QUICK_TRAJECTORIES = 12
 
@@ -232,23 +236,29 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
     -------
     columns : dict
         ``error_inside`` is their mean error, ``error_outside`` that of the others (NaN without any), ``inside`` the
-        share of the rows; ``outside`` tells of each column with rows out of its range their number and the largest
-        values to learn from and to be tested on: "1:31:3.02:8.31 3:4:9.7:10.2".
+        share of the rows; ``outside`` tells of each column with rows out of its range their number, the end of the
+        range that they go beyond and how far: "1:31:3.02:8.31 3:4:-9.7:-10.2".
     """
-    beyond = (test.data < train.data.min(axis=0)) | (test.data > train.data.max(axis=0))
+    low, high = train.data.min(axis=0), train.data.max(axis=0)
+    beyond = (test.data < low) | (test.data > high)
     inside = ~beyond.any(axis=1)
-    counts = beyond.sum(axis=0)
-    largest = (np.abs(part.data).max(axis=0) for part in (train, test))
     return {
         "error_inside": errors[inside].mean() if inside.any() else np.nan,
         "error_outside": errors[~inside].mean() if not inside.all() else np.nan,
         "inside": inside.mean(),
         "outside": " ".join(
-            f"{column}:{n}:{learned:.3g}:{tested:.3g}"
-            for column, (n, learned, tested) in enumerate(zip(counts, *largest, strict=True))
+            f"{column}:{n}:{limit:.3g}:{reached:.3g}"
+            for column, n in enumerate(beyond.sum(axis=0))
             if n
+            for limit, reached in [farthest(low[column], high[column], test.data[:, column])]
         ),
     }
+
+
+def farthest(low: float, high: float, tested: np.ndarray) -> tuple[float, float]:
+    """Of a column's range the end that test rows go beyond, the farther one of two, and how far they go."""
+    least, most = float(tested.min()), float(tested.max())
+    return (low, least) if low - least > most - high else (high, most)
 
 
 def groups_of(regressor: Any, train: Bunch) -> dict[str, np.ndarray]:
@@ -258,14 +268,33 @@ def groups_of(regressor: Any, train: Bunch) -> dict[str, np.ndarray]:
 
 
 def timed(regressor: Any, train: Bunch, test: Bunch) -> tuple[np.ndarray, np.ndarray, float, list[Any]]:
-    """Fit it: mean and std (n, o) on the test rows, processor seconds of one thread, and the fit's warnings."""
+    """Fit it: mean and std (n, o) on the test rows, processor seconds of one thread, and its convergence warnings."""
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ConvergenceWarning)
         start = time.process_time()
         regressor.fit(train.data, train.target, **groups_of(regressor, train))
         seconds = time.process_time() - start
         mean, std = regressor.predict(test.data, return_std=True)
-    return mean, std, seconds, caught
+    return mean, std, seconds, [warning for warning in caught if issubclass(warning.category, ConvergenceWarning)]
+
+
+def how_it_ended(messages: list[str], n_outputs: int) -> dict[str, Any]:
+    """Whether a search ended by itself, and of how many outputs its Gaussian process learned nothing.
+
+    Parameters
+    ----------
+    messages : list of str
+        Of its convergence warnings.
+    n_outputs : int
+
+    Returns
+    -------
+    columns : dict
+        ``converged`` and ``unlearned``.
+    """
+    said = " ".join(messages)
+    counts = [int(found[1] or n_outputs) for found in NOTHING_LEARNED.finditer(said)]
+    return {"converged": not ENDED_EARLY.search(said), "unlearned": min(sum(counts), n_outputs)}
 
 
 def fitted_row(
@@ -304,6 +333,6 @@ def fitted_row(
         "max_iter": "" if max_iter is None or fit.model == "RES-DBNN" else max_iter,
         "n_iter": fitted.n_iter_,
         "bound_per_row": getattr(fitted, "lower_bound_", np.nan) / len(train.data),
-        "converged": not any(issubclass(warning.category, ConvergenceWarning) for warning in caught),
+        **how_it_ended([str(warning.message) for warning in caught], train.target.shape[1]),
         **harness.provenance(),
     }

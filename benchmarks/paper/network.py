@@ -2,9 +2,11 @@
 
 A quarter of the training trajectories of results_table.py is held back; the network learns from the others and is
 looked at on both. Writes one row per fit to a CSV as soon as it is done (what is there already is not fitted again),
-and a page beside it. How results_table.py's networks end was decided here; its test sets are not seen.
+and a page beside it. What has the lowest Error on what was held back (with as many units as the paper) is then fitted
+to all training trajectories, as early stopping, that of results_table.py, is, and looked at on its test sets.
 
-    python benchmarks/paper/network.py                             # the planar systems, two seeds: an hour of one core
+    python benchmarks/paper/network.py --systems cartpole cartpole_damped --seeds 4  # half an hour of one core
+    python benchmarks/paper/network.py                             # the planar systems, two seeds: an hour
     python benchmarks/paper/network.py --systems iiwa14 --seeds 1  # an hour
     python benchmarks/paper/network.py --quick                     # one system, few epochs: half a minute
 """
@@ -23,6 +25,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
+import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupShuffleSplit
 from sklearn.utils import Bunch
@@ -30,19 +33,23 @@ from threadpoolctl import threadpool_limits
 
 import harness
 from harness import Row, column, figure_of
+from paper import results_table
 from paper.models import QUICK_TRAJECTORIES, SYSTEMS, UNTIL_FLAT, Fit, build
+from paper.results_table_report import PAPER
 from skevgp import ResidualRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.metrics import negative_log_predictive_density, prediction_error
 
+WIDE, EARLY = "twice as wide", "early stopping"
+HELD, TEST = "trajectories held back", "test set"
 # What differs from the network of the setting "paper" or, without a prior of its own, "skevgp".
 VARIANTS: dict[str, dict[str, Any]] = {
     "": {},
     "prior of 1": {"prior_scale": 1.0},
     "first step 0.003": {"learning_rate_init": 0.003},
     "batches of 50": {"batch_size": 50},
-    "twice as wide": {},
-    "early stopping": UNTIL_FLAT,
+    WIDE: {},
+    EARLY: UNTIL_FLAT,
 }
 # Each alone; the variants with the third.
 N_EPOCHS = (100, 300, 1000, 3000)
@@ -60,6 +67,8 @@ class Cell:
     ----------
     system, variant : str
     epochs, seed : int
+    tested_on : {"trajectories held back", "test set"}
+        Of the latter what is learned from are all training trajectories.
     size : {"full", "quick"}
     """
 
@@ -67,12 +76,15 @@ class Cell:
     variant: str
     epochs: int
     seed: int
+    tested_on: str
     size: str
 
 
 @lru_cache(maxsize=1)
-def data(system: str, seed: int, size: str) -> tuple[Bunch, Bunch]:
-    """Trajectories to learn from, and others of the same training set."""
+def data(system: str, seed: int, size: str, tested_on: str = HELD) -> tuple[Bunch, Bunch]:
+    """Trajectories to learn from, and others: of the same training set, or a test set."""
+    if tested_on == TEST:
+        return results_table.data(system, seed, 0.0, size)
     whole = make_dynamics(system, QUICK_TRAJECTORIES if size == "quick" else None, random_state=seed)
     split = GroupShuffleSplit(1, test_size=HELD_BACK, random_state=seed)
     ((learned, held_back),) = split.split(whole.data, groups=whole.groups)
@@ -85,26 +97,26 @@ def regressor_of(cell: Cell) -> ResidualRegressor:
     network = regressor.regressor.set_params(
         **{"early_stopping": False, "max_iter": cell.epochs, **VARIANTS[cell.variant]}
     )
-    if cell.variant == "twice as wide":
+    if cell.variant == WIDE:
         network.set_params(hidden_layer_sizes=tuple(2 * units for units in network.hidden_layer_sizes))
     return regressor
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Fit one network, and look at it on what it learned from and on what was held back."""
-    learned, held_back = data(cell.system, cell.seed, cell.size)
+    """Fit one network, and look at it on what it learned from and on other trajectories."""
+    learned, others = data(cell.system, cell.seed, cell.size, cell.tested_on)
     regressor = regressor_of(cell)
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ConvergenceWarning)
         start = time.process_time()
         regressor.fit(learned.data, learned.target)
         seconds = time.process_time() - start
-    mean, std = regressor.predict(held_back.data, return_std=True)
+    mean, std = regressor.predict(others.data, return_std=True)
     return {
-        **{name: getattr(cell, name) for name in ("system", "variant", "epochs", "seed", "size")},
+        **{name: getattr(cell, name) for name in ("system", "variant", "epochs", "seed", "tested_on", "size")},
         "error_learned": prediction_error(learned.target, regressor.predict(learned.data)),
-        "error_held_back": prediction_error(held_back.target, mean),
-        "nlpd_held_back": negative_log_predictive_density(held_back.target, mean, std),
+        "error_tested": prediction_error(others.target, mean),
+        "nlpd_tested": negative_log_predictive_density(others.target, mean, std),
         "loss": regressor.regressor_.loss_curve_[-1],
         "n_iter": regressor.regressor_.n_iter_,
         "converged": not caught,
@@ -115,7 +127,8 @@ def run(cell: Cell) -> dict[str, Any]:
 
 def say(row: dict[str, Any]) -> str:
     return (
-        f"Error held back {row['error_held_back']:.5f}, learned {row['error_learned']:.5f}, {row['fit_seconds']:.0f} s"
+        f"Error on the {row['tested_on']} {row['error_tested']:.5f}, learned {row['error_learned']:.5f}, "
+        f"{row['fit_seconds']:.0f} s"
     )
 
 
@@ -136,11 +149,22 @@ def enough(errors: dict[tuple[str, int], float]) -> int:
     )
 
 
+def best(rows: Sequence[Row]) -> tuple[str, int]:
+    """Of one system: variant and epochs of the lowest mean Error held back, with the paper's number of units."""
+    errors = means([row for row in rows if row["tested_on"] == HELD], "error_tested")
+    return min((key for key in errors if key[0] != WIDE), key=errors.__getitem__)
+
+
+def compared(rows: Sequence[Row]) -> list[tuple[str, int]]:
+    """Of one system: what is fitted to all trajectories. (How early stopping ends is not said by its epochs.)"""
+    return list(dict.fromkeys([best(rows), next(key for key in means(rows, "loss") if key[0] == EARLY)]))
+
+
 def lines_of(rows: Sequence[Row]) -> Iterator[list[str]]:
     """Of one system's table."""
     values = {
         name: means(rows, name)
-        for name in ("error_held_back", "error_learned", "nlpd_held_back", "loss", "n_iter", "fit_seconds")
+        for name in ("error_tested", "error_learned", "nlpd_tested", "loss", "n_iter", "fit_seconds")
     }
     for variant, epochs in sorted(values["loss"], key=lambda key: (list(VARIANTS).index(key[0]), key[1])):
         own = {name: value[variant, epochs] for name, value in values.items()}
@@ -150,9 +174,9 @@ def lines_of(rows: Sequence[Row]) -> Iterator[list[str]]:
         yield [
             variant or "standard",
             f"{values['n_iter'][variant, epochs]:.0f}",
-            figure_of(own["error_held_back"]),
+            figure_of(own["error_tested"]),
             figure_of(own["error_learned"]),
-            f"{own['nlpd_held_back']:.2f}",
+            f"{own['nlpd_tested']:.2f}",
             f"{own['loss']:.2f}",
             str(warned),
             f"{own['fit_seconds']:.0f}",
@@ -169,16 +193,36 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
         f"{harness.provenance_text(rows)}",
     ]
     for system in (system for system in SYSTEMS if any(row["system"] == system for row in rows)):
-        own = [row for row in rows if row["system"] == system]
+        of_system = [row for row in rows if row["system"] == system]
+        own = [row for row in of_system if row["tested_on"] == HELD]
         header = ["", "epochs", "Error held back", "Error learned", "NLPD held back", "loss", "warned", "seconds"]
-        found = enough(means(own, "error_held_back"))
+        found = enough(means(own, "error_tested"))
         seeds = len({row["seed"] for row in own})
         parts += [
             f"## {system}, {seeds} seed{'s' if seeds > 1 else ''}",
             harness.table(header, lines_of(own)),
             f"Enough, since more leave at least {ENOUGH:.0%} of the Error held back: {found} epochs.",
         ]
+        if len(of_system) > len(own):
+            parts += [
+                "Fitted to all training trajectories, on the test sets of results_table.py; in the paper "
+                f"{PAPER[system]['RES-DBNN'].error:.3f}. First what has the lowest Error held back, with the paper's "
+                "number of units.",
+                harness.table(["", "epochs", "Error", "median", "of each data set"], tested_lines(of_system)),
+            ]
     return parts
+
+
+def tested_lines(rows: Sequence[Row]) -> Iterator[list[str]]:
+    """Of one system's test sets."""
+    tested = [row for row in rows if row["tested_on"] == TEST]
+    for variant, epochs in compared(rows):
+        own = [row for row in tested if (row["variant"], int(row["epochs"])) == (variant, epochs)]
+        if own:
+            errors = column(sorted(own, key=lambda row: int(row["seed"])), "error_tested")
+            n_iter = f"{column(own, 'n_iter').mean():.0f}"
+            middle = map(figure_of, (errors.mean(), np.median(errors)))
+            yield [variant or "standard", n_iter, *middle, ", ".join(map(figure_of, errors))]
 
 
 def main() -> None:
@@ -199,11 +243,16 @@ def main() -> None:
     systems = options.systems[:1] if options.quick else options.systems
     epochs = (5, 10) if options.quick else options.epochs
     cells = [
-        Cell(system, variant, n, seed, size)
+        Cell(system, variant, n, seed, HELD, size)
         for system, seed, variant, n in itertools.product(systems, range(n_seeds), options.variants, epochs)
         if not variant or n == (epochs[-1] if options.quick else VARIED)
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
+    for system in systems:
+        rows = [row for row in harness.read(output) if (row["size"], row["system"]) == (size, system)]
+        if any(row["variant"] == EARLY for row in rows):
+            cells = [Cell(system, *how, seed, TEST, size) for how in compared(rows) for seed in range(n_seeds)]
+            n_failures += harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     rows = [row for row in harness.read(output) if row["size"] == size]
     harness.write_report(paragraphs(rows) if rows else [], output, n_failures)
 

@@ -24,6 +24,7 @@ import harness
 from harness import Row, figure_of
 from harness import column as of
 from paper import cartpole, claims, results_table_report
+from paper import network as paper_network
 from paper import unfinished as fits_to_come
 from paper.results_table_report import WRAPPED, Groups
 
@@ -85,7 +86,8 @@ def which_cartpole(results: Results) -> str:
 
 def unfinished(results: Results) -> str:
     """Fits that are missing or ended by a limit."""
-    return fits_to_come.paragraph(results.rows("results_table"), results.rows("learning_curves"))
+    names = ("results_table", "results_table_noise0.01", "learning_curves")
+    return fits_to_come.paragraph(*map(results.rows, names))
 
 
 def outside(results: Results) -> str:
@@ -131,9 +133,43 @@ def spread(results: Results, setting: str, system: str, *models: str) -> str:
     return " to ".join(dict.fromkeys(figure_of(f(ratios)) for f in (min, max)))
 
 
-def paper(results: Results, system: str, model: str) -> str:
-    """The Error in the paper."""
-    return f"{results_table_report.PAPER[system][model].error:.3f}"
+def marks(results: Results) -> str:
+    """What they mean."""
+    return results_table_report.MARKS
+
+
+def outside_share(results: Results, system: str, setting: str, *models: str) -> str:
+    """What part of an Error rows outside the training range make, of the data sets' the lowest and the highest."""
+    shares = [
+        results_table_report.share_outside(row)
+        for model in models
+        for row in results.table.get((system, model, setting), [])
+        if np.isfinite(float(row["inside"]))
+    ]
+    return f"{min(shares):.0%} to {max(shares):.0%}" if shares else MISSING
+
+
+def containing(results: Results, system: str, model: str, setting: str) -> str:
+    """Without noise: CR-1 to 3, means over data sets."""
+    own = results.table.get((system, model, setting))
+    return " / ".join(f"{of(own, f'cr{k}').mean():.3f}" for k in (1, 2, 3)) if own else MISSING
+
+
+def network(results: Results, system: str, which: str, name: str = "error_tested") -> str:
+    """Of the network what is "best" on trajectories held back, or "early" stopping: a mean, "name" or on "test"."""
+    of_system = [row for row in results.rows("network") if row["system"] == system]
+    variant, epochs = paper_network.compared(of_system)[{"best": 0, "early": -1}[which]]
+    if name == "name":
+        return f"{variant}, {epochs} epochs" if variant else f"{epochs} epochs"
+    on = paper_network.TEST if name == "test" else paper_network.HELD
+    own = [row for row in of_system if (row["variant"], int(row["epochs"]), row["tested_on"]) == (variant, epochs, on)]
+    return figure_of(float(of(own, "error_tested" if name == "test" else name).mean())) if own else MISSING
+
+
+def paper(results: Results, system: str, model: str, *names: str) -> str:
+    """In the paper: the Error, or other columns of its table."""
+    own = results_table_report.PAPER[system][model]
+    return " / ".join(f"{getattr(own, name):.3f}" for name in names or ("error",))
 
 
 def held(results: Results, system: str, model: str, setting: str, which: str) -> str:
@@ -161,7 +197,7 @@ FILLERS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(errors, unfinished, which_cartpole, outside, claims_table, tried, calibration),
-        *(error, spread, paper, held, n_parameters, variant),
+        *(error, spread, paper, held, n_parameters, variant, marks, outside_share, containing, network),
     )
 }
 

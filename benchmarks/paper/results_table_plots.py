@@ -9,7 +9,18 @@ import numpy as np
 
 from harness import WIDTH, Row, legend, logarithmic, pyplot, save_picture
 from harness import column as of
-from paper.results_table_report import PAPER, STYLES, WRAPPED, group, marks, models_of, noisy, reliability
+from paper.results_table_report import (
+    N_SEEDS,
+    PAPER,
+    STYLES,
+    WRAPPED,
+    group,
+    limited,
+    models_of,
+    noisy,
+    reliability,
+    unlearned,
+)
 
 
 def plot(rows: list[Row], path: Path) -> None:
@@ -43,9 +54,11 @@ def plot(rows: list[Row], path: Path) -> None:
         axes.set_ylabel("share held - promised" if noisy(rows) else "test Error (SI units)")
     notes = ["a quick run, not to be compared"] if rows[0]["size"] == "quick" else []
     if noisy(rows):
-        notes += [f"noise: {float(rows[0]['noise']):.0%} of each target's standard deviation; means over seeds"]
+        notes += [f"noise: {float(rows[0]['noise']):.0%} of each target's standard deviation; means over data sets"]
+        notes += ["hollow: a fit ended by a limit; three symbols: only CR-1 to 3 were measured"]
     else:
-        notes += ["large: mean over data sets (hollow: a fit ended by a limit), small: each"]
+        notes += ["large: mean over data sets, with their number if not four, small: each"]
+        notes += ["hollow: a fit ended by a limit or, crossed, its Gaussian process learned nothing of an output"]
         notes += ["a dash of the same colour: mean of the rows inside the training range"]
     legend(figure, ncols=3 if n_columns > 1 else 2, title="\n".join(notes))
     save_picture(figure, path)
@@ -61,10 +74,16 @@ def errors_panel(
     for (model, setting), rows in own.items():
         values, (colour, marker) = of(rows, "error_mean"), STYLES[setting]
         place = models.index(model) + offsets[setting]
-        face = "white" if "*" in marks(rows) else colour
+        nothing = any(map(unlearned, rows))
+        face = "white" if nothing or any(map(limited, rows)) else colour
         axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
         axes.plot(place, values.mean(), marker, color=colour, markerfacecolor=face, markersize=7)
-        axes.plot(place, of(rows, "error_inside").mean(), "_", color=colour, markersize=9)
+        axes.plot(place, of(rows, "error_inside").mean(), "_", color=colour, markersize=12)
+        if nothing:
+            axes.plot(place, values.mean(), "x", color=colour, markersize=7)
+        if len(rows) != N_SEEDS:
+            where = {"xytext": (0, 5), "textcoords": "offset points", "ha": "center", "fontsize": 7}
+            axes.annotate(str(len(rows)), (place, values.mean()), color=colour, **where)
     for setting in settings:
         colour, marker = STYLES[setting]
         label = "ours: the paper's setting" if setting == "paper" else f"ours: {setting}"
@@ -82,7 +101,12 @@ def reliability_panel(axes: Any, own: dict[tuple[str, str], list[Row]]) -> None:
     lines = {"EVGP-IFG": "o-", "EVGP-IF": "^--", "RES-VGP": "s-.", "VGP": "v:", "RES-DBNN": "x:"}
     for (model, setting), rows in own.items():
         promised, held = reliability(rows)
-        style = {"color": STYLES[setting][0], "markersize": 4}
-        axes.plot(promised, held - promised, lines[model], **style, label=f"{model}, {setting}")
+        colour, _ = STYLES[setting]
+        face = "white" if any(map(limited, rows)) else colour
+        axes.plot(promised, held - promised, lines[model], color=colour, markerfacecolor=face, markersize=4)
+    for model, line in lines.items():
+        axes.plot([], [], line, color="0.3", markersize=4, label=model)
+    for setting in dict.fromkeys(setting for _, setting in own):
+        axes.plot([], [], color=STYLES[setting][0], linewidth=4, label=setting)
     low, high = axes.get_ylim()
     axes.set(xlabel="share promised", xlim=(0, 1), ylim=(min(low, -0.05), max(high, 0.05)))

@@ -78,6 +78,12 @@ STYLES = {
 WRAPPED = ", wrapped"
 # Which cartpole the paper's may be.
 CARTPOLES = ("cartpole", f"cartpole{WRAPPED}", "cartpole_damped", f"cartpole_damped{WRAPPED}")
+# Data sets of a cell, if nothing is said.
+N_SEEDS = 4
+MARKS = (
+    "An asterisk: a fit of the cell ended by a limit, not by itself. A dagger: in a fit of the cell the Gaussian "
+    "process learned nothing of an output, which a warning says. In brackets: how many data sets, if not four."
+)
 # How far, in log Error, what the paper does not say may move a number: a factor of 1.5.
 UNSAID = np.log(1.5)
 
@@ -121,10 +127,20 @@ def cut_short(row: Row) -> bool:
     return row["max_iter"] == row["n_iter"]
 
 
-def marks(own: list[Row], n_seeds: int = 4) -> str:
-    """What a reader must know of a cell: fits that ended by a limit (*), or fewer seeds."""
-    limited = any(row["converged"] == "False" or cut_short(row) for row in own)
-    return ("\\*" if limited else "") + (f" ({len(own)})" if len(own) != n_seeds else "")
+def limited(row: Row) -> bool:
+    """Whether a limit of iterations ended a fit."""
+    return row["converged"] == "False" or cut_short(row)
+
+
+def unlearned(row: Row) -> bool:
+    """Whether there is an output of which the Gaussian process learned nothing, as a warning said."""
+    return float(row["unlearned"]) > 0.0
+
+
+def marks(own: list[Row]) -> str:
+    """What a reader must know of a cell: `MARKS`, or fewer seeds."""
+    seen = ("\\*" if any(map(limited, own)) else "") + ("†" if any(map(unlearned, own)) else "")
+    return seen + (f" ({len(own)})" if len(own) != N_SEEDS else "")
 
 
 def both(own: list[Row]) -> str:
@@ -163,18 +179,17 @@ def paragraphs(rows: list[Row]) -> list[str]:
             "**A quick run**: fewer rows and iterations than the paper's, not to be compared with its numbers."
         )
     if noisy(rows):
-        parts += ["## CR-2, mean over seeds", glance(groups, models_of(rows), with_noise=True)]
+        parts += ["## CR-2, mean over seeds", MARKS, glance(groups, models_of(rows), with_noise=True)]
     else:
         parts += [
             "## Error, mean over seeds",
-            "*All rows / rows whose columns all lie within the training rows' ranges.* An asterisk: a fit of the cell "
-            "ended by a limit, not by itself. In brackets: how many seeds, if not four.",
+            f"*All rows / rows whose columns all lie within the training rows' ranges.* {MARKS}",
             glance(groups, models_of(rows)),
             *which_cartpole(groups),
             *outside(groups),
         ]
     parts += ["## Where it falls short", shortfalls(groups, noisy(rows))]
-    parts += ["## Calibration", "Shares of the targets within intervals that promise them.", coverage(groups)]
+    parts += ["## Calibration", f"Shares of the targets within intervals that promise them. {MARKS}", coverage(groups)]
     settings = [setting for setting in STYLES if any(key[2] == setting for key in groups)]
     parts += [part for setting in settings for part in (f"## Setting: {setting}", details(groups, setting))]
     parts.append(
@@ -195,7 +210,13 @@ def limits(groups: Groups) -> Iterator[str]:
         for key, own in groups.items()
         if any(row["converged"] == "False" for row in own)
     ]
-    yield f"Fits that ended with a ConvergenceWarning: {', '.join(stopped) or 'none'}."
+    yield f"Fits whose search did not end by itself, as a warning said: {', '.join(stopped) or 'none'}."
+    nothing = [
+        f"{' '.join(key)} ({sum(map(unlearned, own))} of {len(own)})"
+        for key, own in groups.items()
+        if any(map(unlearned, own))
+    ]
+    yield f"Fits of which the Gaussian process learned nothing of an output: {', '.join(nothing) or 'none'}."
     limited = [
         f"{' '.join(key)} ({', '.join(sorted({row['max_iter'] for row in own if cut_short(row)}, key=int))})"
         for key, own in groups.items()
@@ -247,13 +268,20 @@ def which_cartpole(groups: Groups) -> Iterator[str]:
         yield table(["model", "in the paper", *cases], lines)
         scores = closeness(groups, cases, setting)
         if len(scores) > 1:
-            best = max(scores.values())
-            ranked = sorted(scores.items(), key=lambda item: -item[1])
             yield (
-                "Log likelihood of the paper's Errors, nats, against that of the best reading (log Error is normal "
-                "over data sets, with their mean and scatter, and a factor of 1.5 for what the paper does not say; of "
-                "readings and models with two data sets and more): "
-                f"{'; '.join(f'{case} {score - best:+.1f}' for case, score in ranked)}."
+                "Log likelihood of the paper's Error of each model, nats (log Error is normal over data sets, with "
+                "their mean and scatter, and a factor of 1.5 for what the paper does not say; of readings and models "
+                "with two data sets and more, without those of which an output was not learned):"
+            )
+            common = list(next(iter(scores.values())))
+            best = max(sum(own.values()) for own in scores.values())
+            yield table(
+                ["reading", *common, "sum", "less than the best"],
+                [
+                    [case, *(f"{value:.1f}" for value in (*own.values(), total, best - total))]
+                    for case, own in sorted(scores.items(), key=lambda item: -sum(item[1].values()))
+                    for total in [sum(own.values())]
+                ],
             )
 
 
@@ -264,14 +292,16 @@ def spread(own: list[Row]) -> str:
     return ", ".join(map(figure_of, of(own, "error_mean"))) + inside
 
 
-def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, float]:
+def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, dict[str, float]]:
     """The log likelihood of the paper's Errors under our data sets' of each reading, by the models that all have."""
-    models = {case: {model for model in MODELS if len(groups.get((case, model, setting), [])) > 1} for case in cases}
+    own = {(case, model): groups.get((case, model, setting), []) for case in cases for model in MODELS}
+    told = {key for key, rows in own.items() if len(rows) > 1 and not any(map(unlearned, rows))}
+    models = {case: {model for model in MODELS if (case, model) in told} for case in cases}
     # A reading with less than three models would leave too few to compare by.
-    models = {case: own for case, own in models.items() if len(own) > 2}
+    models = {case: known for case, known in models.items() if len(known) > 2}
     common = set.intersection(*models.values()) if models else set()
     return {
-        case: sum(likelihood(published(case, model).error, groups[case, model, setting]) for model in common)
+        case: {model: likelihood(published(case, model).error, own[case, model]) for model in MODELS if model in common}
         for case in models
         if common
     }
@@ -287,22 +317,36 @@ def likelihood(error: float, own: list[Row]) -> float:
 def outside(groups: Groups) -> Iterator[str]:
     """Which test rows lie beyond the training rows, and how much of an Error they make."""
     by_case: dict[str, dict[str, Row]] = {}
-    for (case, _, _), own in groups.items():
+    of_ifg: dict[tuple[str, str, str], Row] = {}
+    for (case, model, setting), own in groups.items():
         for row in (row for row in own if np.isfinite(float(row["inside"]))):
             by_case.setdefault(case, {}).setdefault(row["seed"], row)
+            if model == "EVGP-IFG":
+                of_ifg[case, setting, row["seed"]] = row
+    shown = [setting for setting in ("paper", "skevgp") if any(key[1] == setting for key in of_ifg)]
     lines = []
     for case, by_seed in by_case.items():
         names = layout_of(case.removesuffix(WRAPPED)).column_names
         for seed, row in sorted(by_seed.items(), key=lambda item: int(item[0])):
             columns = [text.split(":") for text in row["outside"].split()]
-            said = [f"{names[int(column)]} {n} (to {reach} for {learned})" for column, n, learned, reach in columns]
-            lines.append([case, seed, f"{1.0 - float(row['inside']):.1%}", ", ".join(said) or "none"])
+            said = [f"{names[int(column)]} {n} ({limit} → {reach})" for column, n, limit, reach in columns]
+            shares = [
+                f"{share_outside(of_ifg[case, setting, seed]):.0%}" if (case, setting, seed) in of_ifg else ""
+                for setting in shown
+            ]
+            lines.append([case, seed, f"{1.0 - float(row['inside']):.1%}", *shares, ", ".join(said) or "none"])
     yield "## The rows outside the training range"
     yield (
-        "Of each data set: the share of test rows with a column beyond all training rows, and of each column how many "
-        "rows, with its largest value in the test set for that in training (rad, m, s, N)."
+        "Of each data set: the share of test rows with a column beyond all training rows, and what share these have "
+        "in the Error of EVGP-IFG. Then of each column how many rows are beyond, from the end of the training rows' "
+        "range to the farthest (rad, m, s, N)."
     )
-    yield table(["system", "seed", "rows outside", "columns"], lines)
+    yield table(["system", "seed", "rows", *(f"of the Error, {setting}" for setting in shown), "columns"], lines)
+
+
+def share_outside(row: Row) -> float:
+    """What part of a fit's Error rows outside the training range make."""
+    return 1.0 - float(row["inside"]) * float(row["error_inside"]) / float(row["error_mean"])
 
 
 def reliability(own: list[Row]) -> tuple[np.ndarray, np.ndarray]:
@@ -320,7 +364,7 @@ def coverage(groups: Groups) -> str:
     lines = []
     for key, own in groups.items():
         held = [of(own, name).mean() for name in names.values()]
-        lines.append([" ".join(key), *(f"{value:.3f}" if np.isfinite(value) else "" for value in held)])
+        lines.append([" ".join(key) + marks(own), *(f"{value:.3f}" if np.isfinite(value) else "" for value in held)])
     return table(["promised", *names], lines)
 
 

@@ -36,6 +36,14 @@ def test_a_place_without_a_function_or_a_number_is_seen():
     errors = [float(row["error_mean"]) for row in rows if (row["system"], row["model"], row["setting"]) == wanted]
     shown = float(filled("# A\n\n{{error pendulum EVGP-IFG skevgp largest}}", results).split()[-1])
     assert shown == pytest.approx(max(errors), rel=5e-3)
+    own = [row for row in rows if (row["system"], row["model"], row["setting"]) == ("acrobot", "EVGP-IF", "skevgp")]
+    numbers = np.array([[float(row[name]) for name in ("inside", "error_inside", "error_mean", "cr2")] for row in own])
+    of_rows_outside = 1.0 - numbers[:, 0] * numbers[:, 1] / numbers[:, 2]
+    said = filled("# A\n\n{{outside_share acrobot skevgp EVGP-IF}}", results).split("\n")[-1]
+    assert said == f"{of_rows_outside.min():.0%} to {of_rows_outside.max():.0%}"
+    said = filled("# A\n\n{{containing acrobot EVGP-IF skevgp}}", results).split(" / ")[1]
+    assert said == f"{numbers[:, 3].mean():.3f}"
+    assert filled("# A\n\n{{paper iiwa14 EVGP-IFG error cr2}}", results).endswith("\n0.027 / 0.480")
 
 
 @pytest.mark.parametrize("name", ["results_table", "results_table_noise0.01"])
@@ -110,7 +118,7 @@ def test_what_is_still_to_be_run_is_counted_and_timed():
     def fit(system, model, setting, seed, angles="raw", **changes):
         return {
             **{"system": system, "model": model, "setting": setting, "seed": str(seed), "angles": angles},
-            **{"converged": "True", "max_iter": "", "n_iter": "500", "fit_seconds": "36", **changes},
+            **{"converged": "True", "max_iter": "", "n_iter": "500", "fit_seconds": "36", "inside": "1", **changes},
         }
 
     table = [
@@ -131,8 +139,8 @@ def test_what_is_still_to_be_run_is_counted_and_timed():
         for seed in range(4)
     ]
 
-    def said(rows, more=curves):
-        lines = unfinished.paragraph(rows, more).splitlines()[2:]
+    def said(rows, more=curves, noisy=table):
+        lines = unfinished.paragraph(rows, noisy, more).splitlines()[2:]
         return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
     assert said(table)[-1][1] == "0"
@@ -163,3 +171,13 @@ def test_what_is_still_to_be_run_is_counted_and_timed():
     authors = {"system": "pendulum", "model": "VGP", "setting": "author"}
     assert said(without(table, authors, {"converged": "False"}))[-1][1] == "0"
     assert said(without(table, authors, {"max_iter": "500"}))[-1][1] == "4"
+    # With noise, too; a row from before there were all columns is no row, and more seeds do not make up for others.
+    lines = said(table, noisy=without(table, {"system": "iiwa14", "seed": "1"}))
+    assert [line[:2] for line in lines[:-1]] == [
+        ["Table 4 with noise: iiwa14, skevgp", "EVGP-IF 1, EVGP-IFG 1"],
+        ["Table 4 with noise: iiwa14, skevgp-nominal", "EVGP-IF 1, EVGP-IFG 1"],
+    ]
+    assert said(without(table, cell, {"inside": "nan"}))[-1][1] == "4"
+    more = [fit(**{name: cell[name] for name in ("system", "model", "setting")}, seed=seed) for seed in (0, 4, 5, 6, 7)]
+    assert said(table + more)[-1][1] == "0"
+    assert said(missing + more)[-1][1] == "1"

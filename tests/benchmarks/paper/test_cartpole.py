@@ -31,7 +31,7 @@ def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
     assert float(full["error_mean"]) == pytest.approx(error, rel=1e-6)
 
     page = output.with_suffix(".md").read_text()
-    assert f"| L-BFGS, full posterior | {error:#.3g} ({error:#.3g}) |" in page
+    assert f"| L-BFGS, full posterior\\* | {error:#.3g} ({error:#.3g}) |" in page
     assert "In the paper: 0.011." in page
     assert "EVGP-IF\n" not in page
     assert output.with_suffix(".png").stat().st_size > 5_000
@@ -47,17 +47,23 @@ def test_variants_change_parameters_that_exist():
 def test_a_page_has_the_mean_of_data_sets_and_each():
     from paper.cartpole import paragraphs
 
-    numbers = dict.fromkeys(("error_median", "error_p99", "cr2", "bound_per_row", "fit_seconds"), "1")
-    names = {"variant": "Adam", "model": "EVGP-IF", "size": "full", "date": "today", "versions": "", "machine": ""}
+    numbers = dict.fromkeys(("error_inside", "error_median", "error_p99", "cr2", "bound_per_row", "fit_seconds"), "1")
+    names = {"max_iter": "9", "n_iter": "8", "converged": "True"}
+    names |= {"variant": "Adam", "model": "EVGP-IF", "size": "full", "date": "today", "versions": "", "machine": ""}
     rows = [{**names, **numbers, "seed": seed, "error_mean": error} for seed, error in (("1", "0.03"), ("0", "0.01"))]
-    assert "| Adam | 0.0200 (0.0100, 0.0300) | 1.00 |" in "\n".join(paragraphs(rows))
+    assert "| Adam | 0.0200 (0.0100, 0.0300) | 1.00 | 1.00 |" in "\n".join(paragraphs(rows))
+    rows[0]["n_iter"] = "9"
+    assert "| Adam\\* | 0.0200 (0.0100, 0.0300) |" in "\n".join(paragraphs(rows))
 
 
 def test_the_picture_has_each_data_set_their_median_and_the_paper(drawn, tmp_path):
     from paper.cartpole import MODELS, plot
 
     rows = [
-        {"variant": variant, "model": model, "seed": str(seed), "error_mean": error, "converged": str(seed < 2)}
+        {
+            **{"variant": variant, "model": model, "seed": str(seed), "error_mean": error},
+            **{"converged": str(seed < 2), "max_iter": "", "n_iter": "9"},
+        }
         for variant in ("Adam", "L-BFGS")
         for model in MODELS
         for seed, error in enumerate(("0.01", "0.03", "0.08"))

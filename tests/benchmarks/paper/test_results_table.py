@@ -6,6 +6,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.utils import Bunch
 
 from skevgp import EVGPRegressor
@@ -131,7 +132,7 @@ def test_rows_beyond_the_training_range_are_told_apart():
     train = Bunch(data=np.array([[0.0, -1.0], [1.0, 2.0], [0.5, 0.0]]))
     test = Bunch(data=np.array([[0.5, 0.0], [0.2, -3.0], [1.5, 2.5], [1.0, 2.0]]))
     found = in_range(train, test, np.array([1.0, 10.0, 30.0, 3.0]))
-    assert found == {"error_inside": 2.0, "error_outside": 20.0, "inside": 0.5, "outside": "0:1:1:1.5 1:2:2:3"}
+    assert found == {"error_inside": 2.0, "error_outside": 20.0, "inside": 0.5, "outside": "0:1:1:1.5 1:2:-1:-3"}
     alone = in_range(train, Bunch(data=test.data[:1]), np.array([1.0]))
     assert alone["inside"] == 1.0
     assert np.isnan(alone["error_outside"])
@@ -170,7 +171,8 @@ def cartpole_rows(system, angles, *errors_by_model):
         {
             **{"system": system, "angles": angles, "model": model, "setting": "paper", "seed": str(seed)},
             **{"error_mean": str(error * (1.1 if seed else 0.9)), "error_inside": str(error / 2)},
-            **{"converged": "True", "max_iter": "", "inside": "0.9", "outside": "1:5:3.0:8.3", "noise": "0.0"},
+            **{"converged": "True", "max_iter": "", "n_iter": "9", "unlearned": "0", "noise": "0.0"},
+            **{"inside": "0.9", "outside": "1:5:3.0:8.3"},
         }
         for model, error in zip(MODELS, errors_by_model, strict=True)
         for seed in (0, 1)
@@ -186,21 +188,51 @@ def test_the_likelier_cartpole_is_the_one_with_the_papers_errors():
     groups = group(like + unlike)
     cases = ["cartpole_damped", "cartpole"]
     close, far = (closeness(groups, cases, "paper")[case] for case in cases)
-    assert close - far > 5
+    assert all(close[model] > far[model] for model in close)
+    assert sum(close.values()) - sum(far.values()) > 5
     few = group(like + unlike + cartpole_rows("cartpole", "wrapped", *paper)[:4])
     assert set(closeness(few, [*cases, "cartpole, wrapped"], "paper")) == set(cases)
     *_, said = which_cartpole(groups)
-    assert f"cartpole_damped +0.0; cartpole {far - close:+.1f}." in said
+    first, second = ([cell.strip() for cell in line.strip("|").split("|")] for line in said.splitlines()[2:])
+    assert (first[0], second[0]) == ("cartpole_damped", "cartpole")
+    assert first[1:] == [*(f"{value:.1f}" for value in close.values()), f"{sum(close.values()):.1f}", "0.0"]
+    assert float(second[-1]) == pytest.approx(sum(close.values()) - sum(far.values()), abs=0.06)
     *_, lines = outside(groups)
-    assert "| cartpole | 1 | 10.0% | theta 5 (to 8.3 for 3.0) |" in lines
+    # A tenth of the rows, of 1.1 times the Error, and nine tenths of half the Error.
+    assert f"| cartpole | 1 | 10.0% | {1 - 0.9 * 0.5 / 1.1:.0%} | theta 5 (3.0 → 8.3) |" in lines
+    # What a model did not learn tells nothing of the plant.
+    for row in groups["cartpole", "VGP", "paper"]:
+        row["unlearned"] = "4"
+    assert [set(own) for own in closeness(groups, cases, "paper").values()] == [set(close) - {"VGP"}] * 2
 
 
 def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
     from paper.results_table_report import both
 
     row = {"error_mean": "0.2", "error_inside": "0.1", "converged": "True", "max_iter": "", "n_iter": "60"}
+    row["unlearned"] = "0"
     assert both([row] * 4) == "0.200 / 0.100"
     assert both([row]) == "0.200 / 0.100 (1)"
     assert both([row] * 3 + [{**row, "converged": "False"}]) == "0.200 / 0.100\\*"
     assert both([{**row, "max_iter": "60"}] * 4) == "0.200 / 0.100\\*"
+    assert both([row] * 3 + [{**row, "unlearned": "1"}]) == "0.200 / 0.100†"
+    assert both([{**row, "unlearned": "nan"}] * 4) == "0.200 / 0.100"
     assert both([{**row, "max_iter": "5000"}] * 4) == "0.200 / 0.100"
+
+
+def test_warnings_tell_how_a_fit_ended():
+    from paper.models import how_it_ended
+
+    X = np.linspace(0.0, 6.0, 60)[:, np.newaxis]
+    y = np.column_stack([np.sin(X), np.cos(X)])
+    with pytest.warns(ConvergenceWarning) as short:
+        EVGPRegressor(n_inducing=8, max_iter=1).fit(X, y)
+    assert how_it_ended([str(short[0].message)], 2) == {"converged": False, "unlearned": 0}
+    with pytest.warns(ConvergenceWarning) as blind:
+        EVGPRegressor(
+            kernel=ConstantKernel(1e-6, "fixed") * RBF(1e3, "fixed"), noise_variance=1.0, n_inducing=3, noise_cv=None
+        ).fit(X, y)
+    found = how_it_ended([str(warning.message) for warning in blind], 2)
+    assert found["unlearned"] == 2
+    assert how_it_ended([], 2) == {"converged": True, "unlearned": 0}
+    assert how_it_ended(["The kernel became white noise: to it"], 2) == {"converged": True, "unlearned": 2}
