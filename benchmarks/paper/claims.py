@@ -248,10 +248,8 @@ def small_sets(rows: list[Row]) -> Iterator[Finding]:
     """With the fewest rows the better of the two EVGPs has a lower Error than the best of the other models."""
     for setting in SETTINGS:
         for system, models in curves(rows, setting):
-            errors = {
-                name: {str(run): float(error) for run, error in enumerate(curve.errors[0]) if np.isfinite(error)}
-                for name, curve in models.items()
-            }
+            first = {name: zip(curve.seeds, curve.errors[0], strict=True) for name, curve in models.items()}
+            errors = {name: {str(seed): e for seed, e in own if np.isfinite(e)} for name, own in first.items()}
             if set(errors) == set(MODELS):
                 means = {name: float(curve.mean[0]) for name, curve in models.items()}
                 ordered = sorted(means, key=means.__getitem__)

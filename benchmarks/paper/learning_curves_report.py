@@ -35,6 +35,8 @@ class Curve:
     Attributes
     ----------
     n_rows : ndarray of shape (n_sizes,)
+    seeds : list of int
+        Of the runs.
     errors : ndarray of shape (n_sizes, n_runs)
         NaN where a run is missing.
     limited : ndarray of shape (n_sizes,)
@@ -42,6 +44,7 @@ class Curve:
     """
 
     n_rows: np.ndarray
+    seeds: list[int]
     errors: np.ndarray
     limited: np.ndarray
 
@@ -70,7 +73,7 @@ def curve_of(rows: list[Row], measure: str) -> Curve:
     for row in rows:
         errors[sizes.index(int(row["n_rows"])), seeds.index(int(row["seed"]))] = float(row[measure])
     limited = {int(row["n_rows"]) for row in rows if row["converged"] == "False"}
-    return Curve(np.array(sizes), errors, np.isin(sizes, list(limited)))
+    return Curve(np.array(sizes), seeds, errors, np.isin(sizes, list(limited)))
 
 
 def curves_of(rows: list[Row], setting: str, measure: str = "error_mean") -> Curves:
