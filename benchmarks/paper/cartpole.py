@@ -137,7 +137,7 @@ def table_of(rows: list[Row], model: str) -> str:
             [
                 variant + ("\\*" if any(map(limited, own)) else ""),
                 f"{figure_of(errors.mean())} ({', '.join(map(figure_of, errors))})",
-                figure_of(column(own, "error_inside").mean()),
+                figure_of(inside) if np.isfinite(inside := column(own, "error_inside").mean()) else "",
                 f"{errors.mean() / np.mean(same):.2f}" if len(same) == len(own) else "",
                 *(figure_of(column(own, name).mean()) for name in ("error_median", "error_p99")),
                 f"{column(own, 'cr2').mean():.3f}",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import partial, reduce
 from pathlib import Path
 
 import numpy as np
@@ -13,12 +13,15 @@ from harness import Row, figure_of, read, table
 from harness import column as of
 from paper import beta_report, learning_curves_report
 from paper.data_sets import is_angle
+from paper.learning_curves_report import PLATEAU
 from paper.models import SYSTEMS
 from paper.results_table_report import MARKS, MODELS, NORMAL, PAPER, Groups, Result, group, marks
 
 # That each claim is looked at in.
 SETTINGS = ("paper", "skevgp")
 EVGP = ("EVGP-IF", "EVGP-IFG")
+# Data sets by which something is decided.
+FEWEST = 3
 
 
 @dataclass(frozen=True)
@@ -83,19 +86,21 @@ def in_words(holds: Sequence[bool | None]) -> str:
 
 
 def lower(first: dict[str, float], second: dict[str, float]) -> bool | None:
-    """Whether one model's Error is below another's, in the mean over the data sets that both have.
+    """Whether one model's Error is below another's, on the data sets that both have.
 
-    Undecided where the mean difference is no larger than its standard error, or there is one data set only.
+    Undecided where it is not so on all of them, or there are fewer than `FEWEST`.
     """
-    seeds = first.keys() & second.keys()
-    differences = np.array([first[seed] - second[seed] for seed in sorted(seeds)])
-    if len(seeds) < 2 or abs(differences.mean()) <= differences.std(ddof=1) / np.sqrt(len(seeds)):
-        return None
-    return bool(differences.mean() < 0.0)
+    return agreed([first[seed] < second[seed] for seed in first.keys() & second.keys()])
+
+
+def agreed(holds: Sequence[bool]) -> bool | None:
+    """What all data sets say, if there are enough."""
+    said = set(holds)
+    return said.pop() if len(said) == 1 and len(holds) >= FEWEST else None
 
 
 def lowest(errors: dict[str, dict[str, float]], wanted: Sequence[str]) -> bool | None:
-    """Whether the best of the wanted models is below the best of the others."""
+    """Whether the best of the wanted models, in the mean over data sets, is below the best of the others."""
     means = {model: np.mean(list(own.values())) for model, own in errors.items()}
     best = min((model for model in means if model in wanted), key=means.__getitem__)
     rival = min((model for model in means if model not in wanted), key=means.__getitem__)
@@ -186,8 +191,12 @@ def away(ratios: Sequence[float]) -> float:
 def best_ratios(groups: Groups) -> Iterator[Finding]:
     """An EVGP's containing ratios are the closest of all models' to 0.683, 0.954, 0.997: differences summed."""
     for place in places(groups):
-        distances = {model: away([of(rows, f"cr{k}").mean() for k in (1, 2, 3)]) for model, rows in place.fits.items()}
-        yield place.finding(min(distances, key=distances.__getitem__) in EVGP, distances)
+        distances = {
+            model: {row["seed"]: away([float(row[f"cr{k}"]) for k in (1, 2, 3)]) for row in rows}
+            for model, rows in place.fits.items()
+        }
+        means = {model: float(np.mean(list(own.values()))) for model, own in distances.items()}
+        yield place.finding(lowest(distances, EVGP), means)
 
 
 def fewest_parameters(groups: Groups) -> Iterator[Finding]:
@@ -248,14 +257,15 @@ def small_sets(rows: list[Row]) -> Iterator[Finding]:
     """With the fewest rows the better of the two EVGPs has a lower Error than the best of the other models."""
     for setting in SETTINGS:
         for system, models in curves(rows, setting):
-            first = {name: zip(curve.seeds, curve.errors[0], strict=True) for name, curve in models.items()}
-            errors = {name: {str(seed): e for seed, e in own if np.isfinite(e)} for name, own in first.items()}
+            size = min(min(curve.n_rows) for curve in models.values())
+            errors = {name: curve.by_seed(size) for name, curve in models.items() if size in curve.n_rows}
             if set(errors) == set(MODELS):
-                means = {name: float(curve.mean[0]) for name, curve in models.items()}
-                ordered = sorted(means, key=means.__getitem__)
-                said = ", ".join(f"{name} {figure_of(means[name])}{star(models[name].limited[0])}" for name in ordered)
-                n_rows = models["EVGP-IFG"].n_rows[0]
-                yield Finding(f"{system}, {n_rows} rows", setting, lowest(errors, EVGP), said)
+                means = {name: float(np.mean(list(own.values()))) for name, own in errors.items()}
+                said = ", ".join(
+                    f"{name} {figure_of(means[name])}{star(models[name].limited[0])}"
+                    for name in sorted(means, key=means.__getitem__)
+                )
+                yield Finding(f"{system}, {size} rows", setting, lowest(errors, EVGP), said)
 
 
 def star(limited: bool) -> str:
@@ -271,18 +281,30 @@ def plateaus(rows: list[Row]) -> Iterator[Finding]:
                 said = ", ".join(
                     f"{name} × {curve.doubling():.2f}{star(curve.limited[-3:].any())}" for name, curve in own.items()
                 )
-                flat = [curve.doubling() > learning_curves_report.PLATEAU for curve in own.values()]
-                yield Finding(system, setting, all(flat), said)
+                flat = [agreed([share > PLATEAU for share in curve.doublings()]) for curve in own.values()]
+                yield Finding(system, setting, None if None in flat and False not in flat else all(flat), said)
 
 
 def gaps(rows: list[Row], other: str) -> Iterator[Finding]:
-    """The difference of another model's Error from EVGP-IFG's is smaller with the most rows than with the fewest."""
+    """Where another model's Error is above EVGP-IFG's with the fewest rows, it is less so, or not, with the most."""
     for setting in SETTINGS:
         for system, models in curves(rows, setting):
-            if other in models:
-                first, last, difference, ratio = learning_curves_report.gap(models[other], models["EVGP-IFG"])
-                said = f"{first} with the fewest rows, then {last}; the ratio falls: {ratio}"
-                yield Finding(system, setting, difference == "yes", said)
+            pair = [models[name] for name in (other, "EVGP-IFG") if name in models]
+            sizes = reduce(np.intersect1d, [curve.n_rows for curve in pair])[[0, -1]]
+            if len(pair) == 2 and sizes[0] < sizes[1]:
+                first, last = (difference(*(curve.by_seed(size) for curve in pair)) for size in sizes)
+                shown = [float(np.mean(list(own.values()))) for own in (first, last)]
+                few, most = (
+                    figure_of(mean) + star(any(curve.limited[curve.n_rows == size].any() for curve in pair))
+                    for mean, size in zip(shown, sizes, strict=True)
+                )
+                said = f"above by {few} with the fewest rows, by {most} with the most"
+                yield Finding(system, setting, lower(last, first) if shown[0] > 0.0 else None, said)
+
+
+def difference(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+    """Of the runs that both have."""
+    return {seed: first[seed] - second[seed] for seed in sorted(first.keys() & second.keys())}
 
 
 def imitated_gravity(rows: list[Row]) -> Iterator[Finding]:
@@ -376,8 +398,8 @@ def paragraphs(found: Sequence[Verdict]) -> list[str]:
         "# The paper's claims, one by one",
         "Written by `benchmarks/paper/reproduction.py` from results_table.csv, learning_curves.csv, beta.csv and "
         f"data_sets.csv. Settings: {settings}, where all five models were fitted; means over the data sets that all "
-        "have. Of Errors a claim is undecided where the mean difference over data sets is no larger than its standard "
-        f"error, or there is one data set only. {MARKS}",
+        f"have. A comparison is undecided unless at least {FEWEST} data sets, or runs, all say the same. Counted is in "
+        f"how many places a claim holds, of all, those that are undecided among them. {MARKS}",
         summary(found),
     ]
     words = {True: "yes", False: "no", None: "undecided"}

@@ -56,11 +56,23 @@ class Curve:
         """The fewest rows with at most this Error."""
         return next((str(size) for size, own in zip(self.n_rows, self.mean, strict=True) if own <= error), "—")
 
+    def by_seed(self, size: int) -> dict[str, float]:
+        """The Error of each run with so many rows."""
+        (own,) = self.errors[self.n_rows == size]
+        return {str(seed): float(error) for seed, error in zip(self.seeds, own, strict=True) if np.isfinite(error)}
+
     def doubling(self) -> float:
-        """What share of the Error a doubling of the rows leaves, by the last three sizes; NaN of one size."""
+        """What share of the mean Error a doubling of the rows leaves, by the last three sizes; NaN of one size."""
+        return self._share_left(self.mean)
+
+    def doublings(self) -> list[float]:
+        """The same of each run that has these sizes."""
+        return [self._share_left(own) for own in self.errors.T if np.isfinite(own[-3:]).all()]
+
+    def _share_left(self, errors: np.ndarray) -> float:
         if len(self.n_rows) < 2:
             return np.nan
-        return float(2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(self.mean[-3:]), 1)[0])
+        return float(2.0 ** np.polyfit(np.log2(self.n_rows[-3:]), np.log2(errors[-3:]), 1)[0])
 
 
 Curves = dict[str, dict[str, Curve]]  # of a setting: system -> model -> curve
@@ -134,7 +146,7 @@ def paragraphs(rows: list[Row]) -> list[str]:
     stopped = sum(row["converged"] == "False" for row in rows)
     parts.append(
         "The median row is the median of the error over test rows: far below the Error where few rows make the Error, "
-        f"those far from the training data. {stopped} of {len(rows)} fits ended with a ConvergenceWarning."
+        f"those far from the training data. {stopped} of {len(rows)} fits did not end by themselves."
     )
     return parts
 

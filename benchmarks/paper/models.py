@@ -38,7 +38,9 @@ ADAM = ("paper", *AUTHORS_SCALE)
 # How wrong the nominal arm is, relative.
 NOMINAL_ERROR = 0.2
 # What convergence warnings say of a search that did not end by itself, and of what it found.
-ENDED_EARLY = re.compile("still (rising|fell)|stopped after|diverged|bound below the first|interrupted|not stay finite")
+ENDED_EARLY = re.compile(
+    "still (rising|fell)|stopped after|diverged|bound below the first|interrupted|ended since|not stay finite"
+)
 NOTHING_LEARNED = re.compile(r"of (\d+) of \d+ outputs fitted together, though|became white noise")
 # Trajectories of a quick run.
 QUICK_TRAJECTORIES = 12
@@ -93,7 +95,7 @@ QUICK = {
     "iiwa14": Quick(10, 2, 3),
 }
 SYSTEMS = tuple(QUICK)
-# The network learns until rows held back gain nothing: more epochs make trajectories held back worse (network.py).
+# The network learns until rows held back gain nothing. (What whole trajectories held back would choose: network.py.)
 UNTIL_FLAT: dict[str, Any] = {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 1000}
 
 
@@ -236,8 +238,8 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
     -------
     columns : dict
         ``error_inside`` is their mean error, ``error_outside`` that of the others (NaN without any), ``inside`` the
-        share of the rows; ``outside`` tells of each column with rows out of its range their number, the end of the
-        range that they go beyond and how far: "1:31:3.02:8.31 3:4:-9.7:-10.2".
+        share of the rows; ``outside`` tells of each end of a column's range that rows go beyond their number, the end
+        and how far they go: "1:31:3.02:8.31 1:4:-3.02:-3.7".
     """
     low, high = train.data.min(axis=0), train.data.max(axis=0)
     beyond = (test.data < low) | (test.data > high)
@@ -248,17 +250,14 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
         "inside": inside.mean(),
         "outside": " ".join(
             f"{column}:{n}:{limit:.3g}:{reached:.3g}"
-            for column, n in enumerate(beyond.sum(axis=0))
+            for column, tested in enumerate(test.data.T)
+            for n, limit, reached in (
+                ((tested > high[column]).sum(), high[column], tested.max()),
+                ((tested < low[column]).sum(), low[column], tested.min()),
+            )
             if n
-            for limit, reached in [farthest(low[column], high[column], test.data[:, column])]
         ),
     }
-
-
-def farthest(low: float, high: float, tested: np.ndarray) -> tuple[float, float]:
-    """Of a column's range the end that test rows go beyond, the farther one of two, and how far they go."""
-    least, most = float(tested.min()), float(tested.max())
-    return (low, least) if low - least > most - high else (high, most)
 
 
 def groups_of(regressor: Any, train: Bunch) -> dict[str, np.ndarray]:
@@ -290,7 +289,7 @@ def how_it_ended(messages: list[str], n_outputs: int) -> dict[str, Any]:
     Returns
     -------
     columns : dict
-        ``converged`` and ``unlearned``.
+        ``converged`` and ``unlearned``: at least so many, for groups of outputs with the same message tell it once.
     """
     said = " ".join(messages)
     counts = [int(found[1] or n_outputs) for found in NOTHING_LEARNED.finditer(said)]

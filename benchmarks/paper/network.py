@@ -141,11 +141,19 @@ def means(rows: Sequence[Row], name: str) -> dict[tuple[str, int], float]:
     }
 
 
-def enough(errors: dict[tuple[str, int], float]) -> int:
-    """The fewest epochs after which no larger number leaves less than `ENOUGH` of the Error held back."""
+def enough(errors: dict[tuple[str, int], float]) -> int | None:
+    """The fewest epochs after which no larger number leaves less than `ENOUGH` of the Error held back; None if no such.
+
+    The largest number that was tried has no larger one to say so.
+    """
     plain = sorted((epochs, error) for (variant, epochs), error in errors.items() if not variant)
     return next(
-        epochs for i, (epochs, error) in enumerate(plain) if all(later >= ENOUGH * error for _, later in plain[i:])
+        (
+            epochs
+            for i, (epochs, error) in enumerate(plain[:-1])
+            if all(later >= ENOUGH * error for _, later in plain[i:])
+        ),
+        None,
     )
 
 
@@ -156,8 +164,9 @@ def best(rows: Sequence[Row]) -> tuple[str, int]:
 
 
 def compared(rows: Sequence[Row]) -> list[tuple[str, int]]:
-    """Of one system: what is fitted to all trajectories. (How early stopping ends is not said by its epochs.)"""
-    return list(dict.fromkeys([best(rows), next(key for key in means(rows, "loss") if key[0] == EARLY)]))
+    """Of one system: what is fitted to all trajectories, the best first, early stopping last; nothing without it."""
+    early = [key for key in means(rows, "loss") if key[0] == EARLY]
+    return list(dict.fromkeys([best(rows), *early])) if early else []
 
 
 def lines_of(rows: Sequence[Row]) -> Iterator[list[str]]:
@@ -201,7 +210,8 @@ def paragraphs(rows: Sequence[Row]) -> list[str]:
         parts += [
             f"## {system}, {seeds} seed{'s' if seeds > 1 else ''}",
             harness.table(header, lines_of(own)),
-            f"Enough, since more leave at least {ENOUGH:.0%} of the Error held back: {found} epochs.",
+            f"Enough, since more leave at least {ENOUGH:.0%} of the Error held back: "
+            f"{f'{found} epochs' if found else 'none of those that were tried'}.",
         ]
         if len(of_system) > len(own):
             parts += [
@@ -250,9 +260,8 @@ def main() -> None:
     n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     for system in systems:
         rows = [row for row in harness.read(output) if (row["size"], row["system"]) == (size, system)]
-        if any(row["variant"] == EARLY for row in rows):
-            cells = [Cell(system, *how, seed, TEST, size) for how in compared(rows) for seed in range(n_seeds)]
-            n_failures += harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
+        cells = [Cell(system, *how, seed, TEST, size) for how in compared(rows) for seed in range(n_seeds)]
+        n_failures += harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
     rows = [row for row in harness.read(output) if row["size"] == size]
     harness.write_report(paragraphs(rows) if rows else [], output, n_failures)
 

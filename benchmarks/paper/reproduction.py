@@ -158,7 +158,10 @@ def containing(results: Results, system: str, model: str, setting: str) -> str:
 def network(results: Results, system: str, which: str, name: str = "error_tested") -> str:
     """Of the network what is "best" on trajectories held back, or "early" stopping: a mean, "name" or on "test"."""
     of_system = [row for row in results.rows("network") if row["system"] == system]
-    variant, epochs = paper_network.compared(of_system)[{"best": 0, "early": -1}[which]]
+    found = paper_network.compared(of_system)
+    if not found:
+        return MISSING
+    variant, epochs = found[{"best": 0, "early": -1}[which]]
     if name == "name":
         return f"{variant}, {epochs} epochs" if variant else f"{epochs} epochs"
     on = paper_network.TEST if name == "test" else paper_network.HELD

@@ -12,7 +12,11 @@ from sklearn.utils import Bunch
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForceGravity
+from skevgp.fitting import advice
 from skevgp.metrics import prediction_error, std_norm
+from skevgp.network.training import Training
+from skevgp.optimizers.minimum import Minimum
+from skevgp.solvers import Adam
 
 from ..conftest import read
 
@@ -132,7 +136,8 @@ def test_rows_beyond_the_training_range_are_told_apart():
     train = Bunch(data=np.array([[0.0, -1.0], [1.0, 2.0], [0.5, 0.0]]))
     test = Bunch(data=np.array([[0.5, 0.0], [0.2, -3.0], [1.5, 2.5], [1.0, 2.0]]))
     found = in_range(train, test, np.array([1.0, 10.0, 30.0, 3.0]))
-    assert found == {"error_inside": 2.0, "error_outside": 20.0, "inside": 0.5, "outside": "0:1:1:1.5 1:2:-1:-3"}
+    assert found.pop("outside") == "0:1:1:1.5 1:1:2:2.5 1:1:-1:-3"
+    assert found == {"error_inside": 2.0, "error_outside": 20.0, "inside": 0.5}
     alone = in_range(train, Bunch(data=test.data[:1]), np.array([1.0]))
     assert alone["inside"] == 1.0
     assert np.isnan(alone["error_outside"])
@@ -218,6 +223,27 @@ def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
     assert both([row] * 3 + [{**row, "unlearned": "1"}]) == "0.200 / 0.100†"
     assert both([{**row, "unlearned": "nan"}] * 4) == "0.200 / 0.100"
     assert both([{**row, "max_iter": "5000"}] * 4) == "0.200 / 0.100"
+
+
+def messages_of_early_ends():
+    """In the library's own words."""
+    ended, going = (Minimum(np.zeros(1), 0.0, [0.0], converged) for converged in (True, False))
+    yield advice.how_it_ended(going, n_iter=9, max_iter=9, tol=0.01)
+    yield advice.how_it_ended(going, n_iter=9, max_iter=100, tol=None)
+    yield advice.interrupted(9)
+    yield advice.interrupted(9, max_time=1.0)
+    yield Adam()._how_it_ended(going, False)
+    yield Adam()._how_it_ended(ended, True)
+    for minimum, interrupted, still_falling in ((going, False, False), (ended, True, False), (ended, False, True)):
+        training = Training(np.zeros(1), minimum, np.zeros(1), np.zeros(0), still_falling)
+        yield training.how_it_ended(9, 0.1, interrupted)
+
+
+@pytest.mark.parametrize("message", [*messages_of_early_ends()])
+def test_searches_that_did_not_end_by_themselves_say_so(message):
+    from paper.models import ENDED_EARLY
+
+    assert ENDED_EARLY.search(message)
 
 
 def test_warnings_tell_how_a_fit_ended():
