@@ -26,7 +26,7 @@ import harness
 from harness import PALETTE, WIDTH, Row, column, figure_of, legend, logarithmic, pyplot, save_picture
 from paper import results_table
 from paper.models import Fit, fitted_row
-from paper.results_table_report import PAPER
+from paper.results_table_report import PAPER, star
 from skevgp.solvers import Adam
 
 MODELS = ("EVGP-IFG", "EVGP-IF")
@@ -134,7 +134,7 @@ def table_of(rows: list[Row], model: str) -> str:
         same = [adam[row["seed"]] for row in own if row["seed"] in adam]
         lines.append(
             [
-                variant + ("\\*" if any(row["converged"] == "False" for row in own) else ""),
+                variant + star(any(row["converged"] == "False" for row in own)),
                 f"{figure_of(errors.mean())} ({', '.join(map(figure_of, errors))})",
                 figure_of(inside) if np.isfinite(inside := column(own, "error_inside").mean()) else "",
                 f"{errors.mean() / np.mean(same):.2f}" if len(same) == len(own) else "",

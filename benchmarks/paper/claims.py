@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial, reduce
 from pathlib import Path
@@ -13,15 +13,16 @@ from harness import Row, figure_of, read, table
 from harness import column as of
 from paper import beta_report, learning_curves_report
 from paper.data_sets import is_angle
-from paper.learning_curves_report import PLATEAU
 from paper.models import SYSTEMS
-from paper.results_table_report import MARKS, MODELS, NORMAL, PAPER, Groups, Result, group, marks
+from paper.results_table_report import MARKS, MODELS, NORMAL, PAPER, Groups, Result, group, marks, star
 
 # That each claim is looked at in.
 SETTINGS = ("paper", "skevgp")
 EVGP = ("EVGP-IF", "EVGP-IFG")
 # Data sets by which something is decided.
 FEWEST = 3
+
+BySeed = dict[str, float]  # of a data set or run: an Error, or what else is compared
 
 
 @dataclass(frozen=True)
@@ -66,13 +67,13 @@ class Verdict:
     findings: tuple[Finding, ...]
     of_the_paper: str = ""
 
-    def text(self, setting: str) -> str:
-        """In how many places of a setting; empty if there is none."""
+    def count(self, setting: str) -> str:
+        """In how many places of a setting it holds; empty if there is none."""
         own = [finding.holds for finding in self.findings if finding.setting == setting]
-        return in_words(own) if own else ""
+        return count_of(own) if own else ""
 
-    def elsewhere(self, holds: bool | None) -> str:
-        """Where it does not hold, or is undecided."""
+    def where(self, holds: bool | None) -> str:
+        """In which places it holds, does not, or is undecided."""
         return "; ".join(
             f"{finding.where}{', ' * bool(finding.setting)}{finding.setting}"
             for finding in self.findings
@@ -80,12 +81,27 @@ class Verdict:
         )
 
 
-def in_words(holds: Sequence[bool | None]) -> str:
-    """In how many places."""
+def count_of(holds: Sequence[bool | None]) -> str:
+    """How many of all hold: "3 of 5"."""
     return f"{sum(held is True for held in holds)} of {len(holds)}"
 
 
-def lower(first: dict[str, float], second: dict[str, float]) -> bool | None:
+def by_seed(rows: Sequence[Row]) -> BySeed:
+    """The Error of each data set."""
+    return {row["seed"]: float(row["error_mean"]) for row in rows}
+
+
+def mean_of(own: BySeed) -> float:
+    """Over data sets."""
+    return float(np.mean(list(own.values())))
+
+
+def best_of(own: dict[str, BySeed], models: Iterable[str]) -> str:
+    """Of some models that of the lowest mean over data sets."""
+    return min(models, key=lambda model: mean_of(own[model]))
+
+
+def lower(first: BySeed, second: BySeed) -> bool | None:
     """Whether one model's Error is below another's, on the data sets that both have.
 
     Undecided where it is not so on all of them, or there are fewer than `FEWEST`.
@@ -99,12 +115,9 @@ def agreed(holds: Sequence[bool]) -> bool | None:
     return said.pop() if len(said) == 1 and len(holds) >= FEWEST else None
 
 
-def lowest(errors: dict[str, dict[str, float]], wanted: Sequence[str]) -> bool | None:
+def lowest(own: dict[str, BySeed], wanted: Sequence[str]) -> bool | None:
     """Whether the best of the wanted models, in the mean over data sets, is below the best of the others."""
-    means = {model: np.mean(list(own.values())) for model, own in errors.items()}
-    best = min((model for model in means if model in wanted), key=means.__getitem__)
-    rival = min((model for model in means if model not in wanted), key=means.__getitem__)
-    return lower(errors[best], errors[rival])
+    return lower(own[best_of(own, wanted)], own[best_of(own, own.keys() - set(wanted))])
 
 
 @dataclass(frozen=True)
@@ -126,19 +139,15 @@ class Place:
     notes: dict[str, str]
 
     @property
-    def errors(self) -> dict[str, dict[str, float]]:
-        """Model -> seed -> Error."""
-        return {model: {row["seed"]: float(row["error_mean"]) for row in rows} for model, rows in self.fits.items()}
+    def errors(self) -> dict[str, BySeed]:
+        """Of each model."""
+        return {model: by_seed(rows) for model, rows in self.fits.items()}
 
-    def said(self, values: dict[str, float]) -> str:
-        """Of each model, the lowest first."""
-        ordered = sorted(values.items(), key=lambda item: item[1])
-        return ", ".join(f"{model} {figure_of(value)}{self.notes[model]}" for model, value in ordered)
-
-    def finding(self, holds: bool | None, values: dict[str, float] | None = None) -> Finding:
-        """By default with mean Errors."""
-        means = {model: float(np.mean(list(own.values()))) for model, own in self.errors.items()}
-        return Finding(self.system, self.setting, holds, self.said(means if values is None else values))
+    def lowest(self, values: dict[str, BySeed], wanted: Sequence[str]) -> Finding:
+        """Whether one of the wanted models has the lowest values, with the means of all, the lowest first."""
+        means = sorted((mean_of(own), model) for model, own in values.items())
+        said = ", ".join(f"{model} {figure_of(mean)}{self.notes[model]}" for mean, model in means)
+        return Finding(self.system, self.setting, lowest(values, wanted), said)
 
 
 def places(groups: Groups) -> Iterator[Place]:
@@ -156,13 +165,13 @@ def places(groups: Groups) -> Iterator[Place]:
 def lowest_error(groups: Groups) -> Iterator[Finding]:
     """The better of the two EVGPs has a lower Error than the best of the other models."""
     for place in places(groups):
-        yield place.finding(lowest(place.errors, EVGP))
+        yield place.lowest(place.errors, EVGP)
 
 
 def lowest_is_ifg(groups: Groups) -> Iterator[Finding]:
     """EVGP-IFG has a lower Error than the best of all others."""
     for place in places(groups):
-        yield place.finding(lowest(place.errors, ("EVGP-IFG",)))
+        yield place.lowest(place.errors, ("EVGP-IFG",))
 
 
 def ifg_below_if(groups: Groups) -> Iterator[Finding]:
@@ -170,16 +179,16 @@ def ifg_below_if(groups: Groups) -> Iterator[Finding]:
     for setting in SETTINGS:
         for system in SYSTEMS:
             own = [groups.get((system, model, setting), []) for model in EVGP]
-            by_seed = [{row["seed"]: float(row["error_mean"]) for row in rows} for rows in own]
-            seeds = sorted(by_seed[0].keys() & by_seed[1].keys(), key=int)
+            plain, gravity = map(by_seed, own)
+            seeds = plain.keys() & gravity.keys()
             if seeds:
-                plain, gravity = (np.array([errors[seed] for seed in seeds]) for errors in by_seed)
+                plain, gravity = ({seed: errors[seed] for seed in seeds} for errors in (plain, gravity))
                 yield Finding(
                     system,
                     setting,
-                    lower(by_seed[1], by_seed[0]),
-                    f"IF {figure_of(plain.mean())}{marks(own[0])}, IFG {figure_of(gravity.mean())}{marks(own[1])}, "
-                    f"lower on {(gravity < plain).sum()} of {len(seeds)} data sets",
+                    lower(gravity, plain),
+                    f"IF {figure_of(mean_of(plain))}{marks(own[0])}, IFG {figure_of(mean_of(gravity))}{marks(own[1])}, "
+                    f"lower on {count_of([gravity[seed] < plain[seed] for seed in seeds])} data sets",
                 )
 
 
@@ -195,16 +204,14 @@ def best_ratios(groups: Groups) -> Iterator[Finding]:
             model: {row["seed"]: away([float(row[f"cr{k}"]) for k in (1, 2, 3)]) for row in rows}
             for model, rows in place.fits.items()
         }
-        means = {model: float(np.mean(list(own.values()))) for model, own in distances.items()}
-        yield place.finding(lowest(distances, EVGP), means)
+        yield place.lowest(distances, EVGP)
 
 
 def fewest_parameters(groups: Groups) -> Iterator[Finding]:
     """The lowest Error is an EVGP's, and it has the fewest numbers to learn (or 10 % more: gravity's own weights)."""
     for place in places(groups):
         counts = {model: float(max(of(rows, "n_parameters"))) for model, rows in place.fits.items()}
-        means = {model: np.mean(list(place.errors[model].values())) for model in EVGP}
-        best = min(means, key=means.__getitem__)
+        best = best_of(place.errors, EVGP)
         fewest = counts[best] <= 1.1 * min(counts.values())
         listed = ", ".join(f"{model} {count:,.0f}" for model, count in counts.items())
         yield Finding(
@@ -214,7 +221,7 @@ def fewest_parameters(groups: Groups) -> Iterator[Finding]:
 
 def in_the_paper(holds: Callable[[dict[str, Result]], bool]) -> str:
     """A claim by the paper's own table: on how many of its four systems."""
-    return in_words([holds(models) for system, models in PAPER.items() if system != "cartpole_damped"])
+    return count_of([holds(models) for system, models in PAPER.items() if system != "cartpole_damped"])
 
 
 def lowest_there(models: dict[str, Result], wanted: Sequence[str] = EVGP) -> bool:
@@ -260,16 +267,9 @@ def small_sets(rows: list[Row]) -> Iterator[Finding]:
             size = min(min(curve.n_rows) for curve in models.values())
             errors = {name: curve.by_seed(size) for name, curve in models.items() if size in curve.n_rows}
             if set(errors) == set(MODELS):
-                means = {name: float(np.mean(list(own.values()))) for name, own in errors.items()}
-                said = ", ".join(
-                    f"{name} {figure_of(means[name])}{star(models[name].limited[0])}"
-                    for name in sorted(means, key=means.__getitem__)
-                )
+                means = sorted((mean_of(own), name) for name, own in errors.items())
+                said = ", ".join(f"{name} {figure_of(mean)}{star(models[name].limited[0])}" for mean, name in means)
                 yield Finding(f"{system}, {size} rows", setting, lowest(errors, EVGP), said)
-
-
-def star(limited: bool) -> str:
-    return "\\*" if limited else ""
 
 
 def plateaus(rows: list[Row]) -> Iterator[Finding]:
@@ -281,7 +281,10 @@ def plateaus(rows: list[Row]) -> Iterator[Finding]:
                 said = ", ".join(
                     f"{name} × {curve.doubling():.2f}{star(curve.limited[-3:].any())}" for name, curve in own.items()
                 )
-                flat = [agreed([share > PLATEAU for share in curve.doublings()]) for curve in own.values()]
+                flat = [
+                    agreed([share > learning_curves_report.PLATEAU for share in curve.doublings()])
+                    for curve in own.values()
+                ]
                 yield Finding(system, setting, None if None in flat and False not in flat else all(flat), said)
 
 
@@ -293,7 +296,7 @@ def gaps(rows: list[Row], other: str) -> Iterator[Finding]:
             sizes = reduce(np.intersect1d, [curve.n_rows for curve in pair])[[0, -1]]
             if len(pair) == 2 and sizes[0] < sizes[1]:
                 first, last = (difference(*(curve.by_seed(size) for curve in pair)) for size in sizes)
-                shown = [float(np.mean(list(own.values()))) for own in (first, last)]
+                shown = [mean_of(own) for own in (first, last)]
                 few, most = (
                     figure_of(mean) + star(any(curve.limited[curve.n_rows == size].any() for curve in pair))
                     for mean, size in zip(shown, sizes, strict=True)
@@ -302,7 +305,7 @@ def gaps(rows: list[Row], other: str) -> Iterator[Finding]:
                 yield Finding(system, setting, lower(last, first) if shown[0] > 0.0 else None, said)
 
 
-def difference(first: dict[str, float], second: dict[str, float]) -> dict[str, float]:
+def difference(first: BySeed, second: BySeed) -> BySeed:
     """Of the runs that both have."""
     return {seed: first[seed] - second[seed] for seed in sorted(first.keys() & second.keys())}
 
@@ -384,8 +387,8 @@ def summary(found: Sequence[Verdict]) -> str:
         ["the paper says", "its own table", *(f"here: {setting}" for setting in SETTINGS), "not so", "undecided"],
         [
             [verdict.claim, verdict.of_the_paper]
-            + [verdict.text(setting) or verdict.text("") for setting in SETTINGS]
-            + [verdict.elsewhere(False), verdict.elsewhere(None)]
+            + [verdict.count(setting) or verdict.count("") for setting in SETTINGS]
+            + [verdict.where(False), verdict.where(None)]
             for verdict in found
         ],
     )

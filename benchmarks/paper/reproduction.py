@@ -155,18 +155,21 @@ def containing(results: Results, system: str, model: str, setting: str) -> str:
     return " / ".join(f"{of(own, f'cr{k}').mean():.3f}" for k in (1, 2, 3)) if own else MISSING
 
 
-def network(results: Results, system: str, which: str, name: str = "error_tested") -> str:
-    """Of the network what is "best" on trajectories held back, or "early" stopping: a mean, "name" or on "test"."""
-    of_system = [row for row in results.rows("network") if row["system"] == system]
-    found = paper_network.compared(of_system)
+def network(results: Results, system: str, which: str, name: str = "error_tested", on: str = "held") -> str:
+    """Of the network's variants the "best" on trajectories "held" back, or "early" stopping: its name, or a mean.
+
+    ``on`` may be "test", too.
+    """
+    rows = [row for row in results.rows("network") if row["system"] == system]
+    found = paper_network.compared(rows)
     if not found:
         return MISSING
     variant, epochs = found[{"best": 0, "early": -1}[which]]
     if name == "name":
         return f"{variant}, {epochs} epochs" if variant else f"{epochs} epochs"
-    on = paper_network.TEST if name == "test" else paper_network.HELD
-    own = [row for row in of_system if (row["variant"], int(row["epochs"]), row["tested_on"]) == (variant, epochs, on)]
-    return figure_of(float(of(own, "error_tested" if name == "test" else name).mean())) if own else MISSING
+    wanted = (variant, epochs, {"held": paper_network.HELD, "test": paper_network.TEST}[on])
+    own = [row for row in rows if (row["variant"], int(row["epochs"]), row["tested_on"]) == wanted]
+    return figure_of(float(of(own, name).mean())) if own else MISSING
 
 
 def paper(results: Results, system: str, model: str, *names: str) -> str:

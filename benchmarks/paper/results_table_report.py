@@ -139,8 +139,13 @@ def unlearned(row: Row) -> bool:
 
 def marks(own: list[Row]) -> str:
     """What a reader must know of a cell: `MARKS`, or fewer seeds."""
-    seen = ("\\*" if any(map(limited, own)) else "") + ("†" if any(map(unlearned, own)) else "")
+    seen = star(any(map(limited, own))) + ("†" if any(map(unlearned, own)) else "")
     return seen + (f" ({len(own)})" if len(own) != N_SEEDS else "")
+
+
+def star(is_limited: bool) -> str:
+    """The asterisk of `MARKS`, in Markdown."""
+    return "\\*" if is_limited else ""
 
 
 def both(own: list[Row]) -> str:

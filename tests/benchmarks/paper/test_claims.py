@@ -179,7 +179,7 @@ def test_a_verdict_says_in_how_many_places():
 
     found = (Finding("sea", "paper", True, "1"), Finding("lake", "paper", False, "2"), Finding("pond", "", None, "3"))
     verdict = Verdict("Fish fly", "They leave the water.", found, "4 of 4")
-    assert [verdict.text(setting) for setting in ("paper", "skevgp", "")] == ["1 of 2", "", "0 of 1"]
+    assert [verdict.count(setting) for setting in ("paper", "skevgp", "")] == ["1 of 2", "", "0 of 1"]
     assert "| Fish fly | 4 of 4 | 1 of 2 | 0 of 1 | lake, paper | pond |" in summary([verdict])
     page = "\n".join(paragraphs([verdict]))
     assert "They leave the water." in page

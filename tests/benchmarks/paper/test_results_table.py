@@ -225,6 +225,29 @@ def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
     assert both([{**row, "max_iter": "5000"}] * 4) == "0.200 / 0.100"
 
 
+def test_the_picture_tells_limited_unlearned_and_few_fits(drawn, tmp_path):
+    from paper.results_table_plots import plot
+
+    errors = {"VGP": ("0.3", 3), "RES-VGP": ("0.2", 4), "EVGP-IF": ("0.01", 4)}
+    rows = [
+        {
+            **{"system": "pendulum", "model": model, "setting": "paper", "seed": str(seed), "angles": "raw"},
+            **{"noise": "0.0", "size": "full", "error_mean": error, "error_inside": "0.001", "max_iter": ""},
+            **{"n_iter": "9", "converged": str(model != "RES-VGP"), "unlearned": str(int(model == "EVGP-IF"))},
+        }
+        for model, (error, n_seeds) in errors.items()
+        for seed in range(n_seeds)
+    ]
+    (figure,) = drawn(plot, rows, tmp_path / "table.png")
+    (axes,) = (axes for axes in figure.axes if axes.get_title())
+    squares = [line for line in axes.lines if line.get_marker() == "s" and len(line.get_ydata())]
+    hollow = {round(float(line.get_ydata()[0]), 9): line.get_markerfacecolor() == "white" for line in squares}
+    assert hollow == {0.3: False, 0.2: True, 0.01: True}
+    crossed = [line.get_ydata()[0] for line in axes.lines if line.get_marker() == "x"]
+    assert crossed == [pytest.approx(0.01)]
+    assert [text.get_text() for text in axes.texts] == ["3"]
+
+
 def messages_of_early_ends():
     """In the library's own words."""
     ended, going = (Minimum(np.zeros(1), 0.0, [0.0], converged) for converged in (True, False))
