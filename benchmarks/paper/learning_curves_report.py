@@ -270,6 +270,13 @@ def plot(rows: list[Row], path: Path) -> None:
         plot_setting(curves_of(rows, setting), own, WORDS.get(setting, setting), rows[0]["size"] == "quick")
 
 
+def n_runs(models: dict[str, Curve]) -> str:
+    """Of the points of a panel, which need not all be of the same number."""
+    numbers = {n for curve in models.values() for n in np.isfinite(curve.errors).sum(axis=1).tolist()}
+    fewest, most = min(numbers), max(numbers)
+    return (f"{fewest} to " if fewest < most else "") + f"{most} run{'s' * (most > 1)}"
+
+
 def plot_setting(curves: Curves, path: Path, setting: str, quick: bool) -> None:
     """One of its pictures."""
     n_columns = min(2, len(curves))
@@ -281,8 +288,7 @@ def plot_setting(curves: Curves, path: Path, setting: str, quick: bool) -> None:
             result = PAPER[system].get(name)
             if result:
                 axes.plot(1.25 * max(curve.n_rows), result.error, "*", color=COLOURS[name], markersize=8, zorder=4)
-        n_runs = max(curve.errors.shape[1] for curve in models.values())
-        axes.set_title(f"{system} ({n_runs} run{'s' * (n_runs > 1)})")
+        axes.set_title(f"{system} ({n_runs(models)})")
         axes.set(xlabel="training rows", ylabel="test Error (SI units)")
         logarithmic(axes, "x")
         sizes = sorted({size for curve in models.values() for size in curve.n_rows})

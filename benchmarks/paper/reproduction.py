@@ -155,6 +155,17 @@ def containing(results: Results, system: str, model: str, setting: str) -> str:
     return " / ".join(f"{of(own, f'cr{k}').mean():.3f}" for k in (1, 2, 3)) if own else MISSING
 
 
+def containing_with(results: Results, system: str, setting: str, n_trajectories: str, *models: str) -> str:
+    """Of the learning curves, with so many trajectories: CR-2, over runs and models the lowest and the highest."""
+    shares = [
+        float(row["cr2"])
+        for row in results.rows("learning_curves")
+        if (row["system"], row["setting"], row["n_trajectories"]) == (system, setting, n_trajectories)
+        and row["model"] in models
+    ]
+    return f"{min(shares):.2f} to {max(shares):.2f}" if shares else MISSING
+
+
 def network(results: Results, system: str, which: str, name: str = "error_tested", on: str = "held") -> str:
     """Of the network's variants the "best" on trajectories "held" back, or "early" stopping: its name, or a mean.
 
@@ -203,7 +214,8 @@ FILLERS: dict[str, Callable[..., str]] = {
     function.__name__: function
     for function in (
         *(errors, unfinished, which_cartpole, outside, claims_table, tried, calibration),
-        *(error, spread, paper, held, n_parameters, variant, marks, outside_share, containing, network),
+        *(error, spread, paper, held, n_parameters, variant, marks, outside_share, containing, containing_with),
+        network,
     )
 }
 

@@ -43,6 +43,15 @@ def test_a_place_without_a_function_or_a_number_is_seen():
     assert said == f"{of_rows_outside.min():.0%} to {of_rows_outside.max():.0%}"
     said = filled("# A\n\n{{containing acrobot EVGP-IF skevgp}}", results).split(" / ")[1]
     assert said == f"{numbers[:, 3].mean():.3f}"
+    cell = {"system": "iiwa14", "setting": "skevgp", "n_trajectories": "60", "size": "full"}
+    shares = [
+        float(row["cr2"])
+        for row in read(RESULTS / "learning_curves.csv")
+        if cell.items() <= row.items() and row["model"].startswith("EVGP")
+    ]
+    said = filled("# A\n\n{{containing_with iiwa14 skevgp 60 EVGP-IF EVGP-IFG}}", results).split("\n")[-1]
+    assert said == f"{min(shares):.2f} to {max(shares):.2f}"
+    assert len(shares) == 8
     assert filled("# A\n\n{{paper iiwa14 EVGP-IFG error cr2}}", results).endswith("\n0.027 / 0.480")
 
 

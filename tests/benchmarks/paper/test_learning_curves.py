@@ -132,10 +132,10 @@ def test_each_panel_draws_medians_quartiles_limits_and_the_papers_points(drawn, 
     from paper.learning_curves_report import COLOURS, plot
 
     rows = made_up(VGP={100: [4.0, 1.0, 1.0], 400: [1.0]}, EVGP_IFG={100: [1.0], 400: [0.5]})
-    rows += [{**row, "system": "acrobot"} for row in rows if row["model"] == "VGP"]
+    rows += [{**row, "system": "acrobot"} for row in rows if row["n_rows"] == "100"]
     rows[0]["converged"] = "False"
     (figure,) = drawn(plot, rows, tmp_path / "curves.png")
-    assert [axes.get_title() for axes in figure.axes] == ["pendulum (3 runs)", "acrobot (3 runs)"]
+    assert [axes.get_title() for axes in figure.axes] == ["pendulum (1 to 3 runs)", "acrobot (1 to 3 runs)"]
     for axes in figure.axes:
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("training rows", "test Error (SI units)")
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
@@ -157,9 +157,11 @@ def test_each_panel_draws_medians_quartiles_limits_and_the_papers_points(drawn, 
     assert "bars from first to third quartile" in figure.legends[0].get_title().get_text()
 
 
-def test_each_setting_has_a_picture(tmp_path):
+def test_each_setting_has_a_picture(drawn, tmp_path):
     from paper.learning_curves_report import plot
 
-    rows = made_up(EVGP_IFG={100: [1.0], 400: [0.5]})
-    plot(rows + [{**row, "setting": "paper"} for row in rows], tmp_path / "curves.png")
+    rows = made_up(EVGP_IFG={100: [1.0, 2.0], 400: [0.5, 0.5]})
+    paper = [{**row, "setting": "paper"} for row in rows if row["seed"] == "0"]
+    figures = drawn(plot, rows + paper, tmp_path / "curves.png")
+    assert [figure.axes[0].get_title() for figure in figures] == ["pendulum (2 runs)", "pendulum (1 run)"]
     assert {path.name for path in tmp_path.iterdir()} == {"curves.png", "curves_paper.png"}
