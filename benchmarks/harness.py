@@ -204,6 +204,7 @@ def run_missing(
     say: Callable[[Any], str],
     fresh: bool = False,
     since: str | None = None,
+    again: Callable[[Row], bool] | None = None,
 ) -> int:
     """Run the cells of which the CSV has no row, in processes, and write what each gives as it comes.
 
@@ -224,6 +225,8 @@ def run_missing(
     since : str, default=None
         A day: rows that were measured before are as if they were not there, until a new one replaces them. (What they
         do not know, because the benchmark measured less then, is "nan".)
+    again : callable, default=None
+        row -> whether it, too, is as if it were not there.
 
     Returns
     -------
@@ -244,7 +247,8 @@ def run_missing(
     rows = read(output)
     if rows and not set(names) <= rows[0].keys():
         raise SystemExit(f"{output} has no columns {sorted(set(names) - rows[0].keys())}: give another --output.")
-    done = {tuple(row[name] for name in names) for row in rows if not since or row["date"] >= since}
+    stay = (row for row in rows if not (since and row["date"] < since) and not (again and again(row)))
+    done = {tuple(row[name] for name in names) for row in stay}
     missing = [cell for cell in cells if key(cell) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:
@@ -270,7 +274,7 @@ def run_missing(
                     said += f"failed: {type(problem).__name__}: {problem}"
                 else:
                     new = result if isinstance(result, list) else [result]
-                    if since:
+                    if since or again:
                         make_way(key(pending[future]), names, list(new[0]), output)
                     append(new, output)
                     said += say(result)

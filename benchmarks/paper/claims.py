@@ -14,7 +14,7 @@ from harness import column as of
 from paper import beta_report, learning_curves_report
 from paper.data_sets import is_angle
 from paper.models import SYSTEMS
-from paper.results_table_report import MARKS, MODELS, NORMAL, PAPER, Groups, Result, group, marks, star
+from paper.results_table_report import MARKS, MODELS, N_SEEDS, NORMAL, PAPER, Groups, Result, group, marks, star
 
 # That each claim is looked at in.
 SETTINGS = ("paper", "skevgp")
@@ -265,10 +265,13 @@ def small_sets(rows: list[Row]) -> Iterator[Finding]:
     for setting in SETTINGS:
         for system, models in curves(rows, setting):
             size = min(min(curve.n_rows) for curve in models.values())
-            errors = {name: curve.by_seed(size) for name, curve in models.items() if size in curve.n_rows}
-            if set(errors) == set(MODELS):
+            every = {name: curve.by_seed(size) for name, curve in models.items() if size in curve.n_rows}
+            seeds = reduce(set.intersection, (set(own) for own in every.values()))
+            if set(every) == set(MODELS) and seeds:
+                errors = {name: {seed: own[seed] for seed in sorted(seeds)} for name, own in every.items()}
                 means = sorted((mean_of(own), name) for name, own in errors.items())
                 said = ", ".join(f"{name} {figure_of(mean)}{star(models[name].limited[0])}" for mean, name in means)
+                said += f" ({len(seeds)})" * (len(seeds) != N_SEEDS)
                 yield Finding(f"{system}, {size} rows", setting, lowest(errors, EVGP), said)
 
 

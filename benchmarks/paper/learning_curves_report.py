@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
@@ -62,8 +63,11 @@ class Curve:
         return {str(seed): float(error) for seed, error in zip(self.seeds, own, strict=True) if np.isfinite(error)}
 
     def doubling(self) -> float:
-        """What share of the mean Error a doubling of the rows leaves, by the last three sizes; NaN of one size."""
-        return self._share_left(self.mean)
+        """What share of the mean Error a doubling of the rows leaves, by the last three sizes and the runs that have
+        them; NaN of one size, or if no run has.
+        """
+        whole = np.isfinite(self.errors[-3:]).all(axis=0)
+        return self._share_left(self.errors[:, whole].mean(axis=1)) if whole.any() else np.nan
 
     def doublings(self) -> list[float]:
         """The same of each run that has these sizes."""
@@ -136,17 +140,16 @@ def paragraphs(rows: list[Row]) -> list[str]:
                 error_table("median row of", medians[system], spread=False),
             ]
         parts += ["### What the paper says of it", *claims(curves)]
-    limits = sorted(
-        {(row["system"], int(row["max_iter"])) for row in rows if row["max_iter"]},
-        key=lambda limit: (list(PAPER).index(limit[0]), limit[1]),
-    )
-    if limits:
-        text = ", ".join(f"{system} {limit}" for system, limit in limits)
-        parts.append(f"Iterations of the GPs were limited by `--max-iter`: {text}.")
-    stopped = sum(row["converged"] == "False" for row in rows)
+    stopped = [row for row in rows if row["converged"] == "False"]
+    if stopped:
+        limited = Counter((row["system"], row["model"], row["setting"], row["n_iter"]) for row in stopped)
+        text = ", ".join(
+            f"{n} of {' '.join(of)} after {n_iter} iterations" for (*of, n_iter), n in sorted(limited.items())
+        )
+        parts.append(f"Ended by a limit, of iterations or of the network's epochs: {text}.")
     parts.append(
         "The median row is the median of the error over test rows: far below the Error where few rows make the Error, "
-        f"those far from the training data. {stopped} of {len(rows)} fits did not end by themselves."
+        f"those far from the training data. {len(stopped)} of {len(rows)} fits did not end by themselves."
     )
     return parts
 
@@ -187,7 +190,10 @@ def claims(curves: Curves) -> Iterator[str]:
                 for system, models in with_ifg.items()
             ],
         )
-    yield "**EVGP is the most accurate.** The model of the lowest Error, with so many rows (without the nominal arm):"
+    yield (
+        "**EVGP is the most accurate.** The model of the lowest Error, with so many rows as all models have "
+        "(without the nominal arm):"
+    )
     yield "\n".join(f"* {system}: {lowest(models)}" for system, models in curves.items() if set(models) != {NOMINAL})
     yield (
         "**VGP and RES-VGP plateau.** What a doubling of the rows leaves of the Error, over the last three sizes (a "
@@ -271,10 +277,11 @@ def plot(rows: list[Row], path: Path) -> None:
 
 
 def n_runs(models: dict[str, Curve]) -> str:
-    """Of the points of a panel, which need not all be of the same number."""
-    numbers = {n for curve in models.values() for n in np.isfinite(curve.errors).sum(axis=1).tolist()}
-    fewest, most = min(numbers), max(numbers)
-    return (f"{fewest} to " if fewest < most else "") + f"{most} run{'s' * (most > 1)}"
+    """Of the points of a panel, and which models do not have all of them at all sizes."""
+    numbers = {name: np.isfinite(curve.errors).sum(axis=1) for name, curve in models.items()}
+    most = int(max(own.max() for own in numbers.values()))
+    fewer = ", ".join(name for name, own in numbers.items() if own.min() < most)
+    return f"{most} run{'s' * (most > 1)}" + (f"; {fewer} fewer" if fewer else "")
 
 
 def plot_setting(curves: Curves, path: Path, setting: str, quick: bool) -> None:
@@ -299,7 +306,8 @@ def plot_setting(curves: Curves, path: Path, setting: str, quick: bool) -> None:
         axes.set_axis_off()
     axes = grid.flat[len(curves) - 1]
     axes.plot([], [], "*", color="0.3", markersize=8, label="in the paper, with all rows")
-    axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="a fit ended by its limit of iterations")
+    if any(curve.limited.any() for models in curves.values() for curve in models.values()):
+        axes.plot([], [], "o", color="0.3", markerfacecolor="white", label="a fit ended by its limit of iterations")
     title = f"{setting}: medians of runs, bars from first to third quartile"
     legend(figure, ncols=4, title=title + ("; a quick run, not to be compared" if quick else ""))
     save_picture(figure, path)

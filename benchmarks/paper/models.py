@@ -96,7 +96,7 @@ QUICK = {
 }
 SYSTEMS = tuple(QUICK)
 # The network learns until rows held back gain nothing. (What whole trajectories held back would choose: network.py.)
-UNTIL_FLAT: dict[str, Any] = {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 10_000}
+UNTIL_FLAT: dict[str, Any] = {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 1000}
 
 
 def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, Any]:

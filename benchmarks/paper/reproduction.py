@@ -156,14 +156,15 @@ def containing(results: Results, system: str, model: str, setting: str) -> str:
 
 
 def containing_with(results: Results, system: str, setting: str, n_trajectories: str, *models: str) -> str:
-    """Of the learning curves, with so many trajectories: CR-2, over runs and models the lowest and the highest."""
-    shares = [
-        float(row["cr2"])
+    """Of the learning curves, with so many trajectories: CR-1 and CR-2, over runs and models the ranges."""
+    own = [
+        row
         for row in results.rows("learning_curves")
         if (row["system"], row["setting"], row["n_trajectories"]) == (system, setting, n_trajectories)
         and row["model"] in models
     ]
-    return f"{min(shares):.2f} to {max(shares):.2f}" if shares else MISSING
+    shares = (of(own, name) for name in ("cr1", "cr2"))
+    return " and ".join(f"{share.min():.2f} to {share.max():.2f}" for share in shares) if own else MISSING
 
 
 def network(results: Results, system: str, which: str, name: str = "error_tested", on: str = "held") -> str:

@@ -114,6 +114,7 @@ def main() -> None:
         help="the most iterations of each fit of an EVGP, which the tables then tell; what is in the CSV stays "
         "(default: the regressor's)",
     )
+    parser.add_argument("--limited", action="store_true", help="fit again what a limit of iterations ended")
     options = parser.parse_args()
     size, noise = "quick" if options.quick else "full", options.noise
     output = harness.output_path(options, f"results_table{f'_noise{noise:g}' if noise else ''}")
@@ -125,7 +126,8 @@ def main() -> None:
         )
         if has(system, model, setting, angles)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
+    again = results_table_report.limited if options.limited else None
+    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since, again=again)
 
     # Everything the file has of this size and noise, not only what was asked for now.
     rows = [row for row in harness.read(output) if (row["size"], row["noise"]) == (size, str(noise))]

@@ -5,12 +5,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
+from statistics import mean
 
 import numpy as np
 
 from harness import Row, table
 from paper.learning_curves import N_TRAJECTORIES, wanted
-from paper.models import ADAM, AUTHORS_SCALE, MODELS, SETTINGS, SYSTEMS, has
+from paper.models import ADAM, AUTHORS_SCALE, MODELS, SETTINGS, SYSTEMS, UNTIL_FLAT, has
 from paper.results_table_report import N_SEEDS, WRAPPED, cut_short
 from skevgp.solvers import Adam
 
@@ -51,9 +52,15 @@ def asked_for_with_noise(system: str, model: str, setting: str) -> bool:
 
 
 def ended(row: Row) -> bool:
-    """Whether a fit ended by itself; with the author's fixed step none comes to rest, and where it stopped counts."""
+    """Whether a fit ended by itself, or has come to what counts as its end.
+
+    That is where the author's fixed step, which never comes to rest, stopped, and the network's last epoch, where its
+    step has fallen to zero.
+    """
     if row["setting"] in AUTHORS_SCALE:
         return not row["max_iter"]
+    if row["model"] == "RES-DBNN" and int(row["n_iter"]) == UNTIL_FLAT["max_iter"]:
+        return True
     return row["converged"] == "True" and not cut_short(row)
 
 
@@ -106,7 +113,10 @@ def of_results_table(rows: list[Row], noisy: list[Row]) -> Iterator[Lack]:
 
 
 def of_learning_curves(rows: list[Row], whole: list[Row]) -> Iterator[Lack]:
-    """A fit to part of the rows takes its part of the time of one to all of them, of Adam's steps the same."""
+    """A fit takes as long as others to so many rows do.
+
+    If there is none it takes its part of the time of one to all rows; of Adam's steps the same.
+    """
     for setting, systems in CURVES.items():
         for system, model in itertools.product(systems, MODELS):
             if not wanted(system, model, setting):
@@ -115,9 +125,11 @@ def of_learning_curves(rows: list[Row], whole: list[Row]) -> Iterator[Lack]:
             for n_trajectories in N_TRAJECTORIES[system]:
                 cell = {"system": system, "model": model, "setting": setting, "n_trajectories": str(n_trajectories)}
                 n = n_lacking(rows, cell)
-                share = 1.0 if adams(model, setting) else n_trajectories / max(N_TRAJECTORIES[system])
                 n_fits += n
-                seconds += n * share * time_of_one(whole, system, model, setting, "raw") if n else 0.0
+                own = [float(row["fit_seconds"]) for row in rows if cell.items() <= row.items() and ended(row)]
+                share = 1.0 if adams(model, setting) else n_trajectories / max(N_TRAJECTORIES[system])
+                if n:
+                    seconds += n * (mean(own) if own else share * time_of_one(whole, system, model, setting, "raw"))
             if n_fits:
                 yield Lack(f"Figure 6: {system}, {setting}", model, n_fits, seconds)
 

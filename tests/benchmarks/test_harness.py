@@ -84,6 +84,15 @@ def test_what_is_older_than_a_day_is_measured_again_and_the_rest_stays(harness, 
     assert path.read_text() == before
 
 
+def test_rows_that_are_asked_for_again_are_measured_again(harness, tmp_path):
+    path = tmp_path / "t.csv"
+    harness.append([{"name": name, "value": 0, "date": "2026-03-03", "more": 0} for name in ("a", "bb")], path)
+    cells = [Cell("a"), Cell("bb")]
+    assert harness.run_missing(cells, dated_row_of, path, 1, str, again=lambda row: row["name"] == "bb") == 0
+    assert {row["name"]: row["value"] for row in harness.read(path)} == {"a": "0", "bb": "2"}
+    assert len(harness.read(path)) == 2
+
+
 @pytest.fixture
 def interruptible():
     """Also in the background of a shell, whose jobs ignore Ctrl-C."""

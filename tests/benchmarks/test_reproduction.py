@@ -44,14 +44,16 @@ def test_a_place_without_a_function_or_a_number_is_seen():
     said = filled("# A\n\n{{containing acrobot EVGP-IF skevgp}}", results).split(" / ")[1]
     assert said == f"{numbers[:, 3].mean():.3f}"
     cell = {"system": "iiwa14", "setting": "skevgp", "n_trajectories": "60", "size": "full"}
-    shares = [
-        float(row["cr2"])
+    own = [
+        [float(row["cr1"]), float(row["cr2"])]
         for row in read(RESULTS / "learning_curves.csv")
         if cell.items() <= row.items() and row["model"].startswith("EVGP")
     ]
+    (low1, low2), (high1, high2) = np.min(own, axis=0), np.max(own, axis=0)
     said = filled("# A\n\n{{containing_with iiwa14 skevgp 60 EVGP-IF EVGP-IFG}}", results).split("\n")[-1]
-    assert said == f"{min(shares):.2f} to {max(shares):.2f}"
-    assert len(shares) == 8
+    assert said == f"{low1:.2f} to {high1:.2f} and {low2:.2f} to {high2:.2f}"
+    assert len(own) == 8
+    assert filled("# A\n\n{{containing_with iiwa14 skevgp 1 EVGP-IF}}", results).endswith(MISSING)
     assert filled("# A\n\n{{paper iiwa14 EVGP-IFG error cr2}}", results).endswith("\n0.027 / 0.480")
 
 
@@ -176,6 +178,13 @@ def test_what_is_still_to_be_run_is_counted_and_timed():
     fewer = without(curves, {"system": "cartpole", "model": "VGP", "setting": "skevgp", "n_trajectories": "24"})
     slow = without(table, {"system": "cartpole", "model": "VGP", "setting": "skevgp"}, {"fit_seconds": "3600"})
     assert said(slow, fewer) == [["Figure 6: cartpole, skevgp", "VGP 4", "2.0"], ["all", "4", "2.0"]]
+    # One of so many rows tells more than one of all of them.
+    one = fit("cartpole", "VGP", "skevgp", 0, n_trajectories="24", fit_seconds="7200")
+    assert said(slow, [*fewer, one]) == [["Figure 6: cartpole, skevgp", "VGP 3", "6.0"], ["all", "3", "6.0"]]
+    # A network is at rest after its last epoch, and not before.
+    network = {"system": "cartpole", "model": "RES-DBNN", "setting": "skevgp", "seed": "0", "angles": "raw"}
+    for n_iter, n_fits in (("1000", "0"), ("100", "1")):
+        assert said(without(table, network, {"converged": "False", "n_iter": n_iter}))[-1][1] == n_fits
     # From the author's starts a fit stops where it does; by --max-iter it is cut short.
     authors = {"system": "pendulum", "model": "VGP", "setting": "author"}
     assert said(without(table, authors, {"converged": "False"}))[-1][1] == "0"

@@ -63,7 +63,9 @@ def test_it_runs_and_resumes(run, tmp_path):
         assert float(row["error_mean"]) == pytest.approx(prediction_error(test.target, mean), rel=1e-6)
         assert float(row["std_norm"]) == pytest.approx(std_norm(std), rel=1e-6)
         assert (row["max_iter"], row["converged"]) == ("2", "False")
-    assert "limited by `--max-iter`: pendulum 2." in page.read_text()
+    assert "epochs: 4 of pendulum EVGP-IFG skevgp after 2 iterations." in page.read_text()
+    assert "0 of 2 cells" in run("--limited")  # of the first run
+    assert len(read(table)) == 4
     assert picture.stat().st_size > 10_000
 
 
@@ -107,6 +109,7 @@ def test_the_page_tells_means_and_ranges_and_checks_the_claims():
     assert "| pendulum | EVGP-IF | 1.00 (× 2.00) | 0.00 (× 1.00) | yes | yes |" in page
     assert "Not so: nowhere." in page
     assert "0 of 19 fits did not end by themselves." in page
+    assert "Ended by a limit" not in page
     worse = "\n".join(paragraphs(made_up(EVGP_IF={100: [1.0], 400: [0.5]}, EVGP_IFG={100: [0.5], 400: [1.5]})))
     assert "Not so: pendulum with 400 rows (1.50 against 0.500)." in worse
     assert "| pendulum | EVGP-IF | 0.500 (× 2.00) | -1.00 (× 0.333) | reversed | reversed |" in worse
@@ -135,7 +138,10 @@ def test_each_panel_draws_medians_quartiles_limits_and_the_papers_points(drawn, 
     rows += [{**row, "system": "acrobot"} for row in rows if row["n_rows"] == "100"]
     rows[0]["converged"] = "False"
     (figure,) = drawn(plot, rows, tmp_path / "curves.png")
-    assert [axes.get_title() for axes in figure.axes] == ["pendulum (1 to 3 runs)", "acrobot (1 to 3 runs)"]
+    assert [axes.get_title() for axes in figure.axes] == [
+        "pendulum (3 runs; VGP, EVGP-IFG fewer)",
+        "acrobot (3 runs; EVGP-IFG fewer)",
+    ]
     for axes in figure.axes:
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("training rows", "test Error (SI units)")
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
@@ -163,5 +169,7 @@ def test_each_setting_has_a_picture(drawn, tmp_path):
     rows = made_up(EVGP_IFG={100: [1.0, 2.0], 400: [0.5, 0.5]})
     paper = [{**row, "setting": "paper"} for row in rows if row["seed"] == "0"]
     figures = drawn(plot, rows + paper, tmp_path / "curves.png")
+    texts = [{text.get_text() for text in figure.legends[0].get_texts()} for figure in figures]
+    assert texts == [{"EVGP-IFG", "in the paper, with all rows"}] * 2
     assert [figure.axes[0].get_title() for figure in figures] == ["pendulum (2 runs)", "pendulum (1 run)"]
     assert {path.name for path in tmp_path.iterdir()} == {"curves.png", "curves_paper.png"}
