@@ -101,7 +101,7 @@ def paragraphs(rows: list[Row], output: Path) -> list[str]:
         seeds = sorted({row["seed"] for row in own}, key=int)
         parts += [
             f"## {system}",
-            f"![b of the {system}]({picture_of(output, system).name})",
+            pictures_text(own, picture_of(output, system)),
             f"Shown: {'means over seeds' if len(seeds) > 1 else 'seed'} {', '.join(seeds)}. The weights of positions "
             "on the next velocities:",
             in_question(own),
@@ -135,11 +135,11 @@ def in_question(rows: list[Row]) -> str:
                 lines.append(
                     [
                         *(SETTINGS[setting], model, f"({velocity}, {feature})", mean_and_error(mean)),
-                        *(figure_of(std.mean()), f"{(mean / std).mean():+.1f}"),
+                        figure_of(std.mean()),
                         *(mean_and_error(tables[name][at]) for name in ("least_squares", "least_squares_of_gp")),
                     ]
                 )
-    header = ["setting", "model", "entry", "b", "std", "b / std", "least squares", "GP"]
+    header = ["setting", "model", "entry", "b", "std", "least squares", "GP"]
     return table(header, lines)
 
 
@@ -220,7 +220,8 @@ def iterations(rows: list[Row]) -> str:
         own = [row for row in rows if row["setting"] == setting]
         most = " to ".join(dict.fromkeys(str(f(column(own, "n_iter").astype(int))) for f in (np.min, np.max)))
         limits = sorted({row["max_iter"] for row in own} - {""}, key=int)
-        said.append(f"{SETTINGS[setting]} {most}" + (f" (limited to {', '.join(limits)})" if limits else ""))
+        limit = f" (limited to {', '.join(limits)})" if limits else ""
+        said.append(f"{most}{limit} in {SETTINGS[setting]}")
     return "; ".join(said)
 
 
@@ -233,14 +234,28 @@ def panels_of(rows: list[Row]) -> list[tuple[str, str, str]]:
     """Lines of the picture: title, setting and column of the CSV. The first two are the same in all settings."""
     settings = settings_of(rows)
     first = settings[0]
-    # Of many settings, standard deviations are shown for the two that differ most.
-    posteriors = settings if len(settings) < 3 else [settings[0], settings[-1]]
     return [
         ("Prior mean", first, "prior_mean"),
         ("Least squares, features alone", first, "least_squares"),
         *((f"b, {SETTINGS[setting]}", setting, "mean") for setting in settings),
-        *((f"Posterior std, {SETTINGS[setting]}", setting, "std") for setting in posteriors),
+        *((f"std, {SETTINGS[setting]}", setting, "std") for setting in settings),
     ]
+
+
+def pictures_of(rows: list[Row], path: Path) -> dict[Path, list[Row]]:
+    """The rows of each picture: that of the author's settings is one of its own, with "_author" behind the name."""
+    own: dict[Path, list[Row]] = {}
+    for row in rows:
+        is_authors = row["setting"].startswith("author")
+        own.setdefault(path.with_stem(f"{path.stem}_author") if is_authors else path, []).append(row)
+    return own
+
+
+def pictures_text(rows: list[Row], path: Path) -> str:
+    """The first, and a link to the other, in Markdown."""
+    first, *others = sorted(pictures_of(rows, path))
+    links = "".join(f"\n\nThe same in the author's settings: [`{other.name}`]({other.name})." for other in others)
+    return f"![b of the {rows[0]['system']}]({first.name}){links}"
 
 
 def plot(rows: list[Row], path: Path) -> None:
@@ -251,8 +266,14 @@ def plot(rows: list[Row], path: Path) -> None:
     rows : list of dict
         Of the CSV, of one system.
     path : Path
-        Of the PNG.
+        Of the PNG; the author's settings have "_author" behind its name.
     """
+    for own_path, own in pictures_of(rows, path).items():
+        plot_settings(own, own_path)
+
+
+def plot_settings(rows: list[Row], path: Path) -> None:
+    """One of its pictures."""
     from matplotlib.colors import LinearSegmentedColormap, LogNorm, SymLogNorm
 
     models, lines = sorted({row["model"] for row in rows}), panels_of(rows)
@@ -291,8 +312,8 @@ def plot(rows: list[Row], path: Path) -> None:
     n_seeds = len({row["seed"] for row in rows})
     said = f"means over {n_seeds} seeds" if n_seeds > 1 else "one seed"
     if is_written(rows):
-        said += ", ± standard deviation between seeds" * (n_seeds > 1) + "; framed: what would imitate gravity"
-    lines = f"{rows[0]['system']}: {said}", f"b: posterior mean; iterations: {iterations(rows)}"
+        said += ", ± standard error" * (n_seeds > 1) + "; framed: what would imitate gravity"
+    lines = f"{rows[0]['system']}: {said}", f"b, std: posterior; iterations: {iterations(rows)}"
     figure.suptitle("\n".join(textwrap.fill(line, 100) for line in lines))
     save_picture(figure, path)
 
@@ -303,7 +324,7 @@ def is_written(rows: list[Row]) -> bool:
 
 
 def heat_map(axes: Any, rows: list[Row], value: str, colours: Any, norm: Any) -> None:
-    """Of a column's means over seeds, with their standard deviation between seeds where there is room."""
+    """Of a column's means over seeds, with their standard error where there is room."""
     from matplotlib.patches import Rectangle
 
     values, outputs, features = matrix(rows, value), names(rows, "output"), names(rows, "feature")
@@ -321,8 +342,8 @@ def heat_map(axes: Any, rows: list[Row], value: str, colours: Any, norm: Any) ->
         dark = 0.3 * red + 0.59 * green + 0.11 * blue < 0.5
         text = written(mean[o, j])
         if len(values) > 1 and value in ("mean", "least_squares"):
-            text += f"\n±{written(values[:, o, j].std(ddof=1))}"
-        axes.text(j, o, text, ha="center", va="center", fontsize=7.5, linespacing=1.0, color="w" if dark else "k")
+            text += f"\n±{written(values[:, o, j].std(ddof=1) / np.sqrt(len(values)))}"
+        axes.text(j, o, text, ha="center", va="center", fontsize=8.5, linespacing=1.0, color="w" if dark else "k")
     for velocity, position in positions(rows) if value in ("mean", "least_squares") else ():
         corner = features.index(position) - 0.48, outputs.index(velocity) - 0.48
         axes.add_patch(Rectangle(corner, 0.96, 0.96, fill=False, edgecolor="k", linewidth=1.2))

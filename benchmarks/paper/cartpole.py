@@ -7,6 +7,7 @@ a picture of the Errors. Data and columns are those of results_table.py.
     python benchmarks/paper/cartpole.py                                     # all, two data sets: an hour of one core
     python benchmarks/paper/cartpole.py --quick                             # few rows and iterations: two minutes
     python benchmarks/paper/cartpole.py --variants "L-BFGS" --seeds 4       # one line on more data sets: four minutes
+    python benchmarks/paper/cartpole.py --systems cartpole_damped --variants Adam "skevgp's defaults" --seeds 4
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ from skevgp.solvers import Adam
 
 MODELS = ("EVGP-IFG", "EVGP-IF")
 ADAM, LBFGS, DEFAULTS = "Adam", "L-BFGS", "skevgp's defaults"
+SHARED = f"{LBFGS}, full posterior, all shared"
 
 
 def adam(**options: Any) -> dict[str, Any]:
@@ -38,7 +40,8 @@ def adam(**options: Any) -> dict[str, Any]:
     return {"solver": Adam(**options)}
 
 
-# What differs from the paper's setting (Adam, diagonal posterior, inducing points per output).
+# What differs from the paper's setting (Adam, diagonal posterior, inducing points per output), of the last one from
+# skevgp's.
 VARIANTS: dict[str, dict[str, Any]] = {
     ADAM: {},
     f"{ADAM}, 40,000 steps": {"max_iter": 40_000},
@@ -52,9 +55,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     f"{LBFGS}, full posterior": {"solver": "lbfgs", "posterior": "full"},
     f"{LBFGS}, a kernel per output": {"solver": "lbfgs", "sharing": "none"},
     f"{LBFGS}, full posterior, a kernel per output": {"solver": "lbfgs", "posterior": "full", "sharing": "none"},
-    DEFAULTS: {"solver": "lbfgs", "posterior": "full", "sharing": "all"},
-    f"{DEFAULTS}, 120 points": {"solver": "lbfgs", "posterior": "full", "sharing": "all", "n_inducing": 120},
+    SHARED: {"solver": "lbfgs", "posterior": "full", "sharing": "all"},
+    f"{SHARED}, 120 points": {"solver": "lbfgs", "posterior": "full", "sharing": "all", "n_inducing": 120},
+    DEFAULTS: {},
 }
+SYSTEMS = ("cartpole", "cartpole_damped")
 QUICK_ITERATIONS = 50
 
 
@@ -64,12 +69,13 @@ class Cell:
 
     Attributes
     ----------
-    variant, model : str
+    system, variant, model : str
     seed : int
         Of data and fit.
     size : {"full", "quick"}
     """
 
+    system: str
     variant: str
     model: str
     seed: int
@@ -81,19 +87,20 @@ def run(cell: Cell) -> dict[str, Any]:
     changes = dict(VARIANTS[cell.variant])
     if cell.size == "quick":
         changes["max_iter"] = QUICK_ITERATIONS
-    fit = Fit("cartpole", cell.model, "paper", cell.seed, cell.size, None)
-    train, test = results_table.data("cartpole", cell.seed, 0.0, cell.size)
+    setting = "skevgp" if cell.variant.startswith(DEFAULTS) else "paper"
+    fit = Fit(cell.system, cell.model, setting, cell.seed, cell.size, None)
+    train, test = results_table.data(cell.system, cell.seed, 0.0, cell.size)
     row = {"variant": cell.variant, **fitted_row(fit, train, test, changes)}
     del row["setting"]  # the variant says it
     return row
 
 
-def groups(rows: list[Row]) -> Iterator[tuple[str, str, list[Row]]]:
-    """Model, variant and its rows."""
-    for model, variant in itertools.product(MODELS, VARIANTS):
-        own = [row for row in rows if (row["model"], row["variant"]) == (model, variant)]
+def groups(rows: list[Row]) -> Iterator[tuple[tuple[str, str], str, list[Row]]]:
+    """System and model, variant and its rows."""
+    for system, model, variant in itertools.product(SYSTEMS, MODELS, VARIANTS):
+        own = [row for row in rows if (row["system"], row["model"], row["variant"]) == (system, model, variant)]
         if own:
-            yield model, variant, own
+            yield (system, model), variant, own
 
 
 def paragraphs(rows: list[Row]) -> list[str]:
@@ -118,14 +125,15 @@ def paragraphs(rows: list[Row]) -> list[str]:
     ]
     if rows[0]["size"] == "quick":
         parts.append("**A quick run**: few rows and iterations, not to be compared with the paper.")
-    for model in dict.fromkeys(model for model, _, _ in groups(rows)):
-        parts += [f"## {model}", table_of(rows, model), f"In the paper: {PAPER['cartpole'][model].error:.3f}."]
+    for system, model in dict.fromkeys(place for place, _, _ in groups(rows)):
+        parts += [f"## {system}: {model}", table_of(rows, system, model)]
+        parts += [f"In the paper: {PAPER['cartpole'][model].error:.3f}."]
     return parts
 
 
-def table_of(rows: list[Row], model: str) -> str:
+def table_of(rows: list[Row], system: str, model: str) -> str:
     """A line per variant of one model; what has fewer data sets is compared with Adam on these."""
-    of_model = {variant: own for own_model, variant, own in groups(rows) if own_model == model}
+    of_model = {variant: own for place, variant, own in groups(rows) if place == (system, model)}
     adam = {row["seed"]: float(row["error_mean"]) for row in of_model.get(ADAM, [])}
     lines = []
     for variant, unordered in of_model.items():
@@ -149,7 +157,7 @@ def table_of(rows: list[Row], model: str) -> str:
 
 
 def plot(rows: list[Row], path: Path) -> None:
-    """A panel per model, a line per variant, a symbol per data set and their median; across, the paper's Error.
+    """A panel per system and model, a line per variant, a symbol per data set, their median; across, the paper's Error.
 
     Parameters
     ----------
@@ -158,15 +166,15 @@ def plot(rows: list[Row], path: Path) -> None:
     path : Path
         Of the PNG.
     """
-    models = list(dict.fromkeys(model for model, _, _ in groups(rows)))
+    places = list(dict.fromkeys(place for place, _, _ in groups(rows)))
     variants = [variant for variant in VARIANTS if any(variant == row["variant"] for row in rows)]
     size = (WIDTH, 1.3 + 0.27 * len(variants))
-    figure, grid = pyplot().subplots(1, len(models), figsize=size, squeeze=False, sharex=True, sharey=True)
+    figure, grid = pyplot().subplots(1, len(places), figsize=size, squeeze=False, sharex=True, sharey=True)
     seeds = sorted({int(row["seed"]) for row in rows})
     styles = dict(zip(seeds, itertools.cycle(zip(PALETTE, "os^Dv<", strict=True)), strict=False))
-    for axes, model in zip(grid[0], models, strict=True):
-        for own_model, variant, own in groups(rows):
-            if own_model != model:
+    for axes, (system, model) in zip(grid[0], places, strict=True):
+        for where, variant, own in groups(rows):
+            if where != (system, model):
                 continue
             place = variants.index(variant)
             for row in own:
@@ -177,7 +185,7 @@ def plot(rows: list[Row], path: Path) -> None:
                 axes.plot(np.median(column(own, "error_mean")), place, "k|", markersize=14, markeredgewidth=2)
         axes.axvline(PAPER["cartpole"][model].error, color="0.3", linestyle="--", linewidth=1.2, label="in the paper")
         logarithmic(axes, "x")
-        axes.set(title=model, xlabel="test Error (SI units)")
+        axes.set(title=f"{system}\n{model}", xlabel="test Error\n(SI units)")
     axes = grid[0, 0]
     axes.set_yticks(range(len(variants)), variants)
     axes.set_ylim(len(variants) - 0.5, -0.5)
@@ -195,7 +203,11 @@ def say(row: dict[str, Any]) -> str:
 
 def main() -> None:
     parser = harness.argument_parser(
-        __doc__, quick="12 trajectories, few iterations and one seed", seeds="seeds 0, 1, ...; default: 2, quick 1"
+        __doc__,
+        quick="12 trajectories, few iterations and one seed",
+        seeds="seeds 0, 1, ...; default: 2, quick 1",
+        systems=SYSTEMS,
+        default_systems=SYSTEMS[:1],
     )
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: both")
     parser.add_argument("--variants", nargs="+", choices=VARIANTS, default=list(VARIANTS), help="default: all")
@@ -204,8 +216,10 @@ def main() -> None:
     output = harness.output_path(options, "cartpole")
     n_seeds = options.seeds or (1 if options.quick else 2)
     cells = [
-        Cell(variant, model, seed, size)
-        for seed, model, variant in itertools.product(range(n_seeds), options.models, options.variants)
+        Cell(system, variant, model, seed, size)
+        for system, seed, model, variant in itertools.product(
+            options.systems, range(n_seeds), options.models, options.variants
+        )
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -62,8 +63,8 @@ PANELS = (
     ("Time with more outputs or layers", "outputs o, or the network's hidden layers L", "milliseconds", (1,)),
     ("Space of wider models", "inducing points m, or the network's units n", "megabytes", (1, 2)),
 )
-NOTES = f"""Behind each name its exponent; grey: slopes 1, 2 and 3; bound: with its gradient; a parameter: 8 bytes
-What is not varied: N = {MANY:,}, m = 100, o = 4, n = 100, L = 2"""
+NOTES = f"""Behind each name its exponent, fitted to the sizes that are not pale; bound: with its gradient
+What is not varied: N = {MANY:,}, m = 100, o = 4, n = 100, L = 2; a parameter: 8 bytes"""
 
 
 def by_cell(rows: list[Row]) -> dict[tuple[str, ...], Row]:
@@ -284,7 +285,7 @@ def explanations(curves: tuple[Curve, ...], rows: list[Row]) -> list[str]:
 
 
 def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
-    """Four panels: measurements, exponents in the legends, thin lines of whole slopes.
+    """Four panels: measurements, exponents in the legends, grey lines of whole slopes.
 
     Parameters
     ----------
@@ -295,7 +296,7 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
     """
     figure, grid = pyplot().subplots(2, 2, figsize=(WIDTH, 7.0))
     for panel, (axes, (title, xlabel, ylabel, slopes)) in enumerate(zip(grid.flat, PANELS, strict=True)):
-        shown, corner = [own for own in curves if own.panel == panel], np.zeros(2)
+        shown = [own for own in curves if own.panel == panel]
         axes.set_visible(bool(shown))
         if not shown:
             continue
@@ -303,23 +304,29 @@ def plot(curves: tuple[Curve, ...], rows: list[Row], path: Path) -> None:
             sizes, values = curve.points(rows)
             values = values * {"seconds": 1e3, "n_bytes": 1e-6, "n_parameters": 8e-6}[curve.value]
             (colour, marker), dotted = STYLES[curve.what, curve.setting], curve.few or curve.value == "n_parameters"
-            axes.plot(
-                *(sizes, values, marker),
-                linestyle=":" if dotted else "-",
-                color=colour,
-                markerfacecolor="white" if dotted else colour,
-                label=f"{curve.label}: {two_digits(curve.exponent(rows)[0])}",
-            )
-            corner = np.maximum(corner, [sizes[-1], values.max()])
+            how = {"marker": marker, "linestyle": ":" if dotted else "-", "color": colour}
+            how["markerfacecolor"] = "white" if dotted else colour
+            axes.plot(sizes, values, alpha=0.35, **how)
+            fitted = sizes >= curve.above
+            label = f"{curve.label}: {two_digits(curve.exponent(rows)[0])}"
+            axes.plot(sizes[fitted], values[fitted], label=label, **how)
         for which in "xy":
             logarithmic(axes, which)
         low, high = axes.get_ylim()
-        ends = np.array([axes.get_xlim()[0], corner[0]])
-        for slope in slopes:
-            line = 1.5 * corner[1] * (ends / corner[0]) ** slope
-            axes.plot(ends, line, color="0.6", linewidth=0.8, zorder=0)
         axes.set_ylim(low, high * (high / low) ** (0.1 + 0.075 * len(shown)))  # room for the legend
         axes.set(title=title, xlabel=xlabel, ylabel=ylabel)
         axes.legend(loc="upper left", handlelength=2.2, borderaxespad=0.2)
+        slope_lines(axes, slopes)
     figure.suptitle(NOTES)
     save_picture(figure, path)
+
+
+def slope_lines(axes: Any, slopes: tuple[int, ...]) -> None:
+    """Grey, each with its number, in the corner below the curves."""
+    (left, right), (low, high) = np.log10(axes.get_xlim()), np.log10(axes.get_ylim())
+    ends = left + (right - left) * np.array([0.68, 0.85])
+    for slope in slopes:
+        line = low + 0.04 * (high - low) + slope * (ends - ends[0])
+        axes.plot(10**ends, 10**line, color="0.4", linewidth=1.0, scalex=False, scaley=False)
+        where = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 8}
+        axes.annotate(f"slope {slope}", (10 ** ends[1], 10 ** line[1]), color="0.4", **where)

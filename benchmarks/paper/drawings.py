@@ -262,7 +262,7 @@ def systems(path: Path) -> None:
     figure, grid = pyplot().subplots(2, 2, figsize=(WIDTH, 5.9), height_ratios=(1.0, 1.25))
     notes = {
         "pendulum": "torque u, viscous friction",
-        "cartpole": "force u on the cart",
+        "cartpole": "force u on the cart\ncartpole_damped: viscous friction, too",
         "acrobot": "torque u at the elbow, viscous friction",
         "iiwa14": "a torque about each of seven axes",
     }
@@ -360,7 +360,7 @@ def model(path: Path) -> None:
     for axes, sign in zip(grid[1:], "+=", strict=True):
         axes.text(-0.07, 0.5, sign, transform=axes.transAxes, fontsize=20, ha="center", va="center")
     legend(figure, "lower", ncols=5)
-    grid[0].set(xticks=range(-2, 9, 2), ylim=(-25, 40), ylabel="y")
+    grid[0].set(xticks=range(-2, 9, 2), ylabel="y")
     save_picture(figure, path)
 
 

@@ -101,9 +101,9 @@ def claims_table(results: Results) -> str:
     return claims.summary(results.verdicts)
 
 
-def tried(results: Results, model: str) -> str:
+def tried(results: Results, system: str, model: str) -> str:
     """A line per variant of the cartpole's fit."""
-    return cartpole.table_of(results.variants, model)
+    return cartpole.table_of(results.variants, system, model)
 
 
 def calibration(results: Results) -> str:
@@ -138,6 +138,47 @@ def marks(results: Results) -> str:
     return results_table_report.MARKS
 
 
+def takes(results: Results, name: str, *conditions: str) -> str:
+    """Processor time of a benchmark's fits, of rows with some values: "setting=paper,skevgp"."""
+    wanted = {column: values.split(",") for column, _, values in (text.partition("=") for text in conditions)}
+    rows = [row for row in results.rows(name) if all(row[column] in values for column, values in wanted.items())]
+    # A fit that has several rows tells its time in each.
+    seconds = sum({float(row["fit_seconds"]) for row in rows})
+    return (f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.0f} min") if rows else MISSING
+
+
+def odds(results: Results, setting: str, *without: str) -> str:
+    """How many times likelier the paper's Errors are on the damped cartpole than on the other, without some models."""
+    cases = ["cartpole", "cartpole_damped"]
+    sums = [
+        sum(value for model, value in own.items() if model not in without)
+        for own in results_table_report.closeness(results.table, cases, setting).values()
+    ]
+    return figure_of(float(np.exp(sums[1] - sums[0]))) if len(sums) == len(cases) else MISSING
+
+
+def wrapped_below(results: Results, *settings: str) -> str:
+    """How many times the cartpoles' Errors with wrapped angles are below the paper's, of all models but the network."""
+    times = [
+        results_table_report.published(case, model).error / float(of(own, "error_mean").mean())
+        for (case, model, setting), own in results.table.items()
+        if case.startswith("cartpole") and WRAPPED in case and model != "RES-DBNN" and setting in settings
+    ]
+    return f"{min(times):,.0f} to {max(times):,.0f}" if times else MISSING
+
+
+def error_rows(results: Results, noise: str, system: str, kind: str, which: str) -> str:
+    """Of a kind of test rows: their share "of_rows", "of_error" (lowest to highest of the data sets), or a mean."""
+    wanted = (system, kind, noise)
+    own = [row for row in results.rows("error_rows") if (row["system"], row["kind"], row["noise"]) == wanted]
+    if not own:
+        return MISSING
+    if which == "of_error":
+        return " to ".join(dict.fromkeys(f"{f(of(own, which)):.0%}" for f in (np.min, np.max)))
+    mean = float(np.nanmean(of(own, which)))
+    return f"{mean:.1%}" if which == "of_rows" else figure_of(mean)
+
+
 def outside_share(results: Results, system: str, setting: str, *models: str) -> str:
     """What part of an Error rows outside the training range make, of the data sets' the lowest and the highest."""
     shares = [
@@ -152,7 +193,9 @@ def outside_share(results: Results, system: str, setting: str, *models: str) -> 
 def containing(results: Results, system: str, model: str, setting: str) -> str:
     """Without noise: CR-1 to 3, means over data sets."""
     own = results.table.get((system, model, setting))
-    return " / ".join(f"{of(own, f'cr{k}').mean():.3f}" for k in (1, 2, 3)) if own else MISSING
+    if not own:
+        return MISSING
+    return " / ".join(f"{of(own, f'cr{k}').mean():.3f}" for k in (1, 2, 3)) + results_table_report.marks(own)
 
 
 def containing_with(results: Results, system: str, setting: str, n_trajectories: str, *models: str) -> str:
@@ -205,9 +248,10 @@ def n_parameters(results: Results, system: str, model: str, setting: str) -> str
     return f"{max(of(own, 'n_parameters')):,.0f}" if own else MISSING
 
 
-def variant(results: Results, name: str, model: str, which: str = "error_mean") -> str:
-    """A column of what was tried on the cartpole, its mean over data sets."""
-    own = [row for row in results.variants if (row["variant"], row["model"]) == (name, model)]
+def variant(results: Results, system: str, name: str, model: str, which: str = "error_mean") -> str:
+    """A column of what was tried on a cartpole, its mean over data sets."""
+    wanted = (system, name, model)
+    own = [row for row in results.variants if (row["system"], row["variant"], row["model"]) == wanted]
     return figure_of(float(of(own, which).mean())) if own else MISSING
 
 
@@ -216,7 +260,7 @@ FILLERS: dict[str, Callable[..., str]] = {
     for function in (
         *(errors, unfinished, which_cartpole, outside, claims_table, tried, calibration),
         *(error, spread, paper, held, n_parameters, variant, marks, outside_share, containing, containing_with),
-        network,
+        *(network, takes, odds, wrapped_below, error_rows),
     )
 }
 

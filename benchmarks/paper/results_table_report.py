@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import norm
+from scipy.stats import t as student
 
 from harness import Row, figure_of, provenance_text, table
 from harness import column as of
@@ -274,9 +274,11 @@ def which_cartpole(groups: Groups) -> Iterator[str]:
         scores = closeness(groups, cases, setting)
         if len(scores) > 1:
             yield (
-                "Log likelihood of the paper's Error of each model, nats (log Error is normal over data sets, with "
-                "their mean and scatter, and a factor of 1.5 for what the paper does not say; of readings and models "
-                "with two data sets and more, without those of which an output was not learned):"
+                "How likely the paper's Error of each model is under each reading: its logarithm, nats. Over data sets "
+                "log Error is taken as normal, its mean and scatter as what ours tell (so a Student's t), widened by a "
+                "factor of 1.5 for what the paper does not say. The models share their data sets, so that their sum "
+                "counts the same evidence several times: it says too much. Left out are readings with fewer than three "
+                "models, and models that not all readings have on two data sets or of which an output was not learned."
             )
             common = list(next(iter(scores.values())))
             best = max(sum(own.values()) for own in scores.values())
@@ -313,10 +315,10 @@ def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, dict[
 
 
 def likelihood(error: float, own: list[Row]) -> float:
-    """The logarithm of it, of one Error."""
+    """The logarithm of it, of one Error: a few data sets tell mean and scatter, so that it is a Student's t."""
     errors = np.log(of(own, "error_mean"))
     scale = np.hypot(errors.std(ddof=1) * np.sqrt(1.0 + 1.0 / len(errors)), UNSAID)
-    return float(norm.logpdf(np.log(error), errors.mean(), scale))
+    return float(student.logpdf(np.log(error), len(errors) - 1, errors.mean(), scale))
 
 
 def outside(groups: Groups) -> Iterator[str]:

@@ -128,17 +128,34 @@ def test_the_picture_has_prior_least_squares_and_posterior_of_each_model_and_col
     at = 2, 0  # the next dq1 from q1
     assert plain.images[0].get_array()[at] == pytest.approx(-0.2)  # mean of -0.1 and -0.3
     assert gravity.images[0].get_array()[at] == pytest.approx(-0.1)
-    assert "-.200\n±.141" in {text.get_text() for text in plain.texts}
+    assert "-.200\n±.100" in {text.get_text() for text in plain.texts}
     assert len(plain.patches) == 2  # frames
     assert not maps[0].patches
     bars = [axes.get_ylabel() for axes in figure.axes if axes not in maps]
     assert bars == ["weight (SI units)", "std (SI units)"]
     title = figure.get_suptitle()
-    assert "means over 2 seeds, ± standard deviation between seeds" in title
-    assert "paper's setting 7 (limited to 7)" in title
+    assert "means over 2 seeds, ± standard error" in title
+    assert "7 (limited to 7) in paper's setting" in title
     # .063 and .164 were hard to tell apart.
     brightness = plain.images[0].to_rgba(np.array([0.063, 0.164]))[:, :3] @ (0.3, 0.59, 0.11)
     assert np.diff(brightness) < -0.15
+
+
+def test_the_authors_settings_have_a_picture_of_their_own(drawn, tmp_path):
+    from paper import beta_report
+
+    given = {"system": "acrobot", "prior_mean": "0", "n_iter": "7", "max_iter": ""}
+    rows = [{**row, **given, "setting": setting} for setting in beta_report.SETTINGS for row in fits({})]
+    figures = drawn(beta_report.plot, rows, tmp_path / "b.png")
+    assert {path.name for path in tmp_path.iterdir()} == {"b.png", "b_author.png"}
+    titles = [{axes.get_title() for axes in figure.axes if axes.images} for figure in figures]
+    for own, settings in zip(titles, (("paper", "skevgp"), ("author", "author-100")), strict=True):
+        said = {f"{what}, {beta_report.SETTINGS[setting]}" for setting in settings for what in ("b", "std")}
+        said |= {"prior mean", "least squares, features alone"}
+        assert own == {f"{model}: {what}" for what in said for model in ("EVGP-IF", "EVGP-IFG")}
+    text = beta_report.pictures_text(rows, tmp_path / "b.png")
+    assert text.startswith("![b of the acrobot](b.png)\n\n")
+    assert "(b_author.png)" in text
 
 
 @pytest.mark.parametrize(

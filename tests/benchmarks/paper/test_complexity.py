@@ -132,6 +132,13 @@ def test_the_picture_has_four_panels_with_units(drawn, tmp_path):
     for panel, (axes, (title, xlabel, ylabel, slopes)) in enumerate(zip(figure.axes, PANELS, strict=True)):
         assert (axes.get_title(), axes.get_xlabel(), axes.get_ylabel()) == (title, xlabel, ylabel)
         shown = [curve for curve in CURVES if curve.panel == panel]
-        assert len(axes.lines) == len(shown) + len(slopes)
+        # Each from its smallest size, pale, and from where its exponent begins.
+        assert len(axes.lines) == 2 * len(shown) + len(slopes)
+        for curve, pale, fitted in zip(shown, axes.lines[::2], axes.lines[1::2], strict=False):
+            assert min(pale.get_xdata()) < min(fitted.get_xdata()) == curve.above
+        for slope, text, line in zip(slopes, axes.texts, axes.lines[-len(slopes) :], strict=True):
+            assert text.get_text() == f"slope {slope}"
+            rise, run = (np.ptp(np.log(values)) for values in (line.get_ydata(), line.get_xdata()))
+            assert rise / run == pytest.approx(slope)
         assert len(axes.get_legend().get_texts()) == len(shown) == len({curve.label for curve in shown}) <= 5
         assert axes.lines[0].get_ydata()[0] == pytest.approx(10.0 if ylabel == "milliseconds" else 1.0)

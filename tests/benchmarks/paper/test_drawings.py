@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib import pyplot
 from numpy.testing import assert_allclose
 
 from skevgp.features import LinkGravity
@@ -14,8 +15,33 @@ def drawings(benchmarks):
     return drawings
 
 
+@pytest.fixture
+def strokes(drawings, monkeypatch):
+    """Draw a system; gives the start and end of its arrows, by colour, and the points of its arcs, by label."""
+
+    def strokes(name):
+        arrows, arcs = {}, {}
+        how = {
+            "arrow": lambda axes, start, end, colour, *_: arrows.setdefault(colour, []).append((start, end)),
+            "arc": lambda axes, points, colour, label, place: arcs.update({label: points}),
+        }
+        for stroke, keep in how.items():
+            monkeypatch.setattr(drawings, stroke, keep)
+        figure, axes = pyplot.subplots()
+        getattr(drawings, name)(axes)
+        pyplot.close(figure)
+        return arrows, arcs
+
+    return strokes
+
+
 def texts(axes):
     return {text.get_text() for text in axes.texts}
+
+
+def beside(q, joint):
+    """A position a little further."""
+    return np.array(q) + 1e-6 * np.eye(len(q))[joint]
 
 
 def test_planar_systems_turn_as_their_equations_say(drawings):
@@ -75,11 +101,50 @@ def test_the_four_systems_are_drawn_with_their_numbers(drawings, drawn, tmp_path
     for name, tip in tips.items():
         balls = [line.get_xydata()[0] for line in panels[name].lines if line.get_markersize() > 15]
         assert_allclose(balls, [tip])
-    for text in (text for axes in panels.values() for text in axes.texts):  # nothing is cut off
+    assert "cartpole_damped: viscous friction" in panels["cartpole"].get_title()
+    words = [text for axes in panels.values() for text in (*axes.texts, axes.title)]
+    for text in (*words, *figure.texts):  # nothing is cut off
         (left, low), (right, high) = text.get_window_extent().get_points()
         assert min(left, low) > 0.0, text.get_text()
         assert right < figure.bbox.width, text.get_text()
         assert high < figure.bbox.height, text.get_text()
+
+
+@pytest.mark.parametrize(
+    ("name", "joint", "labels"),
+    [("pendulum", 0, {"q", "u"}), ("cartpole", 1, {"θ"}), ("acrobot", 0, {"$q_1$"}), ("acrobot", 1, {"$q_2$", "u"})],
+)
+def test_round_arrows_turn_as_a_growing_angle_turns_the_link(drawings, strokes, name, joint, labels):
+    q = drawings.POSES[name]
+    center = drawings.chain(name, q).origins[joint, ::2]
+    links = [drawings.chain(name, p).centers[joint, ::2] for p in (q, beside(q, joint))]
+
+    def sense(start, end):
+        return np.sign(np.linalg.det([start - center, end - center]))
+
+    _, arcs = strokes(name)
+    for label in labels:
+        assert sense(arcs[label][0], arcs[label][1]) == sense(*links), label
+
+
+def test_the_carts_arrows_show_where_it_goes(drawings, strokes):
+    q = drawings.POSES["cartpole"]
+    before, after = (drawings.chain("cartpole", p).origins[0, ::2] for p in (q, beside(q, 0)))
+    arrows, _ = strokes("cartpole")
+    for colour in (drawings.BLUE, drawings.ORANGE):
+        ((start, end),) = arrows[colour]
+        assert_allclose((end - start) / np.linalg.norm(end - start), (after - before) / 1e-6, atol=1e-6)
+
+
+def test_the_arms_arrows_are_the_axes_about_which_it_turns(drawings, strokes):
+    q = drawings.POSES["iiwa14"]
+    arrows, _ = strokes("iiwa14")
+    page = drawings.camera(-30.0, 18.0).T
+    for joint, (start, end) in enumerate(arrows[drawings.BLUE]):
+        before, after = (drawings.chain("iiwa14", p).rotations[joint] for p in (q, beside(q, joint)))
+        turn = (after @ before.T - np.eye(3)) / 1e-6  # by the right hand about the axis
+        assert_allclose(end - start, 0.15 * np.array([turn[2, 1], turn[0, 2], turn[1, 0]]) @ page, atol=1e-6)
+    assert len(arrows[drawings.BLUE]) == 7
 
 
 def test_the_link_is_drawn_with_both_levers(drawings, drawn, tmp_path):
@@ -97,6 +162,10 @@ def test_the_two_parts_of_the_model_add_up(drawings, drawn, tmp_path):
     assert_allclose(known + left, both, atol=1e-12)
     assert np.ptp(np.diff(known)) < 1e-9  # a line
     assert [axes.get_xlabel() for axes in figure.axes] == ["x"] * 3
+    low, high = figure.axes[0].get_ylim()
+    for axes in figure.axes:  # no band is cut off
+        ends = axes.collections[0].get_datalim(axes.transData).intervaly
+        assert low < min(ends) < max(ends) < high
     crosses = next(line for line in figure.axes[1].lines if line.get_label() == "inducing points")
     assert len(crosses.get_xdata()) == 10
 

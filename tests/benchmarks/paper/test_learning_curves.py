@@ -107,6 +107,8 @@ def test_the_page_tells_means_and_ranges_and_checks_the_claims():
     assert "| pendulum | 0.50 | *0.97* | 0.24 | 0.35 | 0.50 |" in page
     assert "| pendulum | RES-DBNN | 8.00 (× 9.00) | 0.250 (× 2.00) | yes | yes |" in page
     assert "| pendulum | EVGP-IF | 1.00 (× 2.00) | 0.00 (× 1.00) | yes | yes |" in page
+    assert "asks that all runs agree" in page  # of claims.md, whose verdicts are stricter
+    assert "rows inside the training range" in page
     assert "Not so: nowhere." in page
     assert "0 of 19 fits did not end by themselves." in page
     assert "Ended by a limit" not in page
@@ -139,8 +141,8 @@ def test_each_panel_draws_medians_quartiles_limits_and_the_papers_points(drawn, 
     rows[0]["converged"] = "False"
     (figure,) = drawn(plot, rows, tmp_path / "curves.png")
     assert [axes.get_title() for axes in figure.axes] == [
-        "pendulum (3 runs; VGP, EVGP-IFG fewer)",
-        "acrobot (3 runs; EVGP-IFG fewer)",
+        "pendulum (3 runs; VGP fewer at 400; EVGP-IFG fewer at 100, 400)",
+        "acrobot (3 runs; EVGP-IFG fewer at 100)",
     ]
     for axes in figure.axes:
         assert (axes.get_xlabel(), axes.get_ylabel()) == ("training rows", "test Error (SI units)")

@@ -211,6 +211,17 @@ def test_the_likelier_cartpole_is_the_one_with_the_papers_errors():
     assert [set(own) for own in closeness(groups, cases, "paper").values()] == [set(close) - {"VGP"}] * 2
 
 
+def test_two_data_sets_tell_little_of_their_scatter():
+    from paper.results_table_report import UNSAID, likelihood
+
+    # Student's t of one degree is Cauchy's distribution.
+    rows = [{"error_mean": str(np.exp(value))} for value in (-1.0, 1.0)]
+    scale = np.sqrt(2.0 * 1.5 + UNSAID**2)
+    for error in (0.1, 1.0, 30.0):
+        density = 1.0 / (np.pi * scale * (1.0 + (np.log(error) / scale) ** 2))
+        assert likelihood(error, rows) == pytest.approx(np.log(density))
+
+
 def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
     from paper.results_table_report import both
 
@@ -245,7 +256,57 @@ def test_the_picture_tells_limited_unlearned_and_few_fits(drawn, tmp_path):
     assert hollow == {0.3: False, 0.2: True, 0.01: True}
     crossed = [line.get_ydata()[0] for line in axes.lines if line.get_marker() == "x"]
     assert crossed == [pytest.approx(0.01)]
-    assert [text.get_text() for text in axes.texts] == ["3"]
+    (number,) = axes.texts
+    assert number.get_text() == "3"
+    # Below all that is drawn.
+    drawn_above = axes.transData.inverted().transform(number.get_window_extent())[1, 1]
+    assert drawn_above < min(min(line.get_ydata()) for line in axes.lines if len(line.get_ydata()))
+
+
+def test_the_legend_is_in_a_panel_that_is_free(drawn, tmp_path):
+    from paper.results_table_plots import plot
+
+    rows = [
+        {
+            **{"system": system, "model": "VGP", "setting": "paper", "seed": str(seed), "angles": "raw"},
+            **{"noise": "0.0", "size": "full", "error_mean": "0.1", "error_inside": "0.01", "max_iter": ""},
+            **{"n_iter": "9", "converged": "True", "unlearned": "0"},
+        }
+        for system in ("pendulum", "cartpole", "acrobot")
+        for seed in range(4)
+    ]
+    (figure,) = drawn(plot, rows, tmp_path / "table.png")
+    free = figure.axes[-1].get_window_extent()
+    box = figure.legends[0].get_window_extent()
+    assert not figure.axes[-1].axison
+    assert free.x0 < box.x0 < box.x1 < free.x1 + 1.0
+    assert free.y0 < box.y0 < box.y1 < free.y1
+
+
+def test_the_picture_of_noise_has_a_panel_for_each_setting_of_one_scale(drawn, tmp_path):
+    from paper.models import PROMISED
+    from paper.results_table_plots import COLOURS, plot
+
+    settings = {"pendulum": ("skevgp", "skevgp-angles"), "acrobot": ("skevgp",)}
+    rows = [
+        {
+            **{"system": system, "model": model, "setting": setting, "seed": "0", "angles": "raw", "noise": "0.01"},
+            **{"size": "full", "max_iter": "", "n_iter": "9", "converged": str(model != "VGP")},
+            **{f"within_{share}": str(share + 0.2 * (model == "VGP")) for share in PROMISED},
+        }
+        for system, own in settings.items()
+        for setting in own
+        for model in ("VGP", "EVGP-IFG")
+    ]
+    (figure,) = drawn(plot, rows, tmp_path / "noise.png")
+    panels = {axes.get_title(): axes for axes in figure.axes if axes.axison}
+    assert list(panels) == ["pendulum, skevgp", "pendulum, skevgp-angles", "acrobot, skevgp"]
+    assert len({axes.get_ylim() for axes in panels.values()}) == 1
+    for axes in panels.values():
+        lines = {line.get_color(): line for line in axes.lines if len(line.get_xdata()) == len(PROMISED)}
+        np.testing.assert_allclose(lines[COLOURS["VGP"]].get_ydata(), 0.2)
+        np.testing.assert_allclose(lines[COLOURS["EVGP-IFG"]].get_ydata(), 0.0)
+        assert [line.get_markerfacecolor() == "white" for line in lines.values()] == [True, False]
 
 
 def messages_of_early_ends():
