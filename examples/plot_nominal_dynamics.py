@@ -141,13 +141,13 @@ move = test.groups == 0
 seconds = test.dt * (1 + np.arange(move.sum()))
 for name in names:
     mean, std = (part[move, output] for part in predictions[name])
-    ax.plot(seconds, np.abs(mean - test.target[move, output]), color=colours[name], label=f"{name}: |error|")
+    ax.plot(seconds, np.abs(mean - test.target[move, output]), color=colours[name], label=name)
     ax.plot(seconds, 2 * std, color=colours[name], linestyle=":", label=f"{name}: 2 std")
 ax.set_yscale("log")
 ax.set_ylim(top=20 * ax.get_ylim()[1])  # room for the legend
 ax.set_xlabel("time (s)")
-ax.set_ylabel(f"{test.target_names[output]} (rad/s)")
-ax.set_title("One-step predictions along a test move")
+ax.set_ylabel(f"|error| of {test.target_names[output]} (rad/s)")
+ax.set_title("One-step errors along a test move")
 
 ax = axes[1, 1]
 parts = (nominal.coef_, nominal.coef_std_, nominal.coef_prior_mean_, nominal.coef_prior_scale_)

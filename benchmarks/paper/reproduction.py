@@ -144,7 +144,12 @@ def takes(results: Results, name: str, *conditions: str) -> str:
     rows = [row for row in results.rows(name) if all(row[column] in values for column, values in wanted.items())]
     # A fit that has several rows tells its time in each.
     seconds = sum({float(row["fit_seconds"]) for row in rows})
-    return (f"{seconds / 3600:.1f} h" if seconds >= 3600 else f"{seconds / 60:.0f} min") if rows else MISSING
+    if not rows:
+        return MISSING
+    unit, length = next(
+        pair for pair in (("h", 3600.0), ("min", 60.0), ("s", 1.0)) if seconds >= pair[1] or pair[0] == "s"
+    )
+    return f"{seconds / length:.{int(unit == 'h')}f} {unit}"
 
 
 def odds(results: Results, setting: str, *without: str) -> str:

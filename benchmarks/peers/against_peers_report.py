@@ -11,10 +11,11 @@ from harness import WIDTH, Row, column, figure_of, legend, logarithmic, pyplot, 
 
 # Whose last bound and NLPD the others are timed against.
 REFERENCE = ("GPflow SGPR", "none")
-# Okabe & Ito's colours: told apart with any colour vision.
+# Okabe & Ito's colours: told apart with any colour vision. Beside skevgp's default its "none" is not drawn: it is
+# the same fit once more there.
 STYLES = {
     ("skevgp", "none"): ("#0072B2", "-", "skevgp"),
-    ("skevgp", "default"): ("#56B4E9", "-", "skevgp, default sharing"),
+    ("skevgp", "default"): ("#0072B2", "-", "skevgp"),
     ("skevgp", "all"): ("#56B4E9", "--", "skevgp, shared"),
     ("skevgp, same limit", "none"): ("#0072B2", ":", "skevgp, 120 iterations"),
     ("GPflow SGPR", "none"): ("#D55E00", "-", "GPflow SGPR"),
@@ -24,7 +25,8 @@ STYLES = {
     ("GPJax SGPR", "none"): ("#CC79A7", "-", "GPJax SGPR"),
     ("scikit-learn GPR", "none"): ("#555555", "-", "scikit-learn GPR, up to 1,500 rows"),
 }
-LINEAR = "scikit-learn BayesianRidge"
+NOTES = """Seconds are the processor's, not those on the wall; bound: the highest so far, of skevgp before calibration
+Models of one output each are fitted one after the other: they have a bound once the last has begun"""
 # The curve's bounds are rounded to 0.001 nats.
 _ROUNDING = 0.01
 
@@ -222,10 +224,9 @@ def draw(rows: list[Row], curves: Curve, path: Path) -> None:
         own = _own(done, dataset=dataset)
         first = min(own, key=lambda row: int(row["seed"]))["seed"]
         own, on_the_way = _own(own, seed=first), _own(curves, dataset=dataset, seed=first)
-        limited = {(row["peer"], row["sharing"]) for row in own if "iterations" in row["stop"]}
-        linear = _done(_own(rows, dataset=dataset, seed=first, peer=LINEAR))
-        _panel(bound, on_the_way, "bound", limited, None)
-        _panel(nlpd, on_the_way, "nlpd", limited, float(linear[0]["nlpd"]) if linear else None)
+        limited = {(row["peer"], row["sharing"]) for row in own if set(row["stop"].split()) != {"converged"}}
+        _panel(bound, on_the_way, "bound", limited)
+        _panel(nlpd, on_the_way, "nlpd", limited)
         # Of the sparse ones: an exact GP has one for each of its rows.
         points = " or ".join(dict.fromkeys(row["m"] for row in own if not row["peer"].startswith("scikit-learn")))
         for axes, what in ((bound, "bound"), (nlpd, "test NLPD")):
@@ -234,30 +235,31 @@ def draw(rows: list[Row], curves: Curve, path: Path) -> None:
     for axes in grid[-1]:
         axes.set_xlabel("seconds of the processor, all threads")
     grid[-1, -1].plot([], [], "o", color="0.3", label="converged")
-    grid[-1, -1].plot([], [], "o", color="0.3", markerfacecolor="white", label="ended by its limit of iterations")
-    note = "Models of one output each are fitted one after the other: they have a bound once the last has begun"
-    legend(figure, ncols=3, title=note)
+    grid[-1, -1].plot([], [], "o", color="0.3", markerfacecolor="white", label="ended by a limit of iterations")
+    legend(figure, ncols=3, title=NOTES)
     save_picture(figure, path)
 
 
-def _panel(axes: Any, curves: Curve, name: str, limited: set[tuple[str, str]], linear: float | None) -> None:
+def _panel(axes: Any, curves: Curve, name: str, limited: set[tuple[str, str]]) -> None:
     """The best so far of the bound, and NLPD as it was; hollow ends are those of a limit."""
     ends = []
     for (peer, sharing), (colour, line, label) in STYLES.items():
         own = [row for row in _own(curves, peer=peer, sharing=sharing) if row[f"{name}_so_far"] not in ("", "nan")]
-        if not own:
+        twice = (peer, sharing) == ("skevgp", "none") and _own(curves, peer=peer, sharing="default")
+        if twice or not own:
             continue
         # Each look at skevgp is a fit of its own: what was sooner by one clock may be later by the other.
         own.sort(key=lambda row: float(row["cpu_seconds_so_far"]))
         seconds, values = column(own, "cpu_seconds_so_far"), column(own, f"{name}_so_far")
         if name == "bound":
             values = np.maximum.accumulate(values) / int(own[0]["n_train"])
-        axes.plot(seconds, values, line, color=colour, label=label)
         face = "white" if (peer, sharing) in limited else colour
-        axes.plot(seconds[-1], values[-1], "o", color=colour, markerfacecolor=face, zorder=4)
+        marker = "o" if len(own) > 1 else "D"
+        (shown,) = axes.plot(seconds[-1], values[-1], marker, color=colour, markerfacecolor=face, zorder=4)
+        if len(own) > 1:
+            (shown,) = axes.plot(seconds, values, line, color=colour)
+        shown.set_label(label)
         ends.append(values[-1])
-    if linear is not None and np.isfinite(linear):
-        axes.axhline(linear, color="#999999", linestyle=":", linewidth=1.2, label="BayesianRidge")
     logarithmic(axes, "x")
     axes.tick_params(labelbottom=True)
     if ends:

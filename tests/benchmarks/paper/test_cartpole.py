@@ -33,7 +33,7 @@ def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
     page = output.with_suffix(".md").read_text()
     assert f"| L-BFGS, full posterior\\* | {error:#.3g} ({error:#.3g}) |" in page
     assert "In the paper: 0.011." in page
-    assert "EVGP-IF\n" not in page
+    assert "cartpole: EVGP-IF\n" not in page
     assert output.with_suffix(".png").stat().st_size > 5_000
 
 
@@ -44,6 +44,26 @@ def test_variants_change_parameters_that_exist():
         EVGPRegressor().set_params(**changes)
 
 
+def test_skevgps_defaults_are_the_regressors(monkeypatch):
+    from paper import cartpole, models
+
+    built = {}
+
+    def keep(fit, train, test, changes):
+        built[fit.model] = models.build(fit).set_params(**changes)
+        return {"setting": fit.setting, "system": fit.system}
+
+    monkeypatch.setattr(cartpole, "fitted_row", keep)
+    monkeypatch.setattr(cartpole.results_table, "data", lambda *_: (None, None))
+    for variant, same in ((cartpole.DEFAULTS, True), (cartpole.SHARED, False)):
+        row = cartpole.run(cartpole.Cell("cartpole_damped", variant, "EVGP-IFG", 0, "full"))
+        assert row == {"variant": variant, "system": "cartpole_damped"}
+        own = built["EVGP-IFG"].get_params(deep=False)
+        defaults = EVGPRegressor(own["feature_map"], n_inducing=60, random_state=0).get_params(deep=False)
+        assert (own == defaults) is same
+        assert own["feature_map"].robot == "cartpole_damped"
+
+
 def test_a_page_has_the_mean_of_data_sets_and_each():
     from paper.cartpole import paragraphs
 
@@ -51,6 +71,7 @@ def test_a_page_has_the_mean_of_data_sets_and_each():
     names = {
         "converged": "True",
         "variant": "Adam",
+        "system": "cartpole",
         "model": "EVGP-IF",
         "size": "full",
         "date": "today",
@@ -68,7 +89,7 @@ def test_the_picture_has_each_data_set_their_median_and_the_paper(drawn, tmp_pat
 
     rows = [
         {
-            **{"variant": variant, "model": model, "seed": str(seed), "error_mean": error},
+            **{"system": "cartpole", "variant": variant, "model": model, "seed": str(seed), "error_mean": error},
             **{"converged": str(seed < 2), "max_iter": "", "n_iter": "9"},
         }
         for variant in ("Adam", "L-BFGS")
@@ -76,9 +97,9 @@ def test_the_picture_has_each_data_set_their_median_and_the_paper(drawn, tmp_pat
         for seed, error in enumerate(("0.01", "0.03", "0.08"))
     ]
     (figure,) = drawn(plot, rows, tmp_path / "cart.png")
-    assert [axes.get_title() for axes in figure.axes] == list(MODELS)
+    assert [axes.get_title() for axes in figure.axes] == [f"cartpole\n{model}" for model in MODELS]
     for axes, paper in zip(figure.axes, (0.011, 0.016), strict=True):
-        assert axes.get_xlabel() == "test Error (SI units)"
+        assert axes.get_xlabel() == "test Error\n(SI units)"
         assert [tick.get_text() for tick in axes.get_yticklabels()] in (["Adam", "L-BFGS"], [])
         medians = [line.get_xdata() for line in axes.lines if line.get_marker() == "|" and len(line.get_xdata())]
         assert medians == [pytest.approx([0.03])] * 2

@@ -155,8 +155,9 @@ def test_a_variant_differs_from_the_standard_by_what_its_name_says():
         "first step 0.003": {"learning_rate_init": 0.003},
         "batches of 50": {"batch_size": 50},
         "twice as wide": {"hidden_layer_sizes": (100, 100)},
-        "early stopping": {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 1000},
+        "early stopping": {"early_stopping": True, "max_iter": 1000},
     }
+    assert parameters("early stopping")["n_iter_no_change"] == 30
 
 
 def test_what_is_tested_was_chosen_by_what_was_held_back():

@@ -197,4 +197,23 @@ def test_each_data_set_has_a_line_of_panels_in_which_fits_end_as_they_did(drawn,
     assert ends[0].get_ydata()[0] == -10.0 / 5000
     assert ends[0].get_xdata()[0] == 8.0  # of the processor
     labels = {text.get_text() for text in figure.legends[0].get_texts()}
-    assert labels == {"skevgp", "GPflow SGPR", "converged", "ended by its limit of iterations"}
+    assert labels == {"skevgp", "GPflow SGPR", "converged", "ended by a limit of iterations"}
+
+
+def test_a_fit_of_one_look_is_a_diamond_and_what_was_fitted_twice_is_drawn_once(drawn, tmp_path):
+    from peers.against_peers_report import draw
+
+    keys = (("skevgp", "none"), ("skevgp", "default"), ("scikit-learn GPR", "none"))
+    key = {"dataset": "kin40k", "m": "9", "n_train": "50", "seed": "0", "seconds": "4.0", "stop": "steps"}
+    rows = [{**key, "peer": peer, "sharing": sharing} for peer, sharing in keys]
+    curves = [
+        {**curve_row(seconds, -10.0, 0.1, row["peer"]), "sharing": row["sharing"]}
+        for row in rows
+        for seconds in ((4.0,) if row["peer"] == "scikit-learn GPR" else (1.0, 4.0))
+    ]
+    (figure,) = drawn(draw, rows, curves, tmp_path / "peers.png")
+    _, nlpd = figure.axes
+    assert [line.get_marker() for line in nlpd.lines] == ["o", "None", "D"] + ["o"] * 2  # and those of the legend
+    assert all(line.get_markerfacecolor() == "white" for line in nlpd.lines[:3:2])  # a limit of steps is a limit
+    texts = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert texts[:2] == ["skevgp", "scikit-learn GPR, up to 1,500 rows"]
