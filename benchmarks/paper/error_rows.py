@@ -3,7 +3,7 @@
 Fits it in skevgp's setting to the data of results_table.py, writes one row per fit and kind of test row to a CSV (what
 is there already is not fitted again), and a page beside it.
 
-    python benchmarks/paper/error_rows.py              # four systems, four seeds: two minutes of one core
+    python benchmarks/paper/error_rows.py              # four systems, four seeds: three minutes of one core
     python benchmarks/paper/error_rows.py --noise 0.01  # on training and test targets; in the same file
     python benchmarks/paper/error_rows.py --quick      # fewer rows and iterations, one seed
 """
