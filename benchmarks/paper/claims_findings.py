@@ -132,11 +132,6 @@ def best_of(own: dict[str, BySeed], models: Iterable[str]) -> str:
     return min(models, key=lambda model: mean_of(own[model]))
 
 
-def worst_of(own: dict[str, BySeed], models: Iterable[str]) -> str:
-    """Of some models that of the highest mean over data sets."""
-    return max(models, key=lambda model: mean_of(own[model]))
-
-
 def lower(first: BySeed, second: BySeed) -> bool | None:
     """Whether one model's Error is below another's, on the data sets that both have.
 
@@ -157,8 +152,15 @@ def together(holds: Sequence[bool | None]) -> bool | None:
 
 
 def lowest(own: dict[str, BySeed], wanted: Sequence[str]) -> bool | None:
-    """Whether the best of the wanted models, in the mean over data sets, is below the best of the others."""
-    return lower(own[best_of(own, wanted)], own[best_of(own, own.keys() - set(wanted))])
+    """Whether the best of the wanted models is below the best of the others, each the best of a data set."""
+    return lower(pick(own, wanted, min), pick(own, own.keys() - set(wanted), min))
+
+
+def pick(own: dict[str, BySeed], models: Iterable[str], by: Callable[[Iterable[float]], float]) -> BySeed:
+    """Of some models the lowest or highest value of each data set that all of these have."""
+    values = [own[model] for model in models]
+    seeds = set.intersection(*(set(one) for one in values))
+    return {seed: by([one[seed] for one in values]) for seed in sorted(seeds)}
 
 
 def compare(first: BySeed, second: BySeed, by: Callable[[float, float], float]) -> BySeed:

@@ -154,12 +154,16 @@ def takes(results: Results, name: str, *conditions: str) -> str:
 
 def odds(results: Results, setting: str, *without: str) -> str:
     """How many times likelier the paper's Errors are on the damped cartpole than on the other, without some models."""
-    cases = ["cartpole", "cartpole_damped"]
-    sums = [
-        sum(value for model, value in own.items() if model not in without)
-        for own in results_table_report.closeness(results.table, cases, setting).values()
+    cases = [
+        case for case in results_table_report.CARTPOLES if any(key[::2] == (case, setting) for key in results.table)
     ]
-    return figure_of(float(np.exp(sums[1] - sums[0]))) if len(sums) == len(cases) else MISSING
+    sums = {
+        case: sum(value for model, value in own.items() if model not in without)
+        for case, own in results_table_report.closeness(results.table, cases, setting).items()
+    }
+    if not {"cartpole", "cartpole_damped"} <= sums.keys():
+        return MISSING
+    return figure_of(float(np.exp(sums["cartpole_damped"] - sums["cartpole"])))
 
 
 def wrapped_below(results: Results, *settings: str) -> str:
@@ -173,11 +177,13 @@ def wrapped_below(results: Results, *settings: str) -> str:
 
 
 def error_rows(results: Results, noise: str, system: str, kind: str, which: str) -> str:
-    """Of a kind of test rows: their share "of_rows", "of_error" (lowest to highest of the data sets), or a mean."""
+    """Of a kind of test rows: their share "of_rows", of the Error of "each" data set, "of_error" (ends), or a mean."""
     wanted = (system, kind, noise)
     own = [row for row in results.rows("error_rows") if (row["system"], row["kind"], row["noise"]) == wanted]
     if not own:
         return MISSING
+    if which == "each":
+        return ", ".join(f"{share:.0%}" for share in of(sorted(own, key=lambda row: int(row["seed"])), "of_error"))
     if which == "of_error":
         return " to ".join(dict.fromkeys(f"{f(of(own, which)):.0%}" for f in (np.min, np.max)))
     mean = float(np.nanmean(of(own, which)))

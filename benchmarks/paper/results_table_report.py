@@ -6,7 +6,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import logsumexp
+from scipy.stats import chi2, norm
 
 from harness import Row, figure_of, provenance_text, table
 from harness import column as of
@@ -275,7 +276,7 @@ def which_cartpole(groups: Groups) -> Iterator[str]:
         if len(scores) > 1:
             yield (
                 "How likely the paper's Error of each model is under each reading: its logarithm, nats. Over data sets "
-                "log Error is taken as normal, its mean and scatter as what ours tell (so a Student's t), widened by a "
+                "log Error is taken as normal, with all means and variances that ours leave possible, and widened by a "
                 "factor of 1.5 for what the paper does not say. The models share their data sets, so that their sum "
                 "counts the same evidence several times: it says too much. Left out are readings with fewer than three "
                 "models, and models that not all readings have on two data sets or of which an output was not learned."
@@ -315,10 +316,13 @@ def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, dict[
 
 
 def likelihood(error: float, own: list[Row]) -> float:
-    """The logarithm of it, of one Error: a few data sets tell mean and scatter, so that it is a Student's t."""
+    """The logarithm of it, of one Error: normal, over all variances that the few data sets leave possible."""
     errors = np.log(of(own, "error_mean"))
-    scale = np.hypot(errors.std(ddof=1) * np.sqrt(1.0 + 1.0 / len(errors)), UNSAID)
-    return float(student.logpdf(np.log(error), len(errors) - 1, errors.mean(), scale))
+    n = len(errors)
+    shares = (np.arange(10_000) + 0.5) / 10_000
+    variances = errors.var(ddof=1) * (n - 1) / chi2.ppf(shares, n - 1)
+    scales = np.sqrt(variances * (1.0 + 1.0 / n) + UNSAID**2)
+    return float(logsumexp(norm.logpdf(np.log(error), errors.mean(), scales)) - np.log(len(shares)))
 
 
 def outside(groups: Groups) -> Iterator[str]:

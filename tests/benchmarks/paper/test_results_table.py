@@ -211,15 +211,23 @@ def test_the_likelier_cartpole_is_the_one_with_the_papers_errors():
     assert [set(own) for own in closeness(groups, cases, "paper").values()] == [set(close) - {"VGP"}] * 2
 
 
-def test_two_data_sets_tell_little_of_their_scatter():
+def test_two_data_sets_tell_little_of_their_scatter(monkeypatch):
+    from paper import results_table_report
     from paper.results_table_report import UNSAID, likelihood
 
-    # Student's t of one degree is Cauchy's distribution.
-    rows = [{"error_mean": str(np.exp(value))} for value in (-1.0, 1.0)]
-    scale = np.sqrt(2.0 * 1.5 + UNSAID**2)
+    def of_errors(*logarithms):
+        return [{"error_mean": str(np.exp(value))} for value in logarithms]
+
     for error in (0.1, 1.0, 30.0):
+        # Without scatter it is what the paper does not say.
+        density = np.exp(-0.5 * (np.log(error) / UNSAID) ** 2) / (np.sqrt(2 * np.pi) * UNSAID)
+        assert likelihood(error, of_errors(-1e-9, 1e-9)) == pytest.approx(np.log(density), rel=1e-3)
+    # Without that Student's t, which of one degree is Cauchy's distribution.
+    monkeypatch.setattr(results_table_report, "UNSAID", 0.0)
+    for error in (0.1, 1.0, 30.0):
+        scale = np.sqrt(2.0 * 1.5)
         density = 1.0 / (np.pi * scale * (1.0 + (np.log(error) / scale) ** 2))
-        assert likelihood(error, rows) == pytest.approx(np.log(density))
+        assert likelihood(error, of_errors(-1.0, 1.0)) == pytest.approx(np.log(density), abs=1e-3)
 
 
 def test_a_limited_cell_and_one_of_fewer_seeds_are_marked():
