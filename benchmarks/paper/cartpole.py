@@ -2,7 +2,8 @@
 
 Fits EVGP with the paper's features, inputs and number of inducing points, but other choices where the paper leaves one
 (of the last variant all are skevgp's defaults), and writes one row per fit to a CSV (what is there already is not
-fitted again); from the CSV come a Markdown table and a picture of the Errors. Data and columns are those of results_table.py.
+fitted again); from the CSV come a Markdown table and a picture of the Errors. Data and columns are those of
+results_table.py.
 
     python benchmarks/paper/cartpole.py                                     # all, two data sets: an hour of one core
     python benchmarks/paper/cartpole.py --quick                             # few rows and iterations: two minutes
