@@ -96,7 +96,7 @@ def network_is_poor(rows: list[Row]) -> Iterator[Finding]:
 
 def fewer_samples(rows: list[Row]) -> Iterator[Finding]:
     """With the last size but one, about half of the rows or less, the better of the two EVGPs has a lower Error than
-    the best of the other models with the most.
+    the best of the other models with the most; these are those of the lowest mean.
     """
     for system, setting, models in curves(rows):
         sizes = sizes_of(models)[-2:]

@@ -27,7 +27,7 @@ from sklearn.utils import Bunch
 import harness
 from harness import Row, column, figure_of
 from paper import results_table
-from paper.models import SYSTEMS, Fit, build, timed
+from paper.models import SYSTEMS, Fit, beyond_range, build, timed
 from skevgp.metrics import containing_ratios
 from skevgp.robots import layout_of
 
@@ -73,8 +73,8 @@ def kinds_of(system: str, train: np.ndarray, test: np.ndarray, errors: np.ndarra
     masks : dict
         Kind -> ndarray of bool of shape (n_test,).
     """
-    beyond = ((test < train.min(axis=0)) | (test > train.max(axis=0))).any(axis=1)
-    angles = test[:, : len(layout_of(system).revolute)][:, np.array(layout_of(system).revolute)]
+    beyond = beyond_range(train, test).any(axis=1)
+    angles = test[:, np.flatnonzero(layout_of(system).revolute)]  # positions come first
     turned = (np.abs(angles) > np.pi).any(axis=1)
     scaler = StandardScaler().fit(train)
     nearest = NearestNeighbors(n_neighbors=1).fit(scaler.transform(train))
@@ -141,7 +141,7 @@ def table_of(rows: Sequence[Row], noise: str) -> str:
                 [
                     *(system, kind, f"{column(own, 'of_rows').mean():.1%}"),
                     ", ".join(f"{share:.0%}" for share in column(own, "of_error")),
-                    *((figure_of(column(known, "error").mean()) if known else ""),),
+                    figure_of(column(known, "error").mean()) if known else "",
                     # Rows chosen by their error are outside of any bands.
                     *(f"{column(known, f'cr{k}').mean():.3f}" if known and kind != WORST else "" for k in (1, 2, 3)),
                 ]

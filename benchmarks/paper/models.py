@@ -225,6 +225,11 @@ def reliability(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[s
     return {f"within_{share}": ratio for share, ratio in zip(PROMISED, ratios, strict=True)}
 
 
+def beyond_range(train: np.ndarray, test: np.ndarray) -> np.ndarray:
+    """Which entries of test rows (n_test, d) lie beyond their column's range over training rows (n_train, d)."""
+    return (test < train.min(axis=0)) | (test > train.max(axis=0))
+
+
 def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
     """How the test rows fare whose columns all lie within the training rows' ranges, and which columns do not.
 
@@ -242,7 +247,7 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
         and how far they go: "1:31:3.02:8.31 1:4:-3.02:-3.7".
     """
     low, high = train.data.min(axis=0), train.data.max(axis=0)
-    beyond = (test.data < low) | (test.data > high)
+    beyond = beyond_range(train.data, test.data)
     inside = ~beyond.any(axis=1)
     return {
         "error_inside": errors[inside].mean() if inside.any() else np.nan,

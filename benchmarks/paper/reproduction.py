@@ -146,10 +146,9 @@ def takes(results: Results, name: str, *conditions: str) -> str:
     seconds = sum({float(row["fit_seconds"]) for row in rows})
     if not rows:
         return MISSING
-    unit, length = next(
-        pair for pair in (("h", 3600.0), ("min", 60.0), ("s", 1.0)) if seconds >= pair[1] or pair[0] == "s"
-    )
-    return f"{seconds / length:.{int(unit == 'h')}f} {unit}"
+    if seconds >= 3600.0:
+        return f"{seconds / 3600.0:.1f} h"
+    return f"{seconds / 60.0:.0f} min" if seconds >= 60.0 else f"{seconds:.0f} s"
 
 
 def odds(results: Results, setting: str, *without: str) -> str:
@@ -177,15 +176,13 @@ def wrapped_below(results: Results, *settings: str) -> str:
 
 
 def error_rows(results: Results, noise: str, system: str, kind: str, which: str) -> str:
-    """Of a kind of test rows: their share "of_rows", of the Error of "each" data set, "of_error" (ends), or a mean."""
+    """Of a kind of test rows: their share "of_rows", "of_error" of each data set, or a mean."""
     wanted = (system, kind, noise)
     own = [row for row in results.rows("error_rows") if (row["system"], row["kind"], row["noise"]) == wanted]
     if not own:
         return MISSING
-    if which == "each":
-        return ", ".join(f"{share:.0%}" for share in of(sorted(own, key=lambda row: int(row["seed"])), "of_error"))
     if which == "of_error":
-        return " to ".join(dict.fromkeys(f"{f(of(own, which)):.0%}" for f in (np.min, np.max)))
+        return ", ".join(f"{share:.0%}" for share in of(sorted(own, key=lambda row: int(row["seed"])), which))
     mean = float(np.nanmean(of(own, which)))
     return f"{mean:.1%}" if which == "of_rows" else figure_of(mean)
 

@@ -316,7 +316,11 @@ def closeness(groups: Groups, cases: list[str], setting: str) -> dict[str, dict[
 
 
 def likelihood(error: float, own: list[Row]) -> float:
-    """The logarithm of it, of one Error: normal, over all variances that the few data sets leave possible."""
+    """The logarithm of it, of one Error: normal, over all means and variances that the few data sets leave possible.
+
+    Without prior knowledge of both the mean is normal, and the variance inverse χ² with n - 1 degrees of freedom
+    (Gelman et al., Bayesian Data Analysis, 3.2).
+    """
     errors = np.log(of(own, "error_mean"))
     n = len(errors)
     shares = (np.arange(10_000) + 0.5) / 10_000

@@ -107,8 +107,8 @@ def test_inside_is_a_second_verdict_by_the_same_rule():
     assert [row["error_mean"] for row in inside_of(rows) if row["model"] == "EVGP-IFG"] == ["0.9"] * 3
     assert rows[0]["error_mean"] != inside_of(rows)[0]["error_mean"]  # the rows stay as they are
 
-    def found(rows, find=ifg_below_if):
-        own = verdict(Line("IFG is best", find), group(rows), group(inside_of(rows)))
+    def found(rows, find=ifg_below_if, of_errors=True):
+        own = verdict(Line("IFG is best", find, of_errors=of_errors), rows, group)
         (finding,) = own.findings
         return own, finding
 
@@ -127,7 +127,7 @@ def test_inside_is_a_second_verdict_by_the_same_rule():
     own, finding = found([{**row, "error_inside": "nan"} for row in rows])
     assert (finding.holds, finding.inside, finding.said_inside) == (True, None, "not measured")
     # What is not of Errors has one verdict.
-    own, finding = found(rows, low_std)
+    own, finding = found(rows, low_std, of_errors=False)
     assert (own.count("skevgp"), own.count("skevgp", inside=True), finding.said_inside) == ("1 / 0 / 0", "", "")
 
 
