@@ -1,21 +1,16 @@
-"""The architecture: who imports what, and how large a folder, a module and a function may be."""
+"""The architecture: who imports what."""
 
 import ast
 import sys
-import threading
-from collections import Counter
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
 import grimp
-import numpy as np
 import pytest
 from importlinter.cli import EXIT_STATUS_SUCCESS, lint_imports
 
 import skevgp
-from skevgp.inference.objectives import BoundObjective
-from skevgp.solvers import LBFGS
 
 PACKAGE = Path(skevgp.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
@@ -115,15 +110,6 @@ def private_names_of_other_folders(tree, module):
     yield from private_attributes(tree, bound)
 
 
-def lengths_of_functions(tree):
-    """The lines of each function, nested ones with it, without its docstring."""
-    for node in ast.walk(tree):
-        if isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef)):
-            first = node.body[0]
-            told = first.end_lineno - first.lineno + 1 if ast.get_docstring(node) is not None else 0
-            yield node.name, node.end_lineno - node.lineno + 1 - told
-
-
 @each_module
 def test_a_module_loads_required_packages_only(module):
     assert set(imports_at_load(parsed(module))) <= REQUIRED | sys.stdlib_module_names
@@ -140,26 +126,6 @@ def test_private_names_stay_in_their_folder(module):
     assert not set(private_names_of_other_folders(parsed(module), module))
 
 
-@each_module
-def test_no_module_is_above_400_lines(module):
-    assert len(module.read_text(encoding="utf-8").splitlines()) <= 400
-
-
-@each_module
-def test_no_function_is_above_60_lines_without_its_docstring(module):
-    assert not {name: length for name, length in lengths_of_functions(parsed(module)) if length > 60}
-
-
-def test_no_folder_has_more_than_9_modules():
-    sizes = Counter(module.parent.relative_to(PACKAGE).as_posix() for module in MODULES if module.stem != "__init__")
-    assert sizes.pop(".") > 0
-    assert not {folder: size for folder, size in sizes.items() if size > 9}
-
-
-def test_the_papers_folder_has_at_most_8_files():
-    assert len(list((PACKAGE / "inference").glob("*.py"))) <= 8
-
-
 def test_no_modules_import_each_other():
     graph = grimp.build_graph("skevgp", exclude_type_checking_imports=True, cache_dir=None)
     arrows = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
@@ -167,62 +133,6 @@ def test_no_modules_import_each_other():
     assert arrows["skevgp.regressor"]
     with pytest.raises(CycleError):
         TopologicalSorter({**arrows, "skevgp._linalg": {"skevgp.regressor"}}).prepare()
-
-
-# --- the walk of a fit -------------------------------------------------------------------------------------------
-
-
-def own_frames(frame):
-    """The package's functions on the way to here, the first one first."""
-    found = []
-    while frame is not None:
-        if Path(frame.f_code.co_filename).is_relative_to(PACKAGE):
-            found.append(frame.f_code.co_qualname)
-        frame = frame.f_back
-    return found[::-1]
-
-
-class Walked(LBFGS):
-    """Writes down the way to each evaluation of the bound: in its own thread, and in the one that waits for it."""
-
-    def objective(self, task, table, n_rows=None):
-        objective, main = super().objective(task, table, n_rows), threading.main_thread().ident
-        assert isinstance(objective, BoundObjective)
-
-        def walked(x):
-            here = own_frames(sys._getframe(1))
-            waiting = [] if threading.get_ident() == main else own_frames(sys._current_frames()[main])
-            self.ways.append((waiting, here))
-            return objective(x)
-
-        return walked
-
-
-def ways(**arguments):
-    rng = np.random.RandomState(0)
-    solver, X = Walked(), rng.randn(60, 2)
-    solver.ways = []
-    model = skevgp.EVGPRegressor(n_inducing=5, solver=solver, tol=10.0, random_state=0, **arguments)
-    model.fit(X, np.column_stack([np.sin(X[:, 0]), X[:, 1] ** 2]))
-    assert len(solver.ways) > model.n_iter_
-    return solver.ways
-
-
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none", [[1], [0]], "auto"], ids=str)
-def test_the_walk_of_a_fit_to_the_bound_is_short(sharing):
-    for waiting, way in ways(sharing=sharing):
-        assert waiting == []
-        assert way[0] == "EVGPRegressor.fit"
-        assert len(way) <= 8, way
-
-
-def test_the_walk_of_fits_in_threads_is_no_longer():
-    """The worker's functions, and those that wait for it in the main thread."""
-    found = ways(sharing="none", n_jobs=2)
-    assert any(waiting for waiting, _ in found)
-    for waiting, way in found:
-        assert waiting[0] == "EVGPRegressor.fit"
-        assert len(waiting) + len(way) <= 8, (waiting, way)
 
 
 # --- tests mirror the house --------------------------------------------------------------------------------------
@@ -300,13 +210,6 @@ def test_private_names_of_scikit_learn_are_found(source, found):
 )
 def test_private_names_of_other_folders_are_found(source, found):
     assert set(private_names_of_other_folders(ast.parse(source), HERE)) == found
-
-
-def test_lengths_of_functions_are_counted():
-    source = (
-        'def f(\n    a,\n):\n    """Of two\n\n    lines."""\n\n    async def g():\n        return 1\n\n    return g\n'
-    )
-    assert dict(lengths_of_functions(ast.parse(source))) == {"f": 8, "g": 2}
 
 
 _RUNS_CODE = {
