@@ -139,8 +139,7 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
         noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
         if return_cov is not False:
             rows = self._inputs_and_features(given, array, slice(None))
-            mean, cov = self._predictor.covariance(*rows)
-            cov = cov + np.eye(len(array))[:, :, np.newaxis] * noise
+            mean, cov = self._predictor.covariance(*rows, noise)
             if return_cov == "joint":
                 return like_y(mean), self._predictor.jointly(cov, *rows)
             return like_y(mean), like_y(cov)
@@ -191,25 +190,11 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
             raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
         if not hasattr(self, "_predictor"):
             return self._before_fit(X).sample_y(X, n_samples, random_state, include_noise)
-        rng = check_random_state(random_state)
-        mean, cov = self.predict(X, return_cov=True, include_noise=include_noise)
-        single = mean.ndim == 1
-        mean, cov = mean.reshape(len(mean), -1), cov.reshape(len(mean), len(mean), -1)
-        common = np.empty((0, *mean.shape))
-        if self._predictor.shared:
-            given, array, _ = self._validated(X)
-            common = self._predictor.common(*self._inputs_and_features(given, array, slice(None)))
-        # Of outputs that share their weights, what comes from these is one draw; all else is independent.
-        weights = rng.standard_normal((len(common), n_samples))
-        samples = np.stack(
-            [
-                rng.multivariate_normal(mean[:, o], cov[:, :, o] - own.T @ own, n_samples, check_valid="ignore").T
-                + own.T @ weights
-                for o, own in enumerate(np.moveaxis(common, 2, 0))
-            ],
-            axis=1,
-        )
-        return samples[:, 0] if single else samples
+        given, array, _ = self._validated(X)
+        rows = self._inputs_and_features(given, array, slice(None))
+        noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
+        samples = self._predictor.sample(*rows, noise, n_samples, check_random_state(random_state))
+        return samples[:, 0] if samples.shape[1] == 1 else samples
 
     def _check_gradient_of(self, theta: ArrayLike | None, eval_gradient: bool) -> None:
         check_fitted(self)

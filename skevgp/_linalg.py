@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from math import isfinite
 
 import numpy as np
-from scipy.linalg import blas, lapack
+from scipy.linalg import blas, eigh, lapack
 
 # The largest relative jitter that is tried before a matrix counts as not finite or hopelessly indefinite.
 MAX_JITTER = 1e-2
@@ -92,6 +92,32 @@ def jittered_cholesky(
         jitter = max(10.0 * jitter, 1e-15)
         if jitter > most:
             raise NotPositiveDefiniteError(f"not positive definite with a relative jitter of {most}")
+
+
+def covariance_root(covariance: np.ndarray) -> np.ndarray:
+    """A root F of a covariance matrix that rounding errors may have made indefinite.
+
+    F is the Cholesky factor where there is one. Else F Fᵀ is the nearest positive semi-definite matrix (Higham 1988,
+    "Computing a nearest symmetric positive semidefinite matrix"), with its rows and columns scaled so that the diagonal
+    stays: without its negative eigenvalues a matrix has a larger one.
+
+    Parameters
+    ----------
+    covariance : ndarray of shape (n, n)
+        Symmetric but for rounding, with a diagonal that is nowhere negative.
+
+    Returns
+    -------
+    root : ndarray of shape (n, n)
+    """
+    factor, info = lapack.dpotrf(covariance.T, lower=0, clean=1)
+    if info == 0 and isfinite(factor.trace()):
+        return factor.T
+    values, vectors = eigh(covariance, check_finite=False)
+    root = vectors * np.sqrt(np.maximum(values, 0.0))
+    sizes = np.einsum("ij,ij->i", root, root)
+    shrink = np.divide(diagonal_of(covariance), sizes, out=np.zeros(len(sizes)), where=sizes > 0.0)
+    return root * np.sqrt(shrink)[:, np.newaxis]
 
 
 def diagonal_of(matrix: np.ndarray) -> np.ndarray:

@@ -197,7 +197,7 @@ def _open_group(
 
 def _unexplained(diagonal: Any, squares: Any) -> Any:
     """What the inducing points leave of k̃(x, x)."""
-    return casadi().fmax(diagonal * (1.0 - _ROUNDING) - squares, 0.0)
+    return casadi().fmax(diagonal - squares, _ROUNDING * diagonal)
 
 
 def _sums_of(sizes: list[int]) -> np.ndarray:

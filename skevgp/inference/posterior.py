@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .._linalg import diagonal_of, times_lower
+from .._linalg import covariance_root, diagonal_of, times_lower
 from ..rows.source import Columns, of_outputs, times_weights
 from .statistics import Kernel, Whitening
 
@@ -130,12 +130,12 @@ class PredictorGroup:
         return replace(self, signal=self.signal * factor**2, mean=self.mean * by, root=self.root * by[:, np.newaxis])
 
     def project(self, prepared: object, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row."""
+        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row, not below its rounding error."""
         m = len(self.points)
         P = np.empty((m + features.shape[1], len(features)))
         V = self.whitening.solve(prepared, out=P[:m])
         P[m:] = features.T
-        return P, self.whitening.unexplained(prepared, V)
+        return P, self.whitening.remaining(prepared, V)
 
 
 class Projected(NamedTuple):
@@ -149,7 +149,7 @@ class Projected(NamedTuple):
     P : ndarray of shape (m + p, n)
         [V; Hᵀ].
     unexplained : ndarray of shape (n,)
-        k̃(x, x) - |v|².
+        k̃(x, x) - |v|², not below its rounding error.
     """
 
     inputs: np.ndarray
@@ -255,17 +255,81 @@ class Predictor:
         mean += self.intercept
         return mean, self.in_order(variances).T if return_variance else None
 
-    def covariance(self, inputs: np.ndarray, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, o) of the noise-free g(x), and its covariance between rows (n, n, o), of each output."""
-        mean, _ = self.predict(inputs, features)
-        outputs, covariance = np.arange(len(self.noise)), np.empty((len(mean), *mean.shape))
-        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
-            P, V = own.P, own.P[: len(group.points)]
-            unexplained = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix() - V.T @ V
-            for output, signal, root in zip(outputs[group.outputs], group.signal, group.root, strict=True):
-                deviation = root @ P
-                covariance[:, :, output] = signal * unexplained + deviation.T @ deviation
+    def covariance(
+        self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float = 0.0
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Mean (n, o) of g(x), and its covariance between rows (n, n, o), of each output.
+
+        The diagonal is what `predict` says of the variance, and nothing is indefinite by more than rounding.
+
+        Parameters
+        ----------
+        inputs, features : ndarray
+            As of `predict`.
+        noise : ndarray of shape (o,) or float, default=0.0
+            A variance of each row by itself: with σ² it is the covariance of y.
+
+        Returns
+        -------
+        mean : ndarray of shape (n, o)
+        covariance : ndarray of shape (n, n, o)
+        """
+        mean, own, common = self._own_covariances(inputs, features, noise)
+        covariance = np.empty((len(mean), *mean.shape))
+        for output, (matrix, shared) in enumerate(zip(own, common, strict=True)):
+            root = covariance_root(matrix)
+            found = root @ root.T
+            diagonal_of(found)[...] = diagonal_of(matrix)
+            covariance[:, :, output] = found + shared.T @ shared
         return mean, covariance
+
+    def sample(
+        self,
+        inputs: np.ndarray,
+        features: np.ndarray,
+        noise: np.ndarray | float,
+        n_samples: int,
+        rng: np.random.RandomState,
+    ) -> np.ndarray:
+        """Draw from the distribution that `covariance` describes; arguments as there.
+
+        Returns
+        -------
+        samples : ndarray of shape (n, o, n_samples)
+        """
+        mean, own, common = self._own_covariances(inputs, features, noise)
+        # Of outputs that share their weights, what comes from these is one draw; all else is independent.
+        of_weights = rng.standard_normal((common.shape[1], n_samples))
+        samples = [
+            own_mean[:, np.newaxis] + covariance_root(matrix) @ rng.standard_normal((len(mean), n_samples))
+            for own_mean, matrix in zip(mean.T, own, strict=True)
+        ]
+        return np.stack([each + shared.T @ of_weights for each, shared in zip(samples, common, strict=True)], axis=1)
+
+    def _own_covariances(
+        self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Mean (n, o), covariances (o, n, n) but for what outputs have in common, and the root (o, k, n) of that."""
+        size, n = self.rows_at_once, len(inputs)
+        # In the blocks of `predict`: rounding depends on how many rows there are.
+        parts = [self.predict(inputs[i : i + size], features[i : i + size], True) for i in range(0, n, size)]
+        mean, variance = (np.concatenate(each) for each in zip(*parts, strict=True))
+        projected = list(self.projected(inputs, features))
+        common = self._common(projected)
+        covariances = np.empty((len(self.noise), n, n))
+        p = common.shape[1]
+        for group, own in zip(self.groups, projected, strict=True):
+            V = own.P[: len(group.points)]
+            unexplained = group.kernel.at(np.log(group.hyperparameters), own.inputs).matrix() - V.T @ V
+            found = np.empty((len(group.signal), n, n))
+            for matrix, signal, root in zip(found, group.signal, group.root, strict=True):
+                deviation = root[: len(root) - p] @ own.P
+                matrix[...] = signal * unexplained + deviation.T @ deviation
+            covariances[group.outputs] = found
+        diagonals = (variance + noise).T - np.square(common).sum(axis=1)
+        for matrix, diagonal in zip(covariances, diagonals, strict=True):
+            diagonal_of(matrix)[...] = np.maximum(diagonal, 0.0)
+        return mean, covariances, common
 
     def novelty(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Var[f(x) | data] / Var[f(x)] of each output, (n, o)."""
@@ -284,10 +348,14 @@ class Predictor:
 
         (Of B⁻¹ = R Rᵀ with R⁻¹ as in `bounds`, the rows of w; all else of an output is independent of the others.)
         """
-        p, parts = self.offset.shape[1] if self.shared else 0, []
-        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
-            parts.append(group.root[:, group.root.shape[1] - p :] @ own.P)
-        return self.in_order(parts).transpose(1, 2, 0)
+        return self._common(self.projected(inputs, features)).transpose(1, 2, 0)
+
+    def _common(self, projected: Iterable[Projected]) -> np.ndarray:
+        """The same of rows as each group sees them, (o, k, n)."""
+        p = self.offset.shape[1] if self.shared else 0
+        return self.in_order(
+            group.root[:, group.root.shape[1] - p :] @ own.P for group, own in zip(self.groups, projected, strict=True)
+        )
 
     def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
         """Covariances (n, n, o) of each output as one (n o, n o) of all, outputs of a row next to each other."""

@@ -138,6 +138,14 @@ class Whitening:
         np.putmask(left, left < _ROUNDING * variance, 0.0)
         return left
 
+    def remaining(self, prepared: Any, V: np.ndarray) -> np.ndarray:
+        """k(x, x) - |v|² of each row, (n,), for a prediction: never below its rounding error.
+
+        |v|² is known to a few units in the last place of k(x, x). A smaller difference cannot be told from 0.
+        """
+        variance = self.covariance.diagonal(prepared)
+        return np.maximum(variance - np.einsum("mn,mn->n", V, V), _ROUNDING * variance)
+
     def pull_back(self, rows_bar: Any, factor_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gradients in the hyperparameters (their logarithms) and X_m, of those in the rows (`pull_back`) and Lᵀ L̄."""
         K_bar = cholesky_pullback(self.L_inv, factor_bar)

@@ -247,7 +247,7 @@ class _Group:
             return _Moments(self.product[:o] @ P, None, prepared, P, None)
         found = self.product @ P
         deviation = found[o:].reshape(o, k, n)
-        unexplained = group.whitening.unexplained(prepared, P[:m])
+        unexplained = group.whitening.remaining(prepared, P[:m])
         variance = np.einsum("okn,okn->on", deviation, deviation) + group.signal[:, np.newaxis] * unexplained
         return _Moments(found[:o], variance, prepared, P, deviation)
 
