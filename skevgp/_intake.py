@@ -139,7 +139,7 @@ class Intake(StatefulEstimator):
             spec = spec.with_noise(self.noise_variance)
         prior, vague = self._prior(given, features, targets, allow_vague)
         target_mean = targets.mean if self.normalize_y else np.zeros(len(targets.mean))
-        units = Units.of(source, targets, target_mean, prior)
+        units = Units.of(source, features, targets, target_mean, prior)
         with np.errstate(over="ignore"):
             spread = prior.scale * features.largest / units.target_unit[:, np.newaxis]
         check_magnitude(

@@ -125,9 +125,11 @@ def _by_folds(
     first = limits if by.groups is None else limits.with_signal_above(values["signal"])
     searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
+    # Rows left out of an output that does not vary say nothing of its variances.
+    still, at_bound = rows.still(), np.column_stack([values["signal"], values["noise"]])
     gone, dependent = 0, False
     if by.groups is not None:
-        explained = values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()
+        explained = (values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()) & ~still
         for own, is_explained in zip(searches, explained, strict=True):
             little = own.without_signal() - _GAIN
             if own.loss(*found[own.output]) > little:
@@ -138,7 +140,7 @@ def _by_folds(
         found = [own.times(own.in_doubt(*best, groups), *best) for own, best in zip(searches, found, strict=True)]
     elif limits.free_noise and len(rows) >= _FEWEST_DEPENDENT:
         dependent = _dependent(model, values, rows, by, rng, searches, found, lowest)
-    signal, noise = np.array(found).T
+    signal, noise = np.where(still[:, np.newaxis], at_bound, found).T
     return Calibrated(signal, noise, gone, dependent)
 
 

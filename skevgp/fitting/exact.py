@@ -362,6 +362,8 @@ def fit_exact(
         variance,
         rows.mean_precision,
         target_scatter=units.target_scatter,
+        rounding=0.0 if units.rounding is None else units.rounding,
+        constant=False if units.constant is None else units.constant,
     )
     if options.optimizer is not None:
         # It is the user's when to go where.

@@ -134,6 +134,8 @@ def starting_table(
     precision: float = 1.0,
     n_kernels: int | None = None,
     target_scatter: np.ndarray | None = None,
+    rounding: np.ndarray | float = 0.0,
+    constant: np.ndarray | bool = False,
 ) -> ParameterTable:
     """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
@@ -161,6 +163,11 @@ def starting_table(
         How many sets of hyperparameters there are, if each group of outputs has its own.
     target_scatter : ndarray of shape (o,), optional
         Variance of the targets, in squared target units: so high may the noise become where the features explain all.
+    rounding : ndarray of shape (o,), default=0.0
+        Variance of the targets' rounding, in squared target units: the noise does not fall below it.
+    constant : ndarray of bool of shape (o,), default=False
+        Targets that do not vary. Where all outputs of the model are such, nothing says how far they may vary: the
+        signal stays at one target unit, and the noise at its lowest.
 
     Returns
     -------
@@ -180,6 +187,8 @@ def starting_table(
     if n_kernels is not None:
         default = np.broadcast_to(default, (n_kernels, default.shape[-1]))
     signal, highest = o / mean_variance, rules.highest_noise * precision * o
+    lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
+    still = bool(np.all(constant))
     return ParameterTable(
         [
             parameter_of(
@@ -193,15 +202,17 @@ def starting_table(
                 rules.signal_limits[1] * signal,
                 target_unit**2,
                 None if rules.widest_signal is None else rules.widest_signal * signal,
+                still,
             ),
             parameter_of(
                 starts.noise,
                 "noise",
-                rules.first_noise * scatter,
-                np.maximum(rules.lowest_noise * scatter, LOWEST_NOISE * precision),
+                lowest_noise if still else rules.first_noise * scatter,
+                lowest_noise,
                 highest,
                 target_unit**2,
                 None if target_scatter is None else np.maximum(highest, target_scatter * precision),
+                still and starts.noise.value is None,
             ),
             Parameter(
                 "inducing_points",
@@ -221,6 +232,7 @@ def parameter_of(
     upper: np.ndarray,
     unit: np.ndarray | float,
     widest: np.ndarray | None = None,
+    stays: bool = False,
 ) -> Parameter:
     """A row of the table, in internal units.
 
@@ -235,11 +247,13 @@ def parameter_of(
         The user's values are divided by it.
     widest : ndarray of the parameter's shape, optional
         The upper limit once a fit has ended at the other, where the user says nothing.
+    stays : bool, default=False
+        Whether it is fixed, whatever the user says.
     """
     first = default if start.value is None else np.broadcast_to(start.value / unit, default.shape)
     if start.bounds is not None:
         lower, upper, widest = start.bounds[:, 0] / unit, start.bounds[:, 1] / unit, None
-    return Parameter(name, first, "log", lower, upper, fixed=start.fixed, widest=widest)
+    return Parameter(name, first, "log", lower, upper, fixed=start.fixed or stays, widest=widest)
 
 
 def prior_predictor(rows: Rows, spec: KernelSpec, prior: CoefficientPrior) -> Predictor:

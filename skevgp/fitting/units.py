@@ -17,6 +17,8 @@ from ..rows.threads import BlockMap
 
 # So that the lowest noise variance in the user's units is not rounded to 0.
 SMALLEST_UNIT = 1e-140
+# What residuals have of rounding errors, as a share of the target's largest value.
+_TARGET_ROUNDING = 1e-14
 # Of a feature's size: where it adds less than this to the others, sums of products leave few of its digits.
 _SEEN = 1e-6
 # Where it adds less than this, refinement would not converge.
@@ -260,22 +262,30 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
             )
 
 
-def unit_of(left_over: np.ndarray, largest: np.ndarray) -> np.ndarray:
-    """The unit of each target: the size of what is left over, not below the rounding error of the target, never 0.
+def unit_of(left_over: np.ndarray, targets: Moments, from_features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unit of each target, and which targets are constant with nothing left over.
+
+    The unit is the size of what is left over, but not below the rounding error of the target. A constant of which
+    nothing is left over says nothing of a size: its unit is 1, as in scikit-learn's scalers.
 
     Parameters
     ----------
     left_over : ndarray of shape (o,)
         Root mean square.
-    largest : ndarray of shape (o,)
-        Of the target's absolute values.
+    targets : Moments
+    from_features : ndarray of shape (o,)
+        The largest number that a feature adds a priori. It is what rounds where the target is 0.
 
     Returns
     -------
     unit : ndarray of shape (o,)
+        Above 0.
+    constant : ndarray of bool of shape (o,)
     """
-    unit = np.maximum(left_over, 1e-14 * largest)
-    return np.where(unit > 0.0, np.maximum(unit, SMALLEST_UNIT), 1.0)
+    rounding = _TARGET_ROUNDING * np.where(targets.largest > 0.0, targets.largest, from_features)
+    constant = (left_over <= rounding) & (np.sqrt(targets.variance) <= rounding)
+    unit = np.maximum(np.where(constant, 1.0, left_over), rounding)
+    return np.maximum(unit, SMALLEST_UNIT), constant
 
 
 @dataclass(frozen=True)
@@ -290,27 +300,37 @@ class Units:
         The size of what the features alone leave over.
     prior : CoefficientPrior
         In the user's units.
-    target_scatter : ndarray of shape (o,), optional
-        The targets' variance, in squared target units; not known of a model from a file.
+    target_scatter, rounding : ndarray of shape (o,), optional
+        The targets' variance, and that of the rounding of their largest value, in squared target units; not known of a
+        model from a file.
+    constant : ndarray of bool of shape (o,), optional
+        Targets that do not vary and of which nothing is left over (`unit_of`); not known of a model from a file.
     """
 
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
     target_scatter: np.ndarray | None = None
+    rounding: np.ndarray | None = None
+    constant: np.ndarray | None = None
 
     @classmethod
     def of(
         cls,
         source: Source,
+        features: Moments,
         targets: Moments,
         target_mean: np.ndarray,
         prior: CoefficientPrior,
     ) -> Units:
-        """The units of a training set, from its rows, its targets' moments, and the prior of its weights."""
+        """The units of a training set: its rows, moments of its features and targets, and the prior of its weights."""
         reference, left_over = features_alone(source, target_mean, prior)
-        unit = unit_of(left_over, targets.largest)
-        return cls(target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2)
+        largest = np.max(np.abs(prior.mean) * features.largest, axis=1, initial=0.0)
+        unit, constant = unit_of(left_over, targets, largest)
+        rounding = (np.finfo(float).eps * targets.largest / unit) ** 2
+        return cls(
+            target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2, rounding, constant
+        )
 
     def to_internal(self, raw: RawRows) -> RawRows:
         """The same inputs and features, and what the reference leaves of the targets, in its own units."""
@@ -319,7 +339,9 @@ class Units:
 
     def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
         """Rows in internal units."""
-        return Rows(source, self.to_internal, threads=BlockMap() if threads is None else threads)
+        return Rows(
+            source, self.to_internal, threads=BlockMap() if threads is None else threads, constant=self.constant
+        )
 
     def internal_prior(self) -> CoefficientPrior:
         """The prior for residuals in units of ``target_unit``."""

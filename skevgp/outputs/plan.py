@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import chain, pairwise, starmap
 from operator import index
-from typing import Literal, TypeVar
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 
@@ -149,10 +149,15 @@ def _table(
     n_kernels: int | None = None,
 ) -> ParameterTable:
     """The parameters of a model of some outputs, with inducing points (g, m, d)."""
+    units = request.units
+
+    def of_these(values: np.ndarray | None, unknown: Any) -> Any:
+        return unknown if values is None else values[outputs]
+
     return starting_table(
         rows.outputs(outputs).inputs,
         points,
-        request.units.target_unit[outputs],
+        units.target_unit[outputs],
         request.spec.starts,
         rows.scatter()[outputs],
         request.solver.rules,
@@ -160,7 +165,9 @@ def _table(
         variance,
         rows.mean_precision,
         n_kernels,
-        None if request.units.target_scatter is None else request.units.target_scatter[outputs],
+        of_these(units.target_scatter, None),
+        of_these(units.rounding, 0.0),
+        of_these(units.constant, False),
     )
 
 

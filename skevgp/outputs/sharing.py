@@ -79,7 +79,8 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
     so that what follows is a matter of the kernel and not of luck: from there each output is fitted alone, and all
     together. If that costs one of them too much (`_LARGEST_LOSS`), each becomes a group, and of all pairs of groups
     those with the kernels most alike are tried first, and joined if it costs no output too much, until none is left.
-    Outputs that learned nothing from the sample are the last group, or if they are constant in the first one.
+    Outputs that learned nothing from the sample are the last group, or if they are constant in the first one. Constants
+    of which nothing is left over have a group of their own: their kernel is as smooth as may be.
 
     Parameters
     ----------
@@ -115,12 +116,13 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
         return [everything]
     # Rows that were not drawn may show it, and then the others must not rule its kernel: a group of its own.
     unknown = [o for o in everything if o not in learned]
-    variance = Rows(request.source, request.units.to_internal).residuals.variance if unknown else np.empty(0)
-    hidden = [o for o in unknown if variance[o] > _CONSTANT]
-    constant = [o for o in unknown if o not in hidden]
+    variance = request.units.rows(request.source).residuals.variance if unknown else np.empty(0)
+    still = [o for o in unknown if request.units.constant is not None and request.units.constant[o]]
+    hidden = [o for o in unknown if variance[o] > _CONSTANT and o not in still]
+    constant = [o for o in unknown if o not in (*hidden, *still)]
 
     def completed(groups: list[list[int]]) -> list[list[int]]:
-        return [sorted([*groups[0], *constant]), *groups[1:], *([hidden] if hidden else [])]
+        return [sorted([*groups[0], *constant]), *groups[1:], *(own for own in (hidden, still) if own)]
 
     if suits(learned, fits.further(learned, fits.together)):
         return completed([learned])

@@ -99,6 +99,8 @@ class Rows:
         Of the memory for blocks, for one of several fits at once.
     threads : BlockMap
         What blocks are worked on by.
+    constant : ndarray of bool, optional
+        Which of all outputs do not vary, so that what scatters of them is rounding.
     """
 
     source: Source
@@ -106,6 +108,7 @@ class Rows:
     columns: Columns = field(default_factory=lambda: slice(None))
     share: float = 1.0
     threads: BlockMap = field(default_factory=BlockMap)
+    constant: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self.source.n_rows
@@ -146,7 +149,13 @@ class Rows:
     def scatter(self) -> np.ndarray:
         """The noise variance σ² (o,) that would explain how residuals vary; the mean of 1 / v where they do not."""
         scatter = self.residuals.variance[self.columns]
-        return np.where(scatter > 0.0, scatter, 1.0) * self.mean_precision
+        return np.where(self.still() | (scatter == 0.0), 1.0, scatter) * self.mean_precision
+
+    def still(self) -> np.ndarray:
+        """Which outputs (o,) do not vary."""
+        n_outputs = len(self.residuals.mean)
+        constant = np.zeros(n_outputs, dtype=bool) if self.constant is None else self.constant
+        return constant[self.columns]
 
     def some(self, chosen: np.ndarray) -> RawRows:
         """Rows by index, in internal units."""

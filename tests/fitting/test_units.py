@@ -4,7 +4,7 @@ import scipy.linalg
 
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.inference.posterior import CoefficientPrior
-from skevgp.rows.source import LocalSource, RawRows
+from skevgp.rows.source import LocalSource, Moments, RawRows
 
 
 def weights_alone(H, r, scale):
@@ -118,11 +118,30 @@ def test_a_decomposition_that_does_not_converge_is_tried_by_another_method(monke
 
 def test_units_survive_extreme_scales():
     values = np.array([1e-120, 1e100, 0.0])
-    np.testing.assert_array_equal(unit_of(values, values), [1e-120, 1e100, 1.0])
+    unit, constant = unit_of(values, Moments.of(np.outer([-1.0, 1.0], values)), np.zeros(3))
+    np.testing.assert_array_equal(unit, [1e-120, 1e100, 1.0])
+    np.testing.assert_array_equal(constant, [False, False, True])
 
 
-def test_the_unit_is_not_below_the_rounding_of_the_target():
-    assert unit_of(np.full(1, 1e-20), np.full(1, 1e5))[0] == pytest.approx(1e-9)
+@pytest.mark.parametrize(
+    ("left_over", "targets", "from_features", "unit", "constant"),
+    [
+        (1e-20, [-1e5, 1e5], 0.0, 1e-9, False),  # features explain what varies
+        (1e-20, [1e5, 1e5], 0.0, 1.0, True),
+        (1e-20, [1e20, 1e20], 0.0, 1e6, True),
+        (1e-9, [1e5, 1e5], 0.0, 1.0, True),
+        (2e-9, [1e5, 1e5], 0.0, 2e-9, False),  # a prior mean that is not 0, and a weight that cannot move
+        (1e-17, [0.0, 0.0], 5.0, 1.0, True),
+        (1e-12, [0.0, 0.0], 5.0, 1e-12, False),
+    ],
+)
+def test_the_unit_is_above_the_rounding_of_the_target_and_1_of_a_constant(
+    left_over, targets, from_features, unit, constant
+):
+    moments = Moments.of(np.array(targets)[:, np.newaxis])
+    found, is_constant = unit_of(np.array([left_over]), moments, np.array([from_features]))
+    assert found[0] == pytest.approx(unit)
+    assert is_constant[0] == constant
 
 
 def test_features_may_hide_the_noise_where_they_are_many_or_weights_far_from_their_prior():
