@@ -209,7 +209,8 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         points = [group.points for group in self._predictor.by_output]
         same = len({len(own) for own in points}) == 1
         self.inducing_points_: Any = np.array(points) if same else points
-        if len(self._predictor.groups) == 1:
+        sets = [own for one in fitted.learned for own in one.values["inducing_points"]]
+        if len(sets) == 1:
             self.inducing_points_ = points[0]
         self.sharing_ = fitted.sharing
         self.loss_curve_ = fitted.loss_curve

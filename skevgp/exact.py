@@ -22,13 +22,13 @@ from ._theta import value_at
 from ._validation import unchanged_if_it_fails
 from .fitting.advice import interrupted
 from .fitting.exact import ExactFit, ExactOptions, fit_exact
+from .fitting.rules import LOWEST_NOISE_EXACT
 from .fitting.start import prior_predictor
 from .rows.dask import is_dask
 from .rows.threads import single_threaded_libraries
 from .solvers import LBFGS
 
-# Without inducing points rounding does not matter before the noise is so low: a smooth function is met to 1e-6.
-_RULES = replace(LBFGS.rules, lowest_noise=1e-12)
+_RULES = replace(LBFGS.rules, lowest_noise=LOWEST_NOISE_EXACT)
 # Of so many, an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
 

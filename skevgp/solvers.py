@@ -11,10 +11,10 @@ from ._linalg import NotPositiveDefiniteError
 from ._state import StatefulEstimator
 from ._validation import check_integer, check_real
 from .fitting.advice import how_it_ended
-from .fitting.rules import Rules
+from .fitting.rules import LOWEST_NOISE_EXACT, Rules
 from .fitting.sparse import SparseTask
 from .fitting.strategy import Attempt, Fit
-from .inference.objectives import BoundObjective, ElboObjective
+from .inference.objectives import ElboObjective
 from .inference.posterior import CoefficientPrior
 from .optimizers.adam import adam
 from .optimizers.curvature import curvature_units
@@ -75,6 +75,7 @@ class LBFGS(StatefulEstimator):
     default_max_iter: ClassVar[int] = 1000
     rules: ClassVar[Rules] = Rules(
         first_noise=1e-4,
+        lowest_noise_exact=LOWEST_NOISE_EXACT,
         other_starts=((0.5, 1.0), (2.0, 100.0), (1.0, 1e3)),
         much_noise=1e3,
         stage=25,
@@ -113,7 +114,7 @@ class LBFGS(StatefulEstimator):
         objective : callable
             x -> (minus the bound per row, its gradient).
         """
-        return BoundObjective(task.model, table, task.blocks_of(n_rows))
+        return task.objective(table, n_rows)
 
     def run(self, task: SparseTask, attempt: Attempt) -> Fit:
         """Go from one start; called by the fit.
@@ -163,7 +164,7 @@ class LBFGS(StatefulEstimator):
 
     def _units(self, task: SparseTask, table: ParameterTable) -> Callable[[np.ndarray], np.ndarray]:
         """From the curvature on the smallest sample, or on the rows that are fitted."""
-        objective = BoundObjective(task.model, table, task.blocks_of(task.samples[0] if task.samples else None))
+        objective = task.objective(table, task.samples[0] if task.samples else None)
         return lambda x: curvature_units(objective, x, table.alike(), self.descent.probes)
 
 

@@ -194,11 +194,13 @@ def test_there_may_be_as_many_folds_as_rows_and_no_more(noise_cv):
     np.testing.assert_array_equal(m.noise_variance_, expected.noise_variance_)
 
 
-def test_points_at_all_rows():
+def test_points_at_all_rows_leave_nothing_to_folds_but_to_groups():
     X, Y = independent(60)
     plain, m = (model(n_inducing=60, noise_cv=cv).fit(X, Y) for cv in (None, 5))
-    assert np.isfinite(m.predict(X_NEW, return_std=True)).all()
-    assert (m.noise_variance_ != plain.noise_variance_).all()
+    np.testing.assert_array_equal(m.noise_variance_, plain.noise_variance_)
+    grouped = model(n_inducing=60).fit(X, Y, groups=np.arange(60) // 6)
+    assert (grouped.noise_variance_ != plain.noise_variance_).all()
+    assert np.isfinite(grouped.predict(X_NEW, return_std=True)).all()
 
 
 def test_units_do_not_matter():

@@ -47,6 +47,8 @@ _WIDER = 1e4
 _DEPENDENT, _WORSE = 4.0, 0.1
 # Of so many rows that can be seen.
 _FEWEST_DEPENDENT = 200
+# A noise that is no more than so many times its lower limit is as good as none.
+_NOISELESS = 1.1
 # What explained more than so much of an output holds for no other group if it gains less than this, in nats per row
 # that was left out.
 _EXPLAINED, _GAIN = 0.5, 0.01
@@ -122,7 +124,11 @@ def _by_folds(
     rng: np.random.RandomState,
 ) -> Calibrated:
     limits, lowest = Limits.of(table, _WIDER if by.wide else 1.0), _left_over(model, values, statistics)
-    first = limits if by.groups is None else limits.with_signal_above(values["signal"])
+    first = limits.with_signal_above(values["signal"])
+    if by.groups is None:
+        # Without noise, errors still fall where the signal rises, and std rises with it: it stays where it is.
+        noiseless = values["noise"] <= _NOISELESS * limits.noise[:, 0]
+        first = limits.with_signal_below(np.where(noiseless, values["signal"], np.inf))
     searches = _searches(model, values, folds, rows, first, _LEFT_OVER * lowest)
     found = list(rows.threads(Search.best, searches))
     # Rows left out of an output that does not vary say nothing of its variances.

@@ -242,9 +242,9 @@ class LeftOut:
         rows, factor, prior = self.rows, self._factor(ratio), self.group.prior
         m, p = self._X.shape
         error = rows.residuals[:, output] - self._Z @ (factor * self._T[:, output])
+        # What a jitter leaves unexplained counts too: it keeps the signal from growing without end.
         variance = rows.noise + self._squares @ _divided(ratio, self._at_zero + ratio * self._slope)
-        if not self.group.complete:
-            variance += ratio * rows.unexplained
+        variance += ratio * rows.unexplained
         if p == 0:
             none = np.empty(0)
             return _AtRatio(ratio, known, error, variance, none, np.empty((len(error), 0)), none, none)

@@ -51,6 +51,11 @@ class Limits:
         low, high = self.signal.T
         return replace(self, signal=np.column_stack([np.clip(least, low, high), high]))
 
+    def with_signal_below(self, most: np.ndarray) -> Limits:
+        """The same with a signal (o,) that does not rise above."""
+        low, high = self.signal.T
+        return replace(self, signal=np.column_stack([low, np.clip(most, low, high)]))
+
 
 @dataclass(frozen=True)
 class Search:

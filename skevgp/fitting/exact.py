@@ -10,7 +10,7 @@ import numpy as np
 
 from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
-from ..inference.exact import ExactModel
+from ..inference.exact import ExactModel, LikelihoodObjective
 from ..inference.posterior import CoefficientPrior, Predictor
 from ..inference.statistics import Kernel
 from ..kernels.parse import KernelSpec
@@ -123,12 +123,8 @@ class ExactTask:
     def minimise(self, attempt: Attempt) -> Fit:
         """L-BFGS on the log marginal likelihood per row."""
         table = self.table.started_at(attempt.values)
-        n, spent = len(self.model.rows.inputs), len(attempt.loss_curve)
-
-        def loss(flat: np.ndarray) -> tuple[float, np.ndarray]:
-            likelihood, gradient = self.model.log_likelihood(table.values(flat))
-            return -likelihood / n, -table.gradient(gradient) / n
-
+        n, spent = self.model.rows.total, len(attempt.loss_curve)
+        loss = LikelihoodObjective(self.model, table)
         monitor = self.monitor.seen_as(spent, n, is_last=attempt.is_last and self.options.n_restarts == 0)
         if self.options.optimizer is not None and table.size > 0:
             return self._minimised_by(self.options.optimizer, table, loss, monitor)
@@ -149,7 +145,7 @@ class ExactTask:
         monitor: Monitor,
     ) -> Fit:
         """The user's optimizer on minus the log marginal likelihood, in logarithms of the user's units."""
-        n, (lower, upper) = len(self.model.rows.inputs), table.limits()
+        n, (lower, upper) = self.model.rows.total, table.limits()
         assert self.units is not None
         log_variance, shift = 2.0 * np.log(self.units.target_unit), log_units_of_contrasts(self.units, self.model).sum()
         in_users_units = table.flat(

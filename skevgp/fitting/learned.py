@@ -10,6 +10,7 @@ import numpy as np
 
 from ..calibration.calibrate import calibrated
 from ..inference.bounds import bounds_at_optimum
+from ..inference.exact import ExactModel
 from ..inference.model import SparseModel
 from ..inference.objectives import evaluate
 from ..inference.posterior import Predictor
@@ -17,8 +18,12 @@ from ..inference.statistics import SufficientStatistics, Whitening
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
 from .advice import far_from_prior, signal_gone
+from .rules import Rules
 from .sparse import SparseTask
 from .strategy import Fit
+
+# Signal over noise variance: above it the jitter of k(X_m, X_m), up to 1e-12 and more of the signal, shows in the std.
+_HIGH_RATIO = 1e9
 
 
 class Doubts(Protocol):
@@ -59,6 +64,8 @@ class Learned:
         Of the rows, if the noise has heavy tails.
     known_bound, known_upper_bound : float, optional
         `bound` and `upper_bound`, where they are known better than from the statistics.
+    exact : bool, default=False
+        Whether the predictor is the exact model's (`SparseTask.exact`).
     """
 
     model: SparseModel
@@ -72,6 +79,7 @@ class Learned:
     doubts: Doubts | None = None
     known_bound: float | None = None
     known_upper_bound: float | None = None
+    exact: bool = False
 
     @cached_property
     def bound(self) -> float:
@@ -88,34 +96,49 @@ class Learned:
     @classmethod
     def of(cls, task: SparseTask, fit: Fit, doubts: Doubts | None = None) -> Learned:
         """What is kept of a fit; signal and noise are calibrated if the task says so and Ctrl-C did not."""
-        model, values = task.model, fit.values
+        model, values, exact = task.model, fit.values, task.exact
+        advice, found, dependent = [fit.message, far_from_prior(model.prior, task.rows)], None, False
         statistics = model.statistics(values, task.blocks)
-        advice, found = [fit.message, far_from_prior(model.prior, task.rows)], None
         if not task.monitor.stopped and task.max_iter > 0:
             advice.append(task.learned_too_little(values))
             if task.noise_cv is not None:
+                # The algebra of folds is the sparse model's.
+                lowest = task.solver.rules.lowest_noise * task.rows.scatter()
+                noisy = values if exact is None else values | {"noise": np.maximum(values["noise"], lowest)}
                 with task.monitor.keeping_the_best():
-                    found = calibrated(model, values, statistics, task.table, task.rows, task.noise_cv, task.seed)
+                    found = calibrated(model, noisy, statistics, task.table, task.rows, task.noise_cv, task.seed)
+                dependent = found is not None and found.dependent
+                if exact is not None and task.noise_cv.groups is None:
+                    # What folds correct, that inducing points represent too little, is no matter here.
+                    found = None
         if found is not None:
             values = values | {"signal": found.signal, "noise": found.noise}
             advice.append(signal_gone(found.gone, len(found.noise)))
-        # Summed row by row, which keeps its digits where the noise is low.
-        if found is None and np.isfinite(fit.bound) and fit.n_rows is None:
-            bound = fit.bound
+        # Else summed row by row, which keeps its digits where the noise is low.
+        known = found is None and np.isfinite(fit.bound) and fit.n_rows is None
+        if exact is None:
+            bound = fit.bound if known else model.bound(values, statistics, task.blocks)
+            upper_bound = model.upper_bound(values, statistics, task.blocks)
         else:
-            bound = model.bound(values, statistics, task.blocks)
-        predictor = None if found is not None else fit.predictor
+            bound = upper_bound = fit.bound if known else float(exact.log_likelihoods(values).sum())
+        if exact is not None and (values["signal"] > _HIGH_RATIO * values["noise"]).any():
+            predictor = exact.predictor(values)
+        elif found is None and fit.predictor is not None:
+            exact, predictor = None, fit.predictor
+        else:
+            exact, predictor = None, model.at_optimum(values, statistics, blocks=task.blocks)
         learned = cls(
             model,
             task.table,
             values,
             statistics,
-            model.at_optimum(values, statistics, blocks=task.blocks) if predictor is None else predictor,
+            predictor,
             fit.loss_curve,
             " ".join(part for part in advice if part),
-            found is not None and found.dependent,
+            dependent,
             known_bound=bound,
-            known_upper_bound=model.upper_bound(values, statistics, task.blocks),
+            known_upper_bound=upper_bound,
+            exact=exact is not None,
         )
         return learned if doubts is None else doubts.told(replace(learned, doubts=doubts))
 
@@ -154,9 +177,14 @@ class Learned:
         }
         kernel, _ = self.model.kernel_of(self.values, index)
         prior = self.model.prior.outputs(own)
-        model = replace(self.model, kernel=kernel, prior=prior, groups=(slice(0, 1),), kernels=None)
-        blocks = model.blocks(rows, points.shape[1])
-        bound, gradient = evaluate(model, values, blocks, partial(bounds_at_optimum, family=model.family))
+        if self.exact:
+            vague = np.zeros(prior.scale.shape, dtype=bool)
+            alone = ExactModel(kernel, prior, vague, rows.some(np.arange(len(rows))))
+            bound, gradient = alone.log_likelihood(values)
+        else:
+            model = replace(self.model, kernel=kernel, prior=prior, groups=(slice(0, 1),), kernels=None)
+            blocks = model.blocks(rows, points.shape[1])
+            bound, gradient = evaluate(model, values, blocks, partial(bounds_at_optimum, family=model.family))
         return bound, np.append(gradient["hyperparameters"], gradient["signal"])
 
     def updated(self, rows: Rows, weight: float = 1.0) -> Learned:
@@ -168,11 +196,18 @@ class Learned:
             return self.doubts.updated(self, rows)
         n_inducing = self.values["inducing_points"].shape[1]
         # Whatever its points were of the rows before.
-        model = replace(self.model, complete=False)
-        whitenings = [group.whitening for group in self.predictor.groups]
-        new = model.statistics(self.values, model.blocks(rows, n_inducing), whitenings)
+        model, values = replace(self.model, complete=False), self.values
+        if self.exact:
+            # From here on the points are some rows of many, with the sparse model's algebra and its lowest noise.
+            lowest = np.where(self.table["noise"].free, Rules.lowest_noise, 0.0)
+            values = values | {"noise": np.maximum(values["noise"], lowest)}
+            whitenings = list(model.whitenings(values))
+        else:
+            whitenings = [group.whitening for group in self.predictor.groups]
+        new = model.statistics(values, model.blocks(rows, n_inducing), whitenings)
         statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
-        return replace(self, model=model, statistics=statistics)._at_optimum(whitenings)
+        learned = replace(self, model=model, values=values, statistics=statistics, exact=False)
+        return learned._at_optimum(whitenings)
 
     def _at_optimum(self, whitenings: list[Whitening]) -> Learned:
         predictor = self.model.at_optimum(self.values, self.statistics, whitenings)

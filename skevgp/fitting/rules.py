@@ -8,6 +8,8 @@ from .._linalg import JITTER, Jitter
 
 # Numbers: samples are held in memory.
 LARGEST_SAMPLE = 2_000_000
+# Of the exact model, where rounding does not matter before the noise is so low: a smooth function is met to 1e-6.
+LOWEST_NOISE_EXACT = 1e-12
 
 
 @dataclass(frozen=True)
@@ -22,6 +24,9 @@ class Rules:
     lowest_noise : float
         Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
         outweighs the noise.
+    lowest_noise_exact : float, optional
+        The lower limit where inducing points are all rows, and the exact model's algebra takes the place of the sparse
+        one's; None keeps the sparse one's.
     highest_noise : float
         Its upper limit, in units of the variance that the features leave over; of a fit that starts there or above,
         the targets' variance if that is more.
@@ -63,6 +68,7 @@ class Rules:
 
     first_noise: float
     lowest_noise: float = 1e-10
+    lowest_noise_exact: float | None = None
     highest_noise: float = 1e2
     lengthscale: float = 0.6
     lengthscale_limits: tuple[float, float] = (1e-2, 1e4)

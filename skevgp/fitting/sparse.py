@@ -12,7 +12,9 @@ import numpy as np
 from .._progress import Monitor
 from ..calibration.folds import CrossValidation
 from ..inference.bounds import bounds_alone
+from ..inference.exact import ExactModel, LikelihoodObjective
 from ..inference.model import SparseModel
+from ..inference.objectives import BoundObjective
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.blocks import Blocks
 from ..rows.internal import Rows
@@ -116,6 +118,29 @@ class SparseTask:
     @cached_property
     def _sample(self) -> Rows:
         return self.rows.sampled(self.samples[-1], self.rng)
+
+    @cached_property
+    def exact(self) -> ExactModel | None:
+        """The exact model of the rows, where the inducing points are all of them; None where they are not.
+
+        The bound is then its likelihood. A jitter of k(X_m, X_m), which costs the bound nothing there, would let the
+        signal grow, and with it the std: the exact model has none.
+        """
+        model, separate = self.model, self.table["hyperparameters"].start.ndim == 2
+        if not model.complete or separate or self.heavy_tails or self.solver.rules.lowest_noise_exact is None:
+            return None
+        rows, kernels = self.rows.some(np.arange(len(self.rows))), None
+        if model.kernels is not None:
+            sets = [model.set_of(o, self.table["inducing_points"]) for o in range(len(model.prior.scale))]
+            kernels = tuple(model.kernels[index] for index in sets)
+        vague = np.zeros(model.prior.scale.shape, dtype=bool)
+        return ExactModel(model.kernel, model.prior, vague, rows, kernels)
+
+    def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
+        """What is minimised on a sample of so many rows, or on all: minus the bound per row, and its gradient."""
+        if n_rows is None and self.exact is not None:
+            return LikelihoodObjective(self.exact, table)
+        return BoundObjective(self.model, table, self.blocks_of(n_rows))
 
     def blocks_of(self, n_rows: int | None) -> Blocks:
         """A sample of so many rows, of which the smaller ones are parts; None means all.

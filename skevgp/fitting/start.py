@@ -253,7 +253,7 @@ def parameter_of(
     first = default if start.value is None else np.broadcast_to(start.value / unit, default.shape)
     if start.bounds is not None:
         lower, upper, widest = start.bounds[:, 0] / unit, start.bounds[:, 1] / unit, None
-    return Parameter(name, first, "log", lower, upper, fixed=start.fixed or stays, widest=widest)
+    return Parameter(name, first, "log", lower, upper, fixed=True if stays else start.fixed, widest=widest)
 
 
 def prior_predictor(rows: Rows, spec: KernelSpec, prior: CoefficientPrior) -> Predictor:

@@ -339,9 +339,8 @@ class Units:
 
     def rows(self, source: Source, threads: BlockMap | None = None) -> Rows:
         """Rows in internal units."""
-        return Rows(
-            source, self.to_internal, threads=BlockMap() if threads is None else threads, constant=self.constant
-        )
+        threads = BlockMap() if threads is None else threads
+        return Rows(source, self.to_internal, threads=threads, constant=self.constant, rounding=self.rounding)
 
     def internal_prior(self) -> CoefficientPrior:
         """The prior for residuals in units of ``target_unit``."""

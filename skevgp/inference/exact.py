@@ -30,7 +30,7 @@ import numpy as np
 from scipy.linalg import lapack
 
 from .._linalg import NotPositiveDefiniteError, diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
-from ..optimizers.parameters import Values
+from ..optimizers.parameters import ParameterTable, Values
 from ..rows.source import RawRows
 from .bounds import LOG_2PI
 from .posterior import CoefficientPrior, Predictor, PredictorGroup
@@ -271,3 +271,21 @@ class ExactModel:
             )
         offset = self.prior.offset
         return Predictor(tuple(groups), values["noise"], offset, np.zeros(len(groups)), self.prior.shared)
+
+
+class LikelihoodObjective:
+    """θ -> minus the log marginal likelihood, per row, and its gradient: what L-BFGS minimises.
+
+    Parameters
+    ----------
+    model : ExactModel
+    table : ParameterTable
+    """
+
+    def __init__(self, model: ExactModel, table: ParameterTable):
+        self.model, self.table = model.with_fewer_features(), table
+
+    def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
+        likelihood, gradient = self.model.log_likelihood(self.table.values(flat))
+        n_rows = self.model.rows.total
+        return -likelihood / n_rows, -self.table.gradient(gradient) / n_rows

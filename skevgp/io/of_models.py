@@ -177,6 +177,7 @@ _FITS = [
         doubts=made(RowDoubts) | nothing,
         known_bound=real(finite=False) | nothing,
         known_upper_bound=real(finite=False) | nothing,
+        exact=flag,
     ),
     plain(RowDoubts, scales=made(RowScales), noise_factor=array("o", least=0.0)),
     # The rows are in no file; new ones get distances of their own.

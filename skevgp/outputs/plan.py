@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, pairwise, starmap
 from operator import index
 from typing import Any, Literal, TypeVar
@@ -106,9 +106,10 @@ def plan(
                 warm.pop("inducing_points", None)
         first = [ground.of_output(ground.points, o) for o in model.first_of_groups]
         sets = _first_sets(first, placement, warm, len(rows))
-        table = _table(request, rows, outputs, sets, ground.variance, len(sets) if model.separate else None)
         # Where they are all rows the bound is the likelihood: no other places are better.
         stay = request.family == "full" and ground.is_all_rows(sets, model, len(rows))
+        n_kernels = len(sets) if model.separate else None
+        table = _table(request, rows, outputs, sets, ground.variance, n_kernels, exact=stay and not model.separate)
         if stay:
             table = table.with_fixed("inducing_points")
         shift = rows.total * units.log_unit(outputs)
@@ -147,9 +148,12 @@ def _table(
     points: np.ndarray,
     variance: float = 1.0,
     n_kernels: int | None = None,
+    exact: bool = False,
 ) -> ParameterTable:
-    """The parameters of a model of some outputs, with inducing points (g, m, d)."""
-    units = request.units
+    """The parameters of a model of some outputs, with inducing points (g, m, d); perhaps for the exact model."""
+    units, rules = request.units, request.solver.rules
+    if exact and not request.heavy_tails and rules.lowest_noise_exact is not None:
+        rules = replace(rules, lowest_noise=rules.lowest_noise_exact)
 
     def of_these(values: np.ndarray | None, unknown: Any) -> Any:
         return unknown if values is None else values[outputs]
@@ -160,7 +164,7 @@ def _table(
         units.target_unit[outputs],
         request.spec.starts,
         rows.scatter()[outputs],
-        request.solver.rules,
+        rules,
         request.spec.covariance.n_hyperparameters,
         variance,
         rows.mean_precision,

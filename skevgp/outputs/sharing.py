@@ -13,7 +13,6 @@ from .._linalg import NotPositiveDefiniteError
 from .._progress import Monitor
 from ..fitting.inducing import Placement
 from ..fitting.sparse import SparseTask
-from ..inference.objectives import BoundObjective
 from ..optimizers.lbfgs import lbfgs
 from ..optimizers.parameters import ParameterTable, Values
 from ..rows.internal import Rows
@@ -213,7 +212,7 @@ class _ShortFits:
         """Of an output with its values; very low where it cannot be computed."""
         task = self._each[output]
         try:
-            loss, _ = BoundObjective(task.model, task.table, task.blocks)(task.table.started_at(values).start())
+            loss, _ = task.objective(task.table)(task.table.started_at(values).start())
         except NotPositiveDefiniteError:
             loss = np.inf
         return -task.rows.total * loss if np.isfinite(loss) else -np.finfo(float).max
@@ -236,7 +235,7 @@ class _ShortFits:
 def _short_fit(task: SparseTask, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
     """The values of each output where so many iterations lead."""
     n_rows = task.rows.total
-    objective = BoundObjective(task.model, table, task.blocks)
+    objective = task.objective(table)
     values = table.values(lbfgs(objective, table.start(), table.limits(), n_iter, _SHORT_TOL / n_rows, monitor).x)
     each = range(len(values["noise"]))
     return [values | {name: values[name][[o]] for name in ("signal", "noise")} for o in each]

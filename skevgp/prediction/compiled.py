@@ -172,11 +172,11 @@ class CompiledPredictor:
 
 def _goes_on(before: Predictor, predictor: Predictor) -> bool:
     """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell."""
-    if before.offset.shape != predictor.offset.shape or len(before.groups) != len(predictor.groups):
+    if before.offset.shape != predictor.offset.shape:
         return False
     return all(
         np.array_equal(old.points, new.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
-        for old, new in zip(before.groups, predictor.groups, strict=True)
+        for old, new in zip(before.by_output, predictor.by_output, strict=True)
     )
 
 

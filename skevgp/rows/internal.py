@@ -15,6 +15,8 @@ from .blocks import AnyBlock, Batch, Block, Blocks, SplitBlock
 from .source import Columns, LocalSource, Moments, RawRows, Source
 from .threads import BlockMap
 
+# Residuals that scatter by no more than so many times the variance of the targets' rounding do not vary.
+_ROUNDED = 16.0
 # Mini-batches are drawn from so many rows at a time: shuffling needs memory.
 _SHUFFLED_ROWS = 2**18
 
@@ -101,6 +103,8 @@ class Rows:
         What blocks are worked on by.
     constant : ndarray of bool, optional
         Which of all outputs do not vary, so that what scatters of them is rounding.
+    rounding : ndarray, optional
+        The variance of the rounding of each output.
     """
 
     source: Source
@@ -109,6 +113,7 @@ class Rows:
     share: float = 1.0
     threads: BlockMap = field(default_factory=BlockMap)
     constant: np.ndarray | None = None
+    rounding: np.ndarray | None = None
 
     def __len__(self) -> int:
         return self.source.n_rows
@@ -148,8 +153,9 @@ class Rows:
 
     def scatter(self) -> np.ndarray:
         """The noise variance σ² (o,) that would explain how residuals vary; the mean of 1 / v where they do not."""
-        scatter = self.residuals.variance[self.columns]
-        return np.where(self.still() | (scatter == 0.0), 1.0, scatter) * self.mean_precision
+        scatter, rounding = self.residuals.variance, 0.0 if self.rounding is None else self.rounding
+        varies = (scatter > _ROUNDED * rounding)[self.columns] & ~self.still()
+        return np.where(varies, scatter[self.columns], 1.0) * self.mean_precision
 
     def still(self) -> np.ndarray:
         """Which outputs (o,) do not vary."""

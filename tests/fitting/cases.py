@@ -29,7 +29,7 @@ def units_of(X=X, H=H, Y=Y, target_mean=0.0):
     o, p = Y.shape[1], H.shape[1]
     mean, scale = (own[np.arange(o) % 2, :p] for own in (COEF_MEAN, COEF_SCALE))
     prior = CoefficientPrior(mean, scale, np.zeros((o, p)))
-    return Units.of(source_of(X, H, Y), Moments.of(Y), np.broadcast_to(target_mean, o), prior)
+    return Units.of(source_of(X, H, Y), Moments.of(H), Moments.of(Y), np.broadcast_to(target_mean, o), prior)
 
 
 def data_of(Y, X=X):

@@ -5,6 +5,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 from skevgp._linalg import NotPositiveDefiniteError
 from skevgp._progress import Monitor
 from skevgp.fitting.inducing import Placement
+from skevgp.inference.objectives import BoundObjective
 from skevgp.optimizers.lbfgs import lbfgs
 from skevgp.outputs import sharing
 from skevgp.outputs.fit import fit_outputs
@@ -63,7 +64,7 @@ def test_constant_outputs_and_noise_have_groups_of_their_own():
     assert found(**data_of(np.hstack([Y, zeros, noise]), X)) == [[0], [1], [3], [2]]
     assert found(**data_of(np.hstack([noise, Y, zeros]), X)) == [[1], [2], [0], [3]]
     assert found(**data_of(np.hstack([noise, zeros]), X)) == [[0, 1]]
-    assert found(**data_of(np.hstack([zeros, zeros + 7.0]), X)) in ([[0, 1]], [[0], [1]])
+    assert sorted(found(**data_of(np.hstack([zeros, zeros + 7.0]), X))) in ([[0, 1]], [[0], [1]])
 
 
 @pytest.mark.parametrize(
@@ -143,13 +144,13 @@ def test_ctrl_c_while_groups_are_looked_for_reaches_the_user(monkeypatch):
 
 @pytest.mark.parametrize("raises", [True, False])
 def test_bounds_that_cannot_be_computed_do_not_end_the_fit(monkeypatch, raises):
-    class Broken(sharing.BoundObjective):
+    class Broken(BoundObjective):
         def __call__(self, flat):
             if raises:
                 raise NotPositiveDefiniteError
             return np.nan, np.full_like(flat, np.nan)
 
-    monkeypatch.setattr(sharing, "BoundObjective", Broken)
+    monkeypatch.setattr("skevgp.fitting.sparse.BoundObjective", Broken)
     assert found(**waves([0.5, 3.0])) == [[0, 1]]
 
 
