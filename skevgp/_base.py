@@ -118,6 +118,11 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
         ValueError
             If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
             of the rows of a Dask array.
+
+        Notes
+        -----
+        The diagonal of the covariance is the square of ``std``. Neither is below the rounding error of the variance,
+        about 1e-15 of the signal's: smaller variances cannot be told from 0.
         """
         if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")

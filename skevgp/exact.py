@@ -71,7 +71,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         A noise variance that is known, in place of one that is learned; ``std`` has it. If each row has its own, give
         their mean here, and to `fit` what they are in units of it, ``relative_variance``.
     normalize_y : bool, default=False
-        Whether the prior mean is the training mean of y, in place of 0.
+        Whether the prior mean is the training mean of y, in place of 0. Of a y that is then constant nothing is known
+        but the constant: its signal stays at a standard deviation of 1.
     optimizer : "fmin_l_bfgs_b", callable or None, default="fmin_l_bfgs_b"
         What finds kernel and noise. None takes the kernel as it is given: a signal variance that is added to one that
         has none is 1, as all numbers of the default kernel are. A callable is one as `GaussianProcessRegressor` takes,

@@ -116,10 +116,12 @@ class EVGPRegressor(SparseGaussianProcess):
         Up to 2,000 rows are predicted, and random folds are of 50,000 rows at most; it takes a few passes over these,
         and memory for a few times as many matrices (m + n_h, m + n_h) as folds. With hundreds of features it takes
         longer than 20 iterations. q is then at its optimum, after Adam too. It is left out
-        with None, with ``max_iter=0``, of fewer than 50 rows, and when a fit is interrupted or out of time;
+        with None, with ``max_iter=0``, of fewer than 50 rows, with inducing points at all rows and no ``groups`` (the
+        model is then the exact one), and when a fit is interrupted or out of time;
         `partial_fit` keeps what the first call found.
     normalize_y : bool, default=False
-        Whether the prior mean is the training mean of y, in place of 0.
+        Whether the prior mean is the training mean of y, in place of 0. Of a y that is then constant nothing is known
+        but the constant: its signal stays at a standard deviation of 1.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
         L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
         among them. The strings are the solvers with their defaults; what only one of them understands is said there:
