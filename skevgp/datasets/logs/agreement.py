@@ -84,6 +84,8 @@ def check_agreement(
     """
     integral = np.zeros_like(rate)
     integral[1:] = np.cumsum((rate[1:] + rate[:-1]) / 2.0 * np.diff(time)[:, np.newaxis], axis=0)
+    if not (np.isfinite(integral).all() and np.isfinite(np.ptp(position, axis=0)).all()):
+        return  # numbers that overflow are told where they are filtered
     floor = max(2.0 * slowest if what == "velocity" else 0.0, _SLOWEST[what])
     causes = {}
     for joint, name in enumerate(names):
@@ -169,19 +171,19 @@ def _cause(
     """What a contradicting signal seems to be; None if it agrees."""
     change, other = windows.change, windows.of(integral[:, joint])
     fastest = np.abs(change / (time[windows.last] - time[windows.first])).max()
-    if np.ptp(rate[:, joint]) == 0.0:
-        return (
-            f"it is {rate[0, joint]:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may never "
-            "fill it"
-        )
     slope, error = _slope(change, other)
     plain = _deviation(change, other)
     if _AGREES[0] <= slope <= _AGREES[1] or abs(slope - 1.0) <= _ERRORS * error:
         if plain <= 0.2:
             return None
         return _unsigned(change, other) or _late(windows, joint, time, integral, pieces, 0.5 * plain)
+    if np.ptp(rate[:, joint]) == 0.0:
+        return (
+            f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may never "
+            "fill it"
+        )
     if slope != 0.0 and _deviation(change, other, slope) <= _FITS:
-        return _scale(slope, what)
+        return _unsigned(change, other) or _scale(slope, what)
     return (
         _other_column(windows, joint, integral, names)
         or _unsigned(change, other)

@@ -267,7 +267,10 @@ class _Steps:
             return np.where(loose, turns, 0.0)
         # A turn that was lost, at any place: only where it stands among slow steps.
         alone = self._share(turns == 0.0) >= 0.5
-        fastest = (np.abs(rest) / self.lasting)[whole & (turns == 0.0) & (error <= _SMOOTH * period)].max(initial=0.0)
+        others = whole & ~loose
+        for before, after in self.lone(self.resolution):
+            others[before:after] = False
+        fastest = (np.abs(self.d) / self.lasting)[others].max(initial=0.0)
         fast = np.abs(self.d) > _FASTER * fastest * self.lasting
         tight = loose & (error <= (_LOOSE if how == "turns" else _TIGHT) * period + spread)
         return np.where(tight & alone & fast, turns, 0.0)
