@@ -179,8 +179,8 @@ def _cause(
         return _unsigned(change, other) or _late(windows, joint, time, integral, pieces, 0.5 * plain)
     if np.ptp(rate[:, joint]) == 0.0:
         return (
-            f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may never "
-            "fill it"
+            f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may "
+            "never fill it"
         )
     if slope != 0.0 and _deviation(change, other, slope) <= _FITS:
         return _unsigned(change, other) or _scale(slope, what)
