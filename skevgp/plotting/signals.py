@@ -12,8 +12,14 @@ from .._optional import require
 from ._style import BLUE, GREEN, PALETTE
 
 _PANELS = {"velocity": "velocity\n(rad/s)", "acceleration": "acceleration\n(rad/s²)", "torque": "torque\n(N m)"}
-_COLOURS = {"gap": "0.3", "rest": GREEN, "edge": PALETTE[4], "too short": PALETTE[3]}
-_WORDS = {"gap": "gap", "rest": "cut: rest", "edge": "cut: filter's edge", "too short": "cut: too short"}
+_COLOURS = {"gap": "0.3", "jump": PALETTE[1], "rest": GREEN, "edge": PALETTE[4], "too short": PALETTE[3]}
+_WORDS = {
+    "gap": "gap",
+    "jump": "jump",
+    "rest": "cut: rest",
+    "edge": "cut: filter's edge",
+    "too short": "cut: too short",
+}
 _MARGIN = 0.25  # of a panel's height, beyond what was processed
 
 
@@ -30,7 +36,7 @@ class SignalsDisplay:
         ``time`` (n,), and ``velocity``, ``acceleration`` and ``torque``, each (n, n_joints) or None where it was not
         recorded; ``position`` (n, n_joints) of the raw ones, and ``why`` (n,) of the processed ones.
     cuts : list of (float, float, str)
-        First and last second, and why: ``"gap"``, ``"rest"``, ``"edge"`` or ``"too short"``.
+        First and last second, and why: ``"gap"``, ``"jump"``, ``"rest"``, ``"edge"`` or ``"too short"``.
     joint_names : sequence of str of length n_joints
         For the titles.
     title : str, default=None
@@ -179,8 +185,8 @@ def _of_joints(signals: Bunch, chosen: list[int]) -> Bunch:
 
 
 def _broken(raw: Bunch, cuts: Sequence[tuple[float, float, str]]) -> Bunch:
-    """With a row of NaN in each gap: no line reaches across. (Of processed signals the ends at gaps are cut.)"""
-    gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why == "gap"], side="right")
+    """With a row of NaN in each gap or jump: no line reaches across. (Ends of processed signals there are cut.)"""
+    gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why in ("gap", "jump")], side="right")
     return Bunch(**{k: v if v is None else np.insert(v, gaps, np.nan, axis=0) for k, v in raw.items()})
 
 

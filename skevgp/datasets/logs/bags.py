@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ _STATES, _TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointT
 _NANO = 1e-9
 
 
-def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Recording:
+def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignored: Collection[str] = ()) -> Recording:
     """Read joint states, or a trajectory.
 
     Parameters
@@ -28,6 +28,8 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Rec
         None is the only one with such messages.
     joints : sequence of str or None
         Which, in which order; None is those of the messages, in theirs.
+    ignored : collection of {"velocity", "acceleration"}
+        What is not read, so that it may be incomplete.
 
     Returns
     -------
@@ -41,6 +43,7 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Rec
         If rosbags is not installed; the message gives the pip command.
     """
     kind, received, messages = _messages(path, topic)
+    rows: list[tuple[Any, ...]]
     if kind == _STATES:
         stamps = np.array([_nanoseconds(message.header.stamp) for message in messages], dtype=np.int64)
         times = stamps if stamps.all() else received  # a driver that leaves one out sets none that can be trusted
@@ -55,6 +58,9 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None) -> Rec
         rows = [(names, p.positions, p.velocities, p.accelerations, p.effort) for _, names, p in points]
     if not rows:
         raise ValueError("the topic has no rows.")
+    for column, field in ((2, "velocity"), (3, "acceleration")):
+        if field in ignored:
+            rows = [(*row[:column], (), *row[column + 1 :]) for row in rows]
     names = _joints([row[0] for row in rows], joints)
     mine = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
     position, velocity, acceleration, effort = (

@@ -14,16 +14,21 @@ from numpy.typing import ArrayLike
 from sklearn.utils import Bunch
 
 from ..._validation import as_floats, check_real
+from ...robots.loading import Robot, read_once
+from .agreement import check_agreement
 from .bags import SUFFIXES as BAGS
 from .bags import read_bag
+from .jumps import Jumps, Wish, check_wrap, find_jumps, kinds_of, wishes
 from .recording import Recording, Signals, naming
-from .signals import Processing, in_order, process, runs
+from .signals import Processing, in_order, pieces, process, runs
 from .tables import SECONDS, check_columns, read_table
 from .tables import SUFFIXES as TABLES
 
 PathLike = str | os.PathLike[str]
 Columns = Mapping[str, int | str | Sequence[int | str]]
 Keep = slice | tuple[float | None, float | None]
+# True, False, "auto" or a period: for all joints, for each one, or by their names.
+Wrap = bool | float | str | Sequence[bool | float | str] | Mapping[str, bool | float | str]
 
 
 @overload
@@ -35,6 +40,10 @@ def load_log(
     topic: str | None = ...,
     joints: Sequence[str] | None = ...,
     gains: ArrayLike = ...,
+    velocity: Literal["recorded", "derive"] = ...,
+    acceleration: Literal["recorded", "derive"] = ...,
+    wrap: Wrap = ...,
+    robot: Robot = ...,
     keep: Keep | Sequence[Keep | None] | None = ...,
     dt: float | None = ...,
     cutoff: float | None = ...,
@@ -52,6 +61,10 @@ def load_log(
     topic: str | None = ...,
     joints: Sequence[str] | None = ...,
     gains: ArrayLike = ...,
+    velocity: Literal["recorded", "derive"] = ...,
+    acceleration: Literal["recorded", "derive"] = ...,
+    wrap: Wrap = ...,
+    robot: Robot = ...,
     keep: Keep | Sequence[Keep | None] | None = ...,
     dt: float | None = ...,
     cutoff: float | None = ...,
@@ -68,6 +81,10 @@ def load_log(
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     gains: ArrayLike = 1.0,
+    velocity: Literal["recorded", "derive"] = "recorded",
+    acceleration: Literal["recorded", "derive"] = "recorded",
+    wrap: Wrap = "auto",
+    robot: Robot = None,
     keep: Keep | Sequence[Keep | None] | None = None,
     dt: float | None = 0.01,
     cutoff: float | None = 5.0,
@@ -84,16 +101,20 @@ def load_log(
     1. What ``keep`` leaves out goes; rows are sorted by time, and of rows with the same time the first one stays. Of a
        clock that goes back by more than a gap there is an error.
     2. Efforts become torques, times ``gains``.
-    3. Steps above ``max_gap`` cut the recording in pieces. Nothing that follows reaches across a gap.
-    4. Signals are interpolated (cubic, without overshoot) to a regular grid of ``dt``, or a finer one where rows are
+    3. Steps above ``max_gap`` cut the recording in pieces. Angles that wrap, such as those in [-π, π), are unwrapped
+       (``wrap``). Any other jump of a position cuts the recording, too. Nothing that follows reaches across a gap or a
+       jump.
+    4. Recorded velocities and accelerations are compared with derivatives of the positions. A contradiction is an
+       error, which names the joint and the likely cause.
+    5. Signals are interpolated (cubic, without overshoot) to a regular grid of ``dt``, or a finer one where rows are
        closer than that.
-    5. All signals pass a Butterworth filter of fourth order forth and back, which shifts none in time; at ``cutoff``
+    6. All signals pass a Butterworth filter of fourth order forth and back, which shifts none in time; at ``cutoff``
        amplitudes are halved. Then the grid is thinned out to ``dt``.
-    6. Velocities that are not recorded are central differences of the filtered positions, and so are accelerations of
+    7. Velocities that are not recorded are central differences of the filtered positions, and so are accelerations of
        the filtered velocities.
-    7. Two periods of ``cutoff`` (0.4 s) are cut at each end of a piece, where the filter guesses what comes (without a
+    8. Two periods of ``cutoff`` (0.4 s) are cut at each end of a piece, where the filter guesses what comes (without a
        filter: the row or two where differences are one-sided).
-    8. Rest is cut: where all joints are slower than ``rest_velocity`` for ``rest_time`` or longer, friction can have
+    9. Rest is cut: where all joints are slower than ``rest_velocity`` for ``rest_time`` or longer, friction can have
        any value.
 
     Parameters
@@ -115,6 +136,22 @@ def load_log(
         the messages, in the order of the first. For tables: how the joints are called, by default q1, q2, ...
     gains : float or array-like of shape (n_joints,), default=1.0
         Torque per effort: 1 where efforts are in N m, else N m per A.
+    velocity : {"recorded", "derive"}, default="recorded"
+        ``"derive"`` ignores recorded velocities, even if they are incomplete or NaN, and differentiates positions.
+        ``"recorded"`` takes them where they are there.
+    acceleration : {"recorded", "derive"}, default="recorded"
+        The same for accelerations.
+    wrap : {"auto", True, False}, float, sequence or dict of them, default="auto"
+        Whether to unwrap the jumps of angles that start again after a turn. A sequence has a value for each joint. A
+        dict has values by the joints' names, and other joints are ``"auto"``.
+
+        - ``"auto"`` unwraps a jump that is near a whole number of turns (2π, or 360 for degrees) and far beyond the
+          joint's motion between two rows.
+        - ``True`` unwraps each step above half a turn whose neighbours are steady, and a number is the period.
+        - ``False`` takes positions as they are. The recording is not cut at jumps of this joint.
+    robot : str, path-like, System or pinocchio.Model, default=None
+        As in `load_robot`. With it, ``"auto"`` never unwraps a joint with limits or a prismatic joint. Joints are
+        matched by ``joints`` or the names in a rosbag2 recording, or else by their order.
     keep : slice, tuple or sequence of them, default=None
         What to read: ``slice(first, stop)``, rows of the file from 0, or ``(first, last)``, seconds since its first
         row, of which either may be None. For several files a list with one for each, None to read all of it.
@@ -144,10 +181,13 @@ def load_log(
         - ``pieces`` : ndarray of shape (n_rows,): numbers that differ where a gap or rest lies between rows;
         - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
         - ``recordings`` : list of Bunch, one per file, with ``raw`` and ``processed``: each a Bunch of ``time``,
-          ``position``, ``velocity``, ``acceleration`` and ``torque`` (raw ones None where they were not recorded);
+          ``position``, ``velocity``, ``acceleration`` and ``torque`` (raw ones None where they were not recorded or
+          ignored; raw positions are unwrapped);
           ``processed`` has also ``why`` of shape (n,), which is empty for the rows in ``data`` and ``"edge"`` or
-          ``"rest"`` for those that were cut; ``cuts``, a list of (first second, last second, ``"gap"``, ``"edge"``,
-          ``"rest"`` or ``"too short"``); ``start``, the first row's time by the file's own clock, s; ``n_repeated``,
+          ``"rest"`` for those that were cut; ``cuts``, a list of (first second, last second, ``"gap"``, ``"jump"``,
+          ``"edge"``, ``"rest"`` or ``"too short"``); ``wrapped``, a dict of how many jumps of each joint were
+          unwrapped; ``periods``, a dict of their periods, without joints that never wrap; ``start``, the first
+          row's time by the file's own clock, s; ``n_repeated``,
           how many rows had the time of another; and ``filename``;
         - ``joint_names``, ``feature_names``, ``target_names``, ``filenames``, ``DESCR``.
     (data, target) : tuple of ndarray
@@ -157,8 +197,9 @@ def load_log(
     ------
     ValueError
         If a file cannot be read, lacks columns, a topic or joints, holds values that are not finite or a clock that
-        goes back, is too short for the filter or all at rest; files differ in their joints; or an argument does not
-        fit them. What is wrong with a file begins with its name.
+        goes back, is too short for the filter or all at rest; a recorded velocity or acceleration contradicts the
+        positions (never filled, another unit or sign, before the gear, another joint's, delayed); files differ in
+        their joints; or an argument does not fit them. What is wrong with a file begins with its name.
     TypeError
         If an argument is of the wrong type.
     OSError
@@ -175,6 +216,13 @@ def load_log(
     -----
     Neighbouring rows of filtered signals say much the same: n_rows is more than what there is to learn from.
     Cross-validate by ``groups``, never by rows.
+
+    Between gaps and jumps, unwrapped positions are continuous. On which turn a joint was across a gap is unknown: each
+    piece begins on the turn that is nearest to the end of the piece before it. A jump that is no whole number of turns
+    is found from the steps around it. It is far longer than any other step of the joint and stands alone, or positions
+    come back after at most three rows. A joint that moves only in such steps is not cut.
+
+    Units of positions are not converted. Degrees stay degrees, and are unwrapped by 360.
 
     Examples
     --------
@@ -201,6 +249,13 @@ def load_log(
     how = Processing(dt, cutoff, max_gap, rest_velocity, rest_time)
     if not isinstance(time_unit, str) or time_unit not in SECONDS:
         raise ValueError(f"time_unit must be one of {list(SECONDS)}; got {time_unit!r}.")
+    ignored = []
+    for name, source in (("velocity", velocity), ("acceleration", acceleration)):
+        if not isinstance(source, str) or source not in ("recorded", "derive"):
+            raise ValueError(f'{name} must be "recorded" or "derive"; got {source!r}.')
+        if source == "derive":
+            ignored.append(name)
+    check_wrap(wrap)
     names_of_joints = [] if joints is None else joints
     if (
         not isinstance(names_of_joints, (list, tuple, np.ndarray))
@@ -209,13 +264,18 @@ def load_log(
     ):
         raise ValueError(f"joints must be a list of different names; got {joints!r}.")
     asked = None if columns is None else check_columns(columns)
+    if asked is not None:
+        asked = {name: places for name, places in asked.items() if name not in ignored}
     files, limits = _files(path, keep)
     recordings, names = [], None if joints is None else list(joints)
+    given = None if robot is None else read_once(robot)
     for file, limit in zip(files, limits, strict=True):
         with naming(file):
-            read = _read(file, asked, time_unit, topic, names)
+            read = _read(file, asked, time_unit, topic, names, ignored)
             names = read.joint_names
-            recordings.append(_recording(read, file, limit, gains, how))
+            wanted = wishes(wrap, names)
+            kinds = kinds_of(given, names, named=joints is not None or asked is None)
+            recordings.append(_recording(read, file, limit, gains, how, wanted, kinds))
     assert names is not None
     log = _log(recordings, names, how)
     return (log.data, log.target) if return_X_y else log
@@ -263,13 +323,18 @@ def _kept(signals: Signals, keep: Keep | None) -> Signals:
 
 
 def _read(
-    file: Path, columns: dict[str, list[int | str]] | None, time_unit: str, topic: str | None, names: list[str] | None
+    file: Path,
+    columns: dict[str, list[int | str]] | None,
+    time_unit: str,
+    topic: str | None,
+    names: list[str] | None,
+    ignored: Sequence[str],
 ) -> Recording:
     ending = "".join(file.suffixes[-2:]).lower()
     if file.is_dir() or file.suffix.lower() in BAGS:
         if columns is not None:
             raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
-        return read_bag(file, topic, names)
+        return read_bag(file, topic, names, ignored)
     if not ending.endswith(TABLES):
         hint = " Convert it with: rosbags-convert --src in.bag --dst out" if ending == ".bag" else ""
         raise ValueError(f"its name must end in one of {', '.join([*TABLES, *BAGS])}.{hint}")
@@ -283,7 +348,15 @@ def _read(
     return read if names is None else Recording(read.signals, names, read.start)
 
 
-def _recording(read: Recording, file: Path, keep: Keep | None, gains: ArrayLike, how: Processing) -> Bunch:
+def _recording(
+    read: Recording,
+    file: Path,
+    keep: Keep | None,
+    gains: ArrayLike,
+    how: Processing,
+    wrap: Sequence[Wish],
+    kinds: Sequence[str],
+) -> Bunch:
     """What was recorded and what became of it."""
     kept = _kept(read.signals, keep)
     factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
@@ -291,7 +364,10 @@ def _recording(read: Recording, file: Path, keep: Keep | None, gains: ArrayLike,
         raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
     raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap)
     with np.errstate(all="ignore"):
-        done = process(raw, step, gap, how)
+        found = find_jumps(raw.time, raw.position, step, gap, wrap, kinds)
+        raw = replace(raw, position=found.position)
+        _check_derivatives(raw, list(pieces(raw.time, gap, found.cuts)), read.joint_names, found, how)
+        done = process(raw, step, gap, how, found.cuts)
     for name, signal in vars(done.signals).items():
         if not np.isfinite(signal).all():
             raise ValueError(f"its {name} overflows when it is filtered and differentiated.")
@@ -302,7 +378,25 @@ def _recording(read: Recording, file: Path, keep: Keep | None, gains: ArrayLike,
         raw=Bunch(**vars(raw)),
         processed=Bunch(**vars(done.signals), why=done.why),
         cuts=done.cuts,
+        wrapped=dict(zip(read.joint_names, found.wraps, strict=True)),
+        periods={n: period for n, period in zip(read.joint_names, found.periods, strict=True) if period is not None},
     )
+
+
+def _check_derivatives(raw: Signals, parts: list[slice], names: list[str], found: Jumps, how: Processing) -> None:
+    """Refuse recorded velocities that contradict the positions, and accelerations that contradict velocities."""
+    if raw.velocity is not None:
+        check_agreement(
+            raw.time, raw.position, raw.velocity, parts, names, slowest=how.rest_velocity, wrapped=found.wrapped
+        )
+    if raw.acceleration is not None:
+        velocity = raw.velocity
+        if velocity is None:
+            velocity = np.zeros_like(raw.position)
+            for rows in parts:
+                if rows.stop - rows.start > 1:
+                    velocity[rows] = np.gradient(raw.position[rows], raw.time[rows], axis=0)
+        check_agreement(raw.time, velocity, raw.acceleration, parts, names, what="acceleration")
 
 
 def _log(recordings: list[Bunch], names: list[str], how: Processing) -> Bunch:
@@ -353,7 +447,15 @@ def _story(recording: Bunch, length: int) -> str:
         f"{sum(last - first for first, last, why in cuts if why == kind):.3g} s of {kind}"
         for kind in sorted({why for _, _, why in cuts})
     ]
+    turns = [
+        f"{name} {recording.wrapped[name]} times by {'2π' if period == 2.0 * np.pi else f'{period:g}'}"
+        for name, period in recording.periods.items()
+    ]
+    unwrapped = f"; unwrapped: {', '.join(turns)}" if turns else ""
+    jumps = sum(why == "jump" for *_, why in cuts)
+    cut_at = f"; positions jump {jumps} times" if jumps else ""
     return (
         f"{recording.filename}: {length} rows of {len(raw.time)} recorded in {raw.time[-1] - raw.time[0]:.4g} s "
-        f"({recording.n_repeated} more repeated a time; cut: {', '.join(lost) or 'nothing'})"
+        f"({recording.n_repeated} more repeated a time; cut: {', '.join(lost) or 'nothing'}{cut_at}"
+        f"{unwrapped})"
     )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -70,8 +70,11 @@ def in_order(raw: Signals, max_gap: float | None) -> tuple[Signals, float, float
     """
     for name, signal in vars(raw).items():
         if signal is not None and not np.isfinite(signal).all():
-            row = np.flatnonzero(~np.isfinite(signal.reshape(len(signal), -1)).all(axis=1))[0]
-            raise ValueError(f"the {name} of row {row} of those kept is not finite.")
+            spoilt = ~np.isfinite(signal.reshape(len(signal), -1)).all(axis=1)
+            hint = f' Pass {name}="derive" to ignore it.' if name in ("velocity", "acceleration") else ""
+            if spoilt.all():
+                raise ValueError(f"the {name} is not finite in any row kept: the driver may never fill it.{hint}")
+            raise ValueError(f"the {name} of row {np.flatnonzero(spoilt)[0]} of those kept is not finite.{hint}")
     order = np.argsort(raw.time, kind="stable")
     steps = np.diff(raw.time[order])
     if not (steps > 0.0).any():
@@ -87,11 +90,17 @@ def in_order(raw: Signals, max_gap: float | None) -> tuple[Signals, float, float
     return raw.at(order[np.r_[True, steps > 0.0]]), step, gap
 
 
-def pieces(time: np.ndarray, gap: float) -> Iterator[slice]:
-    """Rows between which no step exceeds the gap (rounding apart)."""
-    ends = np.flatnonzero(np.diff(time) > gap * (1.0 + 1e-9)) + 1
-    for start, stop in zip([0, *ends], [*ends, len(time)], strict=True):
-        yield slice(start, stop)
+def pieces(time: np.ndarray, gap: float, jumps: Sequence[tuple[int, int]] = ()) -> Iterator[slice]:
+    """Rows between which no step exceeds the gap (rounding apart) and no position jumps.
+
+    Of each jump there is the last row before it and the first one after it. Rows between them are in no piece.
+    """
+    gaps = np.flatnonzero(np.diff(time) > gap * (1.0 + 1e-9))
+    start = 0
+    for before, after in sorted([*jumps, *((row, row + 1) for row in gaps.tolist())]):
+        yield slice(start, before + 1)
+        start = after
+    yield slice(start, len(time))
 
 
 def runs(flags: np.ndarray) -> Iterator[slice]:
@@ -100,8 +109,8 @@ def runs(flags: np.ndarray) -> Iterator[slice]:
         yield slice(start, stop)
 
 
-def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed:
-    """Filter and differentiate a recording, each piece between gaps for itself.
+def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Sequence[tuple[int, int]] = ()) -> Processed:
+    """Filter and differentiate a recording, each piece between gaps and jumps for itself.
 
     Parameters
     ----------
@@ -110,6 +119,8 @@ def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed
     step, gap : float
         The median step and what is taken for a gap, s.
     how : Processing
+    jumps : sequence of (int, int)
+        The last row before each jump of a position, and the first row after it.
 
     Returns
     -------
@@ -125,10 +136,14 @@ def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed
     cuts: list[Cut] = []
     grid = _Grid.of(raw, step, how)
     dt = grid.h * grid.inside
-    for rows in pieces(raw.time, gap):
+    before = -1
+    reached = {after for _, after in jumps}
+    for rows in pieces(raw.time, gap, jumps):
         piece = raw.at(rows)
         if rows.start > 0:
-            cuts.append((float(raw.time[rows.start - 1]), float(piece.time[0]), "gap"))
+            why_not = "jump" if rows.start in reached else "gap"
+            cuts.append((float(raw.time[before]), float(piece.time[0]), why_not))
+        before = rows.stop - 1
         done = _process_piece(piece, grid, how)
         if done is None:
             cuts.append((float(piece.time[0]), float(piece.time[-1]), "too short"))
@@ -147,7 +162,15 @@ def process(raw: Signals, step: float, gap: float, how: Processing) -> Processed
         )
     if not parts:
         lost = 2.0 * grid.edge * dt
-        raise ValueError(f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.")
+        jumping = (
+            f" Positions jump {len(jumps)} times, first at {raw.time[jumps[0][0]]:g} s, and each jump cuts it. "
+            "Positions that move in steps are taken as they are with wrap=False."
+            if jumps
+            else ""
+        )
+        raise ValueError(
+            f"it is too short: no piece without gaps is longer than the {lost:g} s cut at its ends.{jumping}"
+        )
     if not any((why == "").any() for why in reasons):
         raise ValueError(f"all of it is at rest: no joint is faster than rest_velocity={how.rest_velocity:g}.")
     return Processed(_joined(parts), np.concatenate(reasons), sorted(cuts))

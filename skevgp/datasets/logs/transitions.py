@@ -19,8 +19,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     """State transitions of logs, each with its own time step: data for forward dynamics.
 
     A row is the recorded state and the torque that acted until the next row, which is its target. Nothing is resampled
-    or filtered. Left out are transitions across a gap or through rest, as `load_log` found them, and rows with the time
-    of another.
+    or filtered. Angles that wrap are unwrapped, as `load_log` did it. Left out are transitions across a gap, across a
+    jump of a position or through rest, as `load_log` found them, and rows with the time of another.
 
     Parameters
     ----------
@@ -49,7 +49,8 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     Raises
     ------
     ValueError
-        If ``stride`` is below 1, no velocities were recorded, or no transition remains.
+        If ``stride`` is below 1, no velocities were recorded or they were ignored by ``velocity="derive"``, or no
+        transition remains.
     TypeError
         If ``log`` is not what `load_log` returns, or ``stride`` not an integer.
 
@@ -89,7 +90,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
     parts = [_transitions(recording, stride) for recording in log.recordings]
     lengths = [len(part) for part in parts]
     if not any(lengths):
-        raise ValueError(f"No {stride + 1} rows follow each other without a gap or rest: lower stride={stride}.")
+        raise ValueError(f"No {stride + 1} rows follow each other without a gap, jump or rest: lower stride={stride}.")
     rows, n = np.vstack(parts), len(log.joint_names)
     data, target, time = rows[:, : 3 * n + 1], rows[:, 3 * n + 1 : -1], rows[:, -1]
     if return_X_y:
@@ -105,7 +106,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
         target_names=states,
         DESCR=(
             f"{len(data)} transitions of {stride} recorded rows, of {data[:, -1].min():.4g} to {data[:, -1].max():.4g} "
-            f"s, not filtered, but for gaps and rest, of the files {', '.join(log.filenames)}."
+            f"s, not filtered, without gaps, jumps and rest, of the files {', '.join(log.filenames)}."
         ),
     )
 
@@ -114,11 +115,14 @@ def _transitions(recording: Bunch, stride: int) -> np.ndarray:
     """Rows of state, torque, dt, next state and time."""
     raw = recording.raw
     if raw.velocity is None:
-        raise ValueError(f"{recording.filename}: there are no recorded velocities, which are half of the state.")
+        raise ValueError(
+            f"{recording.filename}: there are no recorded velocities, which are half of the state. Differences of "
+            'unfiltered positions are too noisy to replace them, so velocity="derive" of load_log leaves none.'
+        )
     steps = np.diff(raw.time)
     whole = np.ones(len(steps), dtype=bool)
     for first, last, why in recording.cuts:
-        if why in ("gap", "rest"):
+        if why in ("gap", "rest", "jump"):
             whole &= (raw.time[1:] <= first) | (raw.time[:-1] >= last)
     starts = np.concatenate(
         [np.arange(run.start, run.stop - stride + 1, stride) for run in runs(whole)] or [np.empty(0, dtype=np.intp)]

@@ -115,7 +115,9 @@ def test_velocities_must_be_recorded(load):
 
 
 def test_some_transition_must_remain(load):
-    with pytest.raises(ValueError, match="No 1001 rows follow each other without a gap or rest: lower stride=1000"):
+    with pytest.raises(
+        ValueError, match="No 1001 rows follow each other without a gap, jump or rest: lower stride=1000"
+    ):
         log_transitions(load(table_of(T)), stride=1000)
 
 

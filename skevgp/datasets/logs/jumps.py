@@ -1,0 +1,367 @@
+"""Positions that jump: an angle that wraps is unwrapped, any other jump cuts the record.
+
+A jump is a step between two rows that the steps before and after it do not announce. Three questions decide about it,
+and none needs the recorded velocity, which a driver may have computed from the same wrapped angles:
+
+* Does the step equal a whole number of periods (2π or 360) plus the step that its neighbours predict?
+* Is it far beyond the fastest step elsewhere, or do all positions lie within one period, as those of an encoder do that
+  starts again?
+* Does it stand alone? Motion that the rows resolve has at least one more step in the same direction next to it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from numbers import Real
+from typing import Any
+
+import numpy as np
+
+from ..._validation import check_real
+from ...robots import layout_of, load_robot
+from ...robots.loading import named_system
+
+RADIANS, DEGREES = 2.0 * np.pi, 360.0
+_SIDE = 3  # neighbours on each side of a step that predict it
+_FEWEST = 3  # neighbours without which nothing is said of a step
+# A wrap's step, without its periods, may differ from the prediction by this part of a period, plus twice the largest
+# deviation of a neighbour from the prediction.
+_LOOSE, _TIGHT = 0.02, 0.002
+_FASTER = 4.0  # a jump is so many times the fastest step elsewhere
+_LONELY = 8.0  # ... and so many times what its neighbours deviate in its direction
+_COUNTS = 50.0  # ... and so many times the resolution of the positions
+_SMOOTH = 0.125  # of a period: 95 % of steps are predicted better than that where an angle is sampled well
+_STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is no jump
+_SPIKE = 3  # rows that are away and come back, at most
+_MOST = 0.02  # of all steps: a joint with more lone steps is one that moves in steps
+_UNLIMITED = 1e10  # limits beyond it are none
+
+Kind = str  # "any", "turns" (revolute without limits) or "bounded" (prismatic, or with limits)
+Wish = bool | float | str  # True, False, "auto" or a period
+
+
+@dataclass(frozen=True)
+class Jumps:
+    """What was found in the positions of a recording."""
+
+    position: np.ndarray  # (n, n_joints), unwrapped
+    wraps: list[int]  # per joint: how many jumps were unwrapped
+    periods: list[float | None]  # per joint: of what; None where nothing was unwrapped
+    cuts: list[tuple[int, int]]  # last row before a jump of another size, first row after it
+    wrapped: np.ndarray  # (n - 1, n_joints) of bool: the steps that were unwrapped
+
+
+def check_wrap(wrap: Any) -> None:
+    """Refuse what is no wish about wrapping, whatever the joints."""
+    if isinstance(wrap, Mapping):
+        for key, one in wrap.items():
+            if not isinstance(key, str):
+                raise TypeError(f"wrap must have names of joints as keys; got {key!r}.")
+            _check_wish(one, f"wrap[{key!r}]")
+    elif isinstance(wrap, (list, tuple, np.ndarray)):
+        for index, one in enumerate(wrap):
+            _check_wish(one, f"wrap[{index}]")
+    else:
+        _check_wish(wrap, "wrap")
+
+
+def wishes(wrap: Any, names: Sequence[str]) -> list[Wish]:
+    """What is wished for each joint: True, False, "auto" or a period."""
+    if isinstance(wrap, Mapping):
+        unknown = sorted(set(wrap) - set(names))
+        if unknown:
+            raise ValueError(f"wrap has {unknown}, which are none of the joints {list(names)}.")
+        return [_plain(wrap.get(name, "auto")) for name in names]
+    if isinstance(wrap, (list, tuple, np.ndarray)):
+        if len(wrap) != len(names):
+            raise ValueError(f"wrap must have one value for each of the {len(names)} joints; got {wrap!r}.")
+        return [_plain(one) for one in wrap]
+    return [_plain(wrap)] * len(names)
+
+
+def _check_wish(one: Any, name: str) -> None:
+    if isinstance(one, (bool, np.bool_)) or (isinstance(one, str) and one == "auto"):
+        return
+    if not isinstance(one, Real):
+        kind = ValueError if isinstance(one, str) else TypeError
+        raise kind(f'{name} must be "auto", True, False or a period above 0; got {one!r}.')
+    check_real(one, name, minimum=0.0, strict=True)
+
+
+def _plain(one: Any) -> Wish:
+    return one if isinstance(one, str) else bool(one) if isinstance(one, (bool, np.bool_)) else float(one)
+
+
+def kinds_of(robot: Any, names: Sequence[str], named: bool) -> list[Kind]:
+    """Whether each joint of a log can turn without end.
+
+    Parameters
+    ----------
+    robot : str, path-like, System, pinocchio.Model or None
+        As in `load_robot`; None says nothing.
+    names : sequence of str
+        Of the log's joints.
+    named : bool
+        Whether the names are the user's or the file's. Otherwise only their order counts.
+
+    Returns
+    -------
+    kinds : list of {"any", "turns", "bounded"}
+    """
+    if robot is None:
+        return ["any"] * len(names)
+    if named_system(robot) is not None:
+        layout = layout_of(robot)
+        known = dict(zip(layout.position_names, layout.revolute, strict=True))
+    else:
+        model = load_robot(robot)
+        layout = layout_of(model)
+        free = (np.asarray(model.lowerPositionLimit) < -_UNLIMITED) & (model.upperPositionLimit > _UNLIMITED)
+        turning = [bool(turns and one) for turns, one in zip(layout.revolute, free, strict=True)]
+        known = dict(zip(layout.position_names, turning, strict=True))
+    if named and set(names) <= set(known):
+        return ["turns" if known[name] else "bounded" for name in names]
+    if len(names) != len(known):
+        raise ValueError(
+            f"robot has the joints {list(known)}, and the log {list(names)}: give joints of the robot by joints=, or "
+            "as many."
+        )
+    return ["turns" if turns else "bounded" for turns in known.values()]
+
+
+def find_jumps(
+    time: np.ndarray, position: np.ndarray, step: float, gap: float, asked: Sequence[Wish], kinds: Sequence[Kind]
+) -> Jumps:
+    """Unwrap angles, and find the jumps that are no wraps.
+
+    Parameters
+    ----------
+    time : ndarray of shape (n,)
+        Ascending, s.
+    position : ndarray of shape (n, n_joints)
+    step, gap : float
+        The median step, and the longest one that is no gap, s.
+    asked : sequence of {True, False, "auto"} or float
+        Per joint; a number is a period.
+    kinds : sequence of {"any", "turns", "bounded"}
+        Per joint.
+
+    Returns
+    -------
+    jumps : Jumps
+        Between two gaps or jumps, positions are continuous. Across a gap, or a jump that is no wrap, the turn of an
+        unwrapped angle is unknown: the next piece begins at the turn that is nearest to the end of the last one.
+    """
+    steps = np.diff(time)
+    whole = steps <= gap * (1.0 + 1e-9)
+    columns = [_Steps(steps, whole, column, step) for column in position.T]
+    resolutions = [column.resolution for column in columns]
+    periods = _periods(columns, asked, kinds)
+    done, wraps, broken = np.array(position, dtype=np.float64), [], []
+    wrapped = np.zeros((len(steps), len(columns)), dtype=bool)
+    for joint, column in enumerate(columns):
+        period = periods[joint]
+        turns = np.zeros(len(steps)) if period is None else column.turns(period, _how(asked[joint], kinds[joint]))
+        wrapped[:, joint] = turns != 0.0
+        wraps.append(int(wrapped[:, joint].sum()))
+        if wraps[-1]:
+            assert period is not None
+            column = column.unwrapped(turns * period)
+        # A joint that never moves has no resolution of its own.
+        found = [] if asked[joint] is False else column.lone(resolutions[joint] or max(resolutions))
+        broken.extend(found)
+        if wraps[-1]:
+            assert period is not None
+            free = ~whole
+            for before, after in found:
+                free[before:after] = True
+            across = np.round(column.d / period)
+            turns = turns + np.where(free, across, 0.0)
+            done[1:, joint] -= period * np.cumsum(turns)
+    return Jumps(
+        done,
+        wraps,
+        [period if count else None for period, count in zip(periods, wraps, strict=True)],
+        list(_merged(broken)),
+        wrapped,
+    )
+
+
+def _how(asked: Wish, kind: Kind) -> str:
+    return "forced" if asked is not False and asked != "auto" else "turns" if kind == "turns" else "any"
+
+
+def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[Kind]) -> list[float | None]:
+    """By which period each joint may be unwrapped: all joints of a log have the same unit."""
+    wanted = [one is True or (one == "auto" and kind != "bounded") for one, kind in zip(asked, kinds, strict=True)]
+    degrees = any(
+        wish and column.turns(DEGREES, _how(one, kind)).any()
+        for wish, column, one, kind in zip(wanted, columns, asked, kinds, strict=True)
+    )
+    common = DEGREES if degrees else RADIANS
+    return [
+        one if isinstance(one, float) else common if wish else None for one, wish in zip(asked, wanted, strict=True)
+    ]
+
+
+class _Steps:
+    """The steps of one joint.
+
+    Parameters
+    ----------
+    steps : ndarray of shape (n - 1,)
+        Of time, s.
+    whole : ndarray of shape (n - 1,) of bool
+        Where there is no gap.
+    position : ndarray of shape (n,)
+    step : float
+        The median one, s.
+    """
+
+    def __init__(self, steps: np.ndarray, whole: np.ndarray, position: np.ndarray, step: float):
+        self.steps, self.whole, self.position, self.step = steps, whole, position, step
+        self.d = np.diff(position)
+        # Stamps that come in bursts make short steps of time, not fast joints.
+        self.lasting = np.maximum(steps, step)
+
+    @property
+    def resolution(self) -> float:
+        sizes = np.abs(self.d[self.whole])
+        return float(sizes[sizes > 0.0].min(initial=np.inf)) if (sizes > 0.0).any() else 0.0
+
+    def unwrapped(self, jumps: np.ndarray) -> _Steps:
+        """With these parts of the steps taken away."""
+        position = self.position - np.r_[0.0, np.cumsum(jumps)]
+        return _Steps(self.steps, self.whole, position, self.step)
+
+    def turns(self, period: float, how: str) -> np.ndarray:
+        """How many periods are in each step, 0 where it is motion.
+
+        Parameters
+        ----------
+        period : float
+        how : {"any", "turns", "forced"}
+            How much evidence is needed: the most, less for a joint that can turn without end, or little.
+        """
+        none = np.zeros(len(self.d))
+        whole = self.whole
+        if not (np.abs(self.d[whole]) > 0.5 * period).any():
+            return none
+        rest = self.d - period * np.round(self.d / period)
+        middle, deviation = self._neighbours(rest)
+        expected = middle * self.steps
+        turns = np.where(whole, np.round((self.d - np.nan_to_num(expected)) / period), 0.0)
+        rest = self.d - period * turns
+        error = np.abs(rest - expected)
+        jumps = whole & (turns != 0.0)
+        if how == "forced":
+            return np.where(jumps & ((error <= 0.25 * period) | np.isnan(error)), turns, 0.0)
+        known = whole & np.isfinite(error)
+        jumps &= known
+        spread = 2.0 * deviation * self.lasting
+        if not jumps.any():
+            return none
+        loose = jumps & (error <= np.minimum(_LOOSE * period + spread, _SMOOTH * period))
+        if self._starts_again(period, turns, loose) and np.quantile(error[known], 0.95) <= _SMOOTH * period:
+            return np.where(loose, turns, 0.0)
+        # A turn that was lost, at any place: only where it stands among slow steps.
+        alone = self._share(turns == 0.0) >= 0.5
+        others = whole & ~loose
+        for before, after in self.lone(self.resolution):
+            others[before:after] = False
+        fastest = (np.abs(self.d) / self.lasting)[others].max(initial=0.0)
+        fast = np.abs(self.d) > _FASTER * fastest * self.lasting
+        tight = loose & (error <= (_LOOSE if how == "turns" else _TIGHT) * period + spread)
+        return np.where(tight & alone & fast, turns, 0.0)
+
+    def _starts_again(self, period: float, turns: np.ndarray, jumps: np.ndarray) -> bool:
+        """Whether all positions lie within what one jump spans, and come near its ends."""
+        sizes = np.unique(np.abs(turns[jumps]))
+        if len(sizes) != 1:
+            return False
+        reach = np.ptp(self.position)
+        return bool(reach <= (1.0 + _LOOSE) * sizes[0] * period)
+
+    def lone(self, resolution: float) -> list[tuple[int, int]]:
+        """Jumps: the last row before each, and the first one after it.
+
+        Parameters
+        ----------
+        resolution : float
+            The smallest step of the positions that is not 0.
+        """
+        middle, deviation = self._neighbours(self.d, same_direction=True)
+        error = self.d - middle * self.steps
+        size = np.abs(error)
+        limit = np.maximum(_LONELY * deviation * self.lasting, _COUNTS * resolution)
+        lone = self.whole & np.isfinite(size) & (size > limit) & (4.0 * size > _STRONGEST * self.lasting**2)
+        speed = np.abs(self.d) / self.lasting
+        while lone.any():
+            rest = speed[self.whole & ~lone].max(initial=0.0)
+            slower = lone & (size <= _FASTER * rest * self.lasting)
+            if not slower.any():
+                break
+            lone &= ~slower
+        return self._grouped(np.flatnonzero(lone), error)
+
+    def _grouped(self, lone: np.ndarray, error: np.ndarray) -> list[tuple[int, int]]:
+        """Steps away and back are one jump; none if the joint only ever moves in such steps."""
+        groups: list[list[int]] = []
+        for index in lone.tolist():
+            if groups and index - groups[-1][-1] <= _SPIKE and self.whole[groups[-1][-1] : index].all():
+                groups[-1].append(index)
+            else:
+                groups.append([index])
+        away = sum(abs(error[group].sum()) > 0.5 * np.abs(error[group]).max() for group in groups)
+        if away > max(4, _MOST * len(self.d)):
+            return []
+        return [(group[0], group[-1] + 1) for group in groups]
+
+    def _around(self, values: np.ndarray) -> np.ndarray:
+        """The neighbours of each step, without those beyond a gap (NaN), of shape (2 * _SIDE, n - 1)."""
+        n = len(values)
+        runs = np.r_[0, np.cumsum(~self.whole[1:] | ~self.whole[:-1])] if n else np.empty(0)
+        found = np.full((2 * _SIDE, n), np.nan)
+        for row, shift in enumerate([*range(-_SIDE, 0), *range(1, _SIDE + 1)]):
+            here = slice(max(0, -shift), max(0, n - max(0, shift)))
+            there = slice(max(0, shift), max(0, n + min(0, shift)))
+            near = runs[here] == runs[there]
+            found[row, here] = np.where(near, values[there], np.nan)
+        return found
+
+    def _neighbours(self, d: np.ndarray, same_direction: bool = False) -> tuple[np.ndarray, np.ndarray]:
+        """Median rate of each step's neighbours, and the largest deviation of one from it; NaN where there are few.
+
+        With ``same_direction`` a deviation counts only if it has the direction of the step's own.
+        """
+        rates = d / self.lasting
+        around = self._around(rates)
+        enough = np.isfinite(around).sum(axis=0) >= _FEWEST
+        middle, deviation = np.full(len(d), np.nan), np.full(len(d), np.nan)
+        middle[enough] = np.nanmedian(around[:, enough], axis=0)
+        away = around - middle
+        if same_direction:
+            away = np.maximum(away * np.sign(d - middle * self.steps), 0.0)
+        deviation[enough] = np.nanmax(np.abs(away[:, enough]), axis=0)
+        return middle, deviation
+
+    def _share(self, flags: np.ndarray) -> np.ndarray:
+        """Of each step's neighbours, how many have the flag."""
+        around = self._around(flags.astype(np.float64))
+        there = np.isfinite(around)
+        return np.where(there, around, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+
+
+def _merged(found: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
+    """Jumps of all joints in order; those that touch are one."""
+    last: tuple[int, int] | None = None
+    for before, after in sorted(found):
+        if last is not None and before <= last[1] + _SPIKE - 2:
+            last = (last[0], max(last[1], after))
+            continue
+        if last is not None:
+            yield last
+        last = (before, after)
+    if last is not None:
+        yield last

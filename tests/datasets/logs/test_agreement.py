@@ -1,0 +1,70 @@
+"""Recorded velocities that contradict positions."""
+
+import numpy as np
+import pytest
+
+from skevgp.datasets import load_log
+
+T = np.arange(0.0, 20.0, 0.01)
+Q = np.column_stack([np.sin(T) + 0.3 * np.sin(2.7 * T), np.cos(1.4 * T) - 0.2 * np.sin(3.1 * T)])
+DQ = np.column_stack([np.cos(T) + 0.81 * np.cos(2.7 * T), -1.4 * np.sin(1.4 * T) - 0.62 * np.cos(3.1 * T)])
+COLUMNS = {"time": 0, "position": [1, 2], "velocity": [3, 4], "effort": [5, 6]}
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(q, dq, **arguments):
+        file = tmp_path / "log.csv"
+        np.savetxt(file, np.column_stack([T, q, dq, q]), delimiter=",")
+        return load_log(file, columns=COLUMNS, **arguments)
+
+    return load
+
+
+def late(seconds):
+    return np.column_stack([np.interp(T - seconds, T, column) for column in DQ.T])
+
+
+@pytest.mark.parametrize(
+    ("dq", "cause"),
+    [
+        (0.0 * DQ, "joint 'q2': it is 0 in all rows.*never fill"),
+        (DQ * [1.0, 0.0], "Joint 'q2': it is 0 in all rows"),
+        (np.degrees(DQ), "57.*degrees per second"),
+        (DQ * 30.0 / np.pi, "revolutions per minute"),
+        (DQ * [1.0, -101.0], "Joint 'q2': it is -101 times.*motor"),
+        (-DQ, "opposite sign"),
+        (DQ[:, ::-1], "Joint 'q1': the column of 'q2' fits it"),
+        (np.abs(DQ), "speed without sign"),
+        (late(0.2), "0.2 s late"),
+    ],
+)
+def test_a_contradiction_names_joint_and_cause(load, dq, cause):
+    with pytest.raises(ValueError, match=f"log.csv: the recorded velocity contradicts the position.*{cause}"):
+        load(Q, dq)
+    derived = load(Q, dq, velocity="derive")
+    assert derived.recordings[0].raw.velocity is None
+    assert np.abs(derived.data[:, 2:4] - load(Q, DQ).data[:, 2:4]).max() < 1e-2
+
+
+@pytest.mark.parametrize("noise", [0.1, 1.0, 3.0])
+def test_a_noisy_velocity_is_no_contradiction(load, noise):
+    rng = np.random.default_rng(0)
+    load(Q, DQ + noise * rng.standard_normal(DQ.shape))
+
+
+def test_joints_that_hardly_move_are_not_judged(load):
+    rng = np.random.default_rng(0)
+    q = Q * [1.0, 0.0] + 1e-3 * rng.standard_normal(Q.shape)
+    load(q, DQ * [1.0, 0.0])
+
+
+def test_nan_velocities_are_ignored_when_derived(load):
+    with pytest.raises(ValueError, match='velocity is not finite in any row.*velocity="derive"'):
+        load(Q, np.nan * DQ)
+    assert np.isfinite(load(Q, np.nan * DQ, velocity="derive").data).all()
+
+
+def test_invalid_velocity_raises(load):
+    with pytest.raises(ValueError, match='velocity must be "recorded" or "derive"; got \'none\''):
+        load(Q, DQ, velocity="none")

@@ -1,0 +1,116 @@
+"""Positions that jump: wraps are unwrapped, other jumps cut the record, motion stays."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_allclose, assert_array_equal
+
+from skevgp.datasets import load_log, log_transitions
+
+T = np.arange(0.0, 20.0, 0.01)
+Q = 2.5 * T + np.sin(1.3 * T)
+DQ = 2.5 + 1.3 * np.cos(1.3 * T)
+COLUMNS = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+
+
+@pytest.fixture
+def load(tmp_path):
+    def load(q, dq=None, t=T, **arguments):
+        file = tmp_path / "log.csv"
+        np.savetxt(file, np.column_stack([t, q, q if dq is None else dq, np.cos(t)]), delimiter=",", fmt="%.17g")
+        ignored = {"velocity": "derive"} if dq is None else {}
+        return load_log(file, **{"columns": COLUMNS, "rest_velocity": 0.0, **ignored, **arguments})
+
+    return load
+
+
+def assert_same_but_for_turns(found, expected, period):
+    assert_allclose(found[:, 1:], expected[:, 1:], atol=1e-9 * period)
+    turns = (found[:, 0] - expected[:, 0]) / period
+    assert_allclose(turns, np.full(len(turns), np.round(turns[0])), atol=1e-9)
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+@pytest.mark.parametrize(
+    ("unit", "low", "high"),
+    [
+        (1.0, -np.pi, np.pi),
+        (1.0, 0.0, 2.0 * np.pi),
+        (1.0, -4.0 * np.pi, 4.0 * np.pi),
+        (180.0 / np.pi, -180.0, 180.0),
+        (180.0 / np.pi, 0.0, 360.0),
+    ],
+)
+def test_a_wrapped_angle_gives_the_data_of_the_unwrapped_one(load, unit, low, high, recorded):
+    dq = unit * DQ if recorded else None
+    shown = (unit * Q - low) % (high - low) + low
+    plain, log = load(unit * Q, dq), load(shown, dq)
+    assert_same_but_for_turns(log.data, plain.data, high - low)
+    assert log.recordings[0].wrapped == {"q1": np.count_nonzero(np.abs(np.diff(shown)) > 0.5 * (high - low))}
+    assert "unwrapped: q1" in log.DESCR
+    assert "unwrapped" not in plain.DESCR
+    if recorded:
+        found, expected = log_transitions(log), log_transitions(plain)
+        assert_allclose(found.target - found.data[:, :2], expected.target - expected.data[:, :2], atol=1e-9 * unit)
+
+
+def test_a_jump_that_is_no_turn_cuts_the_record(load):
+    log = load(np.sin(T) + 1.3 * (T > 9.995), np.cos(T))
+    (cut,) = [cut for cut in log.recordings[0].cuts if cut[2] == "jump"]
+    assert_allclose(cut[:2], [9.99, 10.0], atol=1e-9)
+    assert len(np.unique(log.pieces)) == 2
+    assert "positions jump 1 times" in log.DESCR
+    transitions = log_transitions(log)
+    assert len(transitions.data) == len(T) - 2
+    assert np.abs(transitions.target[:, 0] - transitions.data[:, 0]).max() < 0.02
+
+
+@pytest.mark.parametrize("n_rows", [1, 2, 3])
+def test_a_spike_is_cut_out(load, n_rows):
+    q = np.sin(T)
+    q[700 : 700 + n_rows] = -2.0
+    log = load(q, np.cos(T))
+    (cut,) = [cut for cut in log.recordings[0].cuts if cut[2] == "jump"]
+    assert_allclose(cut[:2], [T[699], T[700 + n_rows]], atol=1e-9)
+    assert np.abs(log.data[:, 0] - np.sin(log.time)).max() < 1e-3
+
+
+def test_wrap_false_takes_positions_as_they_are(load):
+    shown = (Q + np.pi) % (2.0 * np.pi) - np.pi
+    log = load(shown, wrap=False)
+    assert_array_equal(log.recordings[0].raw.position[:, 0], shown)
+    assert {why for *_, why in log.recordings[0].cuts} == {"edge"}
+
+
+def test_a_joint_with_limits_is_not_unwrapped(load):
+    shown = (Q + np.pi) % (2.0 * np.pi) - np.pi
+    log = load(shown, DQ, robot="cartpole", joints=["theta"])
+    assert log.recordings[0].wrapped["theta"] > 0
+    (recording,) = load(shown, DQ, robot="cartpole", joints=["x"]).recordings
+    assert recording.wrapped == {"x": 0}
+    assert "jump" in {why for *_, why in recording.cuts}
+
+
+@pytest.mark.parametrize(("wrap", "error"), [("yes", ValueError), (0.0, ValueError), (None, TypeError)])
+def test_invalid_wrap_raises(load, wrap, error):
+    with pytest.raises(error, match="wrap must be"):
+        load(Q, DQ, wrap=wrap)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.sampled_from([0.002, 0.01, 0.05]), st.sampled_from([0.01, 1.0, 57.3, 1000.0]))
+def test_smooth_motion_with_noise_and_resolution_is_no_jump(seed, step, unit):
+    from skevgp.datasets.logs.jumps import find_jumps
+
+    rng = np.random.default_rng(seed)
+    t = np.cumsum(rng.uniform(0.6, 1.4, 1500)) * step
+    waves = rng.uniform(0.05, 0.08 / step, 4)
+    q = np.sum(rng.standard_normal(4) * np.sin(2 * np.pi * waves * t[:, None] + rng.uniform(0, 6, 4)) / waves, axis=1)
+    q += rng.choice([0.0, 1e-4, 1e-2]) * rng.standard_normal(len(t))
+    q *= rng.random() > 0.2
+    resolution = rng.choice([1e-9, 1e-4, 1e-2])
+    position = unit * resolution * np.round(q / resolution)[:, None]
+    found = find_jumps(t, position, float(np.median(np.diff(t))), np.inf, ["auto"], ["any"])
+    assert found.cuts == []
+    assert found.wraps == [0]
