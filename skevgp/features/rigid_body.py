@@ -137,6 +137,8 @@ class RigidBodyRegressor(RobotTransformer):
     def share_coef(self) -> bool:
         return self.robot is not None
 
+    _n_blocks: ClassVar[int] = 3
+
     def _column_names(self) -> list[str]:
         names = self._layout.position_names
         return [*self._layout.state_names, *(f"d2{name}/dt2" for name in names)]
