@@ -1,14 +1,14 @@
 """Why a robot's model explains torques badly: columns in another order, degrees, positions beyond the joints' limits.
 
-What is tried is tried on some rows: the torques are regressed on the model's features, with a wide prior, as if columns
-were in another order or in other units. A cause is named if that leaves far less of the torques' variance.
+Torques of some rows are regressed on the model's features with a wide prior. The regression is repeated with columns in
+another order and with angles in radians. A cause is named if it leaves far less of the torques' variance.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from itertools import combinations, permutations
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -17,23 +17,25 @@ from .robots import RigidBody
 from .robots.loading import joint_axes
 
 _ROWS, _ROWS_OF_SEARCH = 400, 200
-# Fewer rows of many joints, and of more joints than these positions are compared with their limits only.
+# Robots of many joints use fewer rows. With more joints than the last number, only limits of positions are compared.
 _TORQUES, _LEAST_ROWS, _MOST_JOINTS = 4000, 100, 40
-# What is left of the torques' variance falls to this share of itself, and by so much, if a cause is named.
+# A cause is named if the residual's share of the variance falls to this share of itself, and by at least the second.
 _FALL, _LEAST_FALL = 0.5, 0.02
 # The prior of a regression is wider than the map's by this factor; noise is at least this share of a variance.
 _WIDER, _LEAST_NOISE = 10.0, 1e-4
 # The least share that a search of orders tells from 0.
 _LEAST_SHARE = 1e-3
-# All orders of so many joints are tried; of some more those that differ by one joint or two, again and again; of many
-# joints that by name, and the backward one.
+# Up to the first number of joints, all orders are tried. Up to the second, a search exchanges or moves joints step by
+# step. With more joints, the orders by name and backwards are tried.
 _MOST_ALL, _MOST_SEARCHED, _MOST_TRIALS = 6, 12, 2000
-# Positions are beyond limits if they are by this share of the range, and look like degrees if they are so many times
-# as large as the larger limit, and larger than a turn.
+# Positions are beyond limits if they exceed them by this share of the range. They look like degrees if they are larger
+# than a turn, and than the larger limit times the second number.
 _BEYOND, _DEGREES = 0.1, 3.0
 _MOST_NAMED, _MOST_SAID = 8, 3
 _UNITS = (("q",), ("q", "v", "a"), ("q", "v"), ("q", "a"), ("v", "a"), ("v",), ("a",))
 _BLOCKS = {"q": "positions", "v": "velocities", "a": "accelerations"}
+# Largest difference from a turn, in rad, of limits that stand for none: joints that turn freely have them.
+_A_TURN = 0.05
 # A limit beyond it is none.
 _LARGEST_LIMIT = 1e6
 
@@ -67,9 +69,19 @@ def likely_causes(
     n_rows = min(len(X), _ROWS, max(_LEAST_ROWS, _TORQUES // n_joints))
     some = np.unique(np.linspace(0, len(X) - 1, n_rows).astype(int))
     trial = _Trial(feature_map, prior, X[some], y[some])
-    units, in_radians, explained = _units(trial, degrees)
-    said = {joint: text for joint, text in said.items() if joint not in explained}
-    return [*units, *_of_limits(said, degrees), *_order(trial, in_radians)]
+    before, tried = trial.left(trial.X, trial.y), _degrees(trial, degrees)
+    best = min(tried, key=lambda one: one.left, default=None)
+    if best is not None and _much_less(best.left, before):
+        rest = {joint: text for joint, text in said.items() if "q" not in best.blocks or joint not in best.joints}
+        return [best.said(trial.names), *_of_limits(rest, degrees), *_order(trial, best.X)]
+    # In another order torques may not tell.
+    of_positions = [one for one in tried if "q" in one.blocks]
+    for one in of_positions if degrees else []:
+        if order := _order(trial, one.X):
+            return [one.said(trial.names), *order]
+    if not any(one.left <= before for one in of_positions):
+        said, degrees = said if is_far else {}, []
+    return [*_of_limits(said, degrees), *_order(trial, trial.X)]
 
 
 class _Trial:
@@ -137,6 +149,8 @@ def _beyond_limits(model: Any, q: np.ndarray) -> tuple[dict[int, str], list[int]
         lower, upper = float(model.lowerPositionLimit[joint]), float(model.upperPositionLimit[joint])
         if not lower < upper or max(-lower, upper) > _LARGEST_LIMIT:
             continue
+        if turns[joint] and abs(upper - lower - 2.0 * np.pi) < _A_TURN:
+            continue
         margin = _BEYOND * (upper - lower)
         if least[joint] >= lower - margin and largest[joint] <= upper + margin:
             continue
@@ -163,28 +177,29 @@ def _listed(said: dict[int, str], joints: list[int]) -> str:
     return ", ".join(said[joint] for joint in joints[:_MOST_SAID]) + more
 
 
-def _units(trial: _Trial, suspects: list[int]) -> tuple[list[str], np.ndarray, list[int]]:
-    """A sentence about degrees, if they explain torques better; the rows in radians; joints of which it says where."""
-    n = len(trial.names)
-    turning = np.flatnonzero(trial.turns).tolist()
-    if not turning:
-        return [], trial.X, []
-    sets = [turning] + ([suspects] if suspects and suspects != turning else [])
-    trials = []
-    for joints in sets:
+class _Degrees(NamedTuple):
+    """Signals in degrees: their blocks and joints, the rows with these in radians, and what is left of torques then."""
+
+    blocks: tuple[str, ...]
+    joints: list[int]
+    X: np.ndarray
+    left: float
+
+    def said(self, names: list[str]) -> str:
+        what = " and ".join(", ".join(_BLOCKS[block] for block in self.blocks).rsplit(", ", 1))
+        return f"{what} of {_some([names[joint] for joint in self.joints])} look like degrees, and must be in radians"
+
+
+def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
+    """What may be in degrees: signals of all joints that turn, or of the suspects."""
+    n, turning, found = len(trial.names), np.flatnonzero(trial.turns).tolist(), []
+    for joints in [turning] * bool(turning) + [suspects] * (bool(suspects) and suspects != turning):
         for blocks in _UNITS:
             X = trial.X.copy()
             for block in blocks:
                 X[:, [n * "qva".index(block) + joint for joint in joints]] *= np.pi / 180.0
-            trials.append((trial.left(X, trial.y), blocks, joints, X))
-    before = trial.left(trial.X, trial.y)
-    left, blocks, joints, X = min(trials, key=lambda one: one[0])
-    if _much_less(left, before):
-        what = " and ".join(", ".join(_BLOCKS[block] for block in blocks).rsplit(", ", 1))
-        names = [trial.names[joint] for joint in joints]
-        return [f"{what} of {_some(names)} look like degrees, and must be in radians"], X, joints * ("q" in blocks)
-    guesses = [one for one in trials if "q" in one[1] and one[2] == suspects]
-    return [], min(guesses, key=lambda one: one[0])[3] if guesses else trial.X, []
+            found.append(_Degrees(blocks, joints, X, trial.left(X, trial.y)))
+    return found
 
 
 def _order(trial: _Trial, X: np.ndarray) -> list[str]:

@@ -240,16 +240,9 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
             As `skevgp.datasets.load_robot`.
         """
         with unchanged_if_it_fails(self):
-            self._fit(X, y, groups, pieces)
-        if self._has_robot and (self._is_far or self._causes):
-            causes = "".join(f"{cause}. " for cause in self._causes)
-            warn_user(
-                f"The robot's model is far from what torques say: {causes}{'Else its' if causes else 'its'} masses may "
-                "be placeholders, or y in other units. Give RigidBodyRegressor wider scales, or y in N m. "
-                f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations; of {self._unexplained} "
-                "hardly anything is explained.)",
-                ConvergenceWarning,
-            )
+            doubt = self._fit(X, y, groups, pieces)
+        if doubt:
+            warn_user(doubt, ConvergenceWarning)
         lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
         if lost:
             warn_user(
@@ -259,7 +252,8 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
             )
         return self
 
-    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> None:
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
+        """Fit, and a message if the robot's model is in doubt."""
         rows_x: np.ndarray
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
@@ -283,14 +277,29 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
         missed = np.array([noise.variance for noise in self._weights.noise])
         little = (missed > _LITTLE * variance) & (variance > 0.0)
         self._unexplained = [name for name, bad in zip(self._outputs, little, strict=True) if bad]
-        self._causes: list[str] = []
-        self._is_far = self._weights.surprise > _FAR or bool(self._unexplained)
-        if self._has_robot and (self._is_far or ((missed > _DOUBTFUL * variance) & (variance > 0.0)).any()):
-            prior, size = self._weights.prior, self._weights.n_weights
-            own = prior.mean[:size], prior.covariance[:size, :size]
-            self._causes = likely_causes(self.feature_map_, rows_x, targets, own, is_far=self._is_far)
+        is_doubtful = ((missed > _DOUBTFUL * variance) & (variance > 0.0)).any()
+        doubt = self._doubt(rows_x, targets, is_doubtful) if self._has_robot else ""
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
+        return doubt
+
+    def _doubt(self, X: np.ndarray, y: np.ndarray, is_doubtful: bool | np.bool_) -> str:
+        """What to warn of where the robot's model explains torques badly, or ""."""
+        is_far = self._weights.surprise > _FAR or bool(self._unexplained)
+        causes: list[str] = []
+        if is_far or is_doubtful:
+            prior, size = self._weights.prior, self._weights.n_weights
+            own = prior.mean[:size], prior.covariance[:size, :size]
+            causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
+        if not is_far and not causes:
+            return ""
+        named = "".join(f"{cause}. " for cause in causes) + ("Otherwise, its" if causes else "its")
+        little = f"; of {self._unexplained} hardly anything is explained" if self._unexplained else ""
+        return (
+            f"The robot's model is far from what torques say: {named} masses may be placeholders, "
+            "or y in other units. Give RigidBodyRegressor wider scales, or y in N m. "
+            f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations{little}.)"
+        )
 
     def _check_columns_of_y(self, y: ArrayLike) -> None:
         """Refuse a frame whose names say that its columns are of the robot's joints in another order."""

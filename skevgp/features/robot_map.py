@@ -83,7 +83,12 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             If the robot needs Pinocchio and it is not installed; the message gives the pip command.
         ValueError, TypeError
             If the robot is unknown, X does not have its columns (and one for the time step), or a time step is not
-            positive.
+            positive. If X is a data frame whose columns bear the names of the robot's joints in another order.
+
+        Warns
+        -----
+        RobotModelWarning
+            As `skevgp.datasets.load_robot`.
         """
         self._timed = self._takes_steps()
         rows: np.ndarray = validate_data(self, X, dtype=np.float64, ensure_all_finite=not self._timed)

@@ -22,6 +22,8 @@ from .unphysical import check_bodies
 from .urdf_file import checked_urdf
 
 _COLLECTION = "example-robot-data"
+# Sentences of a warning about a file.
+_MOST_TOLD = 4
 _MOVABLE = ("revolute", "continuous", "prismatic")
 _LIMITS = ("upperEffortLimit", "lowerEffortLimit", "velocityLimit")
 _AXIS_TOLERANCE = 1e-6
@@ -66,8 +68,8 @@ def load_robot(robot: Robot) -> Any:
     RobotModelWarning
         If no body can have the moments of inertia of a link: an eigenvalue is negative or larger than the sum of the
         other two (triangle inequality), beyond rounding. If a file has numbers that are not used: a negative limit of
-        effort or velocity, and limits of position of which the lower is above the upper. If a link of a file has a
-        negative mass, and the body that it is fixed to has not.
+        effort or velocity, limits of position of which the lower is above the upper, or a joint to mimic that the file
+        does not have. If a link of a file has a negative mass, and the body that it is fixed to has not.
 
     See Also
     --------
@@ -107,7 +109,10 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
         _lift_efforts(model, urdf.unknown_efforts)
         plain, warnings = _plain(model, f"The robot {str(robot)!r}")
-        return plain, [f"The file {str(path)!r}: {warning}" for warning in urdf.warnings] + warnings
+        told = urdf.warnings[:_MOST_TOLD]
+        if len(urdf.warnings) > _MOST_TOLD:
+            told.append(f"({len(urdf.warnings) - _MOST_TOLD} more are like these.)")
+        return plain, [f"The file {str(path)!r}: {' '.join(told)}"] * bool(told) + warnings
     pin = require("pinocchio", "Loading a robot")
     if isinstance(robot, pin.Model):
         return _plain(robot, f"The model {robot.name!r}")
@@ -128,8 +133,9 @@ def list_robots() -> list[str]:
         two have the same, with its folder in front. Legged robots and drones come with the trunk welded to the world.
         ``"romeo"``, ``"romeo_laas_small"`` and the three that end with ``bravo7_gripper`` have joints that move no
         mass: they cannot be simulated, and `NominalDynamics` refuses them. The neck of ``"icub"`` has hardly any
-        inertia, and its accelerations are large. ``"romeo_small"`` and ``"romeo_laas_small"`` have moments of inertia
-        that no body can have, of which `load_robot` warns.
+        inertia, and its accelerations are large. `load_robot` warns of three: ``"romeo_small"`` and
+        ``"romeo_laas_small"`` have moments of inertia that no body can have, and joints of ``"alex_psyonic_hands"``
+        mimic joints that it does not have.
 
     Examples
     --------

@@ -8,9 +8,9 @@ import numpy as np
 
 from .._optional import require
 
-# Moments of inertia are rounded in files: a violation below this share of the largest one is none.
+# Files round moments of inertia. A violation below this share of the largest one is due to that.
 _ROUNDED = 5e-3
-# That of sums in double precision, as a share of all masses times the squared size of the robot.
+# Rounding of sums in double precision, as a share of all masses times the squared size of the robot.
 _ROUNDING = 1e-12
 # Eigenvalues of a mass matrix below minus this share of the largest one are negative.
 _NEGATIVE = 1e-12
@@ -26,9 +26,9 @@ _MEND = (
 def check_bodies(model: Any, called: str, links: list[list[str]]) -> list[str]:
     """What is wrong with the inertias of a model's links.
 
-    A body can have a mass of 0 or above and moments of inertia about its centre of mass that are 0 or above and no
-    larger than the sum of the other two. Of a model in which all do so, no mass matrix has a negative eigenvalue. Else
-    it may have one: whether it does is tried in many configurations within the joints' limits.
+    A body has a mass of 0 or above. Its moments of inertia about the centre of mass are 0 or above, and none is larger
+    than the sum of the other two. A mass matrix can only have a negative eigenvalue if a moment is negative. In this
+    case, mass matrices of many configurations within the joints' limits are computed.
 
     Parameters
     ----------
@@ -47,20 +47,23 @@ def check_bodies(model: Any, called: str, links: list[list[str]]) -> list[str]:
     Raises
     ------
     ValueError
-        If a mass matrix is not positive definite since an inertia has a negative eigenvalue.
+        If a moment of inertia is negative and a mass matrix has a negative eigenvalue. Moments that a file rounded to
+        below 0 are no exception.
     """
     bodies = list(model.inertias)[1:]
     moments = np.array([np.linalg.eigvalsh(body.inertia) for body in bodies])
     masses = np.array([body.mass for body in bodies])
-    rounding = np.maximum(_ROUNDED * np.abs(moments).max(axis=1), _ROUNDING * masses.sum() * _size(model) ** 2)
+    of_sums = _ROUNDING * masses.sum() * _size(model) ** 2
+    negative = moments[:, 0] < -of_sums
+    q = _configuration_of_negative_mass(model) if negative.any() else None
     lacking = moments[:, 0] + moments[:, 1] - moments[:, 2]  # below 0 too if a moment is
     without_mass = (masses == 0.0) & (moments != 0.0).any(axis=1)
-    wrong = np.flatnonzero((lacking < -rounding) | without_mass).tolist()
+    impossible = (lacking < -np.maximum(_ROUNDED * np.abs(moments).max(axis=1), of_sums)) | without_mass
+    wrong = np.flatnonzero(impossible if q is None else impossible | negative).tolist()
     told = [_sentence(model.names[1 + joint], links[joint], masses[joint], moments[joint]) for joint in wrong]
     more = [f"{len(told) - _MOST_NAMED} more links are like it"] if len(told) > _MOST_NAMED else []
     reason = "; ".join(told[:_MOST_NAMED] + more)
-    negative = moments[:, 0] < -rounding
-    if negative.any() and (q := _configuration_of_negative_mass(model)) is not None:
+    if q is not None:
         raise ValueError(
             f"{called} has a mass matrix that is not positive definite, at q = {np.round(q, 3).tolist()}: a joint that "
             f"is pushed would move the other way. No body can have the inertia of a link: {reason}. {_ALLOWED} Correct "

@@ -124,6 +124,7 @@ def checked_urdf(path: Path) -> CheckedUrdf:
     root = elements_of(path.read_bytes(), path)
     with _naming(path):
         _check_expanded(root)
+        _declare_world(root)
         text = _written(root, _ROBOT, "")
         _check_tree(root)
         unknown, warnings = _set_aside(root)
@@ -218,6 +219,13 @@ def _check_expanded(root: Element) -> None:
             )
 
 
+def _declare_world(root: Element) -> None:
+    """Drake, and files that are written for it, need no link of the name "world" for what is fixed to it."""
+    links = [link.attributes.get("name") for link in root.all("link")]
+    if "world" not in links and any(joint.attribute_of("parent", "link") == "world" for joint in root.all("joint")):
+        root.children.append(Element("link", {"name": "world"}, b"<link/>", 0))
+
+
 def _check_tree(root: Element) -> None:
     """Refuse what is no tree (names twice, links that are not there, two roots, circles) or larger than any robot."""
     links = [link.attributes["name"] for link in root.all("link")]
@@ -259,13 +267,14 @@ def _check_tree(root: Element) -> None:
 
 
 def _set_aside(root: Element) -> tuple[list[str], list[str]]:
-    """Refuse numbers that no joint can have, and take away those that are not needed.
+    """Refuse numbers that no joint can have, and replace those that are not needed.
 
     Returns
     -------
     unknown_efforts, warnings : list of str
     """
     unknown, warnings = [], []
+    joints = [joint.attributes["name"] for joint in root.all("joint")]
     for joint in root.all("joint"):
         name, kind = joint.attributes["name"], joint.attributes["type"]
         if kind == "fixed":
@@ -289,12 +298,18 @@ def _set_aside(root: Element) -> tuple[list[str], list[str]]:
                     "used."
                 )
                 limit.attributes |= {"lower": "0", "upper": "0"}
+        for mimic in joint.all("mimic")[:1]:
+            if (other := mimic.attributes.get("joint", "")) not in joints or other == name:
+                warnings.append(
+                    f'{called} has <mimic joint="{other:.80}">, which is not another joint of the file, and moves on '
+                    "its own."
+                )
     for link in root.all("link"):
         for inertial in link.all("inertial")[:1]:
             if (mass := float(inertial.attribute_of("mass", "value"))) < 0.0:
                 warnings.append(
                     f'The link {link.attributes["name"]!r:.80} has <mass value="{mass:g}">; a mass must be 0 or '
-                    "above. It is used as a part of the body to which the link is fixed."
+                    "above. It counts as a part of the body to which the link is fixed."
                 )
     return unknown, warnings
 
@@ -305,8 +320,8 @@ def _check_motion(joint: Element, called: str) -> None:
         for name in ("damping", "friction"):
             if float(dynamics.attributes.get(name, 0.0)) < 0.0:
                 raise ValueError(
-                    f'{called} has <dynamics {name}="{dynamics.attributes[name]}">; {name} must be 0 or above. If an '
-                    "identification found it, its torques do not show this friction: write 0"
+                    f'{called} has <dynamics {name}="{dynamics.attributes[name]}">; {name} must be 0 or above. A '
+                    "negative value from an identification means that torques do not show this friction: write 0"
                 )
     for axis in joint.all("axis")[:1]:
         numbers = [float(each) for each in axis.attributes.get("xyz", "1 0 0").split()]

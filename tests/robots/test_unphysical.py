@@ -46,6 +46,16 @@ def test_a_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_load
         use(arm(tmp_path / "arm.urdf", (-1.0, -1.0, -1.0)))
 
 
+def test_a_small_negative_moment_is_refused_where_a_joint_turns_about_it(tmp_path):
+    """Files round moments, by more than this one; but a push moves the joint the other way."""
+    path = arm(tmp_path / "arm.urdf", (0.01, -0.00001, 0.01))
+    path.write_text(path.read_text().replace("0 0 -0.1", "0 0 0"))
+    with pytest.raises(
+        ValueError, match=r"not positive definite.*'b' of the joint 'j2' has 1 kg and moments .* of -1e-05"
+    ):
+        load_robot(path)
+
+
 def test_a_model_in_memory_is_checked_too(tmp_path):
     model = load_robot(arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.01)))
     model.inertias[2].inertia = -np.eye(3)

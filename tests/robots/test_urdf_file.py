@@ -113,6 +113,15 @@ def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
         load(ARM.replace(old, new, 1))
 
 
+@pytest.mark.parametrize("kind", ["fixed", "revolute"])
+def test_the_world_need_not_be_declared(load, kind):
+    """As Drake has it."""
+    joints = joint("world", "a", kind), joint("a", "b")
+    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
+    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
+        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
+
+
 def test_links_in_a_circle_are_told(load):
     """Pinocchio leaves them out, and makes a robot of the rest."""
     with pytest.raises(ValueError, match=r"it has links in a circle: \['c', 'd'\]"):
@@ -184,6 +193,14 @@ def test_a_negative_limit_of_effort_is_unknown(load):
     assert np.isfinite(RigidBodyRegressor(model).coef_prior(2)[1]).all()
 
 
+def test_a_file_is_warned_of_once(load):
+    names = [f"l{number}" for number in range(8)]
+    text = robot(names, *map(joint, names[:-1], names[1:])).replace('effort="1"', 'effort="-1"')
+    (message,) = warned(load, text)[1]
+    assert message.count("is not used") == 4
+    assert message.endswith("(3 more are like these.)")
+
+
 @pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
 def test_a_negative_limit_of_velocity_is_not_used(load, kind):
     text = robot("ab", joint("a", "b", kind)).replace('velocity="1"', 'velocity="-1"')
@@ -199,6 +216,17 @@ def test_limits_of_position_in_the_wrong_order_are_not_used(load):
     assert "'to_b' has <limit> with lower=3 above upper=-3; its limits of position are not used" in messages[0]
     assert_array_equal(model.lowerPositionLimit, model.upperPositionLimit)
     assert warned(load, text.replace("revolute", "continuous"))[1] == []
+
+
+@pytest.mark.parametrize("other", ["none", "to_b", ""])
+def test_a_joint_that_mimics_none_is_warned_of(load, other):
+    """Joints that mimic move on their own, so that it does not matter."""
+    text = robot("abc", joint("a", "b").replace("</joint>", '<mimic joint="{}"/></joint>'), joint("b", "c"))
+    model, messages = warned(load, text.format(other))
+    assert model.nv == 2
+    assert len(messages) == 1
+    assert f"The joint 'to_b' has <mimic joint=\"{other}\">, which is not another joint of the file" in messages[0]
+    assert warned(load, text.format("to_c"))[1] == []
 
 
 @pytest.mark.parametrize("limit", ['effort="0" velocity="0"', 'lower="0" upper="0" effort="0" velocity="0"'])
