@@ -74,12 +74,12 @@ def likely_causes(
     if best is not None and _much_less(best.left, before):
         rest = {joint: text for joint, text in said.items() if "q" not in best.blocks or joint not in best.joints}
         return [best.said(trial.names), *_of_limits(rest, degrees), *_order(trial, best.X)]
-    # In another order torques may not tell.
+    # With columns in another order too, radians alone explain torques no better.
     of_positions = [one for one in tried if "q" in one.blocks]
     for one in of_positions if degrees else []:
         if order := _order(trial, one.X):
             return [one.said(trial.names), *order]
-    if not any(one.left <= before for one in of_positions):
+    if not any(one.left <= before for one in of_positions):  # radians make it worse: these are not degrees
         said, degrees = said if is_far else {}, []
     return [*_of_limits(said, degrees), *_order(trial, trial.X)]
 

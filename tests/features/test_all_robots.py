@@ -59,7 +59,7 @@ def uses(robot):
     }
 
 
-@pytest.mark.filterwarnings("ignore::skevgp.exceptions.RobotModelWarning")  # of two: tests/robots/test_loading.py
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.RobotModelWarning")  # of three: tests/robots/test_loading.py
 @pytest.mark.parametrize("name", [marked(name) for name in list_robots()])
 def test_every_robot_passes_every_map_prior_and_simulation_or_is_refused(name):
     for use, values in uses(name).items():
