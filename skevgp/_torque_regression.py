@@ -12,6 +12,7 @@ from sklearn.base import clone
 from ._coef_prior import wide_scale
 from ._state import StatefulEstimator
 from ._validation import check_magnitude, checked_groups
+from .exceptions import RobotModelWarning, ignored
 from .features import RigidBodyRegressor
 from .identification.rows_of_logs import blocks_of, groups_of
 from .identification.stiction import likeliest_velocity
@@ -89,7 +90,8 @@ class TorqueRegression(StatefulEstimator):
             velocity = self._likeliest_velocities(rows)
             if (velocity == prior.velocity).all():
                 break
-            self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
+            with ignored(category=RobotModelWarning):  # said already
+                self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
             rows, prior = replace(rows, features=self._features(X, y.shape[1])), replace(prior, velocity=velocity)
             self._weights = identify(rows, prior, start=self._weights)
         return rows

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from threading import RLock
 
-__all__ = ["DependentRowsWarning", "InconsistentVersionWarning"]
+__all__ = ["DependentRowsWarning", "InconsistentVersionWarning", "RobotModelWarning"]
 
 _filters = RLock()
 
@@ -50,6 +50,25 @@ class InconsistentVersionWarning(UserWarning):
     >>> from skevgp.exceptions import InconsistentVersionWarning
     >>> with warnings.catch_warnings():
     ...     warnings.simplefilter("error", InconsistentVersionWarning)
+    """
+
+
+class RobotModelWarning(UserWarning):
+    """A robot's file or model has numbers that no robot can have, and is used all the same.
+
+    Given by `skevgp.datasets.load_robot`, and by what loads a robot, for moments of inertia that violate the triangle
+    inequality and for numbers of a URDF file that are not used, such as a negative limit of effort.
+
+    See Also
+    --------
+    skevgp.InverseDynamics : Its ``write_urdf`` writes inertias that bodies can have.
+
+    Examples
+    --------
+    >>> import warnings
+    >>> from skevgp.exceptions import RobotModelWarning
+    >>> with warnings.catch_warnings():
+    ...     warnings.simplefilter("ignore", RobotModelWarning)
     """
 
 

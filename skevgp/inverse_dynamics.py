@@ -13,14 +13,17 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
+from ._frames import FrameColumns
 from ._identified_robot import IdentifiedRobot
 from ._joint_residual import JointResidual, fit_joint_residual
+from ._likely_causes import likely_causes
 from ._shapes import like_y
 from ._sklearn import Interval, StrOptions, fit_context
 from ._summary import ModelSummary, Summarised, of_inverse_dynamics
 from ._validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails, validate_numbers
-from .exceptions import warn_user
+from .exceptions import RobotModelWarning, ignored, warn_user
 from .features import RigidBodyRegressor
+from .features.robot_map import joints_named
 from .identification.stiction import likeliest_noise
 from .identification.weights import Rows, condensed, left_out
 from .robots import nearest_consistent
@@ -30,6 +33,8 @@ from .robots.loading import Robot
 _FAR = 4.0
 # Physics that leaves this share of a torque's variance explains hardly anything.
 _LITTLE = 0.5
+# Physics that leaves this share of it may do so since columns are in another order, or in degrees.
+_DOUBTFUL = 0.1
 # Of torques: their variances, and ratios of these to what noise may be, are numbers.
 _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
 # The largest speed below which rows count less for f_j: filters blur friction's sign, but f_j learns its average there.
@@ -221,24 +226,23 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
         ImportError
             If Pinocchio is needed and not installed; the message gives the pip command.
         ValueError, TypeError
-            If an argument is out of its range, the data are not finite, or shapes do not fit.
+            If an argument is out of its range, the data are not finite, or shapes do not fit. If X or y is a data frame
+            whose columns bear the names of the robot's joints in another order.
 
         Warns
         -----
         ConvergenceWarning
-            If weights end far from the robot's model, as with placeholders for its masses or y in other units; if f_j
-            of some joints holds for no group that was left out: its signal is then nearly 0.
+            If weights end far from the robot's model, as with placeholders for its masses or y in other units. If
+            torques are explained badly, and much better with columns in another order or angles in degrees: the message
+            names the order, or the signals and joints; and it names positions beyond the limits of the robot's model.
+            If f_j of some joints holds for no group that was left out: its signal is then nearly 0.
+        RobotModelWarning
+            As `skevgp.datasets.load_robot`.
         """
         with unchanged_if_it_fails(self):
-            self._fit(X, y, groups, pieces)
-        if self._has_robot and (self._weights.surprise > _FAR or self._unexplained):
-            warn_user(
-                "The robot's model is far from what torques say: its masses may be placeholders, or y in other units. "
-                "Give RigidBodyRegressor wider scales, or y in N m. "
-                f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations; of {self._unexplained} "
-                "hardly anything is explained.)",
-                ConvergenceWarning,
-            )
+            doubt = self._fit(X, y, groups, pieces)
+        if doubt:
+            warn_user(doubt, ConvergenceWarning)
         lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
         if lost:
             warn_user(
@@ -248,7 +252,8 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
             )
         return self
 
-    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> None:
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
+        """Fit, and a message if the robot's model is in doubt."""
         rows_x: np.ndarray
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
@@ -257,8 +262,10 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
         check_magnitude(rows_x, "X")
         check_magnitude(targets, "y", _LARGEST_TORQUE)
         check_not_vanishing(np.abs(targets).max(axis=0), "y", _SMALLEST_TORQUE)
-        self._map().fit(X)  # a frame's columns must be in the robot's order
-        self.feature_map_ = self._map().fit(rows_x)
+        self.feature_map_ = self._map().fit(X)  # a frame's columns must be in the robot's order
+        self._check_columns_of_y(y)
+        with ignored(category=RobotModelWarning):  # said already
+            self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
         self._known = condensed(rows, self._weights)
         if self.consistent and self._has_robot:
@@ -266,11 +273,42 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
             start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
             self._weights = self._weights.given(nearest_consistent(start.reshape(-1, 10), covariance).ravel())
         self._outputs = self._output_names(targets.shape[1])
-        missed = np.array([noise.variance for noise in self._weights.noise]) > _LITTLE * targets.var(axis=0)
-        varies = targets.var(axis=0) > 0.0
-        self._unexplained = [name for name, bad in zip(self._outputs, missed & varies, strict=True) if bad]
+        variance = targets.var(axis=0)
+        missed = np.array([noise.variance for noise in self._weights.noise])
+        little = (missed > _LITTLE * variance) & (variance > 0.0)
+        self._unexplained = [name for name, bad in zip(self._outputs, little, strict=True) if bad]
+        is_doubtful = ((missed > _DOUBTFUL * variance) & (variance > 0.0)).any()
+        doubt = self._doubt(rows_x, targets, is_doubtful) if self._has_robot else ""
         self._joints = self._residuals(rows_x, rows)
         self._set_attributes()
+        return doubt
+
+    def _doubt(self, X: np.ndarray, y: np.ndarray, is_doubtful: bool | np.bool_) -> str:
+        """What to warn of where the robot's model explains torques badly, or ""."""
+        is_far = self._weights.surprise > _FAR or bool(self._unexplained)
+        causes: list[str] = []
+        if is_far or is_doubtful:
+            prior, size = self._weights.prior, self._weights.n_weights
+            own = prior.mean[:size], prior.covariance[:size, :size]
+            causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
+        if not is_far and not causes:
+            return ""
+        named = "".join(f"{cause}. " for cause in causes) + ("Otherwise, its" if causes else "its")
+        little = f"; of {self._unexplained} hardly anything is explained" if self._unexplained else ""
+        return (
+            f"The robot's model is far from what torques say: {named} masses may be placeholders, "
+            "or y in other units. Give RigidBodyRegressor wider scales, or y in N m. "
+            f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations{little}.)"
+        )
+
+    def _check_columns_of_y(self, y: ArrayLike) -> None:
+        """Refuse a frame whose names say that its columns are of the robot's joints in another order."""
+        frame = FrameColumns.of(y) if self._has_robot else None
+        if frame is not None:
+            joints = self._output_names(len(frame.names))
+            found = joints_named(frame.names, joints)
+            if found is not None and found != joints and sorted(found) == sorted(joints):
+                raise ValueError(f"The columns of y must be in the robot's order {joints}; got {frame.names}.")
 
     def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
         weights, y = self._weights, rows.targets

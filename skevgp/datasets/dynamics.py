@@ -133,6 +133,11 @@ def make_dynamics(
         If an argument is out of its range or of the wrong type, the robot is unknown, it cannot be simulated (see
         `simulate`), or controlled moves run away because ``dt`` is too long or ``duration`` too short.
 
+    Warns
+    -----
+    RobotModelWarning
+        As `load_robot`.
+
     Examples
     --------
     >>> from skevgp.datasets import make_dynamics

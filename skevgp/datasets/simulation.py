@@ -104,6 +104,11 @@ def simulate(
         If a shape does not fit the robot, a value is not a finite real number, ``dt`` is not positive, the robot is
         unknown, its mass matrix is singular (links without inertia), or the integrator gives up.
 
+    Warns
+    -----
+    RobotModelWarning
+        As `load_robot`.
+
     See Also
     --------
     ComputedTorqueController : Moves robots whose joints are all driven.

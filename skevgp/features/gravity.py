@@ -10,8 +10,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from .._sklearn import Interval, StrOptions
-from ..robots import GravityTerm, Layout, get_system, layout_of, load_robot
-from ..robots.loading import Robot, joint_axes
+from ..robots import GravityTerm, Layout, get_system, layout_of
+from ..robots.loading import Robot, joint_axes, known_robot
 from .robot_map import RobotMap, indices_of, same_for_all
 
 # An axis is vertical up to this angle, rad: URDF files round π/2.
@@ -220,7 +220,7 @@ class LinkGravity(GravityMap):
 
     def _prepare(self, robot: Robot | None) -> None:
         if robot is not None:
-            model = load_robot(robot)
+            model = known_robot(robot)
             self._levers = self._levers_of(model)
             self._links = Links(model)
             components = [_COMPONENTS[lever.name] for lever in self._levers]
@@ -230,7 +230,7 @@ class LinkGravity(GravityMap):
             self._signs = np.array([sign for _, sign in components])
 
     def _terms(self) -> Sequence[Lever]:
-        return self._levers if hasattr(self, "_levers") else self._levers_of(load_robot(self.robot))
+        return self._levers if hasattr(self, "_levers") else self._levers_of(known_robot(self.robot))
 
     def _levers_of(self, model: Any) -> list[Lever]:
         names = list(model.names)[1:]

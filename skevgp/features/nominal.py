@@ -9,8 +9,8 @@ from typing import Any, ClassVar, Literal
 import numpy as np
 
 from .._sklearn import Interval, StrOptions
-from ..robots import Layout, RigidBody, load_robot
-from ..robots.loading import Robot
+from ..robots import Layout, RigidBody
+from ..robots.loading import Robot, known_robot
 from .robot_map import STEP, RobotMap, same_for_all
 
 _NAMES = {
@@ -143,7 +143,7 @@ class NominalDynamics(RobotMap):
         self._terms = tuple(self.terms)
         if robot is None:
             return
-        self._body = RigidBody(load_robot(robot))
+        self._body = RigidBody(known_robot(robot))
         # A massless tip makes the mass matrix singular in nearly every configuration: say so before the data are seen.
         self._features(np.random.RandomState(0).uniform(-1.0, 1.0, (1, self._layout.n_columns)))
 

@@ -13,7 +13,7 @@ from sklearn.utils.metaestimators import available_if
 from .._sklearn import Interval
 from .._validation import as_floats
 from ..robots import RigidBody, load_robot
-from ..robots.loading import Robot, effort_limits
+from ..robots.loading import Robot, effort_limits, known_robot
 from .robot_map import RobotTransformer, has_robot, same_for_all
 
 FRICTION = ("viscous", "coulomb", "offset", "armature")
@@ -137,6 +137,8 @@ class RigidBodyRegressor(RobotTransformer):
     def share_coef(self) -> bool:
         return self.robot is not None
 
+    _n_blocks: ClassVar[int] = 3
+
     def _column_names(self) -> list[str]:
         names = self._layout.position_names
         return [*self._layout.state_names, *(f"d2{name}/dt2" for name in names)]
@@ -147,7 +149,7 @@ class RigidBodyRegressor(RobotTransformer):
         # Rows have a matrix each with a robot, which no frame can hold, whatever `set_output` says.
         self._sklearn_auto_wrap_output_keys = {"transform"} if robot is None else set()
         if robot is not None:
-            self.model_ = load_robot(robot).copy()
+            self.model_ = known_robot(robot).copy()
             self._body = RigidBody(self.model_)
 
     def _checked_velocity(self) -> np.ndarray:
@@ -276,7 +278,7 @@ def _sizes(model: Any) -> np.ndarray:
     for joint in range(1, model.njoints):
         link = model.inertias[joint]
         if link.mass > 0.0:
-            sizes[joint - 1] = max(sizes[joint - 1], np.sqrt(np.trace(link.inertia) / 2.0 / link.mass))
+            sizes[joint - 1] = max(sizes[joint - 1], np.sqrt(max(np.trace(link.inertia), 0.0) / 2.0 / link.mass))
             sizes[joint - 1] = max(sizes[joint - 1], np.linalg.norm(link.lever))
         if (parent := model.parents[joint]) > 0:
             sizes[parent - 1] = max(sizes[parent - 1], np.linalg.norm(model.jointPlacements[joint].translation))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from numbers import Real
 from typing import Any, ClassVar, Literal, Self
@@ -32,6 +33,19 @@ def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str,
     return [int(index) for index in indices]
 
 
+def joints_named(names: Sequence[str], joints: Sequence[str]) -> list[str] | None:
+    """The joint that each column bears in its name, such as "elbow" in "position/elbow"; None if one bears none.
+
+    Of several the longest counts. A name that goes on with a letter or a digit is another one.
+    """
+    longest = sorted(joints, key=len, reverse=True)
+    words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])") for joint in longest]
+    found = [
+        next((joint for joint, word in zip(longest, words, strict=True) if word.search(name)), "") for name in names
+    ]
+    return found if all(found) else None
+
+
 class RobotTransformer(TransformerMixin, StatefulEstimator):
     """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
 
@@ -42,6 +56,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
     robot: Robot | None
     dt: float | Literal["column"] | None = None
     _timed = False  # whether rows end with their time step, as of the last fit
+    _n_blocks: ClassVar[int] = 2  # of columns, of which each has one of every joint: [q, q̇]
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
@@ -68,7 +83,12 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             If the robot needs Pinocchio and it is not installed; the message gives the pip command.
         ValueError, TypeError
             If the robot is unknown, X does not have its columns (and one for the time step), or a time step is not
-            positive.
+            positive. If X is a data frame whose columns bear the names of the robot's joints in another order.
+
+        Warns
+        -----
+        RobotModelWarning
+            As `skevgp.datasets.load_robot`.
         """
         self._timed = self._takes_steps()
         rows: np.ndarray = validate_data(self, X, dtype=np.float64, ensure_all_finite=not self._timed)
@@ -87,7 +107,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         return self._layout.column_names + ["dt"] * self._timed
 
     def _check_columns(self) -> None:
-        """As many as the robot has; those that bear its own names must be in its order, and dt the last."""
+        """As many as the robot has; those that bear its joints' names must be in its order, and dt the last."""
         wanted, names = self._column_names(), list(getattr(self, "feature_names_in_", []))
         if self.n_features_in_ != len(wanted):
             hint = "."
@@ -102,6 +122,14 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         misplaced = self._timed and "dt" in names[:-1]
         if misplaced or (names != wanted and set(names) == set(wanted)):
             raise ValueError(f"The columns of X must be in the robot's order {wanted}; got {names}.")
+        joints = list(self._layout.position_names)
+        expected = joints * self._n_blocks
+        found = joints_named(names[: len(expected)], joints) if names else None
+        if found is not None and found != expected and sorted(found) == sorted(expected):
+            raise ValueError(
+                f"The columns of X must be in the robot's order {wanted}; by their names they are those of the joints "
+                f"{found}."
+            )
 
     def _check_steps(self, X: np.ndarray) -> None:
         """Where rows end with their time step, X has not been checked for what is not finite."""

@@ -16,10 +16,14 @@ from typing import Any
 import numpy as np
 
 from .._optional import require
+from ..exceptions import RobotModelWarning, warn_user
 from .systems import GRAVITY, SYSTEMS, Layout, System
-from .urdf_file import text_for_pinocchio
+from .unphysical import check_bodies
+from .urdf_file import checked_urdf
 
 _COLLECTION = "example-robot-data"
+# Sentences of a warning about a file.
+_MOST_TOLD = 4
 _MOVABLE = ("revolute", "continuous", "prismatic")
 _LIMITS = ("upperEffortLimit", "lowerEffortLimit", "velocityLimit")
 _AXIS_TOLERANCE = 1e-6
@@ -53,9 +57,19 @@ def load_robot(robot: Robot) -> Any:
     ValueError
         If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
         joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
-        number of the model makes no sense (not finite, a negative mass or damping, an axis that is not of length 1).
+        number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
+        that is not of length 1 or, in a file, has no direction). If moments of inertia are so far below 0 that the
+        mass matrix is not positive definite. The message names the joint or the link, and the number.
     TypeError
         If ``robot`` is none of the above.
+
+    Warns
+    -----
+    RobotModelWarning
+        If no body can have the moments of inertia of a link: an eigenvalue is negative or larger than the sum of the
+        other two (triangle inequality), beyond rounding. If a file has numbers that are not used: a negative limit of
+        effort or velocity, limits of position of which the lower is above the upper, or a joint to mimic that the file
+        does not have. If a link of a file has a negative mass, and the body that it is fixed to has not.
 
     See Also
     --------
@@ -70,18 +84,35 @@ def load_robot(robot: Robot) -> Any:
     >>> model.damping
     array([0.1, 0.1])
     """
+    model, warnings = _read(robot)
+    for warning in warnings:
+        warn_user(warning, RobotModelWarning)
+    return model
+
+
+def known_robot(robot: Robot) -> Any:
+    """A robot as `load_robot` gives it, without warnings: for who loads it a second time, or needs no inertia."""
+    return _read(robot)[0]
+
+
+def _read(robot: Robot) -> tuple[Any, list[str]]:
     system = named_system(robot)
     if system is not None:
         return _plain(_model_of_table(system), f"The system {system.name!r}")
     if isinstance(robot, (str, os.PathLike)):
         path = urdf_path(robot)
         pin = require("pinocchio", "Loading a robot")
-        text = text_for_pinocchio(path)
+        urdf = checked_urdf(path)
         try:
-            model = pin.buildModelFromXML(text)
+            model = pin.buildModelFromXML(urdf.text)
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
-        return _plain(model, f"The robot {str(robot)!r}")
+        _lift_efforts(model, urdf.unknown_efforts)
+        plain, warnings = _plain(model, f"The robot {str(robot)!r}")
+        told = urdf.warnings[:_MOST_TOLD]
+        if len(urdf.warnings) > _MOST_TOLD:
+            told.append(f"({len(urdf.warnings) - _MOST_TOLD} more are like these.)")
+        return plain, [f"The file {str(path)!r}: {' '.join(told)}"] * bool(told) + warnings
     pin = require("pinocchio", "Loading a robot")
     if isinstance(robot, pin.Model):
         return _plain(robot, f"The model {robot.name!r}")
@@ -100,8 +131,11 @@ def list_robots() -> list[str]:
         The systems of the paper (of the cartpole two, see `make_dynamics`), then what the installed package
         example-robot-data brings, sorted: each URDF file with a joint that moves, by its name without ``_robot``; where
         two have the same, with its folder in front. Legged robots and drones come with the trunk welded to the world.
-        ``"icub"``, ``"romeo"`` and ``"romeo_laas_small"`` have massless links and cannot be simulated
-        (``"icub_reduced"`` and ``"romeo_small"`` can).
+        ``"romeo"``, ``"romeo_laas_small"`` and the three that end with ``bravo7_gripper`` have joints that move no
+        mass: they cannot be simulated, and `NominalDynamics` refuses them. The neck of ``"icub"`` has hardly any
+        inertia, and its accelerations are large. `load_robot` warns of three: ``"romeo_small"`` and
+        ``"romeo_laas_small"`` have moments of inertia that no body can have, and joints of ``"alex_psyonic_hands"``
+        mimic joints that it does not have.
 
     Examples
     --------
@@ -130,7 +164,7 @@ def layout_of(robot: Robot) -> Layout:
     system = named_system(robot)
     if system is not None:
         return system.layout
-    model = load_robot(robot)
+    model = known_robot(robot)
     return Layout(
         model.name,
         position_names=tuple(model.names)[1:],
@@ -270,8 +304,24 @@ def _model_of_table(system: System) -> Any:
     return model
 
 
-def _plain(model: Any, called: str) -> Any:
-    """The model itself, or a copy whose continuous joints have an angle each; an error if that is not possible."""
+def _lift_efforts(model: Any, joints: list[str]) -> None:
+    """Infinite limits of effort, as of a joint without <limit>; a joint of several velocities is refused later."""
+    lower, upper = np.array(model.lowerEffortLimit), np.array(model.upperEffortLimit)
+    for name in joints:
+        velocity = model.joints[model.getJointId(name)].idx_v
+        lower[velocity], upper[velocity] = -np.inf, np.inf
+    if joints:
+        model.lowerEffortLimit, model.upperEffortLimit = lower, upper
+
+
+def _plain(model: Any, called: str) -> tuple[Any, list[str]]:
+    """The model itself, or a copy whose continuous joints have an angle each, and what to warn of.
+
+    Raises
+    ------
+    ValueError
+        If that is not possible.
+    """
     joints = list(model.joints)[1:]
     if not joints:
         raise ValueError(f"{called} has no joint that moves.")
@@ -290,7 +340,18 @@ def _plain(model: Any, called: str) -> Any:
         if not abs(length - 1.0) <= _AXIS_TOLERANCE:
             raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
     _check_numbers(model, called)
-    return model if model.nq == model.nv else _with_angles(model)
+    plain = model if model.nq == model.nv else _with_angles(model)
+    return plain, check_bodies(plain, called, _names_of_links(model))
+
+
+def _names_of_links(model: Any) -> list[list[str]]:
+    """Of the links that move with each joint, as far as the model knows their names."""
+    names: list[list[str]] = [[] for _ in range(model.njoints)]
+    body = require("pinocchio", "Loading a robot").FrameType.BODY
+    for frame in model.frames:
+        if frame.type == body:
+            names[frame.parentJoint].append(frame.name)
+    return names[1:]
 
 
 def _check_numbers(model: Any, called: str) -> None:
@@ -302,20 +363,26 @@ def _check_numbers(model: Any, called: str) -> None:
         "inertias": [link.toDynamicParameters() for link in links],
         "armature": model.armature,
         "damping": model.damping,
+        "friction": model.friction,
     }
     for name, values in numbers.items():
         if not np.isfinite(values).all():
             raise ValueError(f"{called} has NaN or infinity in its {name}; they must be finite.")
-    for name, values in (("masses", [link.mass for link in links]), ("damping", model.damping)):
-        if min(values) < 0.0:
-            raise ValueError(f"{called} has a negative value among its {name}: {min(values):g}.")
+    owned = {"mass": np.array([link.mass for link in links])}
+    owned |= {name: np.array(getattr(model, name)) for name in ("armature", "damping", "friction")}
+    for name, values in owned.items():
+        if (values < 0.0).any():
+            joint = model.names[1 + int(np.argmin(values))]
+            whose = f"link that the joint {joint!r} moves" if name == "mass" else f"joint {joint!r}"
+            raise ValueError(f"{called} has {name}={values.min():g} at the {whose}; it must be 0 or above.")
     for name in (*_LIMITS, "lowerPositionLimit", "upperPositionLimit"):
         if np.isnan(getattr(model, name)).any():
             raise ValueError(f"{called} has NaN in its {name}.")
     least, largest = effort_limits(model)
-    if (least > 0.0).any() or (largest < 0.0).any():
+    for joint in np.flatnonzero((least > 0.0) | (largest < 0.0)).tolist():
         raise ValueError(
-            f"{called} has motors that cannot give 0: their least effort is above it or the largest below."
+            f"{called} has motors that cannot give 0, such as that of the joint {model.names[1 + joint]!r}: its effort "
+            f"is between {least[joint]:g} and {largest[joint]:g}."
         )
 
 

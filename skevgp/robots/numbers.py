@@ -190,4 +190,6 @@ def _placement(pin: Any, values: np.ndarray) -> Any:
 
 
 def _body(pin: Any, values: np.ndarray) -> Any:
-    return pin.Inertia(float(values[0]), values[1:4], values[4:].reshape(3, 3))
+    body = pin.Inertia.Zero()  # its constructor refuses a moment that rounding made negative
+    body.mass, body.lever, body.inertia = float(values[0]), values[1:4], values[4:].reshape(3, 3)
+    return body

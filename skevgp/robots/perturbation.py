@@ -8,7 +8,7 @@ import numpy as np
 from sklearn.utils import check_random_state
 
 from .._validation import check_real
-from .loading import Robot, load_robot
+from .loading import Robot, known_robot, load_robot
 
 
 def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.random.RandomState | None = None) -> Any:
@@ -37,7 +37,13 @@ def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.ra
     ImportError
         If Pinocchio is not installed; the message gives the pip command.
     ValueError, TypeError
-        If ``scale`` is not a number in [0, 1), or the robot is not one that `load_robot` takes.
+        If ``scale`` is not a number in [0, 1), or the robot is not one that `load_robot` takes. If the mass matrix
+        of the perturbed robot is not positive definite.
+
+    Warns
+    -----
+    RobotModelWarning
+        As `load_robot`.
 
     See Also
     --------
@@ -61,4 +67,4 @@ def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.ra
         link = model.inertias[index]
         link.mass, link.lever, link.inertia = mass * link.mass, link.lever * [x, y, z], inertia * link.inertia
     model.armature = model.armature * factors[:, 5]
-    return model
+    return known_robot(model)  # the same check without a second warning

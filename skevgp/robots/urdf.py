@@ -22,7 +22,7 @@ from .inertia import (
     checked_joints,
     checked_links,
 )
-from .loading import Robot, load_robot, named_system, urdf_path
+from .loading import Robot, known_robot, named_system, urdf_path
 from .urdf_file import MOMENTS, Element, elements_of
 
 
@@ -85,7 +85,7 @@ def write_urdf(
     path = _file_of(source)
     data = path.read_bytes()
     root = elements_of(data, path)  # first: Pinocchio's messages say less
-    names = list(load_robot(path).names)[1:]
+    names = list(known_robot(path).names)[1:]
     if not overwrite and Path(target).exists() and Path(target).samefile(path):
         raise ValueError(f"{str(path)!r} is the source; overwrite=True allows to overwrite it.")
     values, deviations = _numbers(parameters, covariance, names)

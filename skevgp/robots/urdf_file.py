@@ -12,6 +12,7 @@ import re
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from difflib import get_close_matches
 from pathlib import Path
 from typing import NamedTuple
 from xml.parsers import expat
@@ -23,6 +24,9 @@ _START_TAG = re.compile(rb"""<[^\s/>]+(?:\s+[^\s=]+\s*=\s*(?:"[^"]*"|'[^']*'))*\
 _LIMITED = ("revolute", "prismatic")
 _KINDS = (*_LIMITED, "continuous", "fixed", "floating", "planar")
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_OF_LIMIT = ("lower", "upper", "effort", "velocity")
+# Pinocchio divides by the square of an axis's length.
+_SHORTEST_AXIS = 1e-9
 # An element takes some hundred times the memory of its text; robots have thousands, nested six deep.
 _MOST_ELEMENTS, _DEEPEST = 1_000_000, 100
 # Pinocchio goes from joint to joint by recursion, and makes matrices of as many rows and columns as joints move.
@@ -90,20 +94,41 @@ def elements_of(data: bytes, path: Path) -> Element:
     return roots[0]
 
 
-def text_for_pinocchio(path: Path) -> str:
-    """What Pinocchio reads of a file: its tree of links and joints, with finite numbers.
+class CheckedUrdf(NamedTuple):
+    """What is read of a URDF file.
+
+    Attributes
+    ----------
+    text : str
+        For Pinocchio: the tree of links and joints, with finite numbers.
+    unknown_efforts : list of str
+        The joints whose limit of effort is not used; the text has 0.
+    warnings : list of str
+        Sentences about what the file has and the text does not, one for each number.
+    """
+
+    text: str
+    unknown_efforts: list[str]
+    warnings: list[str]
+
+
+def checked_urdf(path: Path) -> CheckedUrdf:
+    """What Pinocchio reads of a file, and what is left out.
 
     Raises
     ------
     ValueError
-        If the file is none that `elements_of` reads, something lacks or is no number, or links are not a tree; the
-        message names the file.
+        If the file is none that `elements_of` reads, something lacks or is no number, links are not a tree, friction is
+        negative, or a joint moves along no axis; the message names the file.
     """
     root = elements_of(path.read_bytes(), path)
     with _naming(path):
+        _check_expanded(root)
+        _declare_world(root)
         text = _written(root, _ROBOT, "")
         _check_tree(root)
-    return text
+        unknown, warnings = _set_aside(root)
+    return CheckedUrdf(_written(root, _ROBOT, "") if warnings else text, unknown, warnings)
 
 
 @contextmanager
@@ -142,7 +167,7 @@ _JOINT = _Part(
         "child": _END,
         "origin": _PLACE,
         "axis": _Part({"xyz": 3}),
-        "limit": _Part(dict.fromkeys(("lower", "upper", "effort", "velocity"), 1), ("effort", "velocity")),
+        "limit": _Part(dict.fromkeys(_OF_LIMIT, 1), ("effort", "velocity")),
         "dynamics": _Part({"damping": 1, "friction": 1}),
     },
     each=True,
@@ -182,6 +207,25 @@ def _checked(text: str, n_numbers: int, where: str) -> str:
     return " ".join(parts)
 
 
+def _check_expanded(root: Element) -> None:
+    """Refuse a xacro file, which is a program that writes a URDF file."""
+    found = [root]
+    for element in found:
+        found += element.children
+        if element.tag.startswith("xacro:"):
+            raise ValueError(
+                f"it has the element <{element.tag}> of xacro, which is not run here; expand the file first, by the "
+                "command `xacro robot.xacro > robot.urdf`"
+            )
+
+
+def _declare_world(root: Element) -> None:
+    """Drake, and files that are written for it, need no link of the name "world" for what is fixed to it."""
+    links = [link.attributes.get("name") for link in root.all("link")]
+    if "world" not in links and any(joint.attribute_of("parent", "link") == "world" for joint in root.all("joint")):
+        root.children.append(Element("link", {"name": "world"}, b"<link/>", 0))
+
+
 def _check_tree(root: Element) -> None:
     """Refuse what is no tree (names twice, links that are not there, two roots, circles) or larger than any robot."""
     links = [link.attributes["name"] for link in root.all("link")]
@@ -200,9 +244,11 @@ def _check_tree(root: Element) -> None:
         if kind in _LIMITED and not joint.all("limit"):
             raise ValueError(f"{called} has no <limit>, which a {kind} one needs")
         parent, child = joint.attribute_of("parent", "link"), joint.attribute_of("child", "link")
-        for link in (parent, child):
+        for end, link in (("parent", parent), ("child", child)):
             if link not in known:
-                raise ValueError(f"{called} is at a link {link!r:.80}, which is not there")
+                close = get_close_matches(link, links, n=1)
+                hint = f"; did you mean {close[0]!r:.80}?" if close else ""
+                raise ValueError(f"{called} has the {end} link {link!r:.80}, which is not there{hint}")
         if child in children:
             raise ValueError(f"the link {child!r:.80} is the child of two joints")
         children.add(child)
@@ -210,11 +256,77 @@ def _check_tree(root: Element) -> None:
     roots = [link for link in links if link not in children]
     if len(roots) > 1:
         raise ValueError(f"it has {len(roots)} links that are no joint's child, {roots[:3]}; a tree has one")
-    level, reached, depth = roots, 0, 0
+    level, reached, depth = roots, set[str](), 0
     while level:
-        reached, depth = reached + len(level), depth + 1
+        reached, depth = reached.union(level), depth + 1
         level = [child for link in level for child in below.get(link, [])]
-    if reached < len(links):
-        raise ValueError("it has links in a circle")
+    if len(reached) < len(links):
+        raise ValueError(f"it has links in a circle: {[link for link in links if link not in reached][:5]}")
     if depth > _LONGEST_CHAIN:
         raise ValueError(f"it has {depth} links in a row, more than {_LONGEST_CHAIN}")
+
+
+def _set_aside(root: Element) -> tuple[list[str], list[str]]:
+    """Refuse numbers that no joint can have, and replace those that are not needed.
+
+    Returns
+    -------
+    unknown_efforts, warnings : list of str
+    """
+    unknown, warnings = [], []
+    joints = [joint.attributes["name"] for joint in root.all("joint")]
+    for joint in root.all("joint"):
+        name, kind = joint.attributes["name"], joint.attributes["type"]
+        if kind == "fixed":
+            continue
+        called = f"The joint {name!r:.80}"
+        _check_motion(joint, f"the joint {name!r:.80}")
+        for limit in joint.all("limit")[:1]:
+            numbers = {key: float(value) for key, value in limit.attributes.items() if key in _OF_LIMIT}
+            for key in ("effort", "velocity"):
+                if numbers.get(key, 0.0) < 0.0:
+                    warnings.append(
+                        f'{called} has <limit {key}="{limit.attributes[key]}">; a limit of {key} must be 0 or above, '
+                        "and this one is not used."
+                    )
+                    limit.attributes[key] = "0"
+                    unknown += [name] if key == "effort" else []
+            lower, upper = numbers.get("lower", 0.0), numbers.get("upper", 0.0)
+            if lower > upper and kind in _LIMITED:
+                warnings.append(
+                    f"{called} has <limit> with lower={lower:g} above upper={upper:g}; its limits of position are not "
+                    "used."
+                )
+                limit.attributes |= {"lower": "0", "upper": "0"}
+        for mimic in joint.all("mimic")[:1]:
+            if (other := mimic.attributes.get("joint", "")) not in joints or other == name:
+                warnings.append(
+                    f'{called} has <mimic joint="{other:.80}">, which is not another joint of the file, and moves on '
+                    "its own."
+                )
+    for link in root.all("link"):
+        for inertial in link.all("inertial")[:1]:
+            if (mass := float(inertial.attribute_of("mass", "value"))) < 0.0:
+                warnings.append(
+                    f'The link {link.attributes["name"]!r:.80} has <mass value="{mass:g}">; a mass must be 0 or '
+                    "above. It counts as a part of the body to which the link is fixed."
+                )
+    return unknown, warnings
+
+
+def _check_motion(joint: Element, called: str) -> None:
+    """Refuse negative friction, and an axis that is none."""
+    for dynamics in joint.all("dynamics")[:1]:
+        for name in ("damping", "friction"):
+            if float(dynamics.attributes.get(name, 0.0)) < 0.0:
+                raise ValueError(
+                    f'{called} has <dynamics {name}="{dynamics.attributes[name]}">; {name} must be 0 or above. A '
+                    "negative value from an identification means that torques do not show this friction: write 0"
+                )
+    for axis in joint.all("axis")[:1]:
+        numbers = [float(each) for each in axis.attributes.get("xyz", "1 0 0").split()]
+        if not math.hypot(*numbers) > _SHORTEST_AXIS:
+            raise ValueError(
+                f'{called} has <axis xyz="{axis.attributes["xyz"]}">, which has no direction; one of the three numbers '
+                "must differ from 0"
+            )

@@ -1,13 +1,18 @@
 """What of a URDF file Pinocchio is given; `tests/long/hostile_files.py` damages such files thousands of times."""
 
+import warnings
 from itertools import pairwise
 
+import numpy as np
 import pinocchio
 import pytest
+from numpy.testing import assert_array_equal
 
-from skevgp.robots import load_robot
-from skevgp.robots.loading import _collection
-from skevgp.robots.urdf_file import text_for_pinocchio
+from skevgp.exceptions import RobotModelWarning
+from skevgp.features import RigidBodyRegressor
+from skevgp.robots import layout_of, load_robot
+from skevgp.robots.loading import _collection, effort_limits
+from skevgp.robots.urdf_file import checked_urdf
 
 from .test_urdf import ARM, BOMB
 
@@ -36,14 +41,14 @@ def load(tmp_path):
 
 def test_of_all_robots_pinocchio_makes_the_same_model():
     for path in _collection().values():
-        assert pinocchio.buildModelFromXML(text_for_pinocchio(path)) == pinocchio.buildModelFromUrdf(str(path)), path
+        assert pinocchio.buildModelFromXML(checked_urdf(path).text) == pinocchio.buildModelFromUrdf(str(path)), path
 
 
 def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
     path = tmp_path / "arm.urdf"
     mesh = '<visual><geometry><mesh filename="package://../../etc/passwd"/></geometry></visual>'
     path.write_text(ARM.replace('<link name="lower"/>', f'<link name="lower">{mesh}</link>'))
-    text = text_for_pinocchio(path)
+    text = checked_urdf(path).text
     assert not any(word in text for word in ("mesh", "passwd", "visual", "transmission", "colour", "<!--"))
     assert pinocchio.buildModelFromXML(text) == pinocchio.buildModelFromUrdf(str(path))
 
@@ -73,7 +78,25 @@ def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
             "the joint 'two' is of the type 'spherical', which is none of revolute",
         ),
         ('type="prismatic"', "", "<joint name='two'> has no type"),
-        ('<child link="point"/>', '<child link="none"/>', "the joint 'tip' is at a link 'none', which is not there"),
+        (
+            '<child link="point"/>',
+            '<child link="none"/>',
+            "the joint 'tip' has the child link 'none', which is not there",
+        ),
+        ('<child link="point"/>', '<child link="pont"/>', "link 'pont', which is not there; did you mean 'point'?"),
+        (
+            'damping="0.5"',
+            'damping="-0.5"',
+            "the joint 'one' has <dynamics damping=\"-0.5\">; damping must be 0 or above",
+        ),
+        ('friction="0.25"', 'friction="-0.39"', "'one' has <dynamics friction=\"-0.39\">; friction must be 0 or above"),
+        ('damping="0.5"', 'damping="${d}"', "damping of <dynamics> of <joint name='one'> must be a finite number"),
+        ('<axis xyz="0 0 1"/>', '<axis xyz="0 0 -0"/>', '<axis xyz="0 0 -0">, which has no direction'),
+        (
+            '<link name="point"/>',
+            '<xacro:link name="point"/>',
+            "the element <xacro:link> of xacro.*expand the file first",
+        ),
         ('<child link="point"/>', "<child/>", "<child> of <joint name='tip'> has no link"),
         ('<child link="point"/>', "", "<joint name='tip'> has no child"),
         ('<link name="point"/>', '<link name="base"/>', "two links of the name 'base'"),
@@ -90,9 +113,18 @@ def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
         load(ARM.replace(old, new, 1))
 
 
+@pytest.mark.parametrize("kind", ["fixed", "revolute"])
+def test_the_world_need_not_be_declared(load, kind):
+    """As Drake has it."""
+    joints = joint("world", "a", kind), joint("a", "b")
+    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
+    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
+        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
+
+
 def test_links_in_a_circle_are_told(load):
     """Pinocchio leaves them out, and makes a robot of the rest."""
-    with pytest.raises(ValueError, match="it has links in a circle"):
+    with pytest.raises(ValueError, match=r"it has links in a circle: \['c', 'd'\]"):
         load(robot("abcd", joint("a", "b"), joint("c", "d"), joint("d", "c")))
 
 
@@ -138,3 +170,79 @@ def test_entities_are_not_read(load, declared):
     text = robot(["&a12;", "b"], joint("&a12;", "b"))
     with pytest.raises(ValueError, match="it has a document type declaration, which is not read"):
         load(declared + text)
+
+
+def warned(load, text):
+    """The model, and what is warned of."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        model = load(text)
+    assert all(one.category is RobotModelWarning for one in caught)
+    return model, [str(one.message) for one in caught]
+
+
+def test_a_negative_limit_of_effort_is_unknown(load):
+    """A limit of 0 would be a joint without a motor."""
+    model, messages = warned(
+        load, robot("abc", joint("a", "b"), joint("b", "c")).replace('"1" velocity', '"-5" velocity', 1)
+    )
+    assert len(messages) == 1
+    assert "The joint 'to_b' has <limit effort=\"-5\">; a limit of effort must be 0 or above" in messages[0]
+    assert_array_equal(effort_limits(model), [[-np.inf, -1.0], [np.inf, 1.0]])
+    assert layout_of(model).driven == (0, 1)
+    assert np.isfinite(RigidBodyRegressor(model).coef_prior(2)[1]).all()
+
+
+def test_a_file_is_warned_of_once(load):
+    names = [f"l{number}" for number in range(8)]
+    text = robot(names, *map(joint, names[:-1], names[1:])).replace('effort="1"', 'effort="-1"')
+    (message,) = warned(load, text)[1]
+    assert message.count("is not used") == 4
+    assert message.endswith("(3 more are like these.)")
+
+
+@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
+def test_a_negative_limit_of_velocity_is_not_used(load, kind):
+    text = robot("ab", joint("a", "b", kind)).replace('velocity="1"', 'velocity="-1"')
+    model, messages = warned(load, text)
+    assert len(messages) == 1
+    assert '<limit velocity="-1">; a limit of velocity must be 0 or above' in messages[0]
+    assert_array_equal(model.velocityLimit, [0.0])
+
+
+def test_limits_of_position_in_the_wrong_order_are_not_used(load):
+    text = robot("ab", joint("a", "b")).replace("<limit", '<limit lower="3" upper="-3"')
+    model, messages = warned(load, text)
+    assert "'to_b' has <limit> with lower=3 above upper=-3; its limits of position are not used" in messages[0]
+    assert_array_equal(model.lowerPositionLimit, model.upperPositionLimit)
+    assert warned(load, text.replace("revolute", "continuous"))[1] == []
+
+
+@pytest.mark.parametrize("other", ["none", "to_b", ""])
+def test_a_joint_that_mimics_none_is_warned_of(load, other):
+    """Joints that mimic move on their own, so that it does not matter."""
+    text = robot("abc", joint("a", "b").replace("</joint>", '<mimic joint="{}"/></joint>'), joint("b", "c"))
+    model, messages = warned(load, text.format(other))
+    assert model.nv == 2
+    assert len(messages) == 1
+    assert f"The joint 'to_b' has <mimic joint=\"{other}\">, which is not another joint of the file" in messages[0]
+    assert warned(load, text.format("to_c"))[1] == []
+
+
+@pytest.mark.parametrize("limit", ['effort="0" velocity="0"', 'lower="0" upper="0" effort="0" velocity="0"'])
+def test_limits_of_zero_are_unknown_ones(load, limit):
+    """Exporters of CAD programs write them."""
+    assert warned(load, robot("ab", joint("a", "b")).replace('effort="1" velocity="1"', limit))[1] == []
+
+
+BODY = """<link name="{}"><inertial><mass value="{}"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
+    text = f'<robot name="r"><link name="a"/>{BODY.format("b", 2)}{BODY.format("c", -0.5)}{joint("a", "b")}{{}}</robot>'
+    model, messages = warned(load, text.format(joint("b", "c", "fixed")))
+    assert "The link 'c' has <mass value=\"-0.5\">" in messages[0]
+    assert model.inertias[1].mass == 1.5
+    with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
+        load(text.format(joint("b", "c")))

@@ -1,0 +1,72 @@
+"""Every robot of `list_robots` in every map, prior and simulation: it works without a warning, or is refused."""
+
+import pickle
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from skevgp.datasets import list_robots, load_robot, make_dynamics
+from skevgp.features import (
+    AngleEncoder,
+    InertiaForce,
+    InertiaForceGravity,
+    LinkGravity,
+    NominalDynamics,
+    RigidBodyRegressor,
+)
+from skevgp.robots import layout_of
+
+# Joints that move no mass, some of them.
+MASSLESS = {
+    "bluevolta_bravo7_gripper": "bravo_finger1_joint",
+    "bravo7_gripper": "bravo_finger1_joint",
+    "falcon_bravo7_gripper": "bravo_finger1_joint",
+    "romeo": "LHand",
+    "romeo_laas_small": "l_gripper_joint",
+}
+SLOW = ("tiago_dual",)  # of 101 joints
+
+
+def marked(name):
+    return pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name
+
+
+def uses(robot):
+    """(name, what is made of the robot)."""
+    model = load_robot(robot)
+    layout, n = layout_of(model), model.nv
+    rng = np.random.default_rng(0)
+    rows, torque_rows = rng.uniform(-1.0, 1.0, (1, layout.n_columns)), rng.uniform(-1.0, 1.0, (1, 3 * n))
+
+    def mapped(feature_map, X, n_outputs=2 * n):
+        prior = [feature_map.coef_prior(n_outputs)] if hasattr(feature_map, "coef_prior") else []
+        H = feature_map.fit_transform(X)
+        assert len(feature_map.get_feature_names_out()) == H.shape[-1]
+        assert_array_equal(pickle.loads(pickle.dumps(feature_map)).transform(X), H)
+        after = [feature_map.coef_prior(n_outputs)] if prior else []
+        return [H, feature_map.jacobian(X), *sum(prior + after, ())]
+
+    terms = ["acceleration", "gravity", "bias", "input"]
+    return {
+        "AngleEncoder": lambda: mapped(AngleEncoder(model), rows),
+        "InertiaForce": lambda: mapped(InertiaForce(model), rows),
+        "InertiaForceGravity": lambda: mapped(InertiaForceGravity(model), rows),
+        "LinkGravity": lambda: mapped(LinkGravity(model), rows),
+        "NominalDynamics": lambda: mapped(NominalDynamics(model, terms=terms), rows),
+        "RigidBodyRegressor": lambda: mapped(RigidBodyRegressor(model), torque_rows, n),
+        "make_dynamics": lambda: make_dynamics(model, 1, 2, dt=0.001, random_state=0, return_X_y=True),
+    }
+
+
+@pytest.mark.filterwarnings("ignore::skevgp.exceptions.RobotModelWarning")  # of three: tests/robots/test_loading.py
+@pytest.mark.parametrize("name", [marked(name) for name in list_robots()])
+def test_every_robot_passes_every_map_prior_and_simulation_or_is_refused(name):
+    for use, values in uses(name).items():
+        if name in MASSLESS and use in ("NominalDynamics", "make_dynamics"):
+            with pytest.raises(
+                ValueError, match=rf"not finite: its joints.*{MASSLESS[name]}|singular.*{MASSLESS[name]}"
+            ):
+                values()
+        else:
+            assert all(np.isfinite(value).all() for value in values()), use

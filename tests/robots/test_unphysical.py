@@ -1,0 +1,108 @@
+"""Inertias that no body can have: an error if a mass matrix is not positive definite, else a warning."""
+
+import warnings
+
+import numpy as np
+import pytest
+
+from skevgp.datasets import make_dynamics
+from skevgp.exceptions import RobotModelWarning
+from skevgp.features import NominalDynamics, RigidBodyRegressor
+from skevgp.robots import inertial_parameters, load_robot, perturb_robot, write_urdf
+
+LINK = """<link name="{}"><inertial><origin xyz="0 0 -0.1"/><mass value="{mass}"/>
+<inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+JOINT = """<joint name="j{}" type="continuous"><parent link="{}"/><child link="{}"/><axis xyz="0 1 0"/>
+<origin xyz="0 0 -0.3"/></joint>"""
+
+
+def arm(path, moments, mass=1.0):
+    """Two links, of which the second one has these moments of inertia; both turn about y."""
+    links = LINK.format("a", 0.01, 0.01, 0.01, mass=1.0) + LINK.format("b", *moments, mass=mass)
+    path.write_text(
+        f'<robot name="r"><link name="w"/>{links}{JOINT.format(1, "w", "a")}{JOINT.format(2, "a", "b")}</robot>'
+    )
+    return path
+
+
+NOT_DEFINITE = (
+    r"mass matrix that is not positive definite.*'b' of the joint 'j2' has 1 kg and moments .* of -1, -1, -1 kg"
+)
+
+
+@pytest.mark.parametrize(
+    "use",
+    [
+        load_robot,
+        lambda robot: NominalDynamics(robot).fit(np.zeros((2, 6))),
+        lambda robot: RigidBodyRegressor(robot).coef_prior(2),
+        lambda robot: make_dynamics(robot, 1),
+        perturb_robot,
+    ],
+    ids=["load_robot", "NominalDynamics", "RigidBodyRegressor", "make_dynamics", "perturb_robot"],
+)
+def test_a_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_loads_a_robot(tmp_path, use):
+    with pytest.raises(ValueError, match=NOT_DEFINITE):
+        use(arm(tmp_path / "arm.urdf", (-1.0, -1.0, -1.0)))
+
+
+def test_a_small_negative_moment_is_refused_where_a_joint_turns_about_it(tmp_path):
+    """Files round moments, by more than this one; but a push moves the joint the other way."""
+    path = arm(tmp_path / "arm.urdf", (0.01, -0.00001, 0.01))
+    path.write_text(path.read_text().replace("0 0 -0.1", "0 0 0"))
+    with pytest.raises(
+        ValueError, match=r"not positive definite.*'b' of the joint 'j2' has 1 kg and moments .* of -1e-05"
+    ):
+        load_robot(path)
+
+
+def test_a_model_in_memory_is_checked_too(tmp_path):
+    model = load_robot(arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.01)))
+    model.inertias[2].inertia = -np.eye(3)
+    with pytest.raises(ValueError, match=r"The model 'r' has a mass matrix.*that of the joint 'j2' has 1 kg"):
+        load_robot(model)
+    model.armature = np.full(2, 2.0)  # of rotors: M = J + 2 1, with J above -2
+    with pytest.warns(RobotModelWarning, match="No mass matrix has a negative eigenvalue in 300 configurations"):
+        load_robot(model)
+
+
+@pytest.mark.parametrize(
+    ("moments", "mass", "told"),
+    [
+        ((-0.001, 0.01, 0.01), 1.0, "1 kg and moments .* of -0.001, 0.01, 0.01 kg"),  # about an axis that stays still
+        ((0.01, 0.01, 0.03), 1.0, "1 kg and moments .* of 0.01, 0.01, 0.03 kg"),
+        ((0.01, 0.01, 0.01), 0.0, "0 kg and moments .* of 0.01, 0.01, 0.01 kg"),
+    ],
+    ids=["negative", "triangle", "massless"],
+)
+def test_what_moves_by_the_laws_of_mechanics_all_the_same_is_warned_of(tmp_path, moments, mass, told):
+    path = arm(tmp_path / "arm.urdf", moments, mass)
+    with pytest.warns(RobotModelWarning, match=rf"'b' of the joint 'j2' has {told}.*triangle inequality.*write_urdf"):
+        model = load_robot(path)
+    with pytest.warns(RobotModelWarning, match="triangle inequality"):
+        load_robot(model)
+
+
+def test_a_map_warns_once_of_its_robot(tmp_path):
+    path = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.03))
+    with pytest.warns(RobotModelWarning) as caught:
+        NominalDynamics(path).fit_transform(np.zeros((2, 6)))
+    assert len(caught) == 1
+
+
+@pytest.mark.parametrize(
+    "moments",
+    [(0.0, 0.0, 0.0), (0.02, 0.02, 0.0), (0.01, 0.01, 0.02), (0.00123, 0.00123, 0.00247), (1e-19, -1e-19, -1e-19)],
+    ids=["point", "rod", "disk", "rounded disk", "rounding"],
+)
+def test_a_point_a_rod_a_disk_and_what_files_round_are_bodies(tmp_path, moments):
+    load_robot(arm(tmp_path / "arm.urdf", moments))
+
+
+def test_the_file_that_mends_a_robot_is_not_warned_of(tmp_path):
+    source = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.03))
+    good = inertial_parameters(load_robot(arm(tmp_path / "good.urdf", (0.02, 0.02, 0.02))))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        write_urdf(source, tmp_path / "mended.urdf", good)
+        assert np.allclose(inertial_parameters(load_robot(tmp_path / "mended.urdf")), good)

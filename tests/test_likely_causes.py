@@ -1,0 +1,181 @@
+"""What `InverseDynamics` says of columns in another order or in degrees, and nothing of these where all is right."""
+
+import warnings
+
+import numpy as np
+import pandas as pd
+import pytest
+from sklearn.exceptions import ConvergenceWarning
+
+from skevgp import InverseDynamics
+from skevgp._likely_causes import likely_causes
+from skevgp.datasets import load_robot
+from skevgp.exceptions import RobotModelWarning
+from skevgp.features import NominalDynamics, RigidBodyRegressor
+
+from .test_inverse_dynamics import Arm, with_masses
+
+NOISE = 0.05
+
+
+def causes_of(robot, X, y, is_far=True):
+    feature_map = RigidBodyRegressor(robot).fit(X)
+    return likely_causes(feature_map, X, y, feature_map.coef_prior(y.shape[1]), is_far=is_far)
+
+
+def columns_of(X, order):
+    """Rows in whose blocks column k is that of the joint order[k]."""
+    n = len(order)
+    return X[:, [n * block + joint for block in range(3) for joint in order]]
+
+
+def in_degrees(X, blocks, joints):
+    X, n = X.copy(), X.shape[1] // 3
+    X[:, [n * "qva".index(block) + joint for block in blocks for joint in joints]] *= 180.0 / np.pi
+    return X
+
+
+def warning_of(robot, X, y, **data):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        InverseDynamics(robot, n_inducing=0).fit(X, y, **data)
+    assert all(one.category is ConvergenceWarning for one in caught)
+    assert len(caught) <= 1
+    return str(caught[0].message) if caught else ""
+
+
+@pytest.mark.parametrize("masses", [1.0, 0.1], ids=["rough", "placeholders"])
+@pytest.mark.parametrize("what", ["X and y", "X", "y"])
+def test_columns_in_another_order_are_named_in_their_order(what, masses):
+    arm = Arm(noise=NOISE)
+    order = [2, 1, 0, 5, 3, 4]
+    X = arm.X if what == "y" else columns_of(arm.X, order)
+    y = arm.y if what == "X" else arm.y[:, order]
+    names = list(arm.nominal.names)[1:]
+    (cause,) = causes_of(with_masses(arm, masses), X, y)
+    columns = [names[joint] for joint in order]
+    assert cause == f"the columns of {what} seem to be in the order {columns}, and must be in the robot's: {names}"
+
+
+def test_the_warning_of_a_fit_names_the_order():
+    """A driver that names the elbow first; the score is .8 then."""
+    arm = Arm(noise=NOISE)
+    message = warning_of(arm.nominal, columns_of(arm.X, [2, 1, 0, 3, 4, 5]), arm.y[:, [2, 1, 0, 3, 4, 5]])
+    assert "far from what torques say: the columns of X and y seem to be in the order ['elbow_joint', 's" in message
+    assert warning_of(arm.nominal, arm.X, arm.y) == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["iiwa14", "panda"])
+def test_the_order_of_more_joints_is_searched_step_by_step(robot):
+    arm = Arm(robot, noise=NOISE)
+    order = np.random.default_rng(0).permutation(arm.nominal.nv)
+    columns = [arm.nominal.names[1 + joint] for joint in order.tolist()]
+    found = causes_of(arm.nominal, columns_of(arm.X, order), arm.y[:, order], is_far=False)
+    assert any(f"columns of X and y seem to be in the order {columns}" in cause for cause in found)
+
+
+@pytest.mark.parametrize("blocks", ["qva", "q"])
+@pytest.mark.parametrize("robot", ["ur5", "kinova"])  # the latter has joints without limits
+def test_degrees_are_named(robot, blocks):
+    arm = Arm(robot, noise=NOISE)
+    names = list(arm.nominal.names)[1:]
+    (cause,) = causes_of(arm.nominal, in_degrees(arm.X, blocks, range(6)), arm.y)
+    signals = {"qva": "positions, velocities and accelerations", "q": "positions"}[blocks]
+    assert cause == f"{signals} of {names} look like degrees, and must be in radians"
+
+
+def test_degrees_of_one_joint_are_named():
+    arm = Arm(noise=NOISE)
+    causes = causes_of(arm.nominal, in_degrees(arm.X, "qva", [1]), arm.y)
+    assert len(causes) == 1
+    assert "positions, velocities and accelerations of ['shoulder_lift_joint'] look like degrees" in causes[0]
+
+
+def test_degrees_in_another_order_are_named_both():
+    arm = Arm(noise=NOISE)
+    order = [2, 1, 0, 3, 4, 5]
+    causes = causes_of(arm.nominal, in_degrees(columns_of(arm.X, order), "qva", range(6)), arm.y[:, order])
+    assert "look like degrees" in causes[0]
+    assert "in the order ['elbow_joint', 'shoulder_lift_joint', 'shoulder_pan_joint', 'w" in causes[-1]
+
+
+def test_positions_beyond_their_limits_are_named_if_the_model_is_far_off():
+    arm = Arm(noise=NOISE)
+    X = arm.X.copy()
+    X[:, 0] += 9.0  # of the vertical axis: torques do not know it
+    (cause,) = causes_of(arm.nominal, X, arm.y)
+    assert cause.startswith("positions of 'shoulder_pan_joint' (from ")
+    assert "with limits of -6.28 and 6.28 rad) are beyond the joints' limits" in cause
+    assert causes_of(arm.nominal, X, arm.y, is_far=False) == []
+
+
+def test_of_many_joints_positions_are_compared_with_limits_only():
+    model = load_robot("romeo")
+    X = np.zeros((2, 3 * model.nv))
+    X[:, 4] = 90.0
+    (cause,) = causes_of(model, X, np.zeros((2, model.nv)))
+    assert f"positions of {model.names[5]!r} (from 90 to 90" in cause
+    assert "look like degrees" in cause
+
+
+@pytest.mark.parametrize(
+    "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.slow) for robot in ("ur5", "iiwa14"))]
+)
+def test_where_columns_are_right_no_other_cause_is_named(robot):
+    """However little torques are explained."""
+    arm, rng = Arm(robot, noise=NOISE), np.random.default_rng(0)
+    scale, n = arm.y.std(axis=0), arm.nominal.nv
+    wrong = {
+        "noise": arm.y + 2.0 * scale * rng.normal(size=arm.y.shape),
+        "currents": arm.y / np.linspace(5.0, 15.0, n),
+        "signs": -arm.y,
+        "what no rigid body does": arm.y + scale * np.sin(7.0 * arm.X[:, :n]),
+        "nothing": np.zeros_like(arm.y),
+    }
+    for masses in (1.0, 0.1) if n == 2 else (0.1,):
+        model = with_masses(arm, masses)
+        named = {name: causes_of(model, arm.X, y, is_far=False) for name, y in wrong.items()}
+        assert named == {name: [] for name in wrong}
+
+
+# --- data frames ---------------------------------------------------------------------------------------------------
+
+UR5 = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_joint", "wrist_2_joint", "wrist_3_joint"]
+NAMES = [f"{signal}/{joint}" for signal in ("position", "velocity", "acceleration") for joint in UR5]
+
+
+def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(frame_of):
+    arm = Arm(noise=NOISE)
+    X, y = frame_of(dict(zip(NAMES, arm.X.T, strict=True))), frame_of(dict(zip(UR5, arm.y.T, strict=True)))
+    assert warning_of("ur5", X, y) == ""
+    by_name = sorted(UR5)
+    other = frame_of({name: arm.X[:, NAMES.index(name)] for name in sorted(NAMES)})
+    with pytest.raises(ValueError, match=r"columns of X must be in the robot's order.*of the joints \['elbow_joint'"):
+        InverseDynamics("ur5").fit(other, y)
+    with pytest.raises(ValueError, match=r"columns of y must be in the robot's order.*got \['elbow_joint'"):
+        InverseDynamics("ur5").fit(X, frame_of({name: arm.y[:, UR5.index(name)] for name in by_name}))
+
+
+def test_the_columns_of_each_joint_side_by_side_are_refused(frame_of):
+    side_by_side = [f"{joint}/{signal}" for joint in UR5 for signal in ("q", "dq", "u")]
+    frame = frame_of({name: np.zeros(2) for name in side_by_side})
+    with pytest.raises(ValueError, match="by their names they are those of the joints"):
+        RigidBodyRegressor("ur5").fit(frame)
+    ordered = [f"{joint}/{signal}" for signal in ("q", "dq", "u") for joint in UR5]
+    assert NominalDynamics("ur5").fit_transform(frame_of({name: np.zeros(2) for name in ordered})).shape == (2, 6)
+
+
+@pytest.mark.parametrize("names", [list("abcdef") * 3, [f"x{number}" for number in range(18)]])
+def test_names_that_say_nothing_of_joints_are_any(names):
+    names = [f"{name}{number}" for number, name in enumerate(names)]
+    RigidBodyRegressor("ur5").fit(pd.DataFrame(np.zeros((2, 18)), columns=names))
+
+
+def test_of_an_unphysical_robot_a_fit_warns_once():
+    model = load_robot("acrobot").copy()
+    model.inertias[2].inertia = np.diag([0.1, 0.33, 0.1])
+    arm = Arm("acrobot", noise=NOISE)
+    with pytest.warns(RobotModelWarning, match="'q2' has 1 kg and moments") as caught:
+        InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
+    assert len(caught) == 1
