@@ -207,7 +207,7 @@ def starting_table(
             parameter_of(
                 starts.noise,
                 "noise",
-                lowest_noise if still else rules.first_noise * scatter,
+                np.where(constant, lowest_noise, rules.first_noise * scatter),
                 lowest_noise,
                 highest,
                 target_unit**2,

@@ -48,7 +48,7 @@ def test_it_reports_what_fails(robustness, monkeypatch):
 
 
 def test_a_fixed_jitter_is_another_model(robustness):
-    data = robustness.nasty(1)
+    data = robustness.nasty(7)
     coarse = robustness.fixed_jitter(data, 0, 1e-4, max_iter=0)
     assert coarse["bound_per_row"] != robustness.fit(data, 0, max_iter=0)["bound_per_row"]
 
