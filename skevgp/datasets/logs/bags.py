@@ -38,7 +38,7 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
     Raises
     ------
     ValueError
-        If the file cannot be read, there is no such topic or joint, or signals are missing.
+        If the file cannot be read, there is no such topic or joint, or no message has positions or efforts.
     ImportError
         If rosbags is not installed; the message gives the pip command.
     """
@@ -63,10 +63,12 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
             rows = [(*row[:column], (), *row[column + 1 :]) for row in rows]
     names = _joints([row[0] for row in rows], joints)
     mine = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
+    refused = {at: told for at, index in enumerate(mine) if (told := _twice(rows[index][0]))}
+    problems: dict[int, str] = {}
     position, velocity, acceleration, effort = (
-        _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed)
+        _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed, problems)
         for column, (title, needed) in enumerate(
-            [("positions", True), ("velocities", False), ("accelerations", False), ("efforts", True)], start=1
+            [("position", True), ("velocity", False), ("acceleration", False), ("effort", True)], start=1
         )
     )
     assert position is not None
@@ -74,7 +76,14 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
     times = times[mine]
     # The difference first: nanoseconds since 1970 have more digits than a float.
     time = (times - times[0]) * _NANO
-    return Recording(Signals(time, position, velocity, acceleration, effort), names, float(times[0] * _NANO))
+    signals = Signals(time, position, velocity, acceleration, effort)
+    return Recording(signals, names, float(times[0] * _NANO), problems, refused)
+
+
+def _twice(names: list[str]) -> str:
+    """What is said of a message that has a joint twice; empty if all is well."""
+    twice = next((name for place, name in enumerate(names) if name in names[:place]), None)
+    return "" if twice is None else f"names the joint {twice!r} twice, so that its values are not known"
 
 
 def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]]:
@@ -135,12 +144,21 @@ def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
     return list(joints)
 
 
-def _signal(rows: list[tuple[list[str], Any]], joints: list[str], title: str, needed: bool) -> np.ndarray | None:
-    if not needed and not any(len(values) for _, values in rows):
+def _signal(
+    rows: list[tuple[list[str], Any]], joints: list[str], title: str, needed: bool, problems: dict[int, str]
+) -> np.ndarray | None:
+    """Values (n, n_joints) of the joints, NaN of messages without them; None if no message has any."""
+    if not any(len(values) for _, values in rows):
+        if needed:
+            raise ValueError(f"no message has a value of the {title}.")
         return None
-    if any(len(values) != len(names) for names, values in rows):
-        raise ValueError(f"there are messages without {title}, or with too few or too many.")
-    return np.array([[values[names.index(joint)] for joint in joints] for names, values in rows], dtype=np.float64)
+    found = np.full((len(rows), len(joints)), np.nan)
+    for row, (names, values) in enumerate(rows):
+        if len(values) == len(names):
+            found[row] = [values[names.index(joint)] for joint in joints]
+        else:
+            problems.setdefault(row, f"the message has {len(values)} values of {title} for {len(names)} names")
+    return found
 
 
 def _nanoseconds(stamp: Any) -> int:

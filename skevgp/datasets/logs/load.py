@@ -19,7 +19,7 @@ from .agreement import check_agreement
 from .bags import SUFFIXES as BAGS
 from .bags import read_bag
 from .jumps import Jumps, Wish, check_wrap, find_jumps, kinds_of, wishes
-from .recording import Recording, Signals, naming
+from .recording import Recording, Signals, completed, naming
 from .signals import Processing, in_order, pieces, process, runs
 from .tables import SECONDS, check_columns, read_table
 from .tables import SUFFIXES as TABLES
@@ -37,6 +37,7 @@ def load_log(
     *,
     columns: Columns | None = ...,
     time_unit: Literal["s", "ms", "us", "ns"] = ...,
+    decimal: Literal[".", ","] = ...,
     topic: str | None = ...,
     joints: Sequence[str] | None = ...,
     gains: ArrayLike = ...,
@@ -58,6 +59,7 @@ def load_log(
     *,
     columns: Columns | None = ...,
     time_unit: Literal["s", "ms", "us", "ns"] = ...,
+    decimal: Literal[".", ","] = ...,
     topic: str | None = ...,
     joints: Sequence[str] | None = ...,
     gains: ArrayLike = ...,
@@ -78,6 +80,7 @@ def load_log(
     *,
     columns: Columns | None = None,
     time_unit: Literal["s", "ms", "us", "ns"] = "s",
+    decimal: Literal[".", ","] = ".",
     topic: str | None = None,
     joints: Sequence[str] | None = None,
     gains: ArrayLike = 1.0,
@@ -98,8 +101,10 @@ def load_log(
     Reads tables (.csv, .txt, .tsv, perhaps with .gz; separator and header are found) and rosbag2 recordings
     (.db3, .mcap, or their folder), without ROS. With each file this is done:
 
-    1. What ``keep`` leaves out goes; rows are sorted by time, and of rows with the same time the first one stays. Of a
-       clock that goes back by more than a gap there is an error.
+    1. What ``keep`` leaves out goes. Then incomplete rows at the beginning and the end are left out: a motor that does
+       not answer yet, a row of units, a last line that is cut off. An incomplete row between complete ones is an error.
+       Rows are sorted by time, and of rows with the same time the first one stays. A clock that goes back by more than
+       a gap is an error.
     2. Efforts become torques, times ``gains``.
     3. Steps above ``max_gap`` cut the recording in pieces. Angles that wrap, such as those in [-π, π), are unwrapped
        (``wrap``). Any other jump of a position cuts the recording, too. Nothing that follows reaches across a gap or a
@@ -127,6 +132,8 @@ def load_log(
         ``"actual_q_*"``, or a sequence of those (``range(1, 7)``), in the order of the joints.
     time_unit : {"s", "ms", "us", "ns"}, default="s"
         Of a table's times.
+    decimal : {".", ","}, default="."
+        What sets off decimals in a table. Cells are separated by tabs, semicolons, commas or spaces.
     topic : str, default=None
         For rosbag2: where the messages are, of type ``sensor_msgs/msg/JointState`` or
         ``trajectory_msgs/msg/JointTrajectory``. None is the only one with such messages. Times are those in the
@@ -153,8 +160,9 @@ def load_log(
         As in `load_robot`. With it, ``"auto"`` never unwraps a joint with limits or a prismatic joint. Joints are
         matched by ``joints`` or the names in a rosbag2 recording, or else by their order.
     keep : slice, tuple or sequence of them, default=None
-        What to read: ``slice(first, stop)``, rows of the file from 0, or ``(first, last)``, seconds since its first
-        row, of which either may be None. For several files a list with one for each, None to read all of it.
+        What to read: ``slice(first, stop)``, rows or messages of the file from 0, or ``(first, last)``, seconds since
+        its first row, of which either may be None. A header does not count, a row of units does. Rows that are left out
+        may be incomplete. For several files a list with one for each, None to read all of it.
     dt : float, default=0.01
         Step of the grid, s. None keeps the recorded times, if steps differ by less than 5 %.
     cutoff : float, default=5.0
@@ -188,7 +196,8 @@ def load_log(
           ``"edge"``, ``"rest"`` or ``"too short"``); ``wrapped``, a dict of how many jumps of each joint were
           unwrapped; ``periods``, a dict of their periods, without joints that never wrap; ``start``, the first
           row's time by the file's own clock, s; ``n_repeated``,
-          how many rows had the time of another; and ``filename``;
+          how many rows had the time of another; ``n_incomplete``, how many rows at its beginning and end were left out
+          because values were missing; and ``filename``;
         - ``joint_names``, ``feature_names``, ``target_names``, ``filenames``, ``DESCR``.
     (data, target) : tuple of ndarray
         If ``return_X_y``.
@@ -256,6 +265,8 @@ def load_log(
         if source == "derive":
             ignored.append(name)
     check_wrap(wrap)
+    if not isinstance(decimal, str) or decimal not in (".", ","):
+        raise ValueError(f"decimal must be '.' or ','; got {decimal!r}.")
     names_of_joints = [] if joints is None else joints
     if (
         not isinstance(names_of_joints, (list, tuple, np.ndarray))
@@ -271,7 +282,7 @@ def load_log(
     given = None if robot is None else read_once(robot)
     for file, limit in zip(files, limits, strict=True):
         with naming(file):
-            read = _read(file, asked, time_unit, topic, names, ignored)
+            read = _read(file, asked, time_unit, topic, names, ignored, decimal)
             names = read.joint_names
             wanted = wishes(wrap, names)
             kinds = kinds_of(given, names, named=joints is not None or asked is None)
@@ -310,15 +321,18 @@ def _check_keep(keep: Any) -> Keep | None:
     return first, last
 
 
-def _kept(signals: Signals, keep: Keep | None) -> Signals:
+def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
+    """The numbers of the rows that are kept; by seconds, those without a time between them too."""
+    rows = np.arange(len(time))
     if isinstance(keep, tuple):
-        first, last = keep
-        rows = signals.time >= (0.0 if first is None else first)
-        kept = signals.at(rows & (signals.time <= (np.inf if last is None else last)))
+        first, last = (-np.inf if keep[0] is None else keep[0]), (np.inf if keep[1] is None else keep[1])
+        inside = np.flatnonzero((time >= first) & (time <= last))
+        between = slice(inside[0], inside[-1] + 1) if len(inside) else slice(0)
+        kept = rows[between][~((time[between] < first) | (time[between] > last))]
     else:
-        kept = signals.at(keep or slice(None))
-    if not len(kept.time):
-        raise ValueError(f"keep={keep!r} leaves none of its {len(signals.time)} rows of {signals.time[-1]:g} s.")
+        kept = rows[keep or slice(None)]
+    if not len(kept):
+        raise ValueError(f"keep={keep!r} leaves none of its {len(time)} rows of {np.nanmax(time):g} s.")
     return kept
 
 
@@ -329,6 +343,7 @@ def _read(
     topic: str | None,
     names: list[str] | None,
     ignored: Sequence[str],
+    decimal: Literal[".", ","],
 ) -> Recording:
     ending = "".join(file.suffixes[-2:]).lower()
     if file.is_dir() or file.suffix.lower() in BAGS:
@@ -342,10 +357,10 @@ def _read(
         raise ValueError("columns must say where a table has its signals, by numbers from 0 or by names.")
     if topic is not None:
         raise ValueError(f"topic={topic!r} is for rosbag2 recordings; this is a table.")
-    read = read_table(file, columns, time_unit)
+    read = read_table(file, columns, time_unit, decimal)
     if names is not None and len(names) != len(read.joint_names):
         raise ValueError(f"it has {len(read.joint_names)} joints; expected {len(names)}: {names}.")
-    return read if names is None else Recording(read.signals, names, read.start)
+    return read if names is None else replace(read, joint_names=names)
 
 
 def _recording(
@@ -358,7 +373,7 @@ def _recording(
     kinds: Sequence[str],
 ) -> Bunch:
     """What was recorded and what became of it."""
-    kept = _kept(read.signals, keep)
+    kept, n_incomplete = completed(read, _kept(read.signals.time, keep))
     factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
     if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
         raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
@@ -375,6 +390,7 @@ def _recording(
         filename=str(file),
         start=read.start,
         n_repeated=len(kept.time) - len(raw.time),
+        n_incomplete=n_incomplete,
         raw=Bunch(**vars(raw)),
         processed=Bunch(**vars(done.signals), why=done.why),
         cuts=done.cuts,
@@ -452,10 +468,11 @@ def _story(recording: Bunch, length: int) -> str:
         for name, period in recording.periods.items()
     ]
     unwrapped = f"; unwrapped: {', '.join(turns)}" if turns else ""
+    incomplete = f"{recording.n_incomplete} incomplete at the ends; " if recording.n_incomplete else ""
     jumps = sum(why == "jump" for *_, why in cuts)
     cut_at = f"; positions jump {jumps} times" if jumps else ""
     return (
         f"{recording.filename}: {length} rows of {len(raw.time)} recorded in {raw.time[-1] - raw.time[0]:.4g} s "
-        f"({recording.n_repeated} more repeated a time; cut: {', '.join(lost) or 'nothing'}{cut_at}"
+        f"({recording.n_repeated} more repeated a time; {incomplete}cut: {', '.join(lost) or 'nothing'}{cut_at}"
         f"{unwrapped})"
     )

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -37,11 +37,73 @@ class Signals:
 
 @dataclass(frozen=True)
 class Recording:
-    """A file's signals, their times counted from its first row."""
+    """A file's signals, their times counted from its first row. What a row lacks is NaN."""
 
     signals: Signals
     joint_names: list[str]
     start: float  # the first row's time by the file's own clock, s
+    # Of rows by number: what they lack, where a NaN does not say enough, and what no ``keep`` but theirs makes good.
+    problems: Mapping[int, str] = field(default_factory=dict)
+    refused: Mapping[int, str] = field(default_factory=dict)
+
+
+def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
+    """Rows of a recording without the incomplete ones at their beginning and end, and how many of these there were.
+
+    Drivers publish before the motors answer, tables have a line of units, and the last line may be cut off. A velocity
+    or acceleration that a joint never has counts for nothing here: `in_order` names it.
+
+    Parameters
+    ----------
+    read : Recording
+    rows : ndarray of int
+        The numbers of those that are kept, at least one.
+
+    Returns
+    -------
+    signals : Signals
+    n_incomplete : int
+
+    Raises
+    ------
+    ValueError
+        If a row between complete ones is incomplete, or more than half of the rows are.
+    """
+    for row in rows:
+        if row in read.refused:
+            raise ValueError(f"row {row} {read.refused[row]}.")
+    kept = read.signals.at(rows)
+    lacks: list[tuple[str, np.ndarray]] = []  # of each signal (n, n_joints)
+    for name, signal in vars(kept).items():
+        if signal is not None:
+            lack = np.isnan(signal.reshape(len(rows), -1))
+            if name in ("velocity", "acceleration") and int(rows[0]) not in read.problems:
+                lack &= ~lack.all(axis=0)
+            lacks.append((name, lack))
+    incomplete = np.any([lack.any(axis=1) for _, lack in lacks], axis=0)
+    whole = np.flatnonzero(~incomplete)
+
+    def told(at: int) -> str:
+        """What a row lacks."""
+        row, hint = int(rows[at]), ""
+        name, lack = next((name, lack[at]) for name, lack in lacks if lack[at].any())
+        if name in ("velocity", "acceleration"):
+            hint = f', or pass {name}="derive" to ignore it'
+        joint = "" if name == "time" else f" of joint {read.joint_names[int(np.argmax(lack))]!r}"
+        why = f" ({read.problems[row]})" if row in read.problems else ""
+        signal = "effort" if name == "torque" else name
+        return f"row {row} lacks the {signal}{joint}{why}. Leave it out by keep{hint}."
+
+    if not len(whole):
+        raise ValueError(f"none of its {len(rows)} rows is complete: {told(0)}")
+    inside = np.flatnonzero(incomplete[whole[0] : whole[-1]])
+    if len(inside):
+        raise ValueError(told(int(whole[0] + inside[0])))
+    n_incomplete = len(rows) - int(whole[-1] - whole[0]) - 1
+    if n_incomplete > len(whole):
+        at = 0 if incomplete[0] else int(whole[-1]) + 1
+        raise ValueError(f"{n_incomplete} of its {len(rows)} rows are incomplete: {told(at)}")
+    return kept.at(slice(whole[0], whole[-1] + 1)), n_incomplete
 
 
 @contextmanager

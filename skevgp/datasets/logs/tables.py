@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import csv
 import gzip
+import re
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,6 +24,10 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _REQUIRED = ("time", "position")
 _EFFORT = ("effort", "current")
 _NAMES = (*_REQUIRED, "velocity", "acceleration", *_EFFORT)
+# What spreadsheets and loggers write where there is no value.
+_MISSING = frozenset({"", "nan", "na", "n/a", "null", "none", "-", "--"})
+# Numbers, perhaps with decimals and groups of thousands.
+_DIGITS = re.compile(r"[+-]?[\d.,]*\d[\d.,]*([eE][+-]?\d+)?")
 
 
 def check_columns(columns: Any) -> dict[str, list[int | str]]:
@@ -41,7 +47,9 @@ def check_columns(columns: Any) -> dict[str, list[int | str]]:
     return asked
 
 
-def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: str) -> Recording:
+def read_table(
+    path: Path, columns: Mapping[str, list[int | str]], time_unit: str, decimal: Literal[".", ","] = "."
+) -> Recording:
     """Read a table.
 
     Parameters
@@ -50,6 +58,8 @@ def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: st
     columns : dict of lists of int or str
         As `check_columns` returns it: numbers from 0, names, or patterns of names.
     time_unit : {"s", "ms", "us", "ns"}
+    decimal : {".", ","}, default="."
+        What stands before the decimals.
 
     Returns
     -------
@@ -58,16 +68,26 @@ def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: st
     Raises
     ------
     ValueError
-        If there are no such columns, signals differ in their number of columns, or something is not a number.
+        If there are no such columns, signals differ in their number of columns, or numbers have another decimal sign.
     """
     packed = path.suffix.lower() == ".gz"
     try:
         if packed:
             with gzip.open(path) as content:
                 Allowance(path.stat().st_size).take_all(content)
+
         # The signature of UTF-8, which spreadsheets write, is none of the first column's name.
-        with (gzip.open if packed else open)(path, "rt", encoding="utf-8-sig") as lines:
-            found, values = _read(lines, columns)
+        def opened() -> Any:
+            return (gzip.open if packed else open)(path, "rt", encoding="utf-8-sig")
+
+        with opened() as lines:
+            layout, rows = _layout(lines, columns, decimal)
+            values, problems = layout.numbers(rows), dict[int, str]()
+        if values is None:
+            with opened() as lines:
+                layout, rows = _layout(lines, columns, decimal)
+                values, problems = layout.numbers_one_by_one(rows)
+        found = layout.found
     except (gzip.BadGzipFile, EOFError, zlib.error, UnicodeDecodeError) as error:
         raise ValueError(f"it is no text, or its compression is broken ({error}).") from error
     signals = {name: values[:, places] for name, places in found.items()}
@@ -78,16 +98,19 @@ def read_table(path: Path, columns: Mapping[str, list[int | str]], time_unit: st
         if name != "time" and signal.shape[1] != n_joints:
             raise ValueError(f"there are {n_joints} columns of position, and {signal.shape[1]} of {name}.")
     time = signals["time"][:, 0] * SECONDS[time_unit]
+    known = time[~np.isnan(time)]
+    start = float(known[0]) if len(known) else np.nan
     return Recording(
         Signals(
-            time - time[0],
+            time - start,
             signals["position"],
             signals.get("velocity"),
             signals.get("acceleration"),
             effort,
         ),
         [f"q{number}" for number in range(1, n_joints + 1)],
-        float(time[0]),
+        start,
+        problems,
     )
 
 
@@ -98,13 +121,82 @@ def _as_list(value: Any, name: str) -> list[int | str]:
     return [one if isinstance(one, str) else check_integer(one, f"columns[{name!r}]", minimum=0) for one in several]
 
 
-def _read(text: Any, columns: Mapping[str, list[int | str]]) -> tuple[dict[str, list[int]], np.ndarray]:
-    """Where each signal is among the columns that are read, and their values."""
+@dataclass(frozen=True)
+class _Layout:
+    """How a table is written, and what is read of it.
+
+    Attributes
+    ----------
+    delimiter : str or None
+        None are spaces.
+    decimal : {".", ","}
+    read : list of int
+        The columns that are read.
+    titles : list of str
+        What they are called.
+    found : dict
+        Where each signal is among them.
+    """
+
+    delimiter: str | None
+    decimal: str
+    read: list[int]
+    titles: list[str]
+    found: dict[str, list[int]]
+
+    def numbers(self, lines: Iterator[str]) -> np.ndarray | None:
+        """Values (n, columns read) of lines that are complete, fast; None if one of them is not."""
+        decimal = self.decimal
+        if decimal == ",":
+            if self.delimiter == ",":
+                return None
+            lines = (line.replace(",", ".") if "." not in line else "?" for line in lines)
+        try:
+            return np.loadtxt(
+                lines, delimiter=self.delimiter, usecols=self.read, comments=None, quotechar='"', ndmin=2, dtype=float
+            )
+        except ValueError:
+            return None
+
+    def numbers_one_by_one(self, lines: Iterator[str]) -> tuple[np.ndarray, dict[int, str]]:
+        """The same of any lines, with NaN for what is missing, and what rows lack by their numbers."""
+        values, problems = [], dict[int, str]()
+        for row, line in enumerate(lines):
+            cells, numbers = _cells(line, self.delimiter), []
+            for place, title in zip(self.read, self.titles, strict=True):
+                number = np.nan
+                if place >= len(cells):
+                    problems.setdefault(row, f"it has {len(cells)} cells, and column {place} is read")
+                elif (cell := cells[place]).lower() not in _MISSING:
+                    self._check_decimal(cell, row, title)
+                    try:
+                        number = float(cell.replace(",", ".") if self.decimal == "," else cell)
+                    except ValueError:
+                        problems.setdefault(row, f"{cell!r} in {title} is no number")
+                numbers.append(number)
+            values.append(numbers)
+        return np.array(values), problems
+
+    def _check_decimal(self, cell: str, row: int, title: str) -> None:
+        """Refuse a number whose decimals are set off by the other sign, or thousands by any."""
+        other = "," if self.decimal == "." else "."
+        if other not in cell or not _DIGITS.fullmatch(cell):
+            return
+        if self.decimal == "." and cell.count(",") == 1 and "." not in cell:
+            hint = 'Pass decimal=","'
+        elif self.decimal == "," and cell.count(".") == 1 and "," not in cell:
+            hint = 'Pass decimal="."'
+        else:
+            hint = "Write numbers without separators of thousands"
+        raise ValueError(f"row {row} has {cell!r} in {title}, and decimal={self.decimal!r}. {hint}.")
+
+
+def _layout(text: Any, columns: Mapping[str, list[int | str]], decimal: str) -> tuple[_Layout, Iterator[str]]:
+    """How a table is written, and its rows."""
     comments, first, lines = _beginning(text)
-    separator = max((",", ";", "\t"), key=first.count)
-    delimiter = separator if separator in first else None
+    delimiter = _delimiter(first, decimal)
     cells = _cells(first, delimiter)
-    numeric = all(map(_is_number, cells))
+    numeric = all(_is_number(cell) for cell in cells)
     header = _cells(comments[-1].lstrip("# "), delimiter) if numeric and comments else [] if numeric else cells
     places = {name: _places(asked, header, len(cells), name) for name, asked in columns.items()}
     read = sorted({place for several in places.values() for place in several})
@@ -113,10 +205,18 @@ def _read(text: Any, columns: Mapping[str, list[int | str]]) -> tuple[dict[str, 
     data = next(rows, None)
     if data is None:
         raise ValueError("it has no rows.")
-    values = np.loadtxt(
-        chain([data], rows), delimiter=delimiter, usecols=read, comments=None, quotechar='"', ndmin=2, dtype=np.float64
-    )
-    return {name: [read.index(place) for place in several] for name, several in places.items()}, values
+    titles = [f"column {place}" + (f" ({header[place]})" if place < len(header) else "") for place in read]
+    found = {name: [read.index(place) for place in several] for name, several in places.items()}
+    return _Layout(delimiter, decimal, read, titles, found), chain([data], rows)
+
+
+def _delimiter(line: str, decimal: str) -> str | None:
+    """What separates cells; None are spaces."""
+    for other in ("\t", ";"):
+        # A comma then stands before decimals, or in a name.
+        if other in line:
+            return other
+    return "," if "," in line and (decimal == "." or '"' in line) else None
 
 
 def _beginning(text: Any) -> tuple[list[str], str, Iterator[str]]:
@@ -136,10 +236,11 @@ def _cells(line: str, delimiter: str | None) -> list[str]:
 
 
 def _is_number(cell: str) -> bool:
+    """Whether it is a number, whatever stands before its decimals, or missing."""
     try:
-        float(cell)
+        float(cell.replace(",", "."))
     except ValueError:
-        return cell == ""  # a missing value, which `loadtxt` tells
+        return cell.lower() in _MISSING
     return True
 
 

@@ -205,9 +205,9 @@ def test_a_recording_without_joint_states_lists_its_topics(tmp_path):
 @pytest.mark.parametrize(
     ("messages", "message"),
     [
-        ([(START, state(START, ["a"], [1.0], [1.0]))], "there are messages without efforts, or with too few"),
-        ([(START, state(START, ["a"], [], [], [1.0]))], "there are messages without positions"),
-        ([(START, state(START, ["a", "b"], [1.0, 1.0], [1.0], [1.0, 1.0]))], "messages without velocities, or with"),
+        ([(START, state(START, ["a"], [1.0], [1.0]))], "no message has a value of the effort"),
+        ([(START, state(START, ["a"], [], [], [1.0]))], "no message has a value of the position"),
+        ([(START, state(START, ["a", "b"], [1.0, 1.0], [1.0], [1.0, 1.0]))], "has 1 values of velocity for 2 names"),
         ([(START, state(START, ["a"], [1.0], [1.0], [1.0]))], "it has 1 rows, and not two different times"),
         ([], "the topic '/joint_states' has no messages"),
     ],
@@ -218,7 +218,7 @@ def test_missing_signals_are_told(tmp_path, messages, message):
 
 
 def test_a_trajectory_without_efforts_is_no_data(tmp_path):
-    with pytest.raises(ValueError, match="there are messages without efforts"):
+    with pytest.raises(ValueError, match="no message has a value of the effort"):
         load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory(effort=False)])}))
 
 
@@ -263,3 +263,49 @@ def test_without_rosbags_the_pip_command_is_told(monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
         load_log(UR10)
+
+
+def spoilt_states(rows, **fields):
+    """Joint states of which some have other fields."""
+    messages = list(states())
+    for row in rows:
+        for name, values in fields.items():
+            setattr(messages[row][1], name, values if name == "name" else np.array(values))
+    return {"/joint_states": (STATES, messages)}
+
+
+@pytest.mark.parametrize("field", ["effort", "velocity", "position"])
+@pytest.mark.parametrize("values", [[], [1.0], [np.nan, np.nan]], ids=str)
+def test_incomplete_messages_at_the_ends_are_left_out_and_counted(tmp_path, field, values):
+    """Drivers publish before the motors answer."""
+    file = write(tmp_path / "bag", spoilt_states([0, 1, 2, len(T) - 1], **{field: values}))
+    log = load_log(file)
+    assert log.recordings[0].n_incomplete == 4
+    q, dq, _, current = motion(T[3:-1])
+    raw = log.recordings[0].raw
+    assert_allclose(np.hstack([raw.position, raw.velocity, raw.torque]), np.hstack([q, dq, current]), rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("field", "message"),
+    [
+        ("effort", r"row 7 lacks the effort of joint 'a' \(the message has 0 values of effort for 2 names\)"),
+        ("velocity", r"row 7 lacks the velocity of joint 'a' .*, or pass velocity=\"derive\" to ignore it"),
+    ],
+)
+def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_it_out(tmp_path, field, message):
+    file = write(tmp_path / "bag", spoilt_states([7], **{field: []}))
+    with pytest.raises(ValueError, match=f"bag.mcap: {message}"):
+        load_log(file)
+    assert load_log(file, keep=slice(8, None)).recordings[0].n_incomplete == 0
+    if field == "velocity":
+        assert load_log(file, velocity="derive").recordings[0].raw.velocity is None
+
+
+def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
+    file = write(tmp_path / "one", spoilt_states([4], name=["a", "a"]))
+    with pytest.raises(ValueError, match="messages are of different joints"):
+        load_log(file)
+    every = write(tmp_path / "every", spoilt_states(range(len(T)), name=["a", "a"]))
+    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
+        load_log(every)

@@ -196,9 +196,9 @@ def spoilt(row, column, value):
 @pytest.mark.parametrize(
     ("table", "arguments", "message"),
     [
-        (spoilt(30, 2, np.nan), {}, "the position of row 30 of those kept is not finite"),
+        (spoilt(30, 2, np.nan), {}, "row 30 lacks the position of joint 'q2'. Leave it out by keep"),
         (spoilt(40, 6, np.inf), {}, "the torque of row 40 of those kept is not finite"),
-        (spoilt(7, 0, np.nan), {}, "the time of row 7 of those kept is not finite"),
+        (spoilt(7, 0, np.nan), {}, "row 7 lacks the time. Leave it out by keep"),
         (table_of(irregular_times()), {"dt": None}, r"not regular: steps differ .* median of 0.008\d* s by .* Give dt"),
         (table_of(np.arange(0.0, 0.5, 0.01)), {}, "too short: no piece .* longer than the 0.8 s cut at its ends"),
         (table_of([0.0, 0.01]), {"cutoff": None}, "too short: .* longer than the 0.02 s cut at its ends"),

@@ -163,10 +163,14 @@ def test_a_name_of_two_columns_is_an_error(tmp_path):
         (b"", "it is empty"),
         (b"# only a comment\n", "it is empty"),
         (b"t,q,u\n", "it has no rows"),
-        (b"t,q,u\n0,1,2\n1,,2\n", "could not convert string '' to float64 at row 1, column 2"),
-        (b"t,q,u\n0,1,2\n1,word,2\n", "could not convert string 'word'"),
-        (b"t,q,u\n0,1,2\n1,2\n", "invalid column index 2 at row 2 with 2 columns"),
-        (b"t,q,u\n0,1,2\n1,nan,2\n", "the position of row 1 of those kept is not finite"),
+        (b"t,q,u\n0,1,2\n1,,2\n2,3,4\n", "row 1 lacks the position of joint 'q1'. Leave it out by keep"),
+        (b"t,q,u\n0,1,2\n1,word,2\n2,3,4\n", r"row 1 lacks the position .*'word' in column 1 \(q\) is no number"),
+        (b"t,q,u\n0,1,2\n1,2\n2,3,4\n", "row 1 lacks the effort .*it has 2 cells, and column 2 is read"),
+        (b"t,q,u\n0,1,2\n1,nan,2\n2,3,4\n", "row 1 lacks the position"),
+        (b"t,q,u\n0,,2\n1,,2\n2,,4\n", "none of its 3 rows is complete: row 0 lacks the position"),
+        (b"t,q,u\n0,,2\n1,,2\n2,3,4\n", "2 of its 3 rows are incomplete: row 0 lacks the position"),
+        (b"t;q;u\n0,1;1;2\n", r"row 0 has '0,1' in column 0 \(t\), and decimal='.'. Pass decimal=\",\""),
+        (b"t;q;u\n0;1.234,5;2\n", r"row 0 has '1.234,5' in column 1 \(q\).* without separators of thousands"),
         (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
     ],
 )
@@ -175,6 +179,68 @@ def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
     file.write_bytes(content)
     with pytest.raises(ValueError, match=f"bad.csv: {message}"):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("t;q;u\n0,5;1.5;2\n", r"row 0 has '1.5' in column 1 \(q\), and decimal=','. Pass decimal=\"\.\""),
+        ("t;q;u\n0,5;1.234,5;2\n", r"row 0 has '1.234,5' .* without separators of thousands"),
+    ],
+)
+def test_points_among_decimal_commas_are_errors(tmp_path, text, message):
+    file = tmp_path / "log.csv"
+    file.write_text(text)
+    with pytest.raises(ValueError, match=message):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2}, decimal=",")
+
+
+@pytest.mark.parametrize("decimal", ["", ";", ".,", None, 0])
+def test_decimal_must_be_a_point_or_a_comma(file, decimal):
+    with pytest.raises(ValueError, match=r"decimal must be '\.' or ','; got"):
+        load_log(file, columns=BY_NUMBER, decimal=decimal)
+
+
+@pytest.mark.parametrize("delimiter", [";", "\t", " ", '","'])
+@pytest.mark.parametrize("header", [True, False])
+def test_decimal_commas_are_read(tmp_path, expected, delimiter, header):
+    lines = write_table(tmp_path / "body.csv", TABLE, HEADER if header else None).read_text().splitlines()
+    lines = [line.replace(",", ";").replace(".", ",").replace(";", delimiter) for line in lines]
+    quote = '"' if '"' in delimiter else ""
+    file = tmp_path / "log.csv"
+    file.write_text("".join(f"{quote}{line}{quote}\r\n" for line in lines))
+    assert_equal(load_log(file, columns=BY_NUMBER, decimal=","), expected)
+
+
+UNITS, CUT_OFF = "s,rad,rad,,rad/s,rad/s,A,A\n", "3.1,0.5"
+
+
+@pytest.mark.parametrize("missing", ["", "nan", "NaN", "NA", "n/a", "null", "None", "-"])
+def test_incomplete_rows_at_the_ends_are_left_out_and_counted(tmp_path, expected, missing):
+    """A line of units, motors that do not answer yet, and a last line that is cut off."""
+    header, *rows = write_table(tmp_path / "body.csv", TABLE).read_text().splitlines(keepends=True)
+    first = f"{TABLE[0, 0] - 0.01},0.1,0.1,0,0.1,0.1,{missing},{missing}\n"
+    file = tmp_path / "log.csv"
+    file.write_text(header + UNITS + first + "".join(rows) + CUT_OFF)
+    log = load_log(file, columns=BY_NAME)
+    assert log.recordings[0].n_incomplete == 3
+    assert "3 incomplete at the ends" in log.DESCR
+    np.testing.assert_allclose(log.data, expected.data, atol=1e-9)
+    np.testing.assert_allclose(log.target, expected.target, atol=1e-9)
+    assert expected.recordings[0].n_incomplete == 0
+    assert "incomplete at the ends" not in expected.DESCR
+
+
+@pytest.mark.parametrize("keep", [slice(20, None), (0.1, None)], ids=str)
+def test_rows_that_keep_leaves_out_may_be_incomplete(tmp_path, keep):
+    header, *rows = write_table(tmp_path / "body.csv", TABLE).read_text().splitlines(keepends=True)
+    rows[5] = rows[5].replace(",", ",word,", 1)
+    spoilt = tmp_path / "log.csv"
+    spoilt.write_text(header + "".join(rows))
+    with pytest.raises(ValueError, match=r"row 5 lacks the position of joint 'q1' \('word' in column 1 \(q_1\)"):
+        load_log(spoilt, columns=BY_NAME)
+    whole = load_log(tmp_path / "body.csv", columns=BY_NAME, keep=keep)
+    assert_equal(load_log(spoilt, columns=BY_NAME, keep=keep), whole)
 
 
 @pytest.mark.parametrize("spoil", [lambda data: b"no gzip", lambda data: data[: len(data) // 2]], ids=["no", "half"])
