@@ -166,8 +166,8 @@ def starting_table(
     rounding : ndarray of shape (o,), default=0.0
         Variance of the targets' rounding, in squared target units: the noise does not fall below it.
     constant : ndarray of bool of shape (o,), default=False
-        Targets that do not vary. Where all outputs of the model are such, nothing says how far they may vary: the
-        signal stays at one target unit, and the noise at its lowest.
+        Targets that do not vary. Their noise starts at its lowest. Where all outputs of the model are such, nothing
+        says how far they may vary: the signal stays at one target unit, and the noise where it is.
 
     Returns
     -------
@@ -197,7 +197,8 @@ def starting_table(
             parameter_of(
                 starts.signal,
                 "signal",
-                signal,
+                # Among others, a constant is not to rule the kernel that they share.
+                np.where(np.logical_and(constant, not still), rules.signal_limits[0], 1.0) * signal,
                 rules.signal_limits[0] * signal,
                 rules.signal_limits[1] * signal,
                 target_unit**2,

@@ -27,7 +27,8 @@ def branched():
     ]
     for number, (kind, parent) in enumerate(zip(kinds, [0, 1, 2, 1, 4, 0, 6, 7], strict=True)):
         joint = model.addJoint(parent, kind, pin.SE3.Random(), f"j{number}")
-        model.appendBodyToJoint(joint, pin.Inertia.Random(), pin.SE3.Identity())
+        body = pin.Inertia.FromEllipsoid(0.5 + rng.rand(), *rng.uniform(0.1, 0.4, 3))
+        model.appendBodyToJoint(joint, body, pin.SE3.Random())
     model.gravity.linear = np.array([1.0, -2.0, -9.0])
     model.armature, model.damping = rng.rand(8), rng.rand(8)
     return load_robot(model)
