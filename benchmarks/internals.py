@@ -11,15 +11,15 @@ from typing import Any, Literal
 import numpy as np
 
 from skevgp import EVGPRegressor
-from skevgp._linalg import Jitter
+from skevgp.data.threads import BlockMap
 from skevgp.fitting.sparse import SparseTask
 from skevgp.fitting.strategy import Attempt, Fit
-from skevgp.inference.objectives import ElboObjective
-from skevgp.optimizers.adam import adam
-from skevgp.optimizers.minimum import Minimum, Objective
-from skevgp.optimizers.parameters import ParameterTable
-from skevgp.rows.threads import BlockMap
+from skevgp.model.objectives import ElboObjective
+from skevgp.model.parameters import ParameterTable
 from skevgp.solvers import LBFGS, Adam
+from skevgp.solvers.adam import adam
+from skevgp.solvers.minimum import Minimum, Objective
+from skevgp.utils.linalg import Jitter
 
 
 def _task(n: int, m: int, d: int, n_outputs: int, solver: type[LBFGS] | type[Adam], **options: Any) -> SparseTask:

@@ -9,12 +9,12 @@ from ._version import __version__
 
 if TYPE_CHECKING:
     from . import datasets, exceptions, features, io, kernels, metrics, plotting, solvers
-    from .bnn import BayesianMLPRegressor
-    from .exact import EGPRegressor
-    from .inverse_dynamics import InverseDynamics
-    from .prediction.rollout import rollout
-    from .regressor import EVGPRegressor
-    from .residual import ResidualRegressor
+    from .control.rollout import rollout
+    from .estimators.bnn import BayesianMLPRegressor
+    from .estimators.egp import EGPRegressor
+    from .estimators.evgp import EVGPRegressor
+    from .estimators.residual import ResidualRegressor
+    from .identification.inverse_dynamics import InverseDynamics
 
 __all__ = [
     "BayesianMLPRegressor",
@@ -36,12 +36,12 @@ __all__ = [
 
 _SUBMODULES = ("datasets", "exceptions", "features", "io", "kernels", "metrics", "plotting", "solvers")
 _HOME = {
-    "BayesianMLPRegressor": "bnn",
-    "EGPRegressor": "exact",
-    "EVGPRegressor": "regressor",
-    "InverseDynamics": "inverse_dynamics",
-    "ResidualRegressor": "residual",
-    "rollout": "prediction.rollout",
+    "BayesianMLPRegressor": "estimators.bnn",
+    "EGPRegressor": "estimators.egp",
+    "EVGPRegressor": "estimators.evgp",
+    "InverseDynamics": "identification.inverse_dynamics",
+    "ResidualRegressor": "estimators.residual",
+    "rollout": "control.rollout",
 }
 
 

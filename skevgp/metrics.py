@@ -9,8 +9,8 @@ from numpy.typing import ArrayLike
 from scipy.special import ndtr
 from sklearn.utils import check_array, check_consistent_length
 
-from ._scorers import make_std_scorer
-from ._validation import as_floats
+from .utils.scorers import make_std_scorer
+from .utils.validation import as_floats
 
 __all__ = [
     "calibration_error",

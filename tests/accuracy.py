@@ -8,8 +8,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.inference.bounds import LOG_2PI, bounds_at_optimum
-from skevgp.inference.objectives import ElboObjective, _ElboTerms, evaluate
+from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
+from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
 
 from .precise import PreciseModel, cholesky, condition, solved, squared_exponential
 

@@ -3,16 +3,16 @@
 import autograd.numpy as anp
 import numpy as np
 
+from skevgp.data.blocks import LocalBlocks
+from skevgp.data.internal import MakeBlock, Rows
+from skevgp.data.source import LocalSource, Moments
 from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import starting_table
-from skevgp.inference.bounds import LOG_2PI
-from skevgp.inference.model import SparseModel
-from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.rows.blocks import LocalBlocks
-from skevgp.rows.internal import MakeBlock, Rows
-from skevgp.rows.source import LocalSource, Moments
+from skevgp.model.bounds import LOG_2PI
+from skevgp.model.model import SparseModel
+from skevgp.model.predictor import CoefficientPrior
 
 
 def central_differences(function, x, step=1e-6):

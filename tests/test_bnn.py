@@ -211,7 +211,7 @@ def test_a_loss_that_still_falls_is_told():
 
 
 def test_an_interruption_keeps_a_usable_model(monkeypatch):
-    from skevgp.network.model import VariationalNetwork
+    from skevgp.estimators.bnn_model import VariationalNetwork
 
     original, calls = VariationalNetwork.loss_and_gradient, []
 
@@ -248,7 +248,7 @@ def test_a_rows_prediction_depends_neither_on_its_neighbours_nor_on_the_call(mon
         np.testing.assert_array_equal(part, again)
     for part, row in zip(whole, FITTED.predict(X_NEW[3:4], return_std=True), strict=True):
         np.testing.assert_allclose(row[0], part[3], rtol=1e-12)
-    monkeypatch.setattr("skevgp.bnn._NUMBERS_AT_ONCE", 100 * 8 * 7)
+    monkeypatch.setattr("skevgp.estimators.bnn._NUMBERS_AT_ONCE", 100 * 8 * 7)
     for part, blocks in zip(whole, FITTED.predict(X_NEW, return_std=True), strict=True):
         np.testing.assert_allclose(blocks, part, rtol=1e-12)
 

@@ -6,8 +6,8 @@ from sklearn.compose import make_column_transformer
 from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp._coef_prior import resolve_coef_prior, wide_scale
 from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.fitting.coef_prior import resolve_coef_prior, wide_scale
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(20, 3)) * [1.0, 10.0, 0.1]

@@ -82,9 +82,9 @@ def assert_same(found, expected):
 @pytest.mark.parametrize("name", THREADED)
 def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
     """With blocks so small that threads have something to do."""
-    monkeypatch.setattr("skevgp.rows.blocks._MIN_BLOCK_ROWS", 16)
-    monkeypatch.setattr("skevgp.rows.blocks._WORTH_THREADS", 0)
-    monkeypatch.setattr("skevgp.rows.blocks._BLOCK_NUMBERS", 16)
+    monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 16)
+    monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
+    monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 16)
     one, many = (clone(THREADED[name]).set_params(n_jobs=n_jobs).fit(X, Y) for n_jobs in (None, 3))
     assert_same(said_by(many), said_by(one))
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from skevgp import EVGPRegressor
-from skevgp._files import replacing
 from skevgp.io import save
 from skevgp.robots import inertial_parameters, load_robot, write_urdf
+from skevgp.utils.files import replacing
 
 
 @pytest.fixture(scope="module")

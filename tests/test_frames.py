@@ -6,7 +6,7 @@ import polars as pl
 import pyarrow as pa
 import pytest
 
-from skevgp._frames import FrameColumns
+from skevgp.utils.frames import FrameColumns
 
 COLUMNS = {"a": [1.0, 2.0], "word": ["hot", "cold"]}
 

@@ -8,8 +8,8 @@ from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import EVGPRegressor, ResidualRegressor
-from skevgp._input_noise import variance_by_inputs
 from skevgp.metrics import containing_ratios, prediction_error
+from skevgp.noise.inputs import variance_by_inputs
 from tests.nasty import BadMap
 
 
@@ -56,7 +56,7 @@ def test_where_the_function_is_steep_rows_count_less():
 
 
 def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
-    monkeypatch.setattr("skevgp._input_noise._ROWS_AT_ONCE", 7)
+    monkeypatch.setattr("skevgp.noise.inputs._ROWS_AT_ONCE", 7)
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (40, 2))
     model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, tol=1e6).fit(

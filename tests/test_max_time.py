@@ -5,8 +5,8 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp._progress import Monitor
 from skevgp.solvers import LBFGS
+from skevgp.utils.monitor import Monitor
 
 rng = np.random.RandomState(0)
 X = rng.uniform(-2.0, 2.0, (120, 2))

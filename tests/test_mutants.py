@@ -45,10 +45,10 @@ def test_a_mutant_takes_the_place_of_what_has_been_imported():
 
 
 def test_a_constant_and_a_default_are_put_in_place_too():
-    from skevgp._linalg import JITTER
-    from skevgp.inference import statistics
+    from skevgp.model import statistics
+    from skevgp.utils.linalg import JITTER
 
-    module, source = "inference/statistics.py", (PACKAGE / "inference" / "statistics.py").read_bytes()
+    module, source = "model/statistics.py", (PACKAGE / "model" / "statistics.py").read_bytes()
     of = statistics.Whitening.of
     try:
         put_in_place(module, source.replace(b"_NO_JITTER = 1e-13", b"_NO_JITTER = 0.5"))

@@ -234,7 +234,7 @@ def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch
     settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
     settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
     m = fitted(**settings)
-    monkeypatch.setattr("skevgp.rows.chosen.ORDERED_ROWS", 0)
+    monkeypatch.setattr("skevgp.data.chosen.ORDERED_ROWS", 0)
     np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
 
 
@@ -267,9 +267,9 @@ def test_a_wrong_number_of_folds_is_refused(noise_cv):
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_same_bits_for_any_n_jobs(sharing, groups, monkeypatch):
-    monkeypatch.setattr("skevgp.rows.blocks._MIN_BLOCK_ROWS", 64)
-    monkeypatch.setattr("skevgp.rows.blocks._WORTH_THREADS", 0)
-    monkeypatch.setattr("skevgp.rows.blocks._BLOCK_NUMBERS", 64)
+    monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 64)
+    monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
+    monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 64)
     fits = [fitted(groups, sharing=sharing, n_jobs=n_jobs, max_iter=3, noise_cv=4) for n_jobs in (1, 3)]
     np.testing.assert_array_equal(fits[0].noise_variance_, fits[1].noise_variance_)
     np.testing.assert_array_equal(fits[0].predict(X_NEW), fits[1].predict(X_NEW))

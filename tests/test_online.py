@@ -44,7 +44,7 @@ def test_an_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
     before = found.lower_bound_
     calls = []
     for name in ("bound", "upper_bound", "whitenings"):
-        monkeypatch.setattr(f"skevgp.inference.model.SparseModel.{name}", lambda *_, name=name: calls.append(name))
+        monkeypatch.setattr(f"skevgp.model.model.SparseModel.{name}", lambda *_, name=name: calls.append(name))
     found.partial_fit(X[40:], Y[40:])
     assert calls == []
     monkeypatch.undo()

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import skevgp
-from skevgp._optional import require
 from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import InertiaForceGravity
+from skevgp.utils.optional import require
 
 ROOT = Path(skevgp.__file__).parents[1]
 OPTIONAL = {"pinocchio", "example_robot_data", "matplotlib", "dask", "distributed", "casadi", "rosbags", "skops"}

@@ -6,7 +6,7 @@ from threading import Thread
 import numpy as np
 import pytest
 
-from skevgp._progress import Monitor, Progress, monitor_of
+from skevgp.utils.monitor import Monitor, Progress, monitor_of
 
 
 def heard():

@@ -473,9 +473,9 @@ def test_warm_start_with_other_shapes_starts_anew():
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch):
-    monkeypatch.setattr("skevgp.rows.blocks._MIN_BLOCK_ROWS", 16)
-    monkeypatch.setattr("skevgp.rows.blocks._WORTH_THREADS", 0)
-    monkeypatch.setattr("skevgp.rows.blocks._BLOCK_NUMBERS", 16)
+    monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 16)
+    monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
+    monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 16)
     fits = [
         model(sharing=sharing, solver=solver, n_jobs=n_jobs, max_iter=20, tol=1e9).fit(X, Y) for n_jobs in (None, 1, 2)
     ]

@@ -12,7 +12,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.rows import chosen
+from skevgp.data import chosen
 from skevgp.solvers import Adam
 
 # A few iterations are enough to compare.

@@ -14,10 +14,10 @@ from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.inference.exact import ExactModel
-from skevgp.inference.posterior import CoefficientPrior
+from skevgp.data.source import RawRows
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.rows.source import RawRows
+from skevgp.model.exact import ExactModel
+from skevgp.model.predictor import CoefficientPrior
 from skevgp.solvers import LBFGS
 
 from .oracle import central_differences, relative_error

@@ -12,7 +12,7 @@ import pytest
 from sklearn.base import clone
 from sklearn.preprocessing import StandardScaler
 
-import skevgp._state
+import skevgp.utils.state
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor, __version__
 from skevgp.datasets import load_robot
 from skevgp.exceptions import InconsistentVersionWarning
@@ -49,7 +49,7 @@ def test_the_version_is_in_the_state_and_not_in_the_estimator(estimator):
 @each
 def test_another_version_is_warned_of(estimator, monkeypatch):
     data = pickle.dumps(estimator)
-    monkeypatch.setattr(skevgp._state, "__version__", "99.0")
+    monkeypatch.setattr(skevgp.utils.state, "__version__", "99.0")
     message = rf"{type(estimator).__name__} is a pickle of skevgp {__version__}, and this is 99\.0"
     # What is inside may be warned of too.
     with warnings.catch_warnings(record=True) as caught:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._validation import as_floats, check_integer, check_real
 from ..robots.loading import Robot
+from ..utils.validation import as_floats, check_integer, check_real
 from .plant import Plant
 
 

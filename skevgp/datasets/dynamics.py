@@ -7,8 +7,8 @@ from typing import Literal, overload
 import numpy as np
 from sklearn.utils import Bunch, check_random_state
 
-from .._validation import check_integer, check_real
 from ..robots.loading import Robot
+from ..utils.validation import check_integer, check_real
 from .plant import Plant
 from .sampling import sampling_of
 from .simulation import simulate, turns

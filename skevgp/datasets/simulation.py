@@ -11,8 +11,8 @@ import numpy as np
 from joblib import Parallel, delayed, effective_n_jobs
 from numpy.typing import ArrayLike
 
-from .._validation import as_floats, check_integer, check_real
 from ..robots.loading import Robot
+from ..utils.validation import as_floats, check_integer, check_real
 from .control import ComputedTorqueController
 from .plant import Plant
 

@@ -16,8 +16,8 @@ from urllib.request import urlopen
 import numpy as np
 from sklearn.utils import Bunch
 
-from .._files import replacing
-from .._validation import check_integer, check_real
+from ..utils.files import replacing
+from ..utils.validation import check_integer, check_real
 
 _ADDRESS = "http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz"
 # The folder in the archive, and of the copy that is kept.

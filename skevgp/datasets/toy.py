@@ -7,7 +7,7 @@ from typing import Literal, overload
 import numpy as np
 from sklearn.utils import Bunch, check_random_state
 
-from .._validation import check_integer, check_real
+from ..utils.validation import check_integer, check_real
 
 RandomState = int | np.random.RandomState | None
 

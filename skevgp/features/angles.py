@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_array, check_is_fitted
 
-from .._sklearn import StrOptions
 from ..robots.loading import Robot
+from ..utils.sklearn import StrOptions
 from .robot_map import RobotTransformer, same_for_all
 
 

@@ -9,9 +9,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .._sklearn import Interval, StrOptions
 from ..robots import GravityTerm, Layout, get_system, layout_of
 from ..robots.loading import Robot, joint_axes, known_robot
+from ..utils.sklearn import Interval, StrOptions
 from .robot_map import RobotMap, indices_of, same_for_all
 
 # An axis is vertical up to this angle, rad: URDF files round π/2.

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.base import clone
 
-from .._sklearn import Interval, StrOptions
-from .._validation import as_floats
 from ..robots import Layout
 from ..robots.loading import Robot, named_system, read_once
+from ..utils.sklearn import Interval, StrOptions
+from ..utils.validation import as_floats
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
 from .robot_map import STEP, RobotMap, same_for_all
 

@@ -8,9 +8,9 @@ from typing import Any, ClassVar, Literal
 
 import numpy as np
 
-from .._sklearn import Interval, StrOptions
 from ..robots import Layout, RigidBody
 from ..robots.loading import Robot, known_robot
+from ..utils.sklearn import Interval, StrOptions
 from .robot_map import STEP, RobotMap, same_for_all
 
 _NAMES = {

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils.metaestimators import available_if
 
-from .._sklearn import Interval
-from .._validation import as_floats
 from ..robots import RigidBody, load_robot
 from ..robots.loading import Robot, effort_limits, known_robot
+from ..utils.sklearn import Interval
+from ..utils.validation import as_floats
 from .robot_map import RobotTransformer, has_robot, same_for_all
 
 FRICTION = ("viscous", "coulomb", "offset", "armature")

@@ -14,11 +14,11 @@ from sklearn.utils import assert_all_finite
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from .._sklearn import check_feature_names_in, fit_context
-from .._state import StatefulEstimator
-from .._validation import is_plain
 from ..robots import Layout, layout_of
 from ..robots.loading import Robot, read_once
+from ..utils.sklearn import check_feature_names_in, fit_context
+from ..utils.state import StatefulEstimator
+from ..utils.validation import is_plain
 
 # s: the time step of which default prior scales are.
 STEP = 0.03

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..inference.posterior import CoefficientPrior
-from ..inference.statistics import Kernel
-from ..optimizers.minimum import Minimum
-from ..optimizers.parameters import ParameterTable, Values
-from ..rows.internal import Rows
+from ..data.internal import Rows
+from ..model.parameters import ParameterTable, Values
+from ..model.predictor import CoefficientPrior
+from ..model.statistics import Kernel
+from ..solvers.minimum import Minimum
 from .start import alike_neighbours, neighbours
 
 # When no start got below this share, the user should know.

@@ -8,17 +8,17 @@ from typing import Any
 
 import numpy as np
 
-from .._linalg import NotPositiveDefiniteError
-from .._progress import Monitor
-from ..inference.exact import ExactModel, LikelihoodObjective
-from ..inference.posterior import CoefficientPrior, Predictor
-from ..inference.statistics import Kernel
+from ..data.internal import Rows
+from ..data.source import RawRows
 from ..kernels.parse import KernelSpec
-from ..optimizers.lbfgs import lbfgs
-from ..optimizers.minimum import Minimum
-from ..optimizers.parameters import ParameterTable, Values
-from ..rows.internal import Rows
-from ..rows.source import RawRows
+from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.parameters import ParameterTable, Values
+from ..model.predictor import CoefficientPrior, Predictor
+from ..model.statistics import Kernel
+from ..solvers.lbfgs import lbfgs
+from ..solvers.minimum import Minimum
+from ..utils.linalg import NotPositiveDefiniteError
+from ..utils.monitor import Monitor
 from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
 from .rules import Rules
 from .start import centred_kernels, checked_variance, starting_table

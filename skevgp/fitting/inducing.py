@@ -9,10 +9,10 @@ import numpy as np
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
-from .._validation import as_floats, check_magnitude
+from ..data.source import Moments
 from ..exceptions import ignored
-from ..inference.statistics import Kernel, Whitening
-from ..rows.source import Moments
+from ..model.statistics import Kernel, Whitening
+from ..utils.validation import as_floats, check_magnitude
 from .start import column_scale
 
 # Points that there are first if their number is to be found.

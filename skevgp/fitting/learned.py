@@ -8,16 +8,16 @@ from typing import Protocol
 
 import numpy as np
 
-from ..calibration.calibrate import calibrated
-from ..inference.bounds import bounds_at_optimum
-from ..inference.exact import ExactModel
-from ..inference.model import SparseModel
-from ..inference.objectives import evaluate
-from ..inference.posterior import Predictor
-from ..inference.statistics import SufficientStatistics, Whitening
-from ..optimizers.parameters import ParameterTable, Values
-from ..rows.internal import Rows
+from ..data.internal import Rows
+from ..model.bounds import bounds_at_optimum
+from ..model.exact import ExactModel
+from ..model.model import SparseModel
+from ..model.objectives import evaluate
+from ..model.parameters import ParameterTable, Values
+from ..model.predictor import Predictor
+from ..model.statistics import SufficientStatistics, Whitening
 from .advice import far_from_prior, signal_gone
+from .calibrate import calibrated
 from .rules import Rules
 from .sparse import SparseTask
 from .strategy import Fit

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from .._linalg import JITTER, Jitter
+from ..utils.linalg import JITTER, Jitter
 
 # Numbers: samples are held in memory.
 LARGEST_SAMPLE = 2_000_000

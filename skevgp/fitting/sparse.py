@@ -9,18 +9,18 @@ from typing import Protocol
 
 import numpy as np
 
-from .._progress import Monitor
-from ..calibration.folds import CrossValidation
-from ..inference.bounds import bounds_alone
-from ..inference.exact import ExactModel, LikelihoodObjective
-from ..inference.model import SparseModel
-from ..inference.objectives import BoundObjective
-from ..optimizers.parameters import ParameterTable, Values
-from ..rows.blocks import Blocks
-from ..rows.internal import Rows
-from ..rows.source import of_outputs
+from ..data.blocks import Blocks
+from ..data.internal import Rows
+from ..data.source import of_outputs
+from ..model.bounds import bounds_alone
+from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.model import SparseModel
+from ..model.objectives import BoundObjective
+from ..model.parameters import ParameterTable, Values
+from ..utils.monitor import Monitor
 from .advice import learned_too_little
 from .exact import ExactOptions, Unhindered
+from .folds import CrossValidation
 from .inducing import Placement, distinct_rows, greedy_sample_size, with_more
 from .rules import Rules
 from .start import LOWEST_NOISE

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from .._linalg import NotPositiveDefiniteError, jittered_cholesky
-from ..inference.posterior import CoefficientPrior, Predictor, PredictorGroup
-from ..inference.statistics import Kernel, Whitening
+from ..data.internal import Rows
+from ..data.source import Moments, RawRows
 from ..kernels.covariances import Covariance
 from ..kernels.parse import KernelSpec, Start, Starts
-from ..optimizers.parameters import Parameter, ParameterTable
-from ..rows.internal import Rows
-from ..rows.source import Moments, RawRows
+from ..model.parameters import Parameter, ParameterTable
+from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
+from ..model.statistics import Kernel, Whitening
+from ..utils.linalg import NotPositiveDefiniteError, jittered_cholesky
 from .rules import Rules
 from .units import SMALLEST_UNIT
 

@@ -14,9 +14,9 @@ from typing import Protocol
 
 import numpy as np
 
-from .._progress import Monitor
-from ..inference.posterior import Predictor
-from ..optimizers.parameters import ParameterTable, Values
+from ..model.parameters import ParameterTable, Values
+from ..model.predictor import Predictor
+from ..utils.monitor import Monitor
 from .rules import Rules
 
 # Nats: by less than this, a white kernel and noise are below each other by rounding.

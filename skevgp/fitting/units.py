@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from scipy.linalg import svd
 
-from .._linalg import diagonal_of, jittered_cholesky, triangular_inverse
-from ..inference.posterior import CoefficientPrior, Predictor
-from ..rows.internal import Rows
-from ..rows.source import Columns, Moments, RawRows, Source, times_weights
-from ..rows.threads import BlockMap
+from ..data.internal import Rows
+from ..data.source import Columns, Moments, RawRows, Source, times_weights
+from ..data.threads import BlockMap
+from ..model.predictor import CoefficientPrior, Predictor
+from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
 
 # So that the lowest noise variance in the user's units is not rounded to 0.
 SMALLEST_UNIT = 1e-140

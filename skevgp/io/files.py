@@ -16,12 +16,12 @@ from joblib import parallel_config
 from sklearn.base import BaseEstimator
 from sklearn.pipeline import Pipeline
 
-from .._files import replacing
-from .._frames import FrameColumns
-from .._validation import check_fitted
 from .._version import __version__
+from ..data.maps import take_rows
 from ..exceptions import InconsistentVersionWarning, ignored, warn_user
-from ..rows.maps import take_rows
+from ..utils.files import replacing
+from ..utils.frames import FrameColumns
+from ..utils.validation import check_fitted
 from . import of_maps, of_models
 from .container import Container, write
 from .fields import MalformedError

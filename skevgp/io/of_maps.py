@@ -8,7 +8,6 @@ import numpy as np
 from scipy.interpolate import BSpline
 from sklearn import compose, decomposition, impute, kernel_approximation, pipeline, preprocessing
 
-from .._frames import FrameColumns
 from ..features.angles import AngleEncoder
 from ..features.gravity import GravityMap, Lever, LinkGravity, Links, SineGravity
 from ..features.newton import InertiaForce, InertiaForceGravity
@@ -17,21 +16,8 @@ from ..features.rigid_body import RigidBodyRegressor
 from ..robots.numbers import JOINTS, RobotNumbers
 from ..robots.rigid_body import RigidBody
 from ..robots.systems import GravityTerm, Layout, Link, System
-from .fields import (
-    anything,
-    array,
-    flag,
-    integer,
-    made,
-    mapping,
-    nothing,
-    one_of,
-    real,
-    row,
-    several,
-    text,
-    words,
-)
+from ..utils.frames import FrameColumns
+from .fields import anything, array, flag, integer, made, mapping, nothing, one_of, real, row, several, text, words
 from .records import Record, bare, estimator, plain, state_of
 
 _INPUTS = {"n_features_in_": integer(1), "feature_names_in_": words}

@@ -8,33 +8,33 @@ from typing import Any
 
 import numpy as np
 
-from .._joint_residual import JointResidual, QuietRegressor
-from .._linalg import Jitter
-from ..bnn import BayesianMLPRegressor
-from ..exact import EGPRegressor
+from ..data.source import RawRows
+from ..estimators.bnn import BayesianMLPRegressor
+from ..estimators.bnn_model import VariationalNetwork
+from ..estimators.bnn_training import Scaling
+from ..estimators.egp import EGPRegressor
+from ..estimators.evgp import EVGPRegressor
+from ..estimators.residual import ResidualRegressor
 from ..features.rigid_body import RigidBodyRegressor
 from ..fitting.exact import ExactFit
+from ..fitting.fitted import FittedOutputs
 from ..fitting.learned import Learned
-from ..fitting.noise.mixture import RowScales
-from ..fitting.noise.outliers import RowDoubts
+from ..fitting.outliers import RowDoubts
 from ..fitting.strategy import Fit
 from ..fitting.units import Units
+from ..identification.inverse_dynamics import InverseDynamics
+from ..identification.joint_residual import JointResidual, QuietRegressor
 from ..identification.stiction import JointNoise
 from ..identification.weights import Known, Prior, Weights
-from ..inference.exact import ExactModel
-from ..inference.model import SparseModel
-from ..inference.posterior import CoefficientPrior, Predictor, PredictorGroup
-from ..inference.statistics import SufficientStatistics, Whitening
-from ..inverse_dynamics import InverseDynamics
 from ..kernels.parse import KernelSpec
-from ..network.model import VariationalNetwork
-from ..network.training import Scaling
-from ..optimizers.parameters import Parameter, ParameterTable
-from ..outputs.fitted import FittedOutputs
-from ..regressor import EVGPRegressor
-from ..residual import ResidualRegressor
-from ..rows.source import RawRows
-from ..solvers import LBFGS, Adam
+from ..model.exact import ExactModel
+from ..model.model import SparseModel
+from ..model.parameters import Parameter, ParameterTable
+from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
+from ..model.statistics import SufficientStatistics, Whitening
+from ..noise.student_t import RowScales
+from ..solvers.solvers import LBFGS, Adam
+from ..utils.linalg import Jitter
 from . import of_kernels
 from .fields import (
     MalformedError,

@@ -7,7 +7,7 @@ from . import of_maps, of_models
 # Of predictors, which files of `save` make anew.
 _MADE_ANEW = (
     "operator.itemgetter",
-    "skevgp.inference.statistics.Whitening",
+    "skevgp.model.statistics.Whitening",
     "skevgp.kernels.constant.ConstantAt",
     "skevgp.kernels.cosine.WaveAt",
     "skevgp.kernels.covariances.ProductAt",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .._optional import require
+from ..utils.optional import require
 
 # Okabe & Ito's, safe for colour-blind readers; without black and yellow.
 BLUE, ORANGE, GREEN = "#0072B2", "#D55E00", "#009E73"

@@ -8,9 +8,9 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .._scorers import mean_and_std
-from .._validation import check_integer
 from ..metrics import calibration_error, interval_levels
+from ..utils.scorers import mean_and_std
+from ..utils.validation import check_integer
 from ._style import axes_of, free_color
 
 _DIAGONAL = "as promised"

@@ -6,11 +6,11 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from .._validation import check_fitted
+from ..utils.validation import check_fitted
 from ._style import BLUE, axes_of, check_output
 
 if TYPE_CHECKING:
-    from ..regressor import EVGPRegressor
+    from ..estimators.evgp import EVGPRegressor
 
 
 class CoefficientDisplay:

@@ -11,10 +11,10 @@ from sklearn.base import clone
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_consistent_length, has_fit_parameter
 
-from .._optional import require
-from .._sklearn import num_samples, safe_indexing
-from .._validation import check_integer
 from ..metrics import prediction_error
+from ..utils.optional import require
+from ..utils.sklearn import num_samples, safe_indexing
+from ..utils.validation import check_integer
 from ._style import axes_of, free_color
 
 

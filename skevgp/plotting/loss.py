@@ -6,7 +6,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from .._validation import check_fitted
+from ..utils.validation import check_fitted
 from ._style import axes_of, free_color
 
 

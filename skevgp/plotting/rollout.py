@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch
 
-from .._optional import require
-from .._validation import as_floats, check_integer, check_real
+from ..utils.optional import require
+from ..utils.validation import as_floats, check_integer, check_real
 from ._style import BLUE, ORANGE
 
 

@@ -8,7 +8,7 @@ from typing import Any, Self
 import numpy as np
 from sklearn.utils import Bunch
 
-from .._optional import require
+from ..utils.optional import require
 from ._style import BLUE, GREEN, PALETTE
 
 _PANELS = {"velocity": "velocity\n(rad/s)", "acceleration": "acceleration\n(rad/s²)", "torque": "torque\n(N m)"}

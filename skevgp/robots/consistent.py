@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.linalg import eigh, solve_triangular
 
-from .._validation import check_real
+from ..utils.validation import check_real
 from .inertia import (
     N_PARAMETERS,
     checked_covariance,

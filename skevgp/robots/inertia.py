@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from .._optional import require
-from .._validation import as_floats
+from ..utils.optional import require
+from ..utils.validation import as_floats
 
 N_PARAMETERS = 10
 # Of the symmetric inertia, as it is laid out in the parameters.

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from .._optional import require
 from ..exceptions import RobotModelWarning, warn_user
+from ..utils.optional import require
 from .systems import GRAVITY, SYSTEMS, Layout, System
 from .unphysical import check_bodies
 from .urdf_file import checked_urdf

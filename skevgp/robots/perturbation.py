@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from sklearn.utils import check_random_state
 
-from .._validation import check_real
+from ..utils.validation import check_real
 from .loading import Robot, known_robot, load_robot
 
 

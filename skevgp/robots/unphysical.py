@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .._optional import require
+from ..utils.optional import require
 
 # Files round moments of inertia. A violation below this share of the largest one is due to that.
 _ROUNDED = 5e-3

@@ -14,14 +14,8 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from .._files import replacing
-from .inertia import (
-    N_PARAMETERS,
-    body_parameters,
-    checked_covariance,
-    checked_joints,
-    checked_links,
-)
+from ..utils.files import replacing
+from .inertia import N_PARAMETERS, body_parameters, checked_covariance, checked_joints, checked_links
 from .loading import Robot, known_robot, named_system, urdf_path
 from .urdf_file import MOMENTS, Element, elements_of
 

@@ -11,9 +11,9 @@ from sklearn.exceptions import NotFittedError
 from sklearn.pipeline import FeatureUnion
 
 from skevgp import EVGPRegressor
-from skevgp._coef_prior import resolve_coef_prior
 from skevgp.datasets import make_dynamics, perturb_robot, simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from skevgp.fitting.coef_prior import resolve_coef_prior
 from skevgp.metrics import prediction_error
 from skevgp.robots import System, get_system, layout_of, load_robot
 from skevgp.robots.systems import Link

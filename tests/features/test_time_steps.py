@@ -11,11 +11,11 @@ from sklearn.base import clone
 from sklearn.pipeline import make_union
 
 from skevgp import EVGPRegressor, rollout
-from skevgp._coef_prior import resolve_coef_prior
 from skevgp.datasets import simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
-from skevgp.prediction.elementary import Foreign
-from skevgp.prediction.maps import direct_map
+from skevgp.fitting.coef_prior import resolve_coef_prior
+from skevgp.maps.elementary import Foreign
+from skevgp.maps.maps import direct_map
 from skevgp.robots import layout_of
 
 TERMS = ("acceleration", "gravity", "bias", "input")

@@ -2,12 +2,12 @@
 
 import numpy as np
 
+from skevgp.data.source import LocalSource, Moments
 from skevgp.fitting.inducing import Placement
+from skevgp.fitting.plan import Request
 from skevgp.fitting.units import Units
-from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
-from skevgp.outputs.plan import Request
-from skevgp.rows.source import LocalSource, Moments
+from skevgp.model.predictor import CoefficientPrior
 from skevgp.solvers import LBFGS
 
 _rng = np.random.RandomState(0)

@@ -5,11 +5,11 @@ import pytest
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from skevgp._progress import Monitor
 from skevgp.fitting import exact
 from skevgp.fitting.exact import ExactOptions, fit_exact, log_units_of_contrasts
 from skevgp.kernels.parse import parse_kernel
 from skevgp.solvers import LBFGS
+from skevgp.utils.monitor import Monitor
 
 from .cases import NO_FEATURES, H, N, O, X, Y, source_of, units_of
 

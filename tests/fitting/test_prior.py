@@ -5,8 +5,8 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
 
 from skevgp.fitting.start import prior_predictor
-from skevgp.inference.posterior import CoefficientPrior
 from skevgp.kernels.parse import parse_kernel
+from skevgp.model.predictor import CoefficientPrior
 
 from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, O, X, source_of, units_of
 

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from skevgp._progress import Monitor
-from skevgp.calibration.folds import CrossValidation
+from skevgp.data.threads import BlockMap
+from skevgp.fitting.folds import CrossValidation
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.learned import Learned
+from skevgp.fitting.plan import plan
 from skevgp.fitting.sparse import SparseTask, grown
 from skevgp.fitting.strategy import Attempt, Fit, search
-from skevgp.inference.bounds import bounds_alone
-from skevgp.outputs.plan import plan
-from skevgp.rows.threads import BlockMap
+from skevgp.model.bounds import bounds_alone
 from skevgp.solvers import LBFGS, Adam
+from skevgp.utils.monitor import Monitor
 
 from .cases import NO_FEATURES, H, N, O, X, Y, request, source_of, units_of
 

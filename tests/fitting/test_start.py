@@ -1,14 +1,14 @@
 import numpy as np
 import pytest
 
+from skevgp.data.source import Moments
+from skevgp.data.threads import BlockMap
 from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import alike_neighbours, parameter_of, starting_table
-from skevgp.inference.model import SparseModel
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.optimizers.parameters import ParameterTable
-from skevgp.rows.source import Moments
-from skevgp.rows.threads import BlockMap
+from skevgp.model.model import SparseModel
+from skevgp.model.parameters import ParameterTable
 
 from ..oracle import identity_rows
 from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, N, X, Y, source_of, units_of

@@ -6,10 +6,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skevgp._progress import Monitor
 from skevgp.fitting.rules import Rules
 from skevgp.fitting.strategy import Attempt, Fit, Strategy, better, drawn, search
-from skevgp.optimizers.parameters import Parameter, ParameterTable
+from skevgp.model.parameters import Parameter, ParameterTable
+from skevgp.utils.monitor import Monitor
 
 RULES = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
 PLACES = np.arange(4.0).reshape(1, 2, 2)

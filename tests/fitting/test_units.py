@@ -2,9 +2,9 @@ import numpy as np
 import pytest
 import scipy.linalg
 
+from skevgp.data.source import LocalSource, Moments, RawRows
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
-from skevgp.inference.posterior import CoefficientPrior
-from skevgp.rows.source import LocalSource, Moments, RawRows
+from skevgp.model.predictor import CoefficientPrior
 
 
 def weights_alone(H, r, scale):

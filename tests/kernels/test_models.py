@@ -18,14 +18,14 @@ from sklearn.gaussian_process.kernels import (
 )
 
 from skevgp import EVGPRegressor
+from skevgp.data.blocks import Batch
+from skevgp.data.source import Moments
 from skevgp.fitting.rules import Rules
 from skevgp.fitting.start import checked_variance, starting_table
-from skevgp.inference.model import SparseModel
-from skevgp.inference.objectives import BoundObjective, ElboObjective
 from skevgp.kernels import FunctionKernel
 from skevgp.kernels.parse import Start, Starts, parse_kernel
-from skevgp.rows.blocks import Batch
-from skevgp.rows.source import Moments
+from skevgp.model.model import SparseModel
+from skevgp.model.objectives import BoundObjective, ElboObjective
 
 from ..oracle import central_differences, problem, relative_error
 from .cases import KERNELS, REGISTERED, Z, parsed, polynomial, smooth

@@ -1,7 +1,7 @@
 """Mutation testing of the mathematics: small changes to the source, each of which some test must see.
 
     python -m tests.long.mutants                 # the modules of `TESTS`; about half an hour
-    python -m tests.long.mutants inference/bounds.py --again
+    python -m tests.long.mutants model/bounds.py --again
 
 A mutant is one edit (`_Edits`). It is made in a process of its own, a fork of one that has imported the other packages,
 in which the module's fastest tests run first. Outcomes are kept in a file, so that a run that was stopped goes on where
@@ -30,20 +30,20 @@ import pytest
 
 PACKAGE = Path(__file__).parents[2] / "skevgp"
 EQUIVALENT = Path(__file__).with_name("mutants_equivalent.txt")
-_INFERENCE = [f"tests/inference/test_{name}.py" for name in ("model", "row_weights", "objectives", "families", "exact")]
+_INFERENCE = [f"tests/model/test_{name}.py" for name in ("model", "row_weights", "objectives", "families", "exact")]
 _WEIGHTS = ["tests/test_shared_weights.py", "tests/test_coef_prior.py"]
 # In the order in which they run.
 TESTS = {
-    "inference/bounds.py": ["tests/inference/test_bounds.py", *_WEIGHTS, *_INFERENCE],
-    "inference/statistics.py": [
-        "tests/inference/test_statistics.py",
-        "tests/inference/test_bounds.py",
+    "model/bounds.py": ["tests/model/test_bounds.py", *_WEIGHTS, *_INFERENCE],
+    "model/statistics.py": [
+        "tests/model/test_statistics.py",
+        "tests/model/test_bounds.py",
         *_INFERENCE,
         "tests/kernels/test_models.py::test_gradient_of_the_bound_agrees_with_finite_differences",
     ],
-    "inference/posterior.py": [
-        "tests/inference/test_posterior.py",
-        "tests/inference/test_bounds.py",
+    "model/predictor.py": [
+        "tests/model/test_predictor.py",
+        "tests/model/test_bounds.py",
         *_INFERENCE,
         "tests/test_shared_weights.py",
     ],

@@ -12,14 +12,7 @@ from sklearn.gaussian_process import kernels as sk
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.solvers import Adam
 
-from .cases import (
-    STATELESS,
-    data,
-    fewer,
-    fixed_cases,
-    fixed_models,
-    tables,
-)
+from .cases import STATELESS, data, fewer, fixed_cases, fixed_models, tables
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 

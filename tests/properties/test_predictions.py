@@ -7,15 +7,7 @@ from hypothesis import strategies as st
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
 
-from .cases import (
-    assert_near,
-    columns_of,
-    data,
-    fewer,
-    fixed_cases,
-    learned_cases,
-    size_of,
-)
+from .cases import assert_near, columns_of, data, fewer, fixed_cases, learned_cases, size_of
 
 pytestmark = [
     pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning"),

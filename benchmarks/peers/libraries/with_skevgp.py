@@ -9,7 +9,7 @@ import numpy as np
 
 from peers.jobs import Checkpoint, Fitted, Fixed, Job, Said, Watch
 
-MODULES = ("skevgp.regressor", "scipy")
+MODULES = ("skevgp.estimators.evgp", "scipy")
 JITTER = "relative 1e-12, only where a pivot is below 1e-6"
 
 

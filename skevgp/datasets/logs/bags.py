@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..._optional import require
+from ...utils.optional import require
 from .recording import Recording, Signals
 from .unpacking import Allowance, check_files, check_storages
 

@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from ..._validation import check_real
 from ...robots import layout_of, load_robot
 from ...robots.loading import named_system
+from ...utils.validation import check_real
 
 RADIANS, DEGREES = 2.0 * np.pi, 360.0
 _SIDE = 3  # neighbours on each side of a step that predict it

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from sklearn.utils import Bunch
 
-from ..._validation import as_floats, check_real
 from ...robots.loading import Robot, read_once
+from ...utils.validation import as_floats, check_real
 from .agreement import check_agreement
 from .bags import SUFFIXES as BAGS
 from .bags import read_bag

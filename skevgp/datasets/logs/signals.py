@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import PchipInterpolator
 from scipy.signal import butter, sosfiltfilt
 
-from ..._validation import check_real
+from ...utils.validation import check_real
 from .recording import Signals
 
 _ORDER = 4  # of the filter, which passes twice

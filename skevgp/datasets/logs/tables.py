@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..._validation import check_integer
+from ...utils.validation import check_integer
 from .recording import Recording, Signals
 from .unpacking import Allowance
 

@@ -7,7 +7,7 @@ from typing import Literal, overload
 import numpy as np
 from sklearn.utils import Bunch
 
-from ..._validation import check_integer
+from ...utils.validation import check_integer
 from .signals import runs
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import IO, Any
 
-from ..._optional import require
+from ...utils.optional import require
 
 # A robot at rest compresses a hundred times; what is small may always be unpacked.
 _MOST, _FREE = 300, 2**24

@@ -11,12 +11,12 @@ from sklearn.utils import Bunch
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
+from skevgp.estimators.bnn_training import Training
 from skevgp.features import InertiaForceGravity
 from skevgp.fitting import advice
 from skevgp.metrics import prediction_error, std_norm
-from skevgp.network.training import Training
-from skevgp.optimizers.minimum import Minimum
 from skevgp.solvers import Adam
+from skevgp.solvers.minimum import Minimum
 
 from ..conftest import read
 

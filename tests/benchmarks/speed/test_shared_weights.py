@@ -12,7 +12,7 @@ def test_both_ways_are_timed():
 
 
 def test_each_output_has_an_evaluation_of_its_own_without_sharing(monkeypatch):
-    from skevgp.inference import objectives
+    from skevgp.model import objectives
     from speed import shared_weights
 
     calls = []

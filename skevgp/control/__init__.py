@@ -1,0 +1,1 @@
+"""What controllers ask of a fitted model: fast rows, sampled functions, rollouts, CasADi and C code."""

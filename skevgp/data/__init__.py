@@ -1,0 +1,1 @@
+"""The rows: blocks, threads, memory maps, Dask."""

@@ -1,0 +1,1 @@
+"""The regressors: arguments, documentation and fitted attributes."""

@@ -1,0 +1,265 @@
+"""ResidualRegressor: learn the change of a state in place of the next state."""
+
+from __future__ import annotations
+
+from numbers import Integral
+from typing import Any, ClassVar, Self
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn import get_config
+from sklearn.base import MetaEstimatorMixin, RegressorMixin, clone
+from sklearn.utils import Bunch, Tags, get_tags
+from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, process_routing
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import check_is_fitted, validate_data
+
+from ..data.dask import aligned, as_rows, is_dask
+from ..utils.sklearn import HasMethods, fit_context
+from ..utils.validation import FLOATS, is_frame, unchanged_if_it_fails, validate_frame, validate_numbers
+from .residual_control import ResidualForControl, columns_of, regressor_has
+
+
+class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
+    """Fit a regressor to what y adds to some columns of X, and predict the sum.
+
+    For x = (state, input) and y the next state, the regressor learns the change of state: RES-VGP and RES-DBNN of the
+    paper. What it says of the uncertainty of the change holds for the sum.
+
+    Parameters
+    ----------
+    regressor : estimator
+        A clone of it is fitted. It sees all of X. Scaling of columns and encoding of angles belong in here,
+        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``: in front of the whole they would change the
+        base columns too.
+    base : int, str or array-like of shape (n_outputs,), default=None
+        The column of X from which each output starts: its index, or its name if X is a data frame. None are the first
+        ``n_outputs`` columns.
+
+    Attributes
+    ----------
+    regressor_ : estimator
+        Fitted to ``y - X[:, base_]``.
+    base_ : ndarray of shape (n_outputs,)
+        Indices of columns.
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    References
+    ----------
+    - D. L. Marino, M. Manic (2020): Physics Enhanced Data-Driven Models with Variational Gaussian Processes, section
+      IV-B.
+
+    Examples
+    --------
+    >>> from skevgp import EVGPRegressor, ResidualRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = ResidualRegressor(EVGPRegressor(n_inducing=10, random_state=0)).fit(X, y)
+    >>> mean, std = model.predict(X, return_std=True)
+    >>> round(model.score(X, y), 2)
+    0.96
+    """
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "regressor": [HasMethods(["fit", "predict"])],
+        "base": ["array-like", Integral, str, None],
+    }
+
+    regressor_: Any
+    base_: np.ndarray
+
+    def __init__(self, regressor: Any, *, base: ArrayLike | None = None):
+        self.regressor = regressor
+        self.base = base
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
+        """Fit a clone of the regressor to what y adds to the base columns.
+
+        Parameters
+        ----------
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            A data frame stays one for the regressor; only its base columns need be numbers here. So does a Dask array,
+            whose chunks are not loaded here.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Targets in the units of their base columns.
+        **params : dict
+            For the regressor's ``fit``, such as ``sample_weight``; with metadata routing what it requests of them.
+
+        Returns
+        -------
+        self : ResidualRegressor
+            Fitted.
+
+        Raises
+        ------
+        ValueError
+            If X has fewer columns than y, or ``base`` does not name a column of X for each output.
+        """
+        with unchanged_if_it_fails(self):
+            return self._fit("fit", X, y, params)
+
+    @available_if(regressor_has("partial_fit"))
+    @fit_context(prefer_skip_nested_validation=False)
+    def partial_fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
+        """Go on with some rows, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            New rows, with the columns of the first call.
+        y : array-like of shape (n_samples,) or (n_samples, n_outputs)
+            Their targets.
+        **params : dict
+            For the regressor's ``partial_fit``.
+
+        Returns
+        -------
+        self : ResidualRegressor
+            Fitted.
+
+        Raises
+        ------
+        ValueError
+            As `fit`, and if y does not have the outputs of the first call.
+        """
+        with unchanged_if_it_fails(self):
+            return self._fit("partial_fit", X, y, params)
+
+    def predict(self, X: ArrayLike, **params: Any) -> Any:
+        """Predict y: the base columns plus what the regressor predicts.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, n_features)
+            Rows with the columns of `fit`.
+        **params : dict
+            For the regressor's ``predict``, such as ``return_std``, ``return_cov`` and ``include_noise``.
+
+        Returns
+        -------
+        mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
+            Of y at each row.
+        std or cov : ndarray
+            If the regressor was asked for them: as it returns them.
+        """
+        check_is_fitted(self)
+        X = self._validated(X)
+        predicted = self.regressor_.predict(X, **params)
+        mean, *spread = predicted if isinstance(predicted, tuple) else (predicted,)
+        mean = mean + columns_of(X, self.base_, mean.ndim)
+        return (mean, *spread) if spread else mean
+
+    @available_if(regressor_has("sample_y"))
+    def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = 0, **params: Any) -> np.ndarray:
+        """Draw functions from the posterior at some rows, if the regressor can.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_rows, n_features)
+            Rows with the columns of `fit`.
+        n_samples : int, default=1
+            How many functions.
+        random_state : int, RandomState instance or None, default=0
+            Draws the functions.
+        **params : dict
+            For the regressor's ``sample_y``.
+
+        Returns
+        -------
+        samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
+            Each function at all rows, base columns included.
+        """
+        check_is_fitted(self)
+        X = self._validated(X)
+        samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
+        return samples + columns_of(X, self.base_).reshape(*samples.shape[:-1], 1)
+
+    def get_metadata_routing(self) -> MetadataRouter:
+        """Tell scikit-learn's metadata routing which methods pass what on.
+
+        Returns
+        -------
+        routing : MetadataRouter
+            From `fit`, `partial_fit` and `predict` to those of the regressor.
+        """
+        mapping = MethodMapping()
+        for method in ("fit", "partial_fit", "predict"):
+            mapping.add(caller=method, callee=method)
+        router = MetadataRouter(owner=self).add_self_request(self)
+        return router.add(regressor=self.regressor, method_mapping=mapping)
+
+    def __sklearn_tags__(self) -> Tags:
+        tags, own = super().__sklearn_tags__(), get_tags(self.regressor)
+        tags.target_tags.single_output = own.target_tags.single_output
+        tags.target_tags.multi_output = own.target_tags.multi_output
+        tags.non_deterministic = own.non_deterministic
+        if own.regressor_tags is not None:
+            tags.regressor_tags.poor_score = own.regressor_tags.poor_score
+        return tags
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "regressor_")
+
+    def _fit(self, method: str, X: Any, y: Any, params: dict[str, Any]) -> Self:
+        """Fit a new clone, or go on with the last."""
+        first = method == "fit" or not hasattr(self, "regressor_")
+        if is_frame(X):
+            y = validate_frame(self, X, y, reset=first)
+        elif is_dask(X):
+            validate_data(self, X, reset=first, skip_check_array=True)
+            X, y = aligned(X, y)
+        else:
+            X, y = validate_numbers(self, X, y, reset=first, dtype=FLOATS)
+        n_outputs = 1 if y.ndim == 1 else y.shape[1]
+        if not first and n_outputs != len(self.base_):
+            raise ValueError(f"y has {n_outputs} outputs, but the model has {len(self.base_)}.")
+        base = self._base(n_outputs) if first else self.base_
+        regressor = clone(self.regressor) if first else self.regressor_
+        routed = {method: params}
+        if get_config()["enable_metadata_routing"]:
+            routed = process_routing(self, method, **params).get("regressor", Bunch())
+        residuals = y - columns_of(X, base, y.ndim)
+        if getattr(regressor, "input_noise", None) is not None:
+            # The noise of these columns is in what is learned too.
+            regressor._columns_changed = base
+        self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
+        self.base_ = base
+        return self
+
+    def _validated(self, X: Any) -> Any:
+        """X as the regressor shall see it: a data frame stays one, and the regressor looks at what it holds."""
+        if is_frame(X):
+            validate_frame(self, X, reset=False)
+            return X
+        if is_dask(X):
+            validate_data(self, X, reset=False, skip_check_array=True)
+            return as_rows(X, "X", known=False)
+        return validate_numbers(self, X, reset=False, dtype=FLOATS)
+
+    def _base(self, n_outputs: int) -> np.ndarray:
+        """The index of the column from which each output starts."""
+        if self.base is None:
+            if n_outputs > self.n_features_in_:
+                raise ValueError(
+                    f"base=None takes the first n_outputs={n_outputs} columns of X, which has {self.n_features_in_}; "
+                    "give base the column from which each output starts."
+                )
+            return np.arange(n_outputs)
+        columns = np.atleast_1d(np.asarray(self.base, dtype=object))
+        given = columns.ravel().tolist()
+        if columns.shape != (n_outputs,) or not all(
+            type(c) is not bool and isinstance(c, Integral | str) for c in given
+        ):
+            raise ValueError(
+                f"base={self.base!r} must be one index or name of a column of X for each of n_outputs={n_outputs}."
+            )
+        names = getattr(self, "feature_names_in_", np.empty(0, dtype=object)).tolist()
+        if not {c for c in given if isinstance(c, str)} <= set(names):
+            raise ValueError(f"base={self.base!r} must name columns of X; its columns' names are {names}.")
+        base = np.array([names.index(c) if isinstance(c, str) else c for c in given])
+        if (base < -self.n_features_in_).any() or (base >= self.n_features_in_).any():
+            raise ValueError(f"base={self.base!r} must be below the {self.n_features_in_} columns of X.")
+        return base.astype(np.intp) % self.n_features_in_

@@ -1,0 +1,330 @@
+"""What a fitted model says of itself: kernel, noise, certificate and weights, as text, HTML and a data frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from html import escape
+from textwrap import wrap
+from typing import Any, NamedTuple
+
+import numpy as np
+from sklearn.base import BaseEstimator
+from sklearn.exceptions import NotFittedError
+from sklearn.gaussian_process.kernels import ConstantKernel, Product
+
+from ..fitting.coef_prior import coef_names
+from ..utils.optional import require
+from ..utils.validation import check_fitted
+
+# What the Gaussian process of a joint's torque sees.
+_OF_A_JOINT = ("q", "q̇", "q̈", "torque")
+# Lines of weights that are printed, and columns of text.
+_LINES, _WIDTH = 40, 100
+# Lines of a fact, such as a kernel of many columns.
+_FACT_LINES = 6
+_CELL = 'style="text-align: left; padding: 0 1em 0 0"'
+_TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
+_SCROLLED = 'style="max-height: 30em; max-width: fit-content; overflow: auto"'
+
+
+class Parameter(NamedTuple):
+    """A number that was learned.
+
+    Attributes
+    ----------
+    output : int, str or None
+        Whose it is; None is that of all outputs.
+    part : str
+        ``"weight"``, ``"signal std"``, ``"noise std"``, or a hyperparameter such as ``"length_scale"``.
+    name : str
+        Of the feature, or of the column that the kernel sees.
+    value, std : float
+        What was learned, and its posterior standard deviation (of weights; NaN where there is none).
+    prior_mean, prior_std : float
+        Of weights; NaN where there is none.
+    """
+
+    output: int | str | None
+    part: str
+    name: str
+    value: float
+    std: float = np.nan
+    prior_mean: float = np.nan
+    prior_std: float = np.nan
+
+
+@dataclass(frozen=True)
+class ModelSummary:
+    """What a fitted model says of itself, as returned by its ``summary``.
+
+    ``print`` shows it as text, a notebook as tables.
+
+    Attributes
+    ----------
+    title : str
+        The model, and its size.
+    certificate : str
+        What is known of the log marginal likelihood; empty if nothing is.
+    kernels : dict
+        Of each output, or of None if there is only one: the fitted kernel, as text.
+    parameters : tuple of Parameter
+        All numbers, in the order in which they are shown.
+    lower_bound, upper_bound : float or None
+        On the log marginal likelihood, in nats; of the exact model they are equal. None if nothing is known.
+
+    Examples
+    --------
+    >>> from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import EGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> kernel = ConstantKernel(25.0) * RBF(0.6) + WhiteKernel(2.8)
+    >>> model = EGPRegressor(PolynomialFeatures(1), kernel, coef_scale=[[2.0, 5.0]], max_iter=0).fit(X, y)
+    >>> print(model.summary())
+    EGPRegressor, exact, for 1 output
+    log marginal likelihood: -410.85 nats
+    <BLANKLINE>
+    kernel        5**2 * RBF(length_scale=0.6)
+    signal std    5
+    length_scale  x0 0.6
+    noise std     1.673
+    <BLANKLINE>
+    weight  prior  posterior
+    1       0 ± 2  -0.7097 ± 1.8
+    x0      0 ± 5  2.828 ± 0.73
+    """
+
+    title: str
+    certificate: str
+    kernels: dict[int | str | None, str]
+    parameters: tuple[Parameter, ...]
+    lower_bound: float | None = None
+    upper_bound: float | None = None
+
+    def to_frame(self) -> Any:
+        """All numbers as a pandas.DataFrame: a row for each, with the columns of `Parameter`.
+
+        Returns
+        -------
+        frame : pandas.DataFrame
+            For example ``frame[frame.part == "weight"]``.
+
+        Raises
+        ------
+        ImportError
+            If pandas is not installed; the message gives the pip command.
+        """
+        pandas = require("pandas", "A data frame")
+        return pandas.DataFrame([list(one) for one in self.parameters], columns=list(Parameter._fields))
+
+    def __str__(self) -> str:
+        """As text, the first lines of weights if there are many."""
+        parts = ["\n".join(filter(None, [self.title, self.certificate]))]
+        for output, facts in self._facts():
+            width = max(map(len, facts)) + 2
+            lines = [] if output is None else [f"output {output}"]
+            for name, text in facts.items():
+                wrapped = wrap(text, _WIDTH - width, break_long_words=False, break_on_hyphens=False)
+                if len(wrapped) > _FACT_LINES + 1:
+                    wrapped[_FACT_LINES:] = [f"... and {len(wrapped) - _FACT_LINES} more lines: to_frame() has all"]
+                labels = [name, *[""] * (len(wrapped) - 1)]
+                lines += [f"{label:{width}}{line}" for label, line in zip(labels, wrapped, strict=True)]
+            parts.append("\n".join(lines))
+        # A column's name may have a line end in it.
+        table = [[" ".join(cell.split()) for cell in line] for line in self._weights()]
+        if len(table) > 1:
+            shown = table[: _LINES + 1]
+            widths = [max(len(line[column]) for line in shown) for column in range(len(table[0]))]
+            lines = [
+                "  ".join(f"{cell:{width}}" for cell, width in zip(line, widths, strict=True)).rstrip()
+                for line in shown
+            ]
+            if len(table) > len(shown):
+                lines.append(f"... and {len(table) - len(shown)} more: to_frame() has all")
+            parts.append("\n".join(lines))
+        return "\n\n".join(parts)
+
+    def _repr_html_(self) -> str:
+        """As tables, all names escaped."""
+        parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}</p>"]
+        for output, facts in self._facts():
+            parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
+            parts.append(_html_table(list(facts.items())))
+        table = list(self._weights())
+        if len(table) > 1:
+            parts.append(f"<div {_SCROLLED}>{_html_table(table[1:], table[0])}</div>")
+        return f'<div style="font-size: 0.9em">{"".join(parts)}</div>'
+
+    def _facts(self) -> Iterator[tuple[int | str | None, dict[str, str]]]:
+        """Of each output what is no weight: name -> text."""
+        outputs = [*self.kernels, *(one.output for one in self.parameters if one.part != "weight")]
+        for output in dict.fromkeys(outputs):
+            facts = {"kernel": self.kernels[output]} if output in self.kernels else {}
+            for one in self.parameters:
+                if one.part != "weight" and one.output == output:
+                    said = _plus_minus(one.value, one.std)
+                    text = f"{one.name} {said}" if one.name else said
+                    facts[one.part] = f"{facts[one.part]}, {text}" if one.part in facts else text
+            yield output, facts
+
+    def _weights(self) -> Iterator[tuple[str, ...]]:
+        """The table of β, its header first."""
+        weights = [one for one in self.parameters if one.part == "weight"]
+        several = any(one.output is not None for one in weights)
+        first = ("output",) if several else ()
+        yield *first, "weight", "prior", "posterior"
+        for one in weights:
+            first = (str(one.output),) if several else ()
+            yield *first, one.name, _plus_minus(one.prior_mean, one.prior_std), _plus_minus(one.value, one.std)
+
+
+class Summarised(BaseEstimator):
+    """An estimator that says what it has learned, and shows it in notebooks below scikit-learn's diagram."""
+
+    def _described(self) -> ModelSummary:
+        """Of a fitted model."""
+        raise NotImplementedError
+
+    def summary(self) -> ModelSummary:
+        """Say what was learned: kernel, noise, what is known of the likelihood, and weights beside their prior.
+
+        Returns
+        -------
+        summary : ModelSummary
+            ``print`` shows it as text and a notebook as tables; ``to_frame()`` makes a data frame of it, and
+            ``lower_bound`` and ``upper_bound`` are what is known of the log marginal likelihood.
+
+        Raises
+        ------
+        sklearn.exceptions.NotFittedError
+            If the model is not fitted.
+        """
+        check_fitted(self)
+        return self._described()
+
+    @property
+    def _repr_html_(self) -> Callable[[], str]:
+        """What IPython asks for; scikit-learn has it only if its option ``display`` is "diagram"."""
+        diagram: Callable[[], str] = super()._repr_html_
+        return lambda: diagram() + self._html_of_summary()
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+        """The same for Jupyter."""
+        bundle: dict[str, str] = super()._repr_mimebundle_(**kwargs)
+        if "text/html" in bundle:
+            bundle["text/html"] += self._html_of_summary()
+        return bundle
+
+    def _html_of_summary(self) -> str:
+        try:
+            said = self.summary()._repr_html_()
+        except NotFittedError:
+            return ""
+        return f"<details open><summary>What was learned</summary>{said}</details>"
+
+
+def of_gaussian_process(model: Any) -> ModelSummary:
+    """Of a fitted `EVGPRegressor` or `EGPRegressor`."""
+    several = isinstance(model.kernel_, list)
+    kernels = dict(enumerate(model.kernel_)) if several else {None: model.kernel_}
+    noise = np.atleast_1d(model.noise_variance_)
+    columns = _kernel_columns(model)
+    numbers: list[Parameter] = []
+    for (output, kernel), variance in zip(kernels.items(), noise, strict=True):
+        numbers += _of_kernel(kernel, output, columns)
+        numbers.append(Parameter(output, "noise std", "", float(np.sqrt(variance))))
+    if hasattr(model, "coef_"):
+        outputs = list(range(len(model.coef_))) if model.coef_.ndim == 2 else [None]
+        numbers += _of_weights(model, outputs)
+    points = getattr(model, "inducing_points_", None)
+    lower, upper = (getattr(model, name, None) for name in ("lower_bound_", "upper_bound_"))
+    size = "exact"
+    if points is None:
+        lower = upper = model.log_marginal_likelihood_value_
+    else:
+        counts = {len(own) for own in points} if isinstance(points, list) else {points.shape[-2]}
+        size = f"{' to '.join(dict.fromkeys(map(str, (min(counts), max(counts)))))} inducing points"
+    outputs_text = f"{len(noise)} output{'s' if len(noise) > 1 else ''}"
+    return ModelSummary(
+        f"{type(model).__name__}, {size}, for {outputs_text}",
+        _certificate(lower, upper),
+        {output: str(kernel) for output, kernel in kernels.items()},
+        tuple(numbers),
+        lower,
+        upper,
+    )
+
+
+def of_inverse_dynamics(model: Any, joints: Sequence[str]) -> ModelSummary:
+    """Of a fitted `InverseDynamics`: weights are those of all joints, the rest is of each."""
+    numbers: list[Parameter] = []
+    kernels: dict[int | str | None, str] = {}
+    for index, joint in enumerate(joints):
+        residual = model.residual_models_[index]
+        if residual is not None:
+            kernels[joint] = str(residual.kernel_)
+            columns = _OF_A_JOINT if model._has_robot else _kernel_columns(residual)
+            numbers += _of_kernel(residual.kernel_, joint, columns)
+        numbers.append(Parameter(joint, "noise std", "", float(np.sqrt(model.noise_variance_[index]))))
+        if model.standing_std_[index] > 0.0:
+            numbers.append(Parameter(joint, "at rest", "", float(model.standing_std_[index])))
+        if model.gains_std_[index] > 0.0:
+            numbers.append(Parameter(joint, "gain", "", float(model.gains_[index]), float(model.gains_std_[index])))
+    outputs_text = f"{len(joints)} output{'s' if len(joints) > 1 else ''}"
+    return ModelSummary(
+        f"{type(model).__name__}, {len(model.coef_)} weights, for {outputs_text}",
+        "",
+        kernels,
+        (*numbers, *_of_weights(model, [None])),
+    )
+
+
+def _of_weights(model: Any, outputs: Sequence[int | None]) -> Iterator[Parameter]:
+    attributes = (model.coef_, model.coef_std_, model.coef_prior_mean_, model.coef_prior_scale_)
+    tables = [np.atleast_2d(values) for values in attributes]
+    for output, *rows in zip(outputs, *tables, strict=True):
+        for name, *numbers in zip(model.coef_names_, *rows, strict=True):
+            yield Parameter(output, "weight", str(name), *map(float, numbers))
+
+
+def _kernel_columns(model: Any) -> Sequence[str]:
+    """What the columns that the kernel sees are called."""
+    columns = getattr(model, "feature_names_in_", None)
+    if model.kernel_map_ is not None:
+        return list(coef_names(model.kernel_map_, columns, model._row_shapes[0][-1], "k"))
+    return [f"x{index}" for index in range(model.n_features_in_)] if columns is None else list(columns)
+
+
+def _of_kernel(kernel: Any, output: int | str | None, columns: Sequence[str]) -> Iterator[Parameter]:
+    """Its hyperparameters, the outermost constant as a standard deviation; what is of a column with its name."""
+    if isinstance(kernel, Product) and isinstance(kernel.k1, ConstantKernel):
+        yield Parameter(output, "signal std", "", float(np.sqrt(kernel.k1.constant_value)))
+        kernel = kernel.k2
+    given = kernel.get_params()
+    short = [one.name.rpartition("__")[2] for one in kernel.hyperparameters]
+    for one, last in zip(kernel.hyperparameters, short, strict=True):
+        values = np.atleast_1d(given[one.name])
+        part = last if short.count(last) == 1 else one.name.replace("__", ".")
+        for name, value in zip(columns if len(values) == len(columns) else [""] * len(values), values, strict=True):
+            yield Parameter(output, part, str(name), float(value))
+
+
+def _certificate(lower: Any, upper: Any) -> str:
+    if lower == upper:
+        return f"log marginal likelihood: {lower:.2f} nats"
+    if np.isinf(upper):
+        return f"log marginal likelihood: at least {lower:.2f} nats"
+    return f"log marginal likelihood: from {lower:.2f} to {upper:.2f} nats"
+
+
+def _plus_minus(value: float, std: float) -> str:
+    """A number, to two digits of its standard deviation if that is known."""
+    return f"{value:.4g}" if np.isnan(std) else f"{value:.4g} ± {std:.2g}"
+
+
+def _html_table(lines: Sequence[Sequence[str]], header: Sequence[str] = ()) -> str:
+    head = "".join(f"<th {_CELL}>{escape(cell)}</th>" for cell in header)
+    rows = "".join(f"<tr>{''.join(f'<td {_CELL}>{escape(cell)}</td>' for cell in line)}</tr>" for line in lines)
+    return f"<table {_TABLE}>{f'<thead><tr>{head}</tr></thead>' if header else ''}<tbody>{rows}</tbody></table>"

@@ -1,1 +1,0 @@
-"""Noise with a Student-t's tails."""

@@ -1,0 +1,276 @@
+"""What a fitted model of torques says of the robot: its inertias, a model with them, and what it carries."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+from sklearn.utils import Bunch
+from sklearn.utils.metaestimators import available_if
+from sklearn.utils.validation import check_is_fitted
+
+from ..robots import body_parameters, layout_of, nearest_consistent, physical_consistency, with_parameters, write_urdf
+from ..utils.validation import check_integer, check_magnitude, check_real, validate_numbers
+from .joint_residual import JointResidual
+from .payload import find_payload, payload_prior
+from .torque_regression import TorqueRegression
+from .weights import Known
+
+# Of a payload's mass, kg, and size, m, a priori.
+_LARGEST_SCALE = 1e6
+
+
+def _knows_a_robot(model: IdentifiedRobot) -> bool:
+    if not hasattr(model, "feature_map_") or model._has_robot:
+        return True
+    raise AttributeError("It needs a robot: give InverseDynamics one.")
+
+
+class IdentifiedRobot(TorqueRegression):
+    """What `InverseDynamics` knows of the robot after `fit`."""
+
+    _known: Known
+    _joints: list[JointResidual]
+    _outputs: list[str]
+    coef_: np.ndarray
+    coef_std_: np.ndarray
+    coef_cov_: np.ndarray
+    gains_: np.ndarray
+
+    @available_if(_knows_a_robot)
+    def links(self) -> list[Bunch]:
+        """Say what is known of each link.
+
+        Returns
+        -------
+        links : list of Bunch
+            From the base to the tip, in the frame of the link's joint:
+
+            - ``joint`` : its name;
+            - ``mass``, ``mass_std`` : kg;
+            - ``com``, ``com_std`` : ndarray of shape (3,), the centre of mass, m;
+            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments about it: Ixx, Ixy, Iyy, Ixz, Iyz, Izz,
+              kg m²;
+            - ``consistency`` : above 0 if a body can have them (`robot_model` takes the nearest that one can have).
+
+            Standard deviations are to first order; many of them are the prior's, for torques show combinations only.
+
+        References
+        ----------
+        - P. M. Wensing, S. Kim, J.-J. E. Slotine (2017): Linear Matrix Inequalities for Physically-Consistent Inertial
+          Parameter Identification.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> X = np.random.default_rng(0).normal(size=(300, 3))
+        >>> y = 1.2 * (X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]))  # 1.2 kg in place of the model's 1
+        >>> (link,) = InverseDynamics("pendulum", n_inducing=0).fit(X, y).links()
+        >>> link.joint, float(round(link.mass * -link.com[2], 2))  # what gravity's torque tells: m c
+        ('q', 0.6)
+        """
+        check_is_fitted(self)
+        parameters, covariance = self._inertial()
+        values, slopes = body_parameters(parameters)
+        consistency = physical_consistency(parameters)
+        found = []
+        for number, (joint, value, slope) in enumerate(zip(self._outputs, values, slopes, strict=True)):
+            of = slice(10 * number, 10 * number + 10)
+            std = np.sqrt(np.maximum(np.diag(slope @ covariance[of, of] @ slope.T), 0.0))
+            found.append(
+                Bunch(
+                    joint=joint,
+                    mass=float(value[0]),
+                    mass_std=float(std[0]),
+                    com=value[1:4],
+                    com_std=std[1:4],
+                    inertia=value[4:],
+                    inertia_std=std[4:],
+                    consistency=float(consistency[number]),
+                )
+            )
+        return found
+
+    @available_if(_knows_a_robot)
+    def robot_model(self) -> Any:
+        """Make a model of the robot as it was found.
+
+        Returns
+        -------
+        model : pinocchio.Model
+            A copy of the robot's with identified inertias (the most probable ones that bodies can have), armatures,
+            ``damping`` and ``friction``; what would be negative is 0. Offsets and what physics missed are not in it,
+            and torques are those of the model, without ``gains_``.
+
+        Raises
+        ------
+        ImportError
+            If Pinocchio is not installed; the message gives the pip command.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> X = np.random.default_rng(0).normal(size=(300, 3))
+        >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.7 * X[:, 1]
+        >>> InverseDynamics("pendulum", n_inducing=0).fit(X, y).robot_model().damping.round(2)
+        array([0.7])
+        """
+        check_is_fitted(self)
+        friction = {name: np.maximum(values, 0.0) for name, values in self._friction(self.coef_).items()}
+        return with_parameters(
+            self.feature_map_.model_,
+            nearest_consistent(*self._inertial()),
+            armature=friction.get("armature"),
+            damping=friction.get("viscous"),
+            friction=friction.get("coulomb"),
+        )
+
+    @available_if(_knows_a_robot)
+    def write_urdf(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> None:
+        """Write the robot's URDF file with what was found, and its standard deviations as comments.
+
+        Parameters
+        ----------
+        target : str or path-like
+            The file to write.
+        overwrite : bool, default=False
+            Whether it may be the robot's own file.
+
+        Raises
+        ------
+        ValueError
+            If the robot has no file, or is not one that can be rewritten, or has other joints since `fit`.
+
+        Examples
+        --------
+        >>> import tempfile
+        >>> from pathlib import Path
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> from skevgp.features import RigidBodyRegressor
+        >>> X, body = np.random.default_rng(0).normal(size=(300, 18)), RigidBodyRegressor("ur5")
+        >>> y = body.fit_transform(X) @ body.coef_prior(6)[0]
+        >>> model = InverseDynamics("ur5", n_inducing=0)
+        >>> with tempfile.TemporaryDirectory() as folder:
+        ...     model.fit(X, y).write_urdf(Path(folder) / "found.urdf")
+        ...     "standard deviations: mass=" in (Path(folder) / "found.urdf").read_text(encoding="utf-8")
+        True
+        """
+        check_is_fitted(self)
+        joints = layout_of(self.feature_map_.robot).position_names
+        if list(joints) != self._outputs:
+            raise ValueError(f"The robot's file has other joints than when it was fitted: {list(joints)}.")
+        parameters, covariance = self._inertial()
+        friction, std = self._friction(self.coef_), self._friction(self.coef_std_)
+        write_urdf(
+            self.feature_map_.robot,
+            target,
+            nearest_consistent(parameters, covariance),
+            covariance=covariance,
+            damping=np.maximum(friction["viscous"], 0.0) if "viscous" in friction else None,
+            friction=np.maximum(friction["coulomb"], 0.0) if "coulomb" in friction else None,
+            damping_std=std.get("viscous"),
+            friction_std=std.get("coulomb"),
+            overwrite=overwrite,
+        )
+
+    def _inertial(self) -> tuple[np.ndarray, np.ndarray]:
+        """Means (n_links, 10) and covariance of the links' parameters."""
+        size = 10 * len(self._outputs)
+        return self.coef_[:size].reshape(-1, 10), self.coef_cov_[:size, :size]
+
+    def _friction(self, values: np.ndarray) -> dict[str, np.ndarray]:
+        """Of weights, or their standard deviations, those of friction by name, in the model's units."""
+        n_joints = len(self._outputs)
+        rest = values[10 * n_joints :].reshape(-1, n_joints) / np.abs(self.gains_)
+        return dict(zip(self.feature_map_.friction, rest, strict=True))
+
+    @available_if(_knows_a_robot)
+    def estimate_payload(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        *,
+        groups: ArrayLike | None = None,
+        pieces: ArrayLike | None = None,
+        link: int = -1,
+        mass_scale: float = 5.0,
+        size: float = 0.2,
+    ) -> Bunch:
+        """Find what the robot carries in other logs than those of `fit`.
+
+        Torques with the load are those of the robot and of the ten parameters of the load. All of them, friction and
+        gains are found anew from what both logs say, so what is uncertain of the robot widens the load's interval. (Of
+        what physics missed the mean is subtracted, as if it were known.)
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            With the load, in the order of time.
+        y : array-like of shape (n_samples, n_joints)
+            Torques with the load, in the units of `fit`.
+        groups, pieces : array-like of shape (n_samples,), default=None
+            As in `fit`.
+        link : int, default=-1
+            Which joint's link it is fixed to: the last.
+        mass_scale : float, default=5.0
+            Prior standard deviation of its mass, kg, around 0.
+        size : float, default=0.2
+            Its size with its distance from the joint's frame, m: prior standard deviation of its centre of mass.
+
+        Returns
+        -------
+        payload : Bunch
+            What it carries:
+
+            - ``mass``, ``mass_std``, kg, and ``mass_interval``, which holds 95 %;
+            - ``com``, ``com_std`` : ndarray of shape (3,), in the frame of the link's joint, m (to first order; NaN and
+              inf if the mass is not positive);
+            - ``parameters`` (10,), ``covariance`` (10, 10): as of a link.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If shapes do not fit, data are not finite, or an argument is out of its range.
+
+        References
+        ----------
+        - C. G. Atkeson, C. H. An, J. M. Hollerbach (1986): Estimation of Inertial Parameters of Manipulator Loads and
+          Links, section 2.
+
+        Examples
+        --------
+        >>> import numpy as np
+        >>> from skevgp import InverseDynamics
+        >>> rng = np.random.default_rng(0)
+        >>> X = rng.normal(size=(600, 3))
+        >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.01 * rng.normal(size=600)  # 1 kg at 0.5 m
+        >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X, y)
+        >>> payload = model.estimate_payload(X, 1.5 * y, size=0.5)  # and 0.5 kg at the same place
+        >>> (payload.parameters[[3]] / [-0.5]).round(2)  # its first moment is what torques tell
+        array([0.5])
+        """
+        check_is_fitted(self)
+        n_outputs = len(self._joints)
+        rows_x, targets = validate_numbers(self, X, y, reset=False, dtype=np.float64)
+        targets = np.asarray(targets, dtype=np.float64).reshape(len(rows_x), -1)
+        if targets.shape[1] != n_outputs:
+            raise ValueError(f"y has {targets.shape[1]} columns; the robot has {n_outputs} joints.")
+        check_magnitude(rows_x, "X")
+        check_magnitude(targets, "y")
+        if check_integer(link, "link", minimum=-n_outputs) >= n_outputs:
+            raise ValueError(f"link={link} must be the index of one of the {n_outputs} links.")
+        for name, value in (("mass_scale", mass_scale), ("size", size)):
+            if check_real(value, name, minimum=0.0, strict=True) > _LARGEST_SCALE:
+                raise ValueError(f"{name} must be no more than {_LARGEST_SCALE:g}; got {value!r}.")
+        rows = self._as_rows(rows_x, targets, groups, pieces)
+
+        def missed(torque: np.ndarray) -> np.ndarray:
+            return np.column_stack([f.mean(self._own(rows_x, torque, j)) for j, f in enumerate(self._joints)])
+
+        prior = payload_prior(self._weights.prior, mass_scale, size)
+        return find_payload(rows, link % n_outputs, prior, self._known, missed)

@@ -1,0 +1,405 @@
+"""InverseDynamics: joint torques with bands, and a posterior over masses and friction, from a robot's own logs."""
+
+from __future__ import annotations
+
+from numbers import Integral, Real
+from typing import Any, ClassVar, Literal, Self
+
+import numpy as np
+from joblib import Parallel, delayed
+from numpy.typing import ArrayLike
+from sklearn.base import RegressorMixin
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.utils import Tags, check_random_state
+from sklearn.utils.validation import check_is_fitted
+
+from ..estimators.summary import ModelSummary, Summarised, of_inverse_dynamics
+from ..exceptions import RobotModelWarning, ignored, warn_user
+from ..features import RigidBodyRegressor
+from ..features.robot_map import joints_named
+from ..robots import nearest_consistent
+from ..robots.loading import Robot
+from ..utils.frames import FrameColumns
+from ..utils.shapes import like_y
+from ..utils.sklearn import Interval, StrOptions, fit_context
+from ..utils.validation import check_magnitude, check_not_vanishing, unchanged_if_it_fails, validate_numbers
+from .identified_robot import IdentifiedRobot
+from .joint_residual import JointResidual, fit_joint_residual
+from .likely_causes import likely_causes
+from .stiction import likeliest_noise
+from .weights import Rows, condensed, left_out
+
+# So many prior standard deviations make the prior doubtful.
+_FAR = 4.0
+# Physics that leaves this share of a torque's variance explains hardly anything.
+_LITTLE = 0.5
+# Physics that leaves this share of it may do so since columns are in another order, or in degrees.
+_DOUBTFUL = 0.1
+# Of torques: their variances, and ratios of these to what noise may be, are numbers.
+_SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
+# The largest speed below which rows count less for f_j: filters blur friction's sign, but f_j learns its average there.
+_SHARP = 0.01
+
+
+class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
+    r"""Joint torques of a robot with bands, and its masses and friction with their uncertainty, from logs.
+
+    .. math::
+
+        \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + f_j(x_j) + \varepsilon_j
+
+    The weights β = (π, φ) of `RigidBodyRegressor`, which all joints share, have the robot's model as prior mean; c are
+    errors of the motors' gains, if these are not known. f_j is a sparse Gaussian process (`EVGPRegressor`) of what that
+    leaves in joint j, and sees the joint's own columns only, :math:`x_j = (q_j, \dot q_j, \ddot q_j, \hat\tau_j)`, with
+    the torque that the rest predicts (friction of gears depends on load and speed): columns of other joints would be
+    excuses that hold for one trajectory. Below some speed friction has no sign: the noise is larger there by what
+    Coulomb's friction leaves open.
+
+    Parameters
+    ----------
+    robot : RigidBodyRegressor, str, path-like, System, pinocchio.Model or None, default=None
+        The approximate model: a URDF with wrong masses. `RigidBodyRegressor` sets friction and the prior's scales.
+        Without one each output has a linear model, and a Gaussian process of all columns.
+    gain_scale : float, default=0.0
+        Prior standard deviation of the relative error of each joint's gain, as between currents and torques: 0.1 for
+        gains of a catalogue. 0: y are torques. Predictions hardly depend on it, masses and their intervals do.
+    consistent : bool, default=False
+        Whether the weights are the most probable ones that bodies can have (masses above 0, pseudo-inertias positive
+        definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well. Means
+        move, covariances and noise stay.
+    stiction_velocity : "auto" or None, default="auto"
+        ``"auto"`` finds the speed at which friction of each joint has a sign (filters blur it), if there are three
+        ``groups`` or more to tell; None leaves it as `RigidBodyRegressor` has it.
+    n_inducing : int, default=40
+        Inducing points of each f_j; 0 leaves f_j out.
+    max_rows : int, default=3000
+        Rows that each f_j is fitted to, evenly spread: those of a log at 100 Hz hardly differ. Weights see all.
+    max_iter : int or None, default=None
+        As in `EVGPRegressor`.
+    n_jobs : int or None, default=None
+        Joints that are fitted at the same time, in threads; None means 1, -1 all cores.
+    random_state : int, RandomState instance or None, default=None
+        Places inducing points.
+
+    Attributes
+    ----------
+    coef_, coef_std_ : ndarray of shape (n_h,)
+        Posterior means and standard deviations of β, in the order of ``coef_names_``.
+    coef_cov_ : ndarray of shape (n_h, n_h)
+    coef_names_ : ndarray of str of shape (n_h,)
+        As m(q1), mcx(q1), ..., viscous(q1), ...
+    coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
+        Where a standard deviation is still that of the prior, torques did not show it.
+    gains_, gains_std_ : ndarray of shape (n_outputs,)
+        1 + c: torques of the model times these are those of y.
+    noise_variance_ : ndarray of shape (n_outputs,)
+        σ², of a joint that moves.
+    standing_std_ : ndarray of shape (n_outputs,)
+        What friction adds at rest, a standard deviation.
+    residual_std_ : ndarray of shape (n_outputs,)
+        Standard deviation of each f_j a priori, 0 where there is none.
+    residual_models_ : list of EVGPRegressor or None
+        The f_j.
+    correlation_time_ : ndarray of shape (n_outputs,)
+        How many rows say as much about the weights as an independent one.
+    inflation_ : float
+        By how much more than that groups differ from each other, at least 1: all that rows say of the weights counts
+        so much less.
+    stiction_velocity_ : ndarray of shape (n_outputs,)
+        Up to which speed friction's sign is open in the log, rad/s or m/s.
+    n_iter_ : int
+        The most iterations that an f_j took.
+    feature_map_ : transformer
+    n_features_in_ : int
+    feature_names_in_ : ndarray of str
+        If X had column names.
+
+    See Also
+    --------
+    skevgp.datasets.load_log : Positions, velocities, accelerations and torques of a log.
+    skevgp.features.RigidBodyRegressor : The features, and their prior.
+    EVGPRegressor : With ``feature_map=RigidBodyRegressor(robot)`` the joint model, without what is special here.
+
+    Notes
+    -----
+    Weights are found first, by Bayesian regression in which filtered rows count as what they are worth
+    (``correlation_time_``), and as blocks or groups differ from each other; noise, its part from standing friction
+    and gains are found with them. :math:`\hat\tau` of a training row is predicted from other groups, or blocks of rows,
+    so that y is not used twice. Signal and noise of f_j are calibrated by groups that are left out; f_j is never larger
+    than the residuals, and its lengthscales (but for speeds) are no shorter than a column's standard deviation.
+    Memory: 8 bytes times n_samples * n_outputs * n_h, a few times.
+
+    References
+    ----------
+    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, sections 2.1 and 2.7.
+    - C. J. Geyer (1992): Practical Markov Chain Monte Carlo. Statistical Science.
+
+    Examples
+    --------
+    A pendulum of 1 kg that is believed to weigh 1.2, with friction:
+
+    >>> import numpy as np
+    >>> from skevgp import InverseDynamics
+    >>> from skevgp.datasets import load_robot, perturb_robot
+    >>> from skevgp.features import RigidBodyRegressor
+    >>> t = np.arange(0.0, 20.0, 0.01)
+    >>> q = np.sin(t) + 0.5 * np.sin(2.7 * t)
+    >>> dq = np.gradient(q, t)
+    >>> X = np.column_stack([q, dq, np.gradient(dq, t)])
+    >>> torque = X[:, 2] / 4 + 9.81 / 2 * np.sin(q) + 0.1 * dq + 0.3 * np.tanh(dq / 0.01)
+    >>> y = torque + 0.05 * np.random.default_rng(0).standard_normal(len(t))
+    >>> model = InverseDynamics(perturb_robot("pendulum", random_state=0), random_state=0).fit(X, y)
+    >>> mean, std = model.predict(X, return_std=True)
+    >>> round(model.score(X, y), 3)
+    1.0
+    >>> weights = dict(zip(model.coef_names_, model.coef_.round(2)))
+    >>> float(abs(weights["coulomb(q)"])), float(weights["viscous(q)"])
+    (0.3, 0.1)
+    """
+
+    _parameter_constraints: ClassVar[dict[str, Any]] = {
+        "robot": "no_validation",
+        "gain_scale": [Interval(Real, 0, None, closed="left")],
+        "consistent": ["boolean"],
+        "stiction_velocity": [StrOptions({"auto"}), None],
+        "n_inducing": [Interval(Integral, 0, None, closed="left")],
+        "max_rows": [Interval(Integral, 10, None, closed="left")],
+        "max_iter": [Interval(Integral, 0, None, closed="left"), None],
+        "n_jobs": [Integral, None],
+        "random_state": ["random_state"],
+    }
+
+    def __init__(
+        self,
+        robot: RigidBodyRegressor | Robot | None = None,
+        *,
+        gain_scale: float = 0.0,
+        consistent: bool = False,
+        stiction_velocity: Literal["auto"] | None = "auto",
+        n_inducing: int = 40,
+        max_rows: int = 3000,
+        max_iter: int | None = None,
+        n_jobs: int | None = None,
+        random_state: int | np.random.RandomState | None = None,
+    ):
+        self.robot = robot
+        self.gain_scale = gain_scale
+        self.consistent = consistent
+        self.stiction_velocity = stiction_velocity
+        self.n_inducing = n_inducing
+        self.max_rows = max_rows
+        self.max_iter = max_iter
+        self.n_jobs = n_jobs
+        self.random_state = random_state
+
+    def __sklearn_tags__(self) -> Tags:
+        tags = super().__sklearn_tags__()
+        tags.target_tags.multi_output = True
+        return tags
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def fit(
+        self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None, pieces: ArrayLike | None = None
+    ) -> Self:
+        """Find weights, noise, and what physics missed.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈] in the order of time: rad, rad/s, rad/s² (of prismatic joints m, ...).
+        y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
+            Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents. Up to 1e40, and the
+            largest of a column 0 or above 1e-105.
+        groups : array-like of shape (n_samples,), default=None
+            Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least
+            three of them, none with half of the rows; of fewer, blocks of rows stand in.
+        pieces : array-like of shape (n_samples,), default=None
+            Which rows follow each other without a gap, such as ``load_log(...).pieces``; None: all rows of a group.
+
+        Returns
+        -------
+        self : InverseDynamics
+            The estimator itself, fitted.
+
+        Raises
+        ------
+        ImportError
+            If Pinocchio is needed and not installed; the message gives the pip command.
+        ValueError, TypeError
+            If an argument is out of its range, the data are not finite, or shapes do not fit. If X or y is a data frame
+            whose columns bear the names of the robot's joints in another order.
+
+        Warns
+        -----
+        ConvergenceWarning
+            If weights end far from the robot's model, as with placeholders for its masses or y in other units. If
+            torques are explained badly, and much better with columns in another order or angles in degrees: the message
+            names the order, or the signals and joints; and it names positions beyond the limits of the robot's model.
+            If f_j of some joints holds for no group that was left out: its signal is then nearly 0.
+        RobotModelWarning
+            As `skevgp.datasets.load_robot`.
+        """
+        with unchanged_if_it_fails(self):
+            doubt = self._fit(X, y, groups, pieces)
+        if doubt:
+            warn_user(doubt, ConvergenceWarning)
+        lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
+        if lost:
+            warn_user(
+                f"What physics leaves of {lost} repeats in no group of rows that was left out: these torques are "
+                "predicted by physics, and std says so. More trajectories may show more; n_inducing=0 does not look.",
+                ConvergenceWarning,
+            )
+        return self
+
+    def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
+        """Fit, and a message if the robot's model is in doubt."""
+        rows_x: np.ndarray
+        rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
+        targets = np.asarray(targets, dtype=np.float64)
+        self._one_dimensional = targets.ndim == 1
+        targets = targets.reshape(len(targets), -1)
+        check_magnitude(rows_x, "X")
+        check_magnitude(targets, "y", _LARGEST_TORQUE)
+        check_not_vanishing(np.abs(targets).max(axis=0), "y", _SMALLEST_TORQUE)
+        self.feature_map_ = self._map().fit(X)  # a frame's columns must be in the robot's order
+        self._check_columns_of_y(y)
+        with ignored(category=RobotModelWarning):  # said already
+            self.feature_map_ = self._map().fit(rows_x)
+        rows = self._find_weights(rows_x, targets, groups, pieces)
+        self._known = condensed(rows, self._weights)
+        if self.consistent and self._has_robot:
+            size = 10 * targets.shape[1]
+            start, covariance = self._weights.mean[:size], self._weights.covariance[:size, :size]
+            self._weights = self._weights.given(nearest_consistent(start.reshape(-1, 10), covariance).ravel())
+        self._outputs = self._output_names(targets.shape[1])
+        variance = targets.var(axis=0)
+        missed = np.array([noise.variance for noise in self._weights.noise])
+        little = (missed > _LITTLE * variance) & (variance > 0.0)
+        self._unexplained = [name for name, bad in zip(self._outputs, little, strict=True) if bad]
+        is_doubtful = ((missed > _DOUBTFUL * variance) & (variance > 0.0)).any()
+        doubt = self._doubt(rows_x, targets, is_doubtful) if self._has_robot else ""
+        self._joints = self._residuals(rows_x, rows)
+        self._set_attributes()
+        return doubt
+
+    def _doubt(self, X: np.ndarray, y: np.ndarray, is_doubtful: bool | np.bool_) -> str:
+        """What to warn of where the robot's model explains torques badly, or ""."""
+        is_far = self._weights.surprise > _FAR or bool(self._unexplained)
+        causes: list[str] = []
+        if is_far or is_doubtful:
+            prior, size = self._weights.prior, self._weights.n_weights
+            own = prior.mean[:size], prior.covariance[:size, :size]
+            causes = likely_causes(self.feature_map_, X, y, own, is_far=is_far)
+        if not is_far and not causes:
+            return ""
+        named = "".join(f"{cause}. " for cause in causes) + ("Otherwise, its" if causes else "its")
+        little = f"; of {self._unexplained} hardly anything is explained" if self._unexplained else ""
+        return (
+            f"The robot's model is far from what torques say: {named} masses may be placeholders, "
+            "or y in other units. Give RigidBodyRegressor wider scales, or y in N m. "
+            f"(Weights moved by {self._weights.surprise:.1f} prior standard deviations{little}.)"
+        )
+
+    def _check_columns_of_y(self, y: ArrayLike) -> None:
+        """Refuse a frame whose names say that its columns are of the robot's joints in another order."""
+        frame = FrameColumns.of(y) if self._has_robot else None
+        if frame is not None:
+            joints = self._output_names(len(frame.names))
+            found = joints_named(frame.names, joints)
+            if found is not None and found != joints and sorted(found) == sorted(joints):
+                raise ValueError(f"The columns of y must be in the robot's order {joints}; got {frame.names}.")
+
+    def _residuals(self, X: np.ndarray, rows: Rows) -> list[JointResidual]:
+        weights, y = self._weights, rows.targets
+        guessed = left_out(rows, weights)
+        if self.n_inducing == 0:
+            every = zip((y - guessed).T, rows.speed.T, weights.noise, strict=True)
+            return [
+                JointResidual(None, likeliest_noise(left, speed, last.coulomb, last.velocity, last.variance))
+                for left, speed, last in every
+            ]
+        residual = y - weights.predict(rows.features)
+        some = np.unique(np.linspace(0, len(y) - 1, min(len(y), self.max_rows)).astype(int))
+        seed = check_random_state(self.random_state).randint(np.iinfo(np.int32).max)
+        options = {"n_inducing": self.n_inducing, "max_iter": self.max_iter, "random_state": seed}
+        smooth = np.array([True, False, True, True]) if self._has_robot else np.zeros(X.shape[1], dtype=bool)
+        fits = (
+            delayed(fit_joint_residual)(
+                self._own(X, guessed, j),
+                residual[:, j],
+                rows.speed[:, j],
+                weights.noise[j],
+                min(float(velocity), _SHARP),
+                rows.blocks,
+                some,
+                smooth,
+                **options,
+            )
+            for j, velocity in enumerate(weights.prior.velocity)
+        )
+        return Parallel(n_jobs=self.n_jobs, prefer="threads")(fits)
+
+    def _set_attributes(self) -> None:
+        weights, n_outputs = self._weights, len(self._joints)
+        p = weights.n_weights
+        std = np.sqrt(np.maximum(np.diag(weights.covariance), 0.0))
+        self.coef_, self.coef_std_, self.coef_cov_ = weights.mean[:p], std[:p], weights.covariance[:p, :p]
+        self.coef_names_ = self._names(n_outputs)
+        self.coef_prior_mean_ = weights.prior.mean[:p]
+        self.coef_prior_scale_ = np.sqrt(np.diag(weights.prior.covariance)[:p])
+        self.gains_ = weights.gains(n_outputs)
+        self.gains_std_ = std[p:] if len(std) > p else np.zeros(n_outputs)
+        noise = [joint.noise for joint in self._joints]
+        self.noise_variance_ = np.array([one.variance for one in noise])
+        self.standing_std_ = np.array([one.coulomb / np.sqrt(3.0) for one in noise])
+        self.residual_std_ = np.array([joint.signal for joint in self._joints])
+        self.residual_models_ = [joint.model for joint in self._joints]
+        self.n_iter_ = max([1, *(model.n_iter_ for model in self.residual_models_ if model is not None)])
+        self.correlation_time_ = weights.correlation_time
+        self.inflation_ = weights.inflation
+        self.stiction_velocity_ = np.array([one.velocity for one in noise])
+
+    def predict(
+        self, X: ArrayLike, return_std: bool = False, include_noise: bool = True
+    ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
+        """Predict torques.
+
+        Parameters
+        ----------
+        X : array-like of shape (n_samples, 3 * n_joints)
+            Rows [q, q̇, q̈].
+        return_std : bool, default=False
+            Whether standard deviations are wanted.
+        include_noise : bool, default=True
+            Whether standard deviations are those of measured torques.
+
+        Returns
+        -------
+        mean : ndarray of shape (n_samples,) or (n_samples, n_joints)
+            Torques, like y.
+        std : ndarray of the same shape
+            Their standard deviations; only with ``return_std``.
+        """
+        check_is_fitted(self)
+        rows: np.ndarray = validate_numbers(self, X, reset=False, dtype=np.float64)
+        check_magnitude(rows, "X")
+        n_outputs = len(self._joints)
+        features = self._features(rows, n_outputs)
+        physics = self._weights.predict(features)
+        own = [self._own(rows, physics, j) for j in range(n_outputs)]
+        if not return_std:
+            return self._like_y(physics + np.column_stack([f.mean(x) for f, x in zip(self._joints, own, strict=True)]))
+        found = [f.moments(x) for f, x in zip(self._joints, own, strict=True)]
+        mean = physics + np.column_stack([missed for missed, _ in found])
+        variance = self._weights.variance(features) + np.column_stack([uncertain for _, uncertain in found])
+        if include_noise:
+            speed = self._speed(rows, n_outputs)
+            variance += np.column_stack([f.noise.of(v) for f, v in zip(self._joints, speed.T, strict=True)])
+        return self._like_y(mean), self._like_y(np.sqrt(variance))
+
+    def _like_y(self, values: np.ndarray) -> np.ndarray:
+        return like_y(values) if self._one_dimensional else values
+
+    def _described(self) -> ModelSummary:
+        return of_inverse_dynamics(self, self._outputs)

@@ -1,1 +1,0 @@
-"""The mathematics: statistics, bounds, objectives, posterior. Knows no estimator and no robot."""

@@ -1,0 +1,1 @@
+"""A transformer as a function of one row: its value, its Jacobian, its CasADi expression."""

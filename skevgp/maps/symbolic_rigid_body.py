@@ -1,0 +1,231 @@
+"""Forward and inverse dynamics in CasADi, from the numbers of a Pinocchio model (whose wheel has no CasADi part).
+
+Spatial vectors are Pinocchio's, linear part first, in the frame of their joint (Featherstone 2008, chapters 5 and 7).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..robots.loading import joint_axes
+from ..utils.casadi import casadi
+
+_KNOWN = ("JointModelR", "JointModelP")
+
+
+@dataclass(frozen=True)
+class _Joint:
+    """A joint and the link that it moves.
+
+    Attributes
+    ----------
+    parent : int
+        -1 is the base.
+    axis : ndarray of shape (6,)
+        Motion per unit of velocity.
+    fixed, sine, cosine, linear : ndarray of shape (6, 6)
+        A motion in the parent's frame, seen from this one: times fixed + sine sin q + cosine cos q + linear q.
+    inertia : ndarray of shape (6, 6)
+    armature : float
+    """
+
+    parent: int
+    axis: np.ndarray
+    fixed: np.ndarray
+    sine: np.ndarray
+    cosine: np.ndarray
+    linear: np.ndarray
+    inertia: np.ndarray
+    armature: float
+
+    def transform(self, q: Any) -> Any:
+        """From the parent's frame to this one, for motions; its transpose brings forces back."""
+        ca = casadi()
+        if self.axis[3:].any():
+            return ca.DM(self.fixed) + ca.sin(q) * ca.DM(self.sine) + ca.cos(q) * ca.DM(self.cosine)
+        return ca.DM(self.fixed) + q * ca.DM(self.linear)
+
+
+class SymbolicRigidBody:
+    """What `skevgp.robots.RigidBody` computes, of one symbolic state.
+
+    Parameters
+    ----------
+    model : pinocchio.Model
+        As `skevgp.datasets.load_robot` returns it.
+
+    Raises
+    ------
+    ValueError
+        If a joint is neither revolute nor prismatic.
+    """
+
+    def __init__(self, model: Any):
+        self._joints = _joints_of(model)
+        self._gravity = np.array(model.gravity.vector, dtype=float)
+        self._damping = np.array(model.damping, dtype=float)
+
+    def forces(self, q: Any, v: Any, a: Any, gravity: bool = True) -> Any:
+        """τ = M(q) a + C(q, v) v + g(q), by the recursive Newton-Euler algorithm.
+
+        Parameters
+        ----------
+        q, v : casadi.MX of shape (n_joints, 1)
+        a : casadi.MX of shape (n_joints, 1), or None
+            None are zeros, as of ``v``.
+        gravity : bool, default=True
+
+        Returns
+        -------
+        force : casadi.MX of shape (n_joints, 1)
+        """
+        ca = casadi()
+        transforms, motions, biases = self._kinematics(q, v)
+        accelerations: list[Any] = []
+        forces = []
+        for i, joint in enumerate(self._joints):
+            before = (
+                accelerations[joint.parent] if joint.parent >= 0 else ca.DM(-self._gravity if gravity else np.zeros(6))
+            )
+            own = ca.mtimes(transforms[i], before) + biases[i]
+            accelerations.append(own if a is None else own + ca.DM(joint.axis) * a[i])
+            forces.append(ca.mtimes(ca.DM(joint.inertia), accelerations[i]) + self._gyroscopic(i, motions[i]))
+        found = [None] * len(self._joints)
+        for i, joint in reversed(list(enumerate(self._joints))):
+            found[i] = ca.dot(ca.DM(joint.axis), forces[i])
+            if a is not None:
+                found[i] += joint.armature * a[i]
+            if joint.parent >= 0:
+                forces[joint.parent] += ca.mtimes(transforms[i].T, forces[i])
+        return ca.vertcat(*found)
+
+    def gravity(self, q: Any) -> Any:
+        """g(q), the joint forces (n_joints, 1) that hold the robot still."""
+        return self.forces(q, None, None)
+
+    def accelerations(self, q: Any, v: Any, force: Any, gravity: bool = True) -> Any:
+        """q̈ = M(q)⁻¹ (τ - C(q, v) v - g(q)), by the articulated-body algorithm.
+
+        Parameters
+        ----------
+        q, force : casadi.MX of shape (n_joints, 1)
+        v : casadi.MX of shape (n_joints, 1), or None
+            None are zeros.
+        gravity : bool, default=True
+
+        Returns
+        -------
+        a : casadi.MX of shape (n_joints, 1)
+        """
+        ca = casadi()
+        transforms, motions, biases = self._kinematics(q, v)
+        inertias = [ca.MX(ca.DM(joint.inertia)) for joint in self._joints]
+        forces = [self._gyroscopic(i, motion) for i, motion in enumerate(motions)]
+        passed: list[Any] = [None] * len(self._joints)
+        for i, joint in reversed(list(enumerate(self._joints))):
+            axis = ca.DM(joint.axis)
+            of_axis = ca.mtimes(inertias[i], axis)
+            inertia = ca.dot(axis, of_axis) + joint.armature
+            left = force[i] - ca.dot(axis, forces[i])
+            passed[i] = of_axis, inertia, left
+            if joint.parent >= 0:
+                articulated = inertias[i] - ca.mtimes(of_axis, of_axis.T) / inertia
+                borne = forces[i] + ca.mtimes(articulated, biases[i]) + of_axis * (left / inertia)
+                inertias[joint.parent] += ca.mtimes([transforms[i].T, articulated, transforms[i]])
+                forces[joint.parent] += ca.mtimes(transforms[i].T, borne)
+        found: list[Any] = []
+        accelerations: list[Any] = []
+        for i, joint in enumerate(self._joints):
+            before = (
+                accelerations[joint.parent] if joint.parent >= 0 else ca.DM(-self._gravity if gravity else np.zeros(6))
+            )
+            falling = ca.mtimes(transforms[i], before) + biases[i]
+            of_axis, inertia, left = passed[i]
+            found.append((left - ca.dot(of_axis, falling)) / inertia)
+            accelerations.append(falling + ca.DM(joint.axis) * found[i])
+        return ca.vertcat(*found)
+
+    def accelerations_under(self, q: Any, v: Any, force: Any) -> Any:
+        """The same of joint forces beside the model's viscous damping."""
+        return self.accelerations(q, v, force - casadi().DM(self._damping) * v)
+
+    def _kinematics(self, q: Any, v: Any) -> tuple[list[Any], list[Any], list[Any]]:
+        """Transforms from each joint's parent, motions of the links, and accelerations that follow from these."""
+        ca = casadi()
+        transforms: list[Any] = []
+        motions: list[Any] = []
+        biases: list[Any] = []
+        for i, joint in enumerate(self._joints):
+            transforms.append(joint.transform(q[i]))
+            if v is None:
+                motions.append(None)
+                biases.append(ca.DM.zeros(6))
+                continue
+            own = ca.DM(joint.axis) * v[i]
+            motions.append(own if joint.parent < 0 else ca.mtimes(transforms[i], motions[joint.parent]) + own)
+            biases.append(_cross_motion(motions[i], own))
+        return transforms, motions, biases
+
+    def _gyroscopic(self, i: int, motion: Any) -> Any:
+        """The force v ×* I v of a link."""
+        ca = casadi()
+        if motion is None:
+            return ca.DM.zeros(6)
+        return _cross_force(motion, ca.mtimes(ca.DM(self._joints[i].inertia), motion))
+
+
+def _cross_motion(by: Any, motion: Any) -> Any:
+    """The motion v × m."""
+    ca = casadi()
+    v, w = by[:3], by[3:]
+    return ca.vertcat(ca.cross(w, motion[:3]) + ca.cross(v, motion[3:]), ca.cross(w, motion[3:]))
+
+
+def _cross_force(by: Any, force: Any) -> Any:
+    """The force v ×* f."""
+    ca = casadi()
+    v, w = by[:3], by[3:]
+    return ca.vertcat(ca.cross(w, force[:3]), ca.cross(w, force[3:]) + ca.cross(v, force[:3]))
+
+
+def _joints_of(model: Any) -> list[_Joint]:
+    names, joints = list(model.names)[1:], list(model.joints)[1:]
+    for name, joint in zip(names, joints, strict=True):
+        if not joint.shortname().startswith(_KNOWN) or joint.nq != 1:
+            raise ValueError(
+                f"The joint {name!r} of the robot {model.name!r} is of the type {joint.shortname()}; what can be "
+                "exported are revolute and prismatic joints."
+            )
+    return [
+        _joint(int(model.parents[i + 1]) - 1, axis, model.jointPlacements[i + 1], model.inertias[i + 1], armature)
+        for i, (axis, armature) in enumerate(zip(joint_axes(model), model.armature, strict=True))
+    ]
+
+
+def _joint(parent: int, axis: np.ndarray, placement: Any, inertia: Any, armature: float) -> _Joint:
+    """With the joint's own transform R(q) = I + sin q [u] + (1 - cos q) [u]², or a shift by q u."""
+    before, zero = np.array(placement.toActionMatrixInverse()), np.zeros((3, 3))
+    slide, turn = _skew(axis[:3]), _skew(axis[3:])
+    both = turn @ turn
+    fixed = np.eye(6) + np.block([[both, zero], [zero, both]])
+    # Seen from the turned frame: R(q)ᵀ; from the shifted one: v - q u × w.
+    sine, cosine = -np.block([[turn, zero], [zero, turn]]), -np.block([[both, zero], [zero, both]])
+    linear = -np.block([[zero, slide], [zero, zero]])
+    return _Joint(
+        parent,
+        axis,
+        fixed @ before,
+        sine @ before,
+        cosine @ before,
+        linear @ before,
+        np.array(inertia.matrix()),
+        float(armature),
+    )
+
+
+def _skew(u: np.ndarray) -> np.ndarray:
+    """[u] with [u] a = u × a."""
+    return np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])

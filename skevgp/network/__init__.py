@@ -1,1 +1,0 @@
-"""The Bayesian network's loss and training."""

@@ -1,1 +1,0 @@
-"""Minimisers that know no Gaussian process."""

@@ -1,1 +1,0 @@
-"""What is done with a fitted model beyond `predict`: derivatives, rollouts, predictions without validation."""

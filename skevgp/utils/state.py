@@ -1,0 +1,53 @@
+"""What estimators are in pickles and files: which version of skevgp they are of, and nothing but plain data.
+
+Data frames and Pinocchio's models, which skops cannot hold, are arrays there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from sklearn.base import BaseEstimator
+
+from .._version import __version__
+from ..exceptions import InconsistentVersionWarning, warn_user
+from ..robots.numbers import RobotNumbers
+from .frames import FrameColumns
+
+_KEY = "_skevgp_version"
+
+
+class StatefulEstimator(BaseEstimator):
+    """As scikit-learn's own estimators: the version is in the state, and another one is warned of."""
+
+    def __getstate__(self) -> dict[str, Any]:
+        state = {name: _as_data(value) for name, value in super().__getstate__().items()}
+        # Of a user's class it says nothing; scikit-learn does the same.
+        return {**state, _KEY: __version__} if _is_ours(self) else state
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        state = {name: _from_data(value) for name, value in state.items()}
+        version = state.pop(_KEY, None)
+        if _is_ours(self) and version != __version__:
+            warn_user(
+                f"{type(self).__name__} is a pickle of skevgp {version or '(version unknown)'}, and this is "
+                f"{__version__}: it may fail, or predict something else. Fit it again, or load it with that version "
+                "and save it with skevgp.io.save, whose files are checked when they are read.",
+                InconsistentVersionWarning,
+            )
+        super().__setstate__(state)
+
+
+def _is_ours(estimator: object) -> bool:
+    return type(estimator).__module__.startswith("skevgp.")
+
+
+def _as_data(value: Any) -> Any:
+    data = FrameColumns.of(value)
+    return RobotNumbers.of(value) or value if data is None else data
+
+
+def _from_data(value: Any) -> Any:
+    if isinstance(value, FrameColumns):
+        return value.frame()
+    return value.model() if isinstance(value, RobotNumbers) else value

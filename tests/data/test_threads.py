@@ -1,0 +1,148 @@
+"""Sums in a fixed order, threads that hold few parts at a time, libraries held to one thread."""
+
+from concurrent.futures import ThreadPoolExecutor
+from threading import Event, get_ident
+
+import numpy as np
+import pytest
+from threadpoolctl import threadpool_info, threadpool_limits
+
+from skevgp import EVGPRegressor
+from skevgp.data.threads import BlockMap, add, ordered_sum, single_threaded_libraries, thread_pool
+from skevgp.solvers import LBFGS
+
+
+@pytest.fixture
+def threads():
+    pool = BlockMap(2)
+    yield pool
+    pool.close()
+
+
+def numbers_of_threads():
+    return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
+
+
+def test_tuples_are_added_entry_by_entry():
+    total = add((1, np.ones(2), "a"), (2, np.ones(2), "b"))
+    assert total[::2] == (3, "ab")
+    np.testing.assert_array_equal(total[1], [2.0, 2.0])
+    with pytest.raises(ValueError, match="zip"):
+        add((1, 2), (1,))
+
+
+def test_sums_are_in_order():
+    assert ordered_sum(iter("abc")) == "abc"
+    assert ordered_sum([("a", 1), ("b", 2), ("c", 3)]) == ("abc", 6)
+
+
+def test_one_thread_is_the_callers():
+    assert set(BlockMap()(lambda part: get_ident(), range(3))) == {get_ident()}
+
+
+def test_several_threads_are_others_and_results_come_in_the_parts_order(threads):
+    first_is_late = Event()
+
+    def slow_first(part):
+        if part == 0:
+            assert first_is_late.wait(60.0)
+        elif part == 1:
+            first_is_late.set()
+        return part, get_ident()
+
+    results = list(threads(slow_first, range(9)))
+    assert [part for part, _ in results] == list(range(9))
+    assert get_ident() not in {ident for _, ident in results}
+
+
+def test_few_parts_are_under_way_at_once(threads):
+    """So that the memory of what they make does not grow with their number."""
+    taken = []
+
+    def parts():
+        for part in range(50):
+            taken.append(part)
+            yield part
+
+    for done, _ in enumerate(threads(lambda part: part, parts()), 1):
+        assert len(taken) <= done + 4
+
+
+def test_an_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
+    seen = []
+
+    def fails(part):
+        seen.append(part)
+        if part == 3:
+            raise ValueError("part 3")
+        return part
+
+    with pytest.raises(ValueError, match="part 3"):
+        list(threads(fails, range(1000)))
+    assert len(seen) < 20
+
+
+def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
+    def limited():
+        with single_threaded_libraries():
+            return numbers_of_threads()
+
+    before = numbers_of_threads()
+    assert set(limited().values()) == {1}
+    with ThreadPoolExecutor(1) as other:
+        assert set(other.submit(limited).result().values()) == {1}
+    with single_threaded_libraries(), single_threaded_libraries(), thread_pool(1) as pool:
+        assert set(pool.submit(numbers_of_threads).result().values()) == {1}
+    assert numbers_of_threads() == before
+
+
+def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
+    """Whichever came first."""
+    second_is_in, first_is_out = Event(), Event()
+
+    def second():
+        with single_threaded_libraries():
+            second_is_in.set()
+            assert first_is_out.wait(60.0)
+
+    def first(pool):
+        with single_threaded_libraries():
+            late = pool.submit(second)
+            assert second_is_in.wait(60.0)
+        return late
+
+    with threadpool_limits(2), ThreadPoolExecutor(2) as pool:
+        before = numbers_of_threads()
+        assert set(before.values()) == {2}
+        late = pool.submit(first, pool).result()
+        assert numbers_of_threads()["blas"] == 1
+        first_is_out.set()
+        late.result()
+        assert numbers_of_threads() == before
+
+
+def test_libraries_are_set_free_after_an_error():
+    before = numbers_of_threads()
+    with pytest.raises(ZeroDivisionError), single_threaded_libraries():
+        raise ZeroDivisionError
+    assert numbers_of_threads() == before
+
+
+@pytest.mark.slow
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+def test_fits_have_the_same_bits_in_any_thread():
+    """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
+    rng = np.random.RandomState(0)
+    rows = rng.randn(12_000, 4)
+    target = np.column_stack([np.sin(rows[:, 0]), rows[:, 1] * rows[:, 2]])
+
+    def points(n_jobs):
+        fitted = EVGPRegressor(
+            n_inducing=20, sharing="none", solver=LBFGS(n_restarts=1), max_iter=2, n_jobs=n_jobs, random_state=0
+        )
+        return fitted.fit(rows, target).inducing_points_
+
+    expected = points(1)
+    np.testing.assert_array_equal(points(2), expected)
+    with ThreadPoolExecutor(1) as other:
+        np.testing.assert_array_equal(other.submit(points, 1).result(), expected)

@@ -1,0 +1,103 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from skevgp.data.threads import BlockMap
+from skevgp.fitting import outliers
+from skevgp.fitting.outliers import Look, RowDoubts, fit_doubting, look_at, settle
+from skevgp.fitting.outputs import _best
+from skevgp.fitting.plan import plan
+from skevgp.fitting.strategy import Attempt, better
+from skevgp.noise.student_t import RowScales
+from skevgp.utils.monitor import Monitor
+
+from .cases import N, O, Y, data_of, request
+
+BAD = np.array([3, 17, 40])
+
+
+def task_of(**changes):
+    """With rows of which three are far off."""
+    wrong = Y.copy()
+    wrong[BAD] += 6.0 * Y.std(axis=0)
+    (task,) = plan(
+        request(**data_of(wrong), **changes, heavy_tails=True), np.random.RandomState(0), Monitor(), BlockMap()
+    )
+    return task
+
+
+@pytest.mark.parametrize("changes", [{}, {"family": "diagonal"}, {"sharing": "kernel"}], ids=str)
+def test_no_turn_lowers_the_bound(changes):
+    task = task_of(max_iter=10, **changes)
+    rows = task.rows
+    doubts = RowDoubts(RowScales(O, np.random.RandomState(1).uniform(0.0, 60.0, N)), np.ones(O))
+    weighed = replace(task, rows=doubts.weigh(rows))
+    fit = weighed.minimise(Attempt(task.table.values_at_start(), 10))
+    for _ in range(4):
+        weighed, settled, doubts = settle(weighed, fit, rows, doubts)
+        assert settled.bound >= fit.bound - 1e-8 * abs(fit.bound)
+        further = better(settled, weighed.minimise(Attempt(settled.values, settled.n_iter + 5, settled)))
+        assert further.bound >= settled.bound
+        fit = further
+
+
+def test_a_turn_of_the_doubts_alone_does_not_lower_the_bound_either(monkeypatch):
+    monkeypatch.setattr(outliers, "_TURNS", 1)
+    task = task_of()
+    rows, values = task.rows, task.table.values_at_start()
+    doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
+    weighed = replace(task, rows=doubts.weigh(rows))
+    fit, bounds = weighed.minimise(Attempt(values, 0)), []
+    for _ in range(6):
+        bounds.append(fit.bound)
+        weighed, fit, doubts = settle(weighed, fit, rows, doubts)
+    assert bounds[1] > bounds[0]
+    assert (np.diff(bounds) >= -1e-8 * np.abs(bounds[0])).all()
+
+
+def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
+    """With q(τ) at its optimum the terms with τ are the evidence: the bound from matrices, less what stands for it."""
+    task = task_of()
+    rows = task.rows
+    fit = task.minimise(Attempt(task.table.values_at_start(), 0))
+    doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
+    for _ in range(20):
+        task, fit, doubts = settle(task, fit, rows, doubts)
+    scales, noise = doubts.scales, fit.values["noise"]
+    (statistics,) = task.model.statistics(fit.values, task.blocks)
+    assert statistics.log_variance == pytest.approx(scales.log_variance.sum())
+    look = look_at(rows, outliers.predictor_at(task, fit.values))
+    # Less the divergence of q(g): what depends on the rows.
+    expected = scales.evidence.sum() - 0.5 * N * np.log(2.0 * np.pi * noise).sum()
+    found = -0.5 * (scales.mean @ look.distances(noise) + N * np.log(2.0 * np.pi * noise).sum())
+    assert found - 0.5 * O * statistics.log_variance == pytest.approx(expected, rel=1e-3)
+
+
+def test_outliers_are_found():
+    task = task_of(max_iter=60, tol=0.01)
+    learned = fit_doubting(task, _best)
+    weights = learned.doubts.scales.mean
+    assert (weights[BAD] < 0.1).all()
+    assert (np.delete(weights, BAD) > 0.5).all()
+    assert learned.upper_bound == np.inf
+    np.testing.assert_allclose(learned.predictor.noise, learned.values["noise"] * learned.doubts.noise_factor)
+
+
+def test_what_is_fixed_stays():
+    task = task_of(max_iter=5)
+    task = replace(task, table=task.table.with_fixed("noise"))
+    learned = fit_doubting(task, _best)
+    np.testing.assert_array_equal(learned.predictor.noise, task.table.values_at_start()["noise"])
+
+
+def test_the_variance_of_clean_rows_is_theirs():
+    rng = np.random.RandomState(0)
+    errors = rng.randn(4000, 2) * [1.0, 10.0]
+    bad = rng.rand(4000) < 0.05
+    look = Look(errors, np.zeros_like(errors), np.ones(4000), np.ones(4000))
+    np.testing.assert_allclose(look.clean_variance(), (errors**2).mean(axis=0), rtol=1e-12)
+    spoiled = replace(look, errors=errors + 20.0 * bad[:, np.newaxis] * [1.0, 10.0])
+    np.testing.assert_allclose(spoiled.clean_variance(), [1.0, 100.0], rtol=0.05)
+    twice = replace(spoiled, variance=np.full(4000, 2.0), counts=np.full(4000, 3.0))
+    np.testing.assert_allclose(twice.clean_variance(), 0.5 * spoiled.clean_variance())

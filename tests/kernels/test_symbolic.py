@@ -1,0 +1,109 @@
+import casadi as ca
+import numpy as np
+import pytest
+from sklearn.gaussian_process import kernels as sk
+
+from skevgp.kernels import FunctionKernel
+from skevgp.kernels.symbolic import cross_and_diagonal
+
+from .cases import KERNELS, X, Z, parsed
+
+WITHOUT = {"matern 0.3", "matern 1", "matern 0.8", "matern 1.9, ard", "matern 7.3", "matern 60"}
+
+
+def has_function(kernel):
+    if isinstance(kernel, sk.KernelOperator):
+        return has_function(kernel.k1) or has_function(kernel.k2)
+    return isinstance(kernel, FunctionKernel)
+
+
+EXPORTED = {name: kernel for name, kernel in KERNELS.items() if name not in WITHOUT and not has_function(kernel)}
+EXPORTED["matern 7/2"] = sk.Matern([0.8, 1.3], nu=3.5)
+EXPORTED["matern 21/2"] = sk.Matern(0.8, nu=10.5)
+ROUGH = sk.Matern(0.9, nu=0.5)
+
+
+def symbolic(kernel, points=Z, centre=None):
+    """x -> (k̃(X_m, x), k̃(x, x)), and the same in NumPy, row by row."""
+    covariance, log_hyperparameters = parsed(kernel, centre)
+    x = ca.MX.sym("x", points.shape[1])
+    function = ca.Function("k", [x], list(cross_and_diagonal(covariance, np.exp(log_hyperparameters), points, x)))
+    at = covariance.at(log_hyperparameters, points)
+
+    def numeric(row):
+        prepared = covariance.prepare(row.reshape(1, -1))
+        return at.cross(prepared)[:, 0], np.broadcast_to(at.diagonal(prepared), 1)
+
+    return function, numeric
+
+
+def test_many_kernels_are_tried():
+    assert len(EXPORTED) > 25
+
+
+@pytest.mark.parametrize("kernel", EXPORTED.values(), ids=EXPORTED)
+def test_values_are_those_of_the_covariance(kernel):
+    function, numeric = symbolic(kernel)
+    for row in X[:5]:
+        for found, expected in zip(function(row), numeric(row), strict=True):
+            np.testing.assert_allclose(found.full().ravel(), expected, rtol=1e-12, atol=1e-14)
+
+
+@pytest.mark.parametrize("kernel", EXPORTED.values(), ids=EXPORTED)
+def test_derivatives_are_those_of_the_covariance(kernel):
+    function, numeric = symbolic(kernel)
+    x = ca.MX.sym("x", 2)
+    jacobian = ca.Function("j", [x], [ca.jacobian(own, x) for own in function(x)])
+    h = 1e-6
+    for row in X[:3]:
+        sides = [[numeric(row + sign * h * unit) for unit in np.eye(2)] for sign in (1.0, -1.0)]
+        for i, found in enumerate(jacobian(row)):
+            expected = [(up[i] - down[i]) / (2.0 * h) for up, down in zip(*sides, strict=True)]
+            np.testing.assert_allclose(found.full(), np.transpose(expected), rtol=1e-6, atol=1e-8)
+
+
+@pytest.mark.parametrize("kernel", [*EXPORTED.values(), ROUGH], ids=[*EXPORTED, "rough"])
+def test_where_x_is_an_inducing_point_derivatives_are_finite_and_right(kernel):
+    function, numeric = symbolic(kernel)
+    x = ca.MX.sym("x", 2)
+    cross, _ = function(x)
+    derivatives = ca.Function("d", [x], [ca.jacobian(cross, x), ca.hessian(cross[0], x)[0]])
+    first, second = (own.full() for own in derivatives(Z[0]))
+    np.testing.assert_allclose(function(Z[0])[0].full().ravel(), numeric(Z[0])[0], rtol=1e-12, atol=1e-14)
+    assert np.isfinite(first).all()
+    assert np.isfinite(second).all()
+    h = 1e-5
+    sides = [[numeric(Z[0] + sign * h * unit)[0] for unit in np.eye(2)] for sign in (1.0, -1.0)]
+    expected = [(up - down) / (2.0 * h) for up, down in zip(*sides, strict=True)]
+    # Symmetric differences are right for a kink as well.
+    np.testing.assert_allclose(first, np.transpose(expected), rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize(("nu", "curvature"), [(1.5, 3.0), (2.5, 5.0 / 3.0), (3.5, 7.0 / 5.0)])
+def test_a_matern_is_curved_at_its_points(nu, curvature):
+    function, _ = symbolic(sk.Matern(2.0, nu=nu))
+    x = ca.MX.sym("x", 2)
+    second = ca.Function("h", [x], [ca.hessian(function(x)[0][0], x)[0]])
+    np.testing.assert_allclose(second(Z[0]).full(), -np.eye(2) * curvature / 4.0, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("kernel", [sk.RBF(1.0), sk.Matern(1.0, nu=1.5), sk.RationalQuadratic()], ids=repr)
+def test_a_centre_far_away_costs_no_digits(kernel):
+    far = np.array([1e8, -3e7])
+    function, numeric = symbolic(kernel, Z + far, centre=far)
+    row = X[0] + far
+    np.testing.assert_allclose(function(row)[0].full().ravel(), numeric(row)[0], rtol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "kernel", [sk.RBF(1.0) + FunctionKernel(lambda X, Z, a=1.0: a * X @ Z.T), FunctionKernel(lambda X, Z: X @ Z.T)]
+)
+def test_a_function_kernel_cannot_be_exported(kernel):
+    with pytest.raises(ValueError, match=r"The kernel Function\(.*These can be exported: RBF"):
+        symbolic(kernel)
+
+
+@pytest.mark.parametrize("nu", [0.7, 30.5])
+def test_a_matern_with_bessel_functions_cannot_be_exported(nu):
+    with pytest.raises(ValueError, match=rf"Matern\(nu={nu}\) cannot be written in CasADi.*half-integer"):
+        symbolic(sk.Matern(1.0, nu=nu))

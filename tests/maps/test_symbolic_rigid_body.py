@@ -1,0 +1,88 @@
+import casadi as ca
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from skevgp.datasets import load_robot
+from skevgp.maps.symbolic_rigid_body import SymbolicRigidBody
+from skevgp.robots import RigidBody
+
+ROBOTS = ["pendulum", "cartpole", "acrobot", "iiwa14", "panda", "ur5"]
+
+
+def branched():
+    """A tree of joints of all kinds, aligned and not, with friction, armature and gravity askew."""
+    rng = np.random.RandomState(0)
+    model = pin.Model()
+    model.name = "branched"
+    kinds = [
+        pin.JointModelRX(),
+        pin.JointModelRY(),
+        pin.JointModelRZ(),
+        pin.JointModelPX(),
+        pin.JointModelPY(),
+        pin.JointModelPZ(),
+        pin.JointModelRevoluteUnaligned(np.array([0.6, 0.0, -0.8])),
+        pin.JointModelPrismaticUnaligned(np.array([0.0, 0.6, 0.8])),
+    ]
+    for number, (kind, parent) in enumerate(zip(kinds, [0, 1, 2, 1, 4, 0, 6, 7], strict=True)):
+        joint = model.addJoint(parent, kind, pin.SE3.Random(), f"j{number}")
+        body = pin.Inertia.FromEllipsoid(0.5 + rng.rand(), *rng.uniform(0.1, 0.4, 3))
+        model.appendBodyToJoint(joint, body, pin.SE3.Random())
+    model.gravity.linear = np.array([1.0, -2.0, -9.0])
+    model.armature, model.damping = rng.rand(8), rng.rand(8)
+    return load_robot(model)
+
+
+@pytest.fixture(params=[*ROBOTS, branched], ids=lambda robot: robot if isinstance(robot, str) else robot.__name__)
+def model(request):
+    return load_robot(request.param) if isinstance(request.param, str) else request.param()
+
+
+def test_it_computes_what_pinocchio_does(model):
+    n, body, symbolic = model.nv, RigidBody(model), SymbolicRigidBody(model)
+    q, v, f = (ca.MX.sym(name, n) for name in "qvf")
+    function = ca.Function(
+        "all",
+        [q, v, f],
+        [
+            symbolic.forces(q, v, f),
+            symbolic.forces(q, v, None),
+            symbolic.gravity(q),
+            symbolic.accelerations(q, v, f),
+            symbolic.accelerations_under(q, v, f),
+            symbolic.accelerations(q, None, f, gravity=False),
+        ],
+    )
+    rng = np.random.RandomState(1)
+    for Q, V, F in rng.randn(5, 3, 1, n):
+        expected = [
+            body.forces(Q, V, F),
+            body.forces(Q, V, np.zeros_like(V)),
+            body.gravity(Q),
+            body.accelerations(Q, V, F),
+            body.accelerations(Q, V, F - np.array(model.damping) * V),
+            body.accelerations_by_force(Q, F),
+        ]
+        for found, own in zip(function(Q[0], V[0], F[0]), expected, strict=True):
+            np.testing.assert_allclose(found.full().ravel(), own[0], atol=1e-10 * np.abs(own).max() + 1e-14)
+
+
+def test_derivatives_are_those_of_pinocchio():
+    model = load_robot("iiwa14")
+    n, data = model.nv, model.createData()
+    q, v, f = (ca.MX.sym(name, n) for name in "qvf")
+    given = ca.vertcat(q, v, f)
+    jacobian = ca.Function("j", [q, v, f], [ca.jacobian(SymbolicRigidBody(model).accelerations(q, v, f), given)])
+    Q, V, F = np.random.RandomState(0).randn(3, n)
+    pin.computeABADerivatives(model, data, Q, V, F)
+    expected = np.hstack([data.ddq_dq, data.ddq_dv, np.triu(data.Minv) + np.triu(data.Minv, 1).T])
+    np.testing.assert_allclose(jacobian(Q, V, F).full(), expected, atol=1e-8 * np.abs(expected).max())
+
+
+def test_an_unknown_joint_is_named():
+    model = pin.Model()
+    model.name = "screw"
+    model.addJoint(0, pin.JointModelHX(0.1), pin.SE3.Identity(), "thread")
+    with pytest.raises(ValueError, match=r"The joint 'thread' of the robot 'screw' is of the type JointModelHX"):
+        SymbolicRigidBody(model)

@@ -1,0 +1,173 @@
+import numpy as np
+import pytest
+from scipy.optimize import rosen, rosen_der
+
+from skevgp.solvers.lbfgs import Tolerance, lbfgs
+from skevgp.utils.linalg import NotPositiveDefiniteError
+from skevgp.utils.monitor import Monitor
+
+FREE = (np.full(2, -np.inf), np.full(2, np.inf))
+
+
+def rosenbrock(x):
+    value = 100.0 * (x[1] - x[0] ** 2) ** 2 + (1 - x[0]) ** 2
+    return value, np.array([-400.0 * x[0] * (x[1] - x[0] ** 2) - 2.0 * (1 - x[0]), 200.0 * (x[1] - x[0] ** 2)])
+
+
+def test_lbfgs_finds_the_minimum_and_reports_each_iteration():
+    seen = []
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 200, 1e-12, Monitor(lambda *told: seen.append(told[:2])))
+    np.testing.assert_allclose(minimum.x, 1.0, atol=1e-5)
+    assert minimum.converged
+    assert [i for i, _ in seen] == list(range(1, minimum.n_iter + 1))
+    assert [loss for _, loss in seen] == minimum.loss_curve
+    assert (np.diff(minimum.loss_curve) <= 1e-15).all()
+
+
+def test_lbfgs_respects_bounds():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), (np.full(2, -2.0), np.full(2, 0.5)), 200, 1e-12)
+    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-4)
+
+
+def test_lbfgs_says_that_iterations_ran_out():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 3, 1e-12)
+    assert (minimum.converged, minimum.n_iter) == (False, 3)
+
+
+def test_lbfgs_with_no_iterations_keeps_the_start():
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 0, 1e-12)
+    np.testing.assert_array_equal(minimum.x, [-1.0, 2.0])
+    assert minimum.converged
+    assert minimum.loss == rosenbrock(minimum.x)[0]
+
+
+@pytest.mark.parametrize("failure", ["raise", "overflow", "nan", "infinite gradient"])
+def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
+    """A logarithmic barrier whose line searches step over the wall."""
+    pull, outside = np.array([10.0, -30.0]), []
+
+    def barrier(x):
+        if (np.abs(x) >= 1.0).any():
+            outside.append(x)
+            if failure == "raise":
+                raise NotPositiveDefiniteError("far out")
+            if failure == "overflow":
+                return float(np.full(2, 1e200) @ np.full(2, 1e200)), np.full(2, 1e200) ** 2
+            return (np.nan, np.zeros(2)) if failure == "nan" else (-1e9, np.full(2, np.inf))
+        return -np.log(1.0 - x**2).sum() - pull @ x, 2.0 * x / (1.0 - x**2) - pull
+
+    minimum = lbfgs(barrier, np.zeros(2), FREE, 300, 1e-12)
+    np.testing.assert_allclose(minimum.x, (-1.0 + np.sqrt(1.0 + pull**2)) / pull, atol=1e-6)
+    assert outside
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_a_stall_is_not_the_end(seed):
+    """In a bent valley of twenty columns three small steps in a row may lie far from the minimum at 0."""
+    free = (np.full(20, -np.inf), np.full(20, np.inf))
+    start = np.random.RandomState(seed).uniform(-2.0, 2.0, 20)
+    minimum = lbfgs(lambda x: (rosen(x), rosen_der(x)), start, free, 1000, 0.03)
+    assert minimum.converged
+    assert minimum.loss < 1.0
+
+
+def test_a_start_that_cannot_be_evaluated_has_not_converged():
+    minimum = lbfgs(lambda x: (np.nan, np.zeros(2)), np.zeros(2), FREE, 50, 1e-6)
+    assert not minimum.converged
+    assert minimum.loss == np.inf
+
+
+def test_lbfgs_ends_when_rounding_has_the_last_word():
+    def rough(x):
+        value, gradient = rosenbrock(x)
+        return round(value, 3), gradient
+
+    minimum = lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-6)
+    assert minimum.converged
+    assert minimum.loss < 0.01
+
+
+def test_ctrl_c_keeps_the_best_point_so_far():
+    calls = []
+
+    def interrupted(x):
+        calls.append(x)
+        if len(calls) > 8:
+            raise KeyboardInterrupt
+        return rosenbrock(x)
+
+    monitor = Monitor()
+    minimum = lbfgs(interrupted, np.array([-1.0, 2.0]), FREE, 100, 0.1, monitor)
+    assert monitor.stopped
+    assert not minimum.converged
+    assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
+
+
+def cliff(height):
+    """A gentle slope down to 1, and beyond that a loss which rises at once to any height."""
+
+    def loss(x):
+        beyond = np.maximum(x - 1.0, 0.0)
+        return float((-x + height * beyond**2).sum()), -1.0 + 2.0 * height * beyond
+
+    return loss
+
+
+@pytest.mark.parametrize("height", [1e3, 1e6, 1e9, 1e12])
+def test_a_loss_far_off_does_not_end_the_way(height):
+    minimum = lbfgs(cliff(height), np.zeros(2), FREE, 300, 1e-6)
+    np.testing.assert_allclose(minimum.x, 1.0 + 0.5 / height, atol=1e-4)
+    assert minimum.converged
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rounding_errors_do_not_end_the_way(seed):
+    """A loss with errors far above the tolerance, as near a singular matrix: the best is as good as they allow."""
+    directions = np.random.RandomState(seed).randn(2)
+
+    def rough(x):
+        value, gradient = rosenbrock(x)
+        return value + 1e-9 * np.sin(1e13 * (x @ directions)), gradient
+
+    assert lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
+
+
+def test_starts_that_gain_without_an_iteration_come_to_an_end():
+    """A loss that is lower at each look, wherever that is: as rounding errors may make it, for ever."""
+    looks = []
+
+    def sinking(x):
+        looks.append(x)
+        assert len(looks) < 10_000
+        return -1.0 * len(looks), np.zeros(2)
+
+    minimum = lbfgs(sinking, np.zeros(2), FREE, 20, 1e-9)
+    assert not minimum.converged
+    assert minimum.loss == -len(looks)
+
+
+def test_limits_hold_in_whatever_units():
+    limits = np.full(2, -2.0), np.full(2, 0.5)
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), limits, 200, 1e-12, units=lambda x: np.array([0.1, 7.0]))
+    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-5)
+
+
+def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
+    def valley(x):
+        return rosen(x), rosen_der(x)
+
+    start, free = np.full(20, -1.0), (np.full(20, -np.inf), np.full(20, np.inf))
+    origin = rosen(start)
+    full = lbfgs(valley, start, free, 1000, 1e-9)
+    near = lbfgs(valley, start, free, 1000, Tolerance(1e-9, 1e-4, origin))
+    assert near.converged
+    assert near.n_iter < full.n_iter
+    assert origin - near.loss > 0.97 * (origin - full.loss)
+
+
+def test_a_tolerance_has_a_least_value():
+    assert Tolerance(0.1).at(-5.0) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(1.0) == 1.0
+    assert Tolerance(0.1, 0.5, 3.0).at(4.0) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(np.nan) == 0.1
+    assert Tolerance(0.1, 0.5, 3.0).at(-np.inf) == 0.1

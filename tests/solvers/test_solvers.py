@@ -1,0 +1,275 @@
+"""The solvers as records of options: what they take, what they refuse, what their callbacks are told."""
+
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from sklearn.base import clone
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.model_selection import GridSearchCV
+
+from skevgp import EVGPRegressor
+from skevgp.model.objectives import BoundObjective
+from skevgp.solvers import LBFGS, Adam
+from skevgp.solvers.solvers import SOLVERS, resolved
+
+RNG = np.random.RandomState(0)
+X = RNG.uniform(-2, 2, (80, 2))
+Y = np.column_stack([np.sin(2 * X[:, 0]) + X[:, 1], np.cos(X[:, 1]) * X[:, 0]]) + 0.05 * RNG.randn(80, 2)
+
+few_iterations = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+def model(**arguments):
+    return EVGPRegressor(**{"n_inducing": 10, "sharing": "all", "max_iter": 5, "random_state": 0, **arguments})
+
+
+# --- records of options --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("solver", [LBFGS(n_restarts=2), Adam(batch_size=7, learning_rate=0.2)], ids=str)
+def test_a_solver_is_cloned_with_its_options(solver):
+    assert clone(solver) is not solver
+    assert clone(solver).get_params() == solver.get_params()
+
+
+def test_options_are_reached_through_the_estimator():
+    m = model(solver=Adam(batch_size=7))
+    assert m.get_params()["solver__batch_size"] == 7
+    m.set_params(solver__batch_size=9, solver__learning_rate=0.3)
+    assert (m.solver.batch_size, m.solver.learning_rate) == (9, 0.3)
+    assert clone(m).solver.batch_size == 9
+
+
+def test_an_option_that_the_solver_does_not_have_is_an_error():
+    with pytest.raises(ValueError, match="Invalid parameter 'batch_size' for estimator LBFGS"):
+        model(solver=LBFGS()).set_params(solver__batch_size=9)
+    with pytest.raises(TypeError, match="batch_size"):
+        LBFGS(batch_size=9)
+
+
+@few_iterations
+def test_a_grid_search_goes_over_options():
+    grid = {"solver__batch_size": [5, 40], "solver__learning_rate": [0.1]}
+    search = GridSearchCV(model(solver=Adam(), max_iter=30), grid, cv=2, n_jobs=1).fit(X, Y)
+    assert search.best_params_.keys() == grid.keys()
+    assert search.best_estimator_.solver.batch_size == search.best_params_["solver__batch_size"]
+    scores = search.cv_results_["mean_test_score"]
+    assert np.isfinite(scores).all()
+    assert scores[0] != scores[1]
+
+
+@few_iterations
+def test_a_fit_leaves_the_solver_alone():
+    solver = Adam(batch_size=9)
+    before = dict(vars(solver))
+    model(solver=solver).fit(X, Y)
+    assert vars(solver) == before
+
+
+# --- names ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("name", "kind"), [("lbfgs", LBFGS), ("adam", Adam)])
+@few_iterations
+def test_a_name_is_the_solver_with_its_defaults(name, kind):
+    assert type(resolved(name, "full")) is kind is SOLVERS[name]
+    by_name, by_hand = (model(solver=solver).fit(X, Y).predict(X) for solver in (name, kind()))
+    np.testing.assert_array_equal(by_name, by_hand)
+
+
+@pytest.mark.parametrize("solver", ["sgd", "LBFGS", None, 3, LBFGS, {"n_restarts": 2}], ids=str)
+def test_what_is_no_solver_is_named_with_what_is(solver):
+    names = re.escape('"lbfgs", "adam", skevgp.solvers.LBFGS(...), skevgp.solvers.Adam(...)')
+    with pytest.raises(ValueError, match=f"solver must be one of {names}; got "):
+        resolved(solver, "full")
+    with pytest.raises((ValueError, TypeError), match="solver"):
+        model(solver=solver).fit(X, Y)
+
+
+# --- options out of range ------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("solver", "error", "message"),
+    [
+        (LBFGS(n_restarts=-1), ValueError, "n_restarts of LBFGS must be at least 0; got -1"),
+        (LBFGS(n_restarts=1.5), TypeError, "n_restarts of LBFGS must be an integer; got 1.5"),
+        (LBFGS(callback="print"), TypeError, "callback of LBFGS must be None or a function; got 'print'"),
+        (Adam(n_restarts=True), TypeError, "n_restarts of Adam must be an integer; got True"),
+        (Adam(batch_size=0), ValueError, "batch_size of Adam must be at least 1; got 0"),
+        (Adam(batch_size="all"), TypeError, "batch_size of Adam must be an integer; got 'all'"),
+        (Adam(learning_rate=0.0), ValueError, "learning_rate of Adam must be finite and above 0.0; got 0.0"),
+        (Adam(learning_rate=np.nan), ValueError, "learning_rate of Adam must be finite and above 0.0; got nan"),
+        (Adam(schedule="linear"), ValueError, 'schedule of Adam must be "cosine" or "constant"; got \'linear\''),
+        (Adam(learning_rate="fast"), TypeError, "learning_rate of Adam must be a number; got 'fast'"),
+        (Adam(natural_gradient=1), TypeError, "natural_gradient of Adam must be True or False; got 1"),
+    ],
+    ids=str,
+)
+def test_an_option_out_of_range_is_named(solver, error, message):
+    with pytest.raises(error, match=message):
+        resolved(solver, "full")
+    with pytest.raises(error, match=message):
+        model(solver=solver).fit(X, Y)
+
+
+def test_natural_gradients_need_the_full_posterior():
+    assert resolved(Adam(natural_gradient=True), "full").natural_gradient
+    with pytest.raises(ValueError, match=r'natural_gradient=True of Adam needs posterior="full"; got posterior='):
+        resolved(Adam(natural_gradient=True), "diagonal")
+
+
+@few_iterations
+def test_a_batch_of_more_rows_than_there_are_is_all_of_them():
+    all_rows, more = (model(solver=Adam(batch_size=n)).fit(X, Y).lower_bound_ for n in (80, 10_000))
+    assert all_rows == more
+
+
+# --- subclasses ----------------------------------------------------------------------------------------------------
+
+
+@few_iterations
+@pytest.mark.parametrize("kind", [LBFGS, Adam])
+def test_a_subclass_may_have_other_rules(kind):
+    class Loud(kind):
+        """Starts from a hundred times the noise."""
+
+        rules = replace(kind.rules, first_noise=100.0 * kind.rules.first_noise)
+
+    own, loud = (model(solver=solver(), max_iter=0).fit(X, Y).noise_variance_ for solver in (kind, Loud))
+    np.testing.assert_allclose(loud, 100.0 * own)
+    assert clone(Loud(n_restarts=3)).n_restarts == 3
+
+
+@few_iterations
+def test_a_subclass_may_have_another_number_of_iterations():
+    class Short(LBFGS):
+        default_max_iter = 4
+
+    assert model(solver=Short(), max_iter=None, tol=0.0).fit(X, Y).n_iter_ == 4
+    assert model(solver=Short(), max_iter=6, tol=0.0).fit(X, Y).n_iter_ == 6
+
+
+@few_iterations
+def test_a_subclass_may_look_at_each_evaluation():
+    seen = []
+
+    class Watched(LBFGS):
+        def objective(self, task, table, n_rows=None):
+            objective = super().objective(task, table, n_rows)
+            assert isinstance(objective, BoundObjective)
+
+            def watched(x):
+                seen.append((table.size, objective(x)[0]))
+                return objective(x)
+
+            return watched
+
+    m = model(solver=Watched(), inducing_init="k-means").fit(X, Y)
+    assert len(seen) >= m.n_iter_
+    assert {size for size, _ in seen} == {2 + 2 * 2 + 10 * 2}
+    np.testing.assert_array_equal(m.predict(X), model(inducing_init="k-means").fit(X, Y).predict(X))
+
+
+# --- callbacks -----------------------------------------------------------------------------------------------------
+
+
+def told(sharing, solver, n_jobs=None, y=Y, **arguments):
+    """What a callback is told, and the fitted model."""
+    calls = []
+    m = model(
+        sharing=sharing, solver=solver(callback=lambda *what: calls.append(what)), n_jobs=n_jobs, **arguments
+    ).fit(X, y)
+    return calls, m
+
+
+@few_iterations
+@pytest.mark.parametrize("sharing", ["all", "kernel"])
+@pytest.mark.parametrize("solver", [LBFGS, Adam])
+def test_a_callback_is_told_each_iteration_and_bound(solver, sharing):
+    calls, m = told(sharing, solver)
+    assert [iteration for iteration, _, _ in calls] == list(range(1, m.n_iter_ + 1))
+    assert {outputs for _, _, outputs in calls} == {range(0, 2)}
+    np.testing.assert_allclose([-bound for _, bound, _ in calls], m.loss_curve_, rtol=1e-10)
+
+
+@few_iterations
+@pytest.mark.parametrize("n_jobs", [None, 2])
+@pytest.mark.parametrize("solver", [LBFGS, Adam])
+def test_outputs_that_share_nothing_have_callbacks_of_their_own(solver, n_jobs):
+    """Each as if it were fitted alone; together they make up the loss curve."""
+    calls, m = told("none", solver, n_jobs)
+    curves = []
+    for o in range(2):
+        own = [(iteration, bound) for iteration, bound, outputs in calls if outputs == range(o, o + 1)]
+        alone, _ = told("none", solver, y=Y[:, o])
+        assert [iteration for iteration, _ in own] == [iteration for iteration, _, _ in alone]
+        np.testing.assert_allclose([bound for _, bound in own], [bound for _, bound, _ in alone], rtol=1e-6)
+        curves.append([-bound for _, bound in own])
+    assert len(calls) == sum(map(len, curves))
+    padded = [np.pad(curve, (0, m.n_iter_ - len(curve)), "edge") for curve in curves]
+    np.testing.assert_allclose(np.sum(padded, axis=0), m.loss_curve_, rtol=1e-10)
+
+
+def test_an_error_in_a_callback_is_the_fits():
+    def fails(iteration, bound, outputs):
+        raise ZeroDivisionError("mine")
+
+    with pytest.raises(ZeroDivisionError, match="mine"):
+        model(solver=LBFGS(callback=fails)).fit(X, Y)
+
+
+# --- what Adam keeps -----------------------------------------------------------------------------------------------
+
+
+@few_iterations
+def test_adam_never_ends_below_its_start():
+    """Steps that are too large: the first point is kept, judged by all rows."""
+    start = model(solver="adam", max_iter=0).fit(X, Y)
+    for rate in (0.1, 30.0):
+        assert model(solver=Adam(learning_rate=rate), max_iter=20).fit(X, Y).lower_bound_ >= start.lower_bound_ - 1e-6
+
+
+@few_iterations
+@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+def test_no_iterations_are_the_start(solver):
+    m = model(solver=solver, max_iter=0).fit(X, Y)
+    assert m.n_iter_ == 0
+    assert m.loss_curve_.shape == (0,)
+    assert np.isfinite(m.predict(X, return_std=True)).all()
+
+
+@pytest.mark.parametrize("solver", [LBFGS, Adam])
+def test_a_stop_iteration_of_the_callback_ends_the_fit_with_the_best_so_far(solver):
+    seen = []
+
+    def stop(iteration, bound, outputs):
+        seen.append(iteration)
+        if iteration == 4:
+            raise StopIteration
+
+    with pytest.warns(ConvergenceWarning, match="interrupted after 4 iterations"):
+        model = EVGPRegressor(n_inducing=5, solver=solver(callback=stop), random_state=0).fit(X, Y)
+    assert seen == [1, 2, 3, 4]
+    assert np.isfinite(model.predict(X)).all()
+
+
+def test_parameters_of_a_solver_that_is_a_string_are_reached():
+    model = EVGPRegressor(solver="adam").set_params(solver__batch_size=7)
+    assert (type(model.solver), model.solver.batch_size) == (Adam, 7)
+    assert EVGPRegressor(solver="adam").set_params(n_inducing=3).solver == "adam"
+    with pytest.raises(ValueError, match="Invalid parameter 'batch_size' for estimator LBFGS"):
+        EVGPRegressor().set_params(solver__batch_size=7)
+
+
+def test_a_solver_of_the_registry_may_be_given_as_an_object(monkeypatch):
+    class Mine:
+        def check(self, posterior):
+            self.asked = posterior
+
+    monkeypatch.setitem(SOLVERS, "mine", Mine)
+    mine = Mine()
+    assert resolved(mine, "full") is mine
+    assert mine.asked == "full"
