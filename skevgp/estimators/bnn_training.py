@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..solvers.adam import adam, is_flat
-from ..solvers.minimum import Minimum
+from ..solvers.base import Minimum
 from ..utils.monitor import Monitor
 from ..utils.validation import LARGEST
 from .bnn_model import Layer, VariationalNetwork

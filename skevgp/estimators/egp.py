@@ -16,19 +16,15 @@ from sklearn.utils import check_random_state
 
 from ..data.dask import is_dask
 from ..data.threads import single_threaded_libraries
-from ..fitting.advice import interrupted
-from ..fitting.exact import ExactFit, ExactOptions, fit_exact
-from ..fitting.rules import LOWEST_NOISE_EXACT
+from ..fitting.exact import ExactFit, fit_exact, value_at
+from ..fitting.messages import interrupted
+from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
-from ..fitting.theta import value_at
-from ..solvers.solvers import LBFGS
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import unchanged_if_it_fails
 from .base import ExplicitGaussianProcess
-from .intake import Problem
 
-_RULES = replace(LBFGS.rules, lowest_noise=LOWEST_NOISE_EXACT)
 # Of so many, an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
 
@@ -261,22 +257,14 @@ class EGPRegressor(ExplicitGaussianProcess):
             monitor_of(self.verbose, max_time=self.max_time) as monitor,
         ):
             problem = self._exact_problem(X, y, sample_weight, relative_variance)
-            rows = problem.units.rows(problem.source)
-            options = ExactOptions(
-                _RULES,
-                0 if self.optimizer is None else self.max_iter,
-                self._tolerance(len(rows)),
-                self.n_restarts,
-                self.optimizer if callable(self.optimizer) else None,
-            )
+            problem = replace(problem, max_iter=0 if self.optimizer is None else self.max_iter)
             self._fitted = fit_exact(
-                problem.units,
-                rows,
-                problem.spec,
-                problem.vague,
-                options,
+                problem,
                 check_random_state(self.random_state),
                 monitor,
+                self.n_restarts,
+                self._tolerance(problem.source.n_rows),
+                self.optimizer if callable(self.optimizer) else None,
             )
             self._set_common_attributes()
             if problem.vague.any():

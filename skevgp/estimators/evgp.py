@@ -14,11 +14,10 @@ from sklearn.utils import check_random_state
 
 from ..data.threads import single_threaded_libraries
 from ..exceptions import DependentRowsWarning, warn_user
-from ..fitting.advice import DEPENDENT_ROWS, interrupted
-from ..fitting.outputs import fit_outputs
-from ..fitting.plan import Sharing
-from ..fitting.sharing import with_groups
-from ..solvers.solvers import LBFGS, Adam, check_weights, resolved
+from ..fitting.fit import fit_model
+from ..fitting.messages import DEPENDENT_ROWS, interrupted
+from ..fitting.problem import Sharing
+from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import check_integer, unchanged_if_it_fails
@@ -376,7 +375,7 @@ class EVGPRegressor(SparseGaussianProcess):
             slowly, and none is sorted) and their log density would be lower by 0.1: ``groups`` should say which belong
             together.
         """
-        solver = resolved(self.solver, self.posterior)
+        solver = as_solver(self.solver)
         if not isinstance(self.n_inducing, str):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
@@ -386,14 +385,13 @@ class EVGPRegressor(SparseGaussianProcess):
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
             problem = self._problem(X, y, sample_weight, relative_variance, groups)
             self._training_data = problem.data
-            request = self._request(problem, solver)
-            check_weights(solver, self.posterior, problem.units.prior, self.sharing, problem.per_output)
+            problem = self._asked(problem, solver)
+            problem.check()
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
-            request = with_groups(request, rng, monitor, previous)
-            self._fitted = fit_outputs(request, rng, monitor, previous)
+            self._fitted = fit_model(problem, rng, monitor, previous)
             if self.input_noise is not None:
-                self._fitted = self._with_noisy_inputs(request, rng, monitor)
+                self._fitted = self._with_noisy_inputs(problem, rng, monitor)
             self._set_attributes()
             self._set_weights(problem.data[-1])
         self._warn_of((interrupted(self.n_iter_),) if monitor.interrupted else self._fitted.messages)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any, Literal
 
@@ -20,6 +19,7 @@ from ..data.maps import example_of, fit_map, take_rows
 from ..data.row_weights import chosen_rows
 from ..data.source import LocalSource, Moments, Source, moments_of_rows
 from ..fitting.coef_prior import resolve_coef_prior, says_shared, wide_scale
+from ..fitting.problem import Problem
 from ..fitting.units import Units
 from ..kernels.parse import KernelSpec, parse_kernel
 from ..model.predictor import CoefficientPrior
@@ -41,39 +41,6 @@ _VAGUE = 1e3
 _NEGLIGIBLE = 1e-80
 # What features may add, in units of what they leave: its square, by the least noise variance, has to be finite.
 _LARGEST_SPREAD = 1e130
-
-
-@dataclass(frozen=True)
-class Problem:
-    """What a fit starts from.
-
-    Attributes
-    ----------
-    data : tuple
-        What `Intake._source` makes the source from.
-    source : Source
-        The rows through the maps.
-    units : Units
-    spec : KernelSpec
-        With the start of the noise.
-    vague : ndarray of shape (o, p)
-        Which weights have an infinite prior scale; in ``units.prior`` theirs is very wide.
-    n_columns : int
-        Width of the kernel's inputs.
-    per_output : bool
-        Whether outputs have inputs or features of their own.
-    groups : ndarray of shape (n,), optional
-        The group of each row of the source.
-    """
-
-    data: tuple[Any, Any, np.ndarray, Any]
-    source: Source
-    units: Units
-    spec: KernelSpec
-    vague: np.ndarray
-    n_columns: int
-    per_output: bool
-    groups: np.ndarray | None
 
 
 class Intake(StatefulEstimator):

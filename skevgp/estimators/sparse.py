@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import closing
 from dataclasses import replace
-from functools import partial
 from typing import Any, Literal, Self
 
 import numpy as np
@@ -13,20 +11,17 @@ from numpy.typing import ArrayLike
 
 from ..data.dask import is_dask
 from ..data.row_weights import chosen_rows
-from ..data.threads import BlockMap, single_threaded_libraries
-from ..fitting.fitted import FittedOutputs
-from ..fitting.folds import CrossValidation
+from ..data.threads import single_threaded_libraries
+from ..fitting.calibration import CrossValidation
+from ..fitting.fit import Fitted, fit_model
 from ..fitting.inducing import Placement
-from ..fitting.outputs import fit_outputs
-from ..fitting.plan import Request, Sharing
-from ..fitting.theta import value_at
+from ..fitting.problem import Problem, Sharing
 from ..noise.inputs import fit_to_noisy_inputs, input_covariance, relative_noise, variance_by_inputs
-from ..solvers.solvers import LBFGS, Adam, resolved
+from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import Monitor
 from ..utils.sklearn import fit_context
 from ..utils.validation import check_magnitude, unchanged_if_it_fails
 from .base import ExplicitGaussianProcess
-from .intake import Problem
 
 
 class SparseGaussianProcess(ExplicitGaussianProcess):
@@ -46,7 +41,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
     forgetting_factor: float
     n_jobs: int | None
 
-    _fitted: FittedOutputs
+    _fitted: Fitted
     _training_data: tuple[Any, Any, np.ndarray, Any] | None = None
 
     @fit_context(prefer_skip_nested_validation=False)
@@ -112,50 +107,6 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             self._set_weights(chosen)
         return self
 
-    def lower_bound(self, theta: ArrayLike | None = None, eval_gradient: bool = False) -> Any:
-        """Bound the log marginal likelihood under another kernel, with the fitted noise and inducing points.
-
-        With q at its optimum, for the rows of the last `fit`, as they now are. The model refers to them, which keeps
-        them in memory (not in pickles and copies).
-
-        Parameters
-        ----------
-        theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
-            Logarithms of the free hyperparameters, as ``kernel_.theta``; of several outputs one row each, which need
-            not agree in what the fitted kernels share. None means the fitted ones.
-        eval_gradient : bool, default=False
-            Whether to return the gradient too; only with a ``theta``.
-
-        Returns
-        -------
-        bound : float
-            In nats, summed over outputs.
-        gradient : ndarray of the shape of ``theta``
-            If ``eval_gradient``. For what outputs share add up its rows.
-
-        Raises
-        ------
-        ValueError
-            If ``theta`` has another shape or is out of range, a gradient is asked for without it, or the rows are gone:
-            after `partial_fit`, and in copies and pickles, which leave them out.
-        """
-        self._check_gradient_of(theta, eval_gradient)
-        if theta is None:
-            return self.lower_bound_
-        if self._predictor.shared:
-            raise ValueError("lower_bound(theta) needs outputs with weights of their own: no share_coef.")
-        if self.input_noise is not None:
-            raise ValueError("lower_bound(theta) needs rows whose noise does not hang on the kernel: no input_noise.")
-        if self._training_data is None:
-            raise ValueError(
-                "lower_bound(theta) needs the rows of fit, and this model has none: partial_fit keeps none, and copies "
-                "and pickles of a model leave them out. Call fit, or lower_bound() for the fitted kernel."
-            )
-        with closing(BlockMap(effective_n_jobs(self.n_jobs))) as threads, single_threaded_libraries():
-            rows = self._fitted.units.rows(self._source(*self._training_data), threads)
-            order, kernels = self._spec.order, self._numbers_of_kernels()
-            return value_at(theta, eval_gradient, order, kernels, partial(self._fitted.bound_at, rows))
-
     def set_params(self, **params: Any) -> Self:
         """Set parameters; by ``solver__...`` a solver that is a string becomes what it stands for.
 
@@ -170,7 +121,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
             The estimator itself.
         """
         if isinstance(self.solver, str) and any(name.startswith("solver__") for name in params):
-            self.solver = resolved(self.solver, self.posterior)
+            self.solver = as_solver(self.solver)
         return super().set_params(**params)
 
     def __getstate__(self) -> dict[str, Any]:
@@ -209,7 +160,7 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         points = [group.points for group in self._predictor.by_output]
         same = len({len(own) for own in points}) == 1
         self.inducing_points_: Any = np.array(points) if same else points
-        sets = [own for one in fitted.learned for own in one.values["inducing_points"]]
+        sets = [own for one in fitted.models for own in one.values["inducing_points"]]
         if len(sets) == 1:
             self.inducing_points_ = points[0]
         self.sharing_ = fitted.sharing
@@ -229,33 +180,30 @@ class SparseGaussianProcess(ExplicitGaussianProcess):
         if all(is_asked for _, is_asked in asked):
             raise ValueError('input_noise and noise="student-t" do not go together; give one of them.')
 
-    def _with_noisy_inputs(self, request: Request, rng: np.random.RandomState, monitor: Monitor) -> FittedOutputs:
+    def _with_noisy_inputs(self, problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> Fitted:
         """The fit once its rows are as noisy as their inputs make them."""
         assert self.input_noise is not None
         assert self._training_data is not None
         covariance = input_covariance(self.input_noise, self.n_features_in_)
 
-        def refit(variance: np.ndarray, before: FittedOutputs) -> FittedOutputs:
-            return fit_outputs(replace(request, row_variance=variance), rng, monitor, before)
+        def refit(variance: np.ndarray, before: Fitted) -> Fitted:
+            return fit_model(replace(problem, row_variance=variance), rng, monitor, before)
 
         return fit_to_noisy_inputs(self, self._fitted, self._training_data, covariance, refit, monitor)
 
-    def _request(self, problem: Problem, solver: LBFGS | Adam) -> Request:
-        """What the fits of all outputs are asked for."""
+    def _asked(self, problem: Problem, solver: LBFGS | Adam) -> Problem:
+        """The problem with what the arguments say of the fits."""
         folds = self.noise_cv
         free_signal = problem.spec.starts.signal.bounds is None
-        return Request(
-            problem.source,
-            problem.units,
-            problem.spec,
-            self.sharing,
-            self.posterior,
-            Placement.of(self.inducing_init, self.n_inducing, self.max_inducing, problem.n_columns),
-            solver,
-            solver.default_max_iter if self.max_iter is None else self.max_iter,
-            None if isinstance(self.tol, str) else self.tol,
-            None if folds is None else CrossValidation(folds, problem.groups, free_signal),
-            effective_n_jobs(self.n_jobs),
-            problem.per_output,
+        return replace(
+            problem,
+            sharing=self.sharing,
+            family=self.posterior,
+            placement=Placement.of(self.inducing_init, self.n_inducing, self.max_inducing, problem.n_columns),
+            solver=solver,
+            max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,
+            tol=None if isinstance(self.tol, str) else self.tol,
+            noise_cv=None if folds is None else CrossValidation(folds, problem.groups, free_signal),
+            n_threads=effective_n_jobs(self.n_jobs),
             heavy_tails=self.noise == "student-t",
         )

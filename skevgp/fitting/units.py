@@ -300,19 +300,18 @@ class Units:
         The size of what the features alone leave over.
     prior : CoefficientPrior
         In the user's units.
-    target_scatter, rounding : ndarray of shape (o,), optional
-        The targets' variance, and that of the rounding of their largest value, in squared target units; not known of a
-        model from a file.
-    constant : ndarray of bool of shape (o,), optional
-        Targets that do not vary and of which nothing is left over (`unit_of`); not known of a model from a file.
+    target_scatter, rounding : ndarray of shape (o,)
+        The targets' variance, and that of the rounding of their largest value, in squared target units.
+    constant : ndarray of bool of shape (o,)
+        Targets that do not vary and of which nothing is left over (`unit_of`).
     """
 
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
-    target_scatter: np.ndarray | None = None
-    rounding: np.ndarray | None = None
-    constant: np.ndarray | None = None
+    target_scatter: np.ndarray
+    rounding: np.ndarray
+    constant: np.ndarray
 
     @classmethod
     def of(

@@ -9,7 +9,7 @@ import numpy as np
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from ..estimators.evgp import EVGPRegressor
-from ..fitting.advice import signal_gone
+from ..fitting.messages import signal_gone
 from .stiction import JointNoise, likeliest_noise, noise_at
 
 # What is left of a torque, squared: less is nothing, and no kernel's variance.

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
 from ..control.compiled import CompiledPredictor
-from ..fitting.fitted import FittedOutputs
+from ..fitting.fit import Fitted
 from ..model.predictor import Predictor
 from ..utils.monitor import Monitor
 from ..utils.validation import LARGEST, as_floats, check_magnitude, is_frame
@@ -132,19 +132,19 @@ def _own_variance(squares: np.ndarray, by_inputs: np.ndarray, counts: np.ndarray
 
 def fit_to_noisy_inputs(
     model: Model,
-    fitted: FittedOutputs,
+    fitted: Fitted,
     data: tuple[Any, Any, np.ndarray, Any],
     covariance: np.ndarray,
-    refit: Callable[[np.ndarray, FittedOutputs], FittedOutputs],
+    refit: Callable[[np.ndarray, Fitted], Fitted],
     monitor: Monitor,
-) -> FittedOutputs:
+) -> Fitted:
     """Fits whose rows are as noisy as their inputs make them.
 
     Parameters
     ----------
     model : estimator
         With its maps; its predictor is set on the way.
-    fitted : FittedOutputs
+    fitted : Fitted
         As if inputs were exact.
     data : tuple
         Of the fit: what the maps see, X, y, and the rows that count.

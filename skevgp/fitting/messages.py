@@ -1,4 +1,4 @@
-"""What the user should know of how a fit went: sentences, empty if there is nothing to say."""
+"""Messages: what the user should know of how a fit went. Each is empty if there is nothing to say."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from ..data.internal import Rows
 from ..model.parameters import ParameterTable, Values
 from ..model.predictor import CoefficientPrior
 from ..model.statistics import Kernel
-from ..solvers.minimum import Minimum
+from ..solvers.base import Minimum
 from .start import alike_neighbours, neighbours
 
 # When no start got below this share, the user should know.
@@ -26,7 +26,7 @@ DEPENDENT_ROWS = (
 )
 
 
-def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
+def lbfgs_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
     """Why L-BFGS ended before it converged; nothing if it did.
 
     Parameters
@@ -53,6 +53,22 @@ def how_it_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None
         f"The {'bound' if sparse else 'likelihood'} was still rising after max_iter={max_iter} iterations. Raise "
         f"max_iter, or stop earlier on purpose with {sooner}."
     )
+
+
+def adam_ended(minimum: Minimum, fell: bool, learning_rate: float, batch_size: int) -> str:
+    """Why Adam's result is not what was hoped for; nothing if it is."""
+    if not minimum.converged:
+        return (
+            f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
+            f"(now {learning_rate}), or raise batch_size (now {batch_size})."
+        )
+    if fell:
+        return (
+            f"Adam ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters "
+            "are kept. Raise max_iter (steps become small only towards the end) or batch_size, or lower "
+            f"learning_rate (now {learning_rate})."
+        )
+    return ""
 
 
 def interrupted(n_iter: int, max_time: float | None = None) -> str:
