@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data.source import Columns
+from ..data.rows import Columns
 from ..kernels.symbolic import cross_and_diagonal
 from ..maps.symbolic import Mapped, mapped
 from ..model.predictor import Predictor, PredictorGroup

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from ..data.source import of_outputs
+from ..data.rows import of_outputs
 from ..maps.derivatives import MappedRows, chained, mapped
 from ..maps.maps import maps_of
 from ..model.predictor import Predictor, PredictorGroup

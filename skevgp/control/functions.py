@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data.source import of_outputs
+from ..data.rows import of_outputs
 from ..kernels.waves import RandomFunctions, random_functions
 from ..maps.derivatives import MappedRows, chained, mapped
 from ..model.predictor import Predictor, PredictorGroup

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..data.source import times_weights
+from ..data.rows import times_weights
 from ..maps.elementary import DirectMap
 from ..model.predictor import Predictor, PredictorGroup, Projected
 

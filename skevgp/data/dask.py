@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from sklearn.utils import check_array
 
 from ..utils.optional import require
-from ..utils.validation import as_floats, check_magnitude
+from ..utils.validation import as_floats, check_magnitude, is_dask
 from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
-from .chosen import Chosen
-from .mapped import MappedRows, RowShapes
-from .maps import EXAMPLE_ROWS, fit_map, fresh_map, spread
-from .source import LocalSource, RawRows
+from .maps import EXAMPLE_ROWS, MappedRows, RowShapes, fit_map, fresh_map, spread
+from .rows import LocalSource, RawRows, made
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
+from .weights import Chosen
 
 # Sums of so many partitions are added up on a worker at a time.
 _SUMMED_AT_ONCE = 8
@@ -27,11 +26,6 @@ _MAP_SAMPLE = 10_000
 
 # Takes the lowest and the highest of some numbers, and raises an error if they will not do.
 Range = Callable[[float, float], None]
-
-
-def is_dask(values: Any) -> bool:
-    """Whether it is a Dask collection; does not import Dask."""
-    return hasattr(values, "__dask_graph__")
 
 
 def _dask() -> Any:
@@ -321,7 +315,7 @@ def _some(partition: LocalSource, rows: np.ndarray) -> LocalSource:
 
 
 def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:
-    return LocalBlocks(partition.through(make), partition.n_rows, n_inducing, keep=False)
+    return LocalBlocks(partial(made, partition.take, make), partition.n_rows, n_inducing, keep=False)
 
 
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:

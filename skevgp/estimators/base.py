@@ -11,14 +11,14 @@ from sklearn.base import MultiOutputMixin, RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 
-from ..data.dask import as_rows, is_dask, predict_chunks
+from ..data.dask import as_rows, predict_chunks
 from ..exceptions import warn_user
 from ..fitting.coef_prior import coef_names
 from ..fitting.units import Units
 from ..model.predictor import Predictor
 from ..utils.shapes import like_y
 from ..utils.sklearn import Interval, StrOptions
-from ..utils.validation import check_fitted, check_integer, is_plain
+from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
 from .control import ForControl
 from .exportable import Exportable
 from .summary import ModelSummary, Summarised, of_gaussian_process

@@ -13,9 +13,8 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.chosen import Chosen, rows_of
-from ..data.row_weights import chosen_rows
 from ..data.threads import single_threaded_libraries
+from ..data.weights import Chosen, chosen_rows, rows_of
 from ..exceptions import warn_user
 from ..utils.monitor import monitor_of
 from ..utils.shapes import like_y

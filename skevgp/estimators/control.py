@@ -12,12 +12,11 @@ from sklearn.utils import check_random_state
 from ..control.compiled import CompiledPredictor
 from ..control.functions import FunctionSamples
 from ..control.paths import Functions
-from ..data.dask import is_dask
 from ..maps.derivatives import gradient_covariance, mapped
 from ..maps.maps import maps_of
 from ..model.predictor import Predictor
 from ..utils.shapes import like_y
-from ..utils.validation import check_fitted, check_integer, is_plain
+from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
 from .intake import Intake
 
 # Of the derivatives of all rows at once.

@@ -14,7 +14,6 @@ from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
-from ..data.dask import is_dask
 from ..data.threads import single_threaded_libraries
 from ..fitting.exact import ExactFit, fit_exact, value_at
 from ..fitting.messages import interrupted
@@ -22,7 +21,7 @@ from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import unchanged_if_it_fails
+from ..utils.validation import is_dask, unchanged_if_it_fails
 from .base import ExplicitGaussianProcess
 
 # Of so many, an iteration takes a few milliseconds at most.

@@ -12,12 +12,10 @@ from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils.validation import validate_data
 
-from ..data.chosen import Chosen
-from ..data.dask import DaskSource, aligned, dask_example, fit_map_to_chunks, is_dask
-from ..data.mapped import MappedRows, RowShapes, check_shapes, map_rows
-from ..data.maps import example_of, fit_map, take_rows
-from ..data.row_weights import chosen_rows
-from ..data.source import LocalSource, Moments, Source, moments_of_rows
+from ..data.dask import DaskSource, aligned, dask_example, fit_map_to_chunks
+from ..data.maps import MappedRows, RowShapes, check_shapes, example_of, fit_map, map_rows, take_rows
+from ..data.rows import LocalSource, Moments, Source, moments_of_rows
+from ..data.weights import Chosen, chosen_rows
 from ..fitting.coef_prior import resolve_coef_prior, says_shared, wide_scale
 from ..fitting.problem import Problem
 from ..fitting.units import Units
@@ -29,6 +27,7 @@ from ..utils.validation import (
     check_magnitude,
     check_not_vanishing,
     checked_groups,
+    is_dask,
     is_frame,
     validate_frame,
     validate_numbers,

@@ -14,9 +14,9 @@ from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, proces
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..data.dask import aligned, as_rows, is_dask
+from ..data.dask import aligned, as_rows
 from ..utils.sklearn import HasMethods, fit_context
-from ..utils.validation import FLOATS, is_frame, unchanged_if_it_fails, validate_frame, validate_numbers
+from ..utils.validation import FLOATS, is_dask, is_frame, unchanged_if_it_fails, validate_frame, validate_numbers
 from .residual_control import ResidualForControl, columns_of, regressor_has
 
 

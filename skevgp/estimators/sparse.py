@@ -9,9 +9,8 @@ import numpy as np
 from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 
-from ..data.dask import is_dask
-from ..data.row_weights import chosen_rows
 from ..data.threads import single_threaded_libraries
+from ..data.weights import chosen_rows
 from ..fitting.calibration import CrossValidation
 from ..fitting.fit import Fitted, fit_model
 from ..fitting.inducing import Placement
@@ -20,7 +19,7 @@ from ..noise.inputs import fit_to_noisy_inputs, input_covariance, relative_noise
 from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import Monitor
 from ..utils.sklearn import fit_context
-from ..utils.validation import check_magnitude, unchanged_if_it_fails
+from ..utils.validation import check_magnitude, is_dask, unchanged_if_it_fails
 from .base import ExplicitGaussianProcess
 
 

@@ -30,7 +30,7 @@ from scipy.stats import norm
 from scipy.stats import t as student_t
 
 from ..data.blocks import AnyBlock
-from ..data.internal import Rows
+from ..data.rows import Rows
 from ..model.bounds import Group, PosteriorFamily, bounds_at_optimum, projected
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values

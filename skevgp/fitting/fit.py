@@ -8,8 +8,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..data.internal import Rows
-from ..data.source import Source
+from ..data.rows import Rows, Source
 from ..data.threads import BlockMap, side_by_side
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values

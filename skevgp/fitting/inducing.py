@@ -9,7 +9,7 @@ import numpy as np
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
-from ..data.source import Moments
+from ..data.rows import Moments
 from ..exceptions import ignored
 from ..model.statistics import Kernel, Whitening
 from ..utils.validation import as_floats, check_magnitude

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..data.internal import Rows
+from ..data.rows import Rows
 from ..model.parameters import ParameterTable, Values
 from ..model.predictor import CoefficientPrior
 from ..model.statistics import Kernel

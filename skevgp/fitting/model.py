@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 
 from ..data.blocks import Blocks
-from ..data.internal import Rows
-from ..data.source import of_outputs
+from ..data.rows import Rows, of_outputs
 from ..data.threads import BlockMap
 from ..model.bounds import bounds_alone
 from ..model.exact import ExactModel, LikelihoodObjective

@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..data.internal import Rows
-from ..data.source import LocalSource
+from ..data.rows import LocalSource, Rows
 from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.student_t import RowScales

@@ -8,7 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..data.source import Source
+from ..data.rows import Source
 from ..kernels.parse import KernelSpec
 from ..model.bounds import PosteriorFamily
 from ..solvers import LBFGS, Adam

@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..data.internal import Rows
-from ..data.source import LocalSource
+from ..data.rows import LocalSource, Rows
 from ..data.threads import BlockMap, side_by_side
 from ..model.parameters import ParameterTable, Values
 from ..solvers import LBFGS

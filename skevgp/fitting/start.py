@@ -8,8 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..data.internal import Rows
-from ..data.source import Moments, RawRows
+from ..data.rows import Moments, RawRows, Rows
 from ..kernels.covariances import Covariance
 from ..kernels.parse import KernelSpec, Start
 from ..model.parameters import Parameter, ParameterTable

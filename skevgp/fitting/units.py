@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import svd
 
-from ..data.internal import Rows
-from ..data.source import Columns, Moments, RawRows, Source, times_weights
+from ..data.rows import Columns, Moments, RawRows, Rows, Source, times_weights
 from ..data.threads import BlockMap
 from ..model.predictor import CoefficientPrior, Predictor
 from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse

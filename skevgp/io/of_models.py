@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..data.source import RawRows
+from ..data.rows import RawRows
 from ..estimators.bnn import BayesianMLPRegressor
 from ..estimators.bnn_model import VariationalNetwork
 from ..estimators.bnn_training import Scaling

@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from ..data.source import RawRows
+from ..data.rows import RawRows
 from ..utils.linalg import (
     NotPositiveDefiniteError,
     diagonal_of,
