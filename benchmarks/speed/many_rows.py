@@ -24,11 +24,11 @@ from typing import Any, ClassVar
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
+from skevgp.fitting.rules import Rules
 
 import harness
 from harness import Row
 from skevgp import EVGPRegressor
-from skevgp.fitting.rules import Rules
 from skevgp.metrics import negative_log_predictive_density
 from skevgp.solvers import LBFGS, Adam
 from speed.scaling import N_INDUCING, make_files
@@ -76,7 +76,7 @@ def run(cell: Cell) -> dict[str, Any]:
         steps = EPOCHS[cell.fit] * cell.n_rows // BATCH_SIZE
         model.set_params(solver=Adam(batch_size=BATCH_SIZE, natural_gradient=True), max_iter=steps)
     elif cell.fit == "reference":
-        model.set_params(solver=OnAllRows(), max_iter=cell.max_iter, tol=0.0)
+        model.set_params(solver=OnAllRows(tol=0.0), max_iter=cell.max_iter)
     with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
         warnings.simplefilter("always")
         start, cpu_start = time.perf_counter(), time.process_time()

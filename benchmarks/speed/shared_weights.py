@@ -28,7 +28,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 import harness
 from harness import Row
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
 from skevgp.solvers import LBFGS
 
 N_OUTPUTS, N_FEATURES, N_COLUMNS = 6, 40, 3
@@ -76,7 +76,7 @@ def evaluations(cell: Cell, share_coef: bool) -> Callable[[], None]:
         Waves(),
         kernel_map=FunctionTransformer(own_columns),
         n_inducing=cell.m,
-        share_coef=share_coef,
+        coef_prior=CoefPrior(shared=share_coef),
         sharing="none",
         noise_cv=None,
         solver=Caught(),
