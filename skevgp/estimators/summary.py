@@ -75,11 +75,12 @@ class ModelSummary:
     --------
     >>> from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     >>> from sklearn.preprocessing import PolynomialFeatures
-    >>> from skevgp import EGPRegressor
+    >>> from skevgp import CoefPrior, EGPRegressor
     >>> from skevgp.datasets import make_toy
     >>> X, y = make_toy(random_state=0, return_X_y=True)
     >>> kernel = ConstantKernel(25.0) * RBF(0.6) + WhiteKernel(2.8)
-    >>> model = EGPRegressor(PolynomialFeatures(1), kernel, coef_scale=[[2.0, 5.0]], max_iter=0).fit(X, y)
+    >>> prior = CoefPrior(scale=[[2.0, 5.0]])
+    >>> model = EGPRegressor(PolynomialFeatures(1), kernel, coef_prior=prior, max_iter=0).fit(X, y)
     >>> print(model.summary())
     EGPRegressor, exact, for 1 output
     log marginal likelihood: -410.85 nats
