@@ -13,6 +13,8 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.kernels import Cosine
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (40, 2))
@@ -37,7 +39,7 @@ KERNELS = {
 def start(regressor=EGPRegressor, kernel=None, y=Y[:, 0], **arguments):
     """A model whose kernel is where the user said."""
     kernel = 2.0 * RBF([1.0, 2.0]) if kernel is None else kernel
-    return regressor(kernel=kernel, noise_variance=0.1, **{"max_iter": 0} | arguments).fit(X, y)
+    return regressor(kernel=kernel, noise=Gaussian(variance=0.1), **({"max_iter": 0} | arguments)).fit(X, y)
 
 
 def elsewhere(model, seed=0):
@@ -139,7 +141,9 @@ def fitted_value(model):
 
 
 @pytest.mark.parametrize(
-    "model", [EGPRegressor(tol=1e-7), EVGPRegressor(n_inducing=8, tol=1e-7, random_state=0)], ids=["exact", "sparse"]
+    "model",
+    [EGPRegressor(tol=1e-7), EVGPRegressor(n_inducing=8, solver=LBFGS(tol=1e-7), random_state=0)],
+    ids=["exact", "sparse"],
 )
 def test_a_fit_ends_where_the_gradient_vanishes(model):
     model = model.fit(X, Y[:, 0])
@@ -236,7 +240,9 @@ def test_a_theta_stays_in_a_kernel_that_is_not_cloned(y):
 
 
 def test_dask_has_the_same_bound():
-    there = EVGPRegressor(TREND, KERNELS["constant in front"], inducing_init=X[:6], noise_variance=0.1, max_iter=0)
+    there = EVGPRegressor(
+        TREND, KERNELS["constant in front"], inducing_init=X[:6], noise=Gaussian(variance=0.1), max_iter=0
+    )
     here = copy.deepcopy(there).fit(X, Y[:, 0])
     there = there.fit(da.from_array(X, chunks=(15, 2)), da.from_array(Y[:, 0], chunks=15))
     theta = elsewhere(here)
@@ -291,7 +297,9 @@ def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
     jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
     x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
     kernel = ConstantKernel(1.0, "fixed") * DotProduct(1.0)
-    model = EVGPRegressor(kernel=kernel, inducing_init=x[6:], posterior="diagonal", noise_variance=0.1, max_iter=0)
+    model = EVGPRegressor(
+        kernel=kernel, inducing_init=x[6:], solver=LBFGS(posterior="diagonal"), noise=Gaussian(variance=0.1), max_iter=0
+    )
     model.fit(x, RNG.randn(9))
     theta = model.kernel_.theta
     slope = (model.lower_bound(theta + 0.01) - model.lower_bound(theta - 0.01)) / 0.02

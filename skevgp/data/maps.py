@@ -13,6 +13,7 @@ from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.utils.validation import has_fit_parameter
 
+from ..utils.frames import FrameColumns
 from ..utils.sklearn import safe_indexing
 from ..utils.validation import LARGEST, as_floats, check_magnitude, is_frame
 from .rows import RawRows
@@ -299,6 +300,14 @@ class Maps:
     n_columns: int = 0
     columns: np.ndarray | None = None
     shapes: RowShapes | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A data frame as arrays: whoever reads it need not have its package.
+        return {**vars(self), "example": FrameColumns.of(self.example) or self.example}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        example = state["example"]
+        vars(self).update(state, example=example.frame() if isinstance(example, FrameColumns) else example)
 
     def rows(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The kernel's inputs and the features of some rows, given as the maps see them and as the kernel does."""
