@@ -234,7 +234,7 @@ def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch
     settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
     settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
     m = fitted(**settings)
-    monkeypatch.setattr("skevgp.data.chosen.ORDERED_ROWS", 0)
+    monkeypatch.setattr("skevgp.data.weights.ORDERED_ROWS", 0)
     np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
 
 

@@ -12,7 +12,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.data import chosen
+from skevgp.data import weights
 from skevgp.solvers import Adam
 
 # A few iterations are enough to compare.
@@ -161,7 +161,7 @@ def at_fixed_points(**parameters):
 @pytest.mark.parametrize("parameters", [{}, {"posterior": "diagonal"}, {"kernel_map": StandardScaler()}], ids=str)
 def test_many_rows_are_weighed_where_they_stand(parameters, monkeypatch):
     small = at_fixed_points(**parameters).fit(X, Y, WEIGHTS, relative_variance=NOISE)
-    monkeypatch.setattr(chosen, "ORDERED_ROWS", 10)
+    monkeypatch.setattr(weights, "ORDERED_ROWS", 10)
     large = at_fixed_points(**parameters).fit(X, Y, WEIGHTS, relative_variance=NOISE)
     assert_same(large, small)
     assert large.upper_bound_ == pytest.approx(small.upper_bound_, rel=1e-8)
@@ -181,7 +181,7 @@ def test_blocks_threads_and_pieces_do_not_matter():
 
 
 def test_memory_maps(tmp_path, monkeypatch):
-    monkeypatch.setattr(chosen, "ORDERED_ROWS", 10)
+    monkeypatch.setattr(weights, "ORDERED_ROWS", 10)
     path = tmp_path / "x.npy"
     np.save(path, X)
     mapped = np.load(path, mmap_mode="r")

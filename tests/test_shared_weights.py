@@ -14,7 +14,7 @@ from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.data.source import RawRows
+from skevgp.data.rows import RawRows
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.exact import ExactModel
 from skevgp.model.predictor import CoefficientPrior

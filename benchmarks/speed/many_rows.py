@@ -28,7 +28,7 @@ import numpy as np
 import harness
 from harness import Row
 from skevgp import EVGPRegressor
-from skevgp.fitting.rules import Rules
+from skevgp.fitting.search import Rules
 from skevgp.metrics import negative_log_predictive_density
 from skevgp.solvers import LBFGS, Adam
 from speed.scaling import N_INDUCING, make_files

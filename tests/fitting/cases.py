@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from skevgp.data.source import LocalSource, Moments
+from skevgp.data.rows import LocalSource, Moments
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.plan import Request
 from skevgp.fitting.units import Units
@@ -21,7 +21,7 @@ COEF_MEAN, COEF_SCALE = np.array([[0.5, 0.0], [0.0, 10.0]]), np.array([[2.0, 1.0
 
 
 def source_of(X=X, H=H, Y=Y):
-    return LocalSource.of(X, H, Y)
+    return LocalSource.holding(RawRows(X, H, Y))
 
 
 def units_of(X=X, H=H, Y=Y, target_mean=0.0):

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.calibrate import calibrated
-from skevgp.fitting.calibration_search import Limits, Search
-from skevgp.fitting.folds import CrossValidation, random_folds
+from skevgp.fitting.calibration import calibrated
+from skevgp.fitting.calibration import Limits, Search
+from skevgp.fitting.calibration import CrossValidation, random_folds
 
 from ..oracle import problem
 from .test_left_out import left_out, rows_of

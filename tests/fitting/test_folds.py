@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
 
-from skevgp.fitting.folds import (
+from skevgp.fitting.calibration import (
     FEWEST_ROWS,
     PREDICTED_ROWS,
     CrossValidation,

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 from scipy.linalg import block_diag, solve_triangular
 
-from skevgp.data.internal import Rows
-from skevgp.data.source import LocalSource, RawRows
-from skevgp.fitting.left_out import LeftOut, Seen, prior_of, sums_of_others
+from skevgp.data.rows import Rows
+from skevgp.data.rows import LocalSource, RawRows
+from skevgp.fitting.calibration import LeftOut, Seen, prior_of, sums_of_others
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.model.statistics import collect
 
@@ -130,7 +130,7 @@ def test_left_out_rows_are_predicted_as_by_refits_without_their_fold(family, sha
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_of_many_features_too(family, joint, monkeypatch):
     """More of them than inducing points are not made diagonal at each ratio."""
-    monkeypatch.setattr("skevgp.fitting.left_out._MANY_FEATURES", 0)
+    monkeypatch.setattr("skevgp.fitting.calibration._MANY_FEATURES", 0)
     model, rows, table = problem(family, p=7)
     if joint:
         reference = np.repeat(model.prior.reference[:1], 2, axis=0)

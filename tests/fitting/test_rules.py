@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from skevgp.fitting.rules import Rules
+from skevgp.fitting.search import Rules
 
 RULES = Rules(first_noise=1e-4)
 

@@ -6,7 +6,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from skevgp.fitting.rules import Rules
+from skevgp.fitting.search import Rules
 from skevgp.fitting.strategy import Attempt, Fit, Strategy, better, drawn, search
 from skevgp.model.parameters import Parameter, ParameterTable
 from skevgp.utils.monitor import Monitor

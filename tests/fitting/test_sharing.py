@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
-from skevgp.data.source import LocalSource
+from skevgp.data.rows import LocalSource
 from skevgp.fitting import sharing
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.outputs import fit_outputs

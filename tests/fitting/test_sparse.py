@@ -7,7 +7,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.folds import CrossValidation
+from skevgp.fitting.calibration import CrossValidation
 from skevgp.fitting.inducing import Placement
 from skevgp.fitting.learned import Learned
 from skevgp.fitting.plan import plan

@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
 
-from skevgp.data.source import Moments
+from skevgp.data.rows import Moments
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.rules import Rules
+from skevgp.fitting.search import Rules
 from skevgp.fitting.start import alike_neighbours, parameter_of, starting_table
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from skevgp.data.source import LocalSource, Moments, RawRows
+from skevgp.data.rows import LocalSource, Moments, RawRows
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.model.predictor import CoefficientPrior
 

@@ -19,15 +19,13 @@ from sklearn.gaussian_process.kernels import (
 
 from skevgp import EVGPRegressor
 from skevgp.data.blocks import Batch
-from skevgp.data.source import Moments
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import checked_variance, starting_table
+from skevgp.fitting.start import checked_variance
 from skevgp.kernels import FunctionKernel
 from skevgp.kernels.parse import Start, Starts, parse_kernel
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective, ElboObjective
 
-from ..oracle import central_differences, problem, relative_error
+from ..oracle import central_differences, problem, relative_error, table_of
 from .cases import KERNELS, REGISTERED, Z, parsed, polynomial, smooth
 
 
@@ -40,8 +38,8 @@ def model_with(kernel, shared=True, **sizes):
     points = table["inducing_points"].start
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
     variance = checked_variance(covariance, spec.starts.hyperparameters.value, points[0])
-    inputs, ones, size = Moments.of(rows.inputs), np.ones(2), covariance.n_hyperparameters
-    table = starting_table(inputs, points, ones, starts, ones, Rules(1e-2), size, variance)
+    size = covariance.n_hyperparameters
+    table = table_of(rows.inputs, points, starts, np.ones(2), size, mean_variance=variance)
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
 
 

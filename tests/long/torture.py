@@ -197,7 +197,7 @@ def _hidden_nats(model, bound, X, y):
     y = np.asarray(y, dtype=float).reshape(len(X), -1)
     # Targets are known to their last digit, and what is left over of them no better.
     nats += 0.5 * np.sum((np.finfo(float).eps * y) ** 2 / model.noise_variance_)
-    for one in model._fitted.learned:
+    for one in model._fitted.models:
         if one.model.complete:
             # The eigenvalues of what a jitter j leaves of K are no larger than j times the rows that are the same.
             m = one.values["inducing_points"].shape[1]

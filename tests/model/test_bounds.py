@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 from autograd import grad
 
-from skevgp.data.source import Moments
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import starting_table
+from skevgp.fitting.search import Rules
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import (
@@ -24,7 +22,7 @@ from skevgp.model.objectives import BoundObjective
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
-from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, whitened
+from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, table_of, whitened
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)
@@ -71,15 +69,8 @@ def test_gradient_agrees_with_finite_differences(family, shared):
 def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
-    table = starting_table(
-        Moments.of(rows.inputs),
-        table["inducing_points"].start,
-        np.ones(2),
-        Starts(Start(), Start(), Start()),
-        np.ones(2),
-        Rules(0.1),
-        1,
-    )
+    starts, points = Starts(Start(), Start(), Start()), table["inducing_points"].start
+    table = table_of(rows.inputs, points, starts, np.ones(2), 1, Rules(0.1))
     loss = plain_loss(model, rows, table)
     value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
     assert relative_error(gradient, grad(loss)(table.start())) < 1e-9
