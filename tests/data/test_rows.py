@@ -88,6 +88,7 @@ def test_what_is_sent_to_workers_can_be_pickled():
     part = pickle.loads(pickle.dumps(LocalSource(Loads(), 400).part(10, 20)))
     np.testing.assert_array_equal(part.take(np.arange(10)).inputs, X[10:20])
 
+
 # --- in internal units ------------------------------------------------------------------------------------------------
 
 

@@ -8,7 +8,7 @@ from skevgp.model.predictor import CoefficientPrior
 
 
 def weights_alone(H, r, scale):
-    source = LocalSource.of(np.zeros((len(H), 1)), H, r)
+    source = LocalSource.holding(RawRows(np.zeros((len(H), 1)), H, r))
     w, left_over = features_alone(
         source, np.zeros(len(scale)), CoefficientPrior(np.zeros_like(scale), scale, np.zeros_like(scale))
     )
