@@ -226,9 +226,7 @@ def test_a_fit_that_cannot_go_on_starts_cold(why):
     assert all(model.warm is None for model in models(**changes))
 
 
-@pytest.mark.parametrize(
-    "X", [1e3 * X + 1e4, 1e-3 * X + 1e4, np.hstack([X, X[:, :1]])], ids=["wide", "narrow", "more"]
-)
+@pytest.mark.parametrize("X", [1e3 * X + 1e4, 1e-3 * X + 1e4, np.hstack([X, X[:, :1]])], ids=["wide", "narrow", "more"])
 def test_points_of_another_space_are_left_with_all_else(X):
     """It then starts from the cold values, though some of the data's range is the same."""
     (model,) = models(previous=fitted(), X=X)

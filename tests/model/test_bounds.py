@@ -4,7 +4,9 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd import grad
+from sklearn.gaussian_process.kernels import ConstantKernel, DotProduct
 
+from skevgp import EVGPRegressor
 from skevgp.fitting.search import Rules
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
@@ -22,6 +24,7 @@ from skevgp.model.objectives import BoundObjective
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
+from ..accuracy import at_the_fit
 from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, table_of, whitened
 
 FAMILIES = ("full", "diagonal")
@@ -281,6 +284,19 @@ def test_with_points_at_all_rows_both_bounds_are_the_log_likelihood(p, copies):
     lower, upper = bounds_of(model, rows, values)
     exact = dense_bounds(*dense_arguments(values), rows, model.prior)[1]
     np.testing.assert_allclose((lower, upper), exact, rtol=1e-8)
+
+
+def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
+    """Three points on a line, of a linear kernel: K is singular, and a diagonal q's bound has the logarithm of what a
+    jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
+    x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
+    kernel = ConstantKernel(1.0, "fixed") * DotProduct(1.0)
+    model = EVGPRegressor(kernel=kernel, inducing_init=x[6:], posterior="diagonal", noise_variance=0.1, max_iter=0)
+    one, blocks = at_the_fit(model.fit(x, np.random.RandomState(0).randn(9)))
+    objective, start = BoundObjective(one.sparse, one.table, blocks), one.table.start()
+    step = 0.01 * np.eye(len(start))[0]
+    slope = 9 * (objective(start + step)[0] - objective(start - step)[0]) / 0.02
+    assert 9 * objective(start)[1][0] == pytest.approx(slope, abs=0.1)
 
 
 def test_a_jitter_is_known_from_the_factor():

@@ -65,29 +65,6 @@ def test_the_bound_of_any_q_is_below_that_of_the_best(case, n_steps, natural):
     )
 
 
-@given(fixed_cases(exact=False), st.data())
-def test_the_bound_of_other_kernels(case, draws):
-    """At the fitted one it is that of the fit; elsewhere its gradient is its slope, and the likelihood is above it."""
-    if case.model.share_coef:
-        case = case.with_model(share_coef=False)
-    model, exact = case.fitted(), exact_of(case.model).fit(case.X, case.Y)
-    kernels = model.kernel_ if isinstance(model.kernel_, list) else [model.kernel_]
-    theta = np.array([kernel.theta for kernel in kernels])
-    theta = theta if isinstance(model.kernel_, list) else theta[0]
-    assert model.lower_bound(theta) == pytest.approx(model.lower_bound_, rel=1e-7, abs=1e-6)
-    step = draws.draw(st.lists(st.sampled_from([0.0, 0.5, -0.5]), min_size=theta.size, max_size=theta.size))
-    theta = theta + np.reshape(step, theta.shape)
-    value, gradient = model.lower_bound(theta, eval_gradient=True)
-    assert_in_order(value, exact.log_marginal_likelihood(theta))
-    if case.model.posterior == "diagonal":
-        # Of points that need a jitter, rounding is too much of this bound for short steps (tests/test_theta.py).
-        return
-    ways = 1e-5 * np.eye(theta.size).reshape(-1, *theta.shape)
-    slopes = [(model.lower_bound(theta + way) - model.lower_bound(theta - way)) / 2e-5 for way in ways]
-    # Rounding of such points again, 1e-10 of the bound, over a way of 1e-5.
-    np.testing.assert_allclose(np.ravel(gradient), slopes, rtol=1e-3, atol=1e-3 + 1e-5 * abs(value))
-
-
 @given(data(fewest_rows=2), st.data())
 def test_more_rows_leave_less_to_know(rows, draws):
     X, Y, X_new = rows
