@@ -206,7 +206,8 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
 
 def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict[str, Any]:
     """`fit` with another relative jitter of k(X_m, X_m)."""
-    return fit(data, seed, solver=internals.with_jitter(jitter), **arguments)
+    with internals.with_jitter(jitter):
+        return fit(data, seed, **arguments)
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:

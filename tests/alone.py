@@ -18,7 +18,7 @@ def lowest_signal_and_noise(model):
     """Of each output, in the user's units: the lower limit of s² and limits of σ², or what they are fixed at."""
     fitted, unit = model._fitted, model._fitted.units.target_unit**2
     models = [(list(range(len(unit))), fitted)] if isinstance(model, EGPRegressor) else None
-    models = models or zip(fitted.outputs, fitted.learned, strict=True)
+    models = models or zip(fitted.outputs, fitted.models, strict=True)
     found = {}
     for outputs, one in models:
         for within, output in enumerate(outputs):

@@ -98,11 +98,11 @@ def test_a_second_ctrl_c_does_not_wait():
     """It ends the fit where it is; the model is as it was."""
 
     class Impatient(LBFGS):
-        def run(self, task, attempt):
-            fit = super().run(task, attempt)
+        def minimise(self, *arguments):
+            minimum = super().minimise(*arguments)
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
-            return fit
+            return minimum
 
     model = sparse(solver=Impatient())
     with pytest.raises(KeyboardInterrupt):

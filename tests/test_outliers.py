@@ -88,11 +88,6 @@ def test_noise_that_is_known_to_be_large_is_no_reason_to_doubt():
     assert (evgp().fit(X, WRONG).weights_[BAD] < 0.1).all()
 
 
-def test_lower_bound_sees_the_doubts():
-    model = evgp(feature_map=PolynomialFeatures(1)).fit(X, WRONG[:, 0])
-    assert model.lower_bound(model.kernel_.theta) == pytest.approx(model.lower_bound_, rel=1e-8)
-
-
 def test_bounds_of_the_iterations_end_at_the_fits():
     model = evgp(max_iter=200, noise_cv=None).fit(X, WRONG[:, 0])
     assert -model.loss_curve_[-1] <= model.lower_bound_ + 1e-6 * abs(model.lower_bound_)

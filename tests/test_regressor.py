@@ -539,6 +539,14 @@ def test_fitted_models_pickle_and_clone():
         clone(m).predict(X_NEW)
 
 
+def test_pickles_do_not_grow_with_the_rows():
+    def size(repeats):
+        m = EVGPRegressor(inducing_init=X[:6], max_iter=0)
+        return len(pickle.dumps(m.fit(np.tile(X, (repeats, 1)), np.tile(Y, (repeats, 1)))))
+
+    assert size(100) < size(1) + 500
+
+
 def test_predict_sets_nothing():
     m = model(max_iter=0).fit(X, Y)
     before = dict(vars(m))

@@ -9,8 +9,8 @@ from sklearn.gaussian_process.kernels import RBF, Matern, RationalQuadratic
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.kernels import FunctionKernel
 
-from ..maps.test_derivatives import close, differences
 from .cases import N_OUTPUTS, QUICK, D
+from .test_derivatives import close, differences
 
 N = 1500
 

@@ -8,7 +8,7 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics
-from skevgp.fitting.advice import nothing_learned, white_kernel
+from skevgp.fitting.messages import nothing_learned, white_kernel
 from skevgp.kernels.parse import parse_kernel
 
 from ..oracle import identity_rows

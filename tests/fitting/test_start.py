@@ -1,16 +1,15 @@
 import numpy as np
 import pytest
 
-from skevgp.data.source import Moments
 from skevgp.data.threads import BlockMap
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import alike_neighbours, parameter_of, starting_table
+from skevgp.fitting.search import Rules
+from skevgp.fitting.start import alike_neighbours, parameter_of
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.model import SparseModel
 from skevgp.model.parameters import ParameterTable
 
-from ..oracle import identity_rows
+from ..oracle import identity_rows, table_of
 from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, N, X, Y, source_of, units_of
 
 
@@ -54,7 +53,7 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     rules = Rules(1e-4, 1e-10, lengthscale=0.5, **limits)
     scatter, points = np.array([1.0, 0.01]), np.zeros((1, 3, 2))
     starts = Starts(Start(), Start(), Start())
-    table = starting_table(Moments.of(X), points, np.ones(2), starts, scatter, rules, 2)
+    table = table_of(X, points, starts, scatter, 2, rules)
     first, (sigma, root) = table.values(table.start()), (X.std(axis=0), np.sqrt(2.0))
     np.testing.assert_allclose(first["hyperparameters"], 0.5 * root * sigma)
     np.testing.assert_allclose(first["signal"], 1.0)

@@ -2,13 +2,13 @@ import numpy as np
 import pytest
 import scipy.linalg
 
-from skevgp.data.source import LocalSource, Moments, RawRows
+from skevgp.data.rows import LocalSource, Moments, RawRows
 from skevgp.fitting.units import features_alone, may_hide_noise, noise_of_most_evidence, unit_of
 from skevgp.model.predictor import CoefficientPrior
 
 
 def weights_alone(H, r, scale):
-    source = LocalSource.of(np.zeros((len(H), 1)), H, r)
+    source = LocalSource.holding(RawRows(np.zeros((len(H), 1)), H, r))
     w, left_over = features_alone(
         source, np.zeros(len(scale)), CoefficientPrior(np.zeros_like(scale), scale, np.zeros_like(scale))
     )

@@ -23,6 +23,7 @@ from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.exceptions import DependentRowsWarning
+from skevgp.solvers import LBFGS
 from tests.alone import alone
 from tests.nasty import MapError, random_case
 
@@ -196,8 +197,8 @@ def _hidden_nats(model, bound, X, y):
     y = np.asarray(y, dtype=float).reshape(len(X), -1)
     # Targets are known to their last digit, and what is left over of them no better.
     nats += 0.5 * np.sum((np.finfo(float).eps * y) ** 2 / model.noise_variance_)
-    for one in model._fitted.learned:
-        if one.model.complete:
+    for one in model._fitted.models:
+        if one.sparse.complete:
             # The eigenvalues of what a jitter j leaves of K are no larger than j times the rows that are the same.
             m = one.values["inducing_points"].shape[1]
             left = max(group.whitening.jitter() for group in one.predictor.groups) * (len(X) - m + 1)

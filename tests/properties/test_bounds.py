@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 
-from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
 
 from .cases import STATELESS, data, fewer, fixed_cases, fixed_models, tables

@@ -1,7 +1,6 @@
 """The solvers as records of options: what they take, what they refuse, what their callbacks are told."""
 
 import re
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,9 +9,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GridSearchCV
 
 from skevgp import EVGPRegressor
-from skevgp.model.objectives import BoundObjective
-from skevgp.solvers import LBFGS, Adam
-from skevgp.solvers.solvers import SOLVERS, resolved
+from skevgp.solvers import LBFGS, SOLVERS, Adam, as_solver
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (80, 2))
@@ -74,7 +71,7 @@ def test_a_fit_leaves_the_solver_alone():
 @pytest.mark.parametrize(("name", "kind"), [("lbfgs", LBFGS), ("adam", Adam)])
 @few_iterations
 def test_a_name_is_the_solver_with_its_defaults(name, kind):
-    assert type(resolved(name, "full")) is kind is SOLVERS[name]
+    assert type(as_solver(name)) is kind is SOLVERS[name]
     by_name, by_hand = (model(solver=solver).fit(X, Y).predict(X) for solver in (name, kind()))
     np.testing.assert_array_equal(by_name, by_hand)
 
@@ -83,7 +80,7 @@ def test_a_name_is_the_solver_with_its_defaults(name, kind):
 def test_what_is_no_solver_is_named_with_what_is(solver):
     names = re.escape('"lbfgs", "adam", skevgp.solvers.LBFGS(...), skevgp.solvers.Adam(...)')
     with pytest.raises(ValueError, match=f"solver must be one of {names}; got "):
-        resolved(solver, "full")
+        as_solver(solver)
     with pytest.raises((ValueError, TypeError), match="solver"):
         model(solver=solver).fit(X, Y)
 
@@ -110,15 +107,14 @@ def test_what_is_no_solver_is_named_with_what_is(solver):
 )
 def test_an_option_out_of_range_is_named(solver, error, message):
     with pytest.raises(error, match=message):
-        resolved(solver, "full")
+        as_solver(solver)
     with pytest.raises(error, match=message):
         model(solver=solver).fit(X, Y)
 
 
 def test_natural_gradients_need_the_full_posterior():
-    assert resolved(Adam(natural_gradient=True), "full").natural_gradient
     with pytest.raises(ValueError, match=r'natural_gradient=True of Adam needs posterior="full"; got posterior='):
-        resolved(Adam(natural_gradient=True), "diagonal")
+        model(solver=Adam(natural_gradient=True, posterior="diagonal")).fit(X, Y)
 
 
 @few_iterations
@@ -131,25 +127,12 @@ def test_a_batch_of_more_rows_than_there_are_is_all_of_them():
 
 
 @few_iterations
-@pytest.mark.parametrize("kind", [LBFGS, Adam])
-def test_a_subclass_may_have_other_rules(kind):
-    class Loud(kind):
-        """Starts from a hundred times the noise."""
-
-        rules = replace(kind.rules, first_noise=100.0 * kind.rules.first_noise)
-
-    own, loud = (model(solver=solver(), max_iter=0).fit(X, Y).noise_variance_ for solver in (kind, Loud))
-    np.testing.assert_allclose(loud, 100.0 * own)
-    assert clone(Loud(n_restarts=3)).n_restarts == 3
-
-
-@few_iterations
 def test_a_subclass_may_have_another_number_of_iterations():
     class Short(LBFGS):
         default_max_iter = 4
 
-    assert model(solver=Short(), max_iter=None, tol=0.0).fit(X, Y).n_iter_ == 4
-    assert model(solver=Short(), max_iter=6, tol=0.0).fit(X, Y).n_iter_ == 6
+    assert model(solver=Short(tol=0.0), max_iter=None).fit(X, Y).n_iter_ == 4
+    assert model(solver=Short(tol=0.0), max_iter=6).fit(X, Y).n_iter_ == 6
 
 
 @few_iterations
@@ -157,20 +140,20 @@ def test_a_subclass_may_look_at_each_evaluation():
     seen = []
 
     class Watched(LBFGS):
-        def objective(self, task, table, n_rows=None):
-            objective = super().objective(task, table, n_rows)
-            assert isinstance(objective, BoundObjective)
-
+        def minimise(self, objective, start, *others):
             def watched(x):
-                seen.append((table.size, objective(x)[0]))
+                seen.append(len(x))
                 return objective(x)
 
-            return watched
+            return super().minimise(watched, start, *others)
 
-    m = model(solver=Watched(), inducing_init="k-means").fit(X, Y)
+    m = model(solver=Watched(n_restarts=1), inducing_init="k-means").fit(X, Y)
     assert len(seen) >= m.n_iter_
-    assert {size for size, _ in seen} == {2 + 2 * 2 + 10 * 2}
-    np.testing.assert_array_equal(m.predict(X), model(inducing_init="k-means").fit(X, Y).predict(X))
+    assert set(seen) == {2 + 2 * 2 + 10 * 2}
+    np.testing.assert_array_equal(
+        m.predict(X), model(solver=LBFGS(n_restarts=1), inducing_init="k-means").fit(X, Y).predict(X)
+    )
+    assert clone(Watched(n_restarts=3)).n_restarts == 3
 
 
 # --- callbacks -----------------------------------------------------------------------------------------------------
@@ -262,14 +245,3 @@ def test_parameters_of_a_solver_that_is_a_string_are_reached():
     assert EVGPRegressor(solver="adam").set_params(n_inducing=3).solver == "adam"
     with pytest.raises(ValueError, match="Invalid parameter 'batch_size' for estimator LBFGS"):
         EVGPRegressor().set_params(solver__batch_size=7)
-
-
-def test_a_solver_of_the_registry_may_be_given_as_an_object(monkeypatch):
-    class Mine:
-        def check(self, posterior):
-            self.asked = posterior
-
-    monkeypatch.setitem(SOLVERS, "mine", Mine)
-    mine = Mine()
-    assert resolved(mine, "full") is mine
-    assert mine.asked == "full"

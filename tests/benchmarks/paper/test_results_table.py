@@ -14,10 +14,11 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.estimators.bnn_training import Training
 from skevgp.features import InertiaForceGravity
-from skevgp.fitting import advice
+from skevgp.fitting import messages
 from skevgp.metrics import prediction_error, std_norm
 from skevgp.noise import Gaussian
 from skevgp.solvers import Adam
+from skevgp.solvers.base import Minimum
 
 from ..conftest import read
 
@@ -321,10 +322,10 @@ def test_the_picture_of_noise_has_a_panel_for_each_setting_of_one_scale(drawn, t
 def messages_of_early_ends():
     """In the library's own words."""
     ended, going = (Minimum(np.zeros(1), 0.0, [0.0], converged) for converged in (True, False))
-    yield advice.how_it_ended(going, n_iter=9, max_iter=9, tol=0.01)
-    yield advice.how_it_ended(going, n_iter=9, max_iter=100, tol=None)
-    yield advice.interrupted(9)
-    yield advice.interrupted(9, max_time=1.0)
+    yield messages.lbfgs_ended(going, n_iter=9, max_iter=9, tol=0.01)
+    yield messages.lbfgs_ended(going, n_iter=9, max_iter=100, tol=None)
+    yield messages.interrupted(9)
+    yield messages.interrupted(9, max_time=1.0)
     yield Adam()._how_it_ended(going, False)
     yield Adam()._how_it_ended(ended, True)
     for minimum, interrupted, still_falling in ((going, False, False), (ended, True, False), (ended, False, True)):

@@ -2,8 +2,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from skevgp.data import chosen as module
-from skevgp.data.chosen import Chosen, rows_of
+from skevgp.data import weights as module
+from skevgp.data.weights import Chosen, rows_of
 
 RNG = np.random.RandomState(0)
 X = RNG.randint(0, 3, (60, 2)).astype(float)
