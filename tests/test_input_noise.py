@@ -3,12 +3,13 @@
 import numpy as np
 import pandas as pd
 import pytest
-from skevgp.noise.inputs import variance_by_inputs
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
+from skevgp.data.dataset import Dataset
+from skevgp.fitting.noisy_inputs import look_at_slopes
 from skevgp.metrics import containing_ratios, prediction_error
 from skevgp.noise import Gaussian, StudentT
 from skevgp.solvers import LBFGS
@@ -21,6 +22,12 @@ def waves(n, x_noise, y_noise, seed=0):
     x = rng.uniform(-2.0, 2.0, (n, 1))
     g = np.where(x > 0.0, np.sin(6.0 * x), 0.2 * x)[:, 0] + 0.0
     return x + x_noise * rng.randn(n, 1), g + y_noise * rng.randn(n), x, g
+
+
+def variance_by_inputs(model, X, Y, covariance):
+    """∂g Σ ∂gᵀ of each row and output."""
+    data = Dataset.further(model, model._posterior.maps, X, Y)
+    return look_at_slopes(model._posterior, data, X, covariance)[0]
 
 
 def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
@@ -37,8 +44,7 @@ def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
     # Weights that are learned from noisy X are a little too small, and what they leave counts as noise.
     assert found.noise_variance_ == pytest.approx(0.012, rel=0.4)
     covariance = np.diag([0.1**2, 0.05**2])
-    variance = variance_by_inputs(found, *found._training_data[:2], found._training_data[3], covariance)
-    np.testing.assert_allclose(variance, by_inputs, rtol=0.15)
+    np.testing.assert_allclose(variance_by_inputs(found, X, y, covariance), by_inputs, rtol=0.15)
 
 
 def test_where_the_function_is_steep_rows_count_less():
@@ -58,16 +64,14 @@ def test_where_the_function_is_steep_rows_count_less():
 
 
 def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
-    monkeypatch.setattr("skevgp.noise.inputs._ROWS_AT_ONCE", 7)
+    monkeypatch.setattr("skevgp.fitting.noisy_inputs._ROWS_AT_ONCE", 7)
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (40, 2))
-    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, solver=LBFGS(tol=1e6)).fit(
-        X, np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
-    )
+    Y = np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
+    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, solver=LBFGS(tol=1e6)).fit(X, Y)
     covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
-    given, used, _, chosen = model._training_data
-    found = chosen.as_given(variance_by_inputs(model, given, used, chosen, covariance))
     slopes = model.jacobian(X)
+    found = variance_by_inputs(model, X, Y, covariance)
     np.testing.assert_allclose(found, np.einsum("noi,ij,noj->no", slopes, covariance, slopes), rtol=1e-10)
 
 

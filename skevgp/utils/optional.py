@@ -12,6 +12,7 @@ _PACKAGES = {
     "dask": ("'dask[array,distributed]'", "dask"),
     "casadi": ("casadi", "casadi"),
     "rosbags": ("rosbags", "logs"),
+    "skops": ("skops", "io"),
 }
 
 

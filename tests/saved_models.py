@@ -35,7 +35,7 @@ from sklearn.preprocessing import (
     StandardScaler,
 )
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.datasets import load_robot
 from skevgp.features import (
     AngleEncoder,
@@ -46,8 +46,9 @@ from skevgp.features import (
     RigidBodyRegressor,
 )
 from skevgp.kernels import Cosine
+from skevgp.noise import Gaussian
 from skevgp.robots import get_system
-from skevgp.solvers import Adam
+from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
 X, X_NEW = RNG.uniform(-2.0, 2.0, (60, 2)), RNG.uniform(-2.0, 2.0, (7, 2))
@@ -88,16 +89,16 @@ CASES = {
     "outputs": (evgp(sharing="auto"), X, Y, X_NEW),
     "independent": (evgp(sharing="none"), X, Y, X_NEW),
     "groups": (evgp(sharing=[[0, 2], [1]]), X, Y, X_NEW),
-    "kernel": (evgp(sharing="kernel", posterior="diagonal"), X, Y, X_NEW),
+    "kernel": (evgp(sharing="kernel", solver=LBFGS(posterior="diagonal")), X, Y, X_NEW),
     "adam": (evgp(solver="adam"), X, Y, X_NEW),
-    "adam-object": (evgp(solver=Adam(batch_size=20), posterior="diagonal"), X, Y, X_NEW),
-    "auto-m": (evgp(n_inducing="auto", max_inducing=20), X, Y[:, 0], X_NEW),
+    "adam-object": (evgp(solver=Adam(batch_size=20, posterior="diagonal")), X, Y, X_NEW),
+    "auto-m": (evgp(n_inducing="auto", solver=LBFGS(max_inducing=20)), X, Y[:, 0], X_NEW),
     "student-t": (evgp(noise="student-t"), X, Y[:, 0], X_NEW),
-    "input-noise": (evgp(input_noise=0.1), X, Y[:, 0], X_NEW),
+    "input-noise": (evgp(noise=Gaussian(inputs=0.1)), X, Y[:, 0], X_NEW),
     "no-calibration": (evgp(noise_cv=None, normalize_y=True), X, Y, X_NEW),
-    "shared-weights": (evgp(InertiaForce(), share_coef=True), X, Y, X_NEW),
+    "shared-weights": (evgp(InertiaForce(), coef_prior=CoefPrior(shared=True)), X, Y, X_NEW),
     **{f"kernel-{name}": (evgp(kernel=kernel), X, Y, X_NEW) for name, kernel in KERNELS.items()},
-    "exact": (EGPRegressor(InertiaForce(), max_iter=3, coef_scale=np.inf), X, Y, X_NEW),
+    "exact": (EGPRegressor(InertiaForce(), max_iter=3, coef_prior=CoefPrior(scale=np.inf)), X, Y, X_NEW),
     "exact-plain": (EGPRegressor(max_iter=3), X, Y[:, 0], X_NEW),
     "residual": (ResidualRegressor(evgp(), base=[1]), X, Y[:, 0], X_NEW),
     "network": (BayesianMLPRegressor((5,), max_iter=2, early_stopping=True, random_state=0), X, Y, X_NEW),
