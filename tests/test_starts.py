@@ -11,6 +11,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.fitting import search
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
@@ -125,14 +126,9 @@ def test_points_are_placed_anew_only_where_the_kernel_can_learn():
     assert auto.lower_bound_ == first.lower_bound_
 
 
-class Quick(LBFGS):
-    """Places inducing points anew after a few iterations."""
-
-    rules = replace(LBFGS.rules, stage=20)
-
-
-def test_an_interrupted_fit_keeps_the_best_of_both_places():
+def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
     """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
+    monkeypatch.setattr(search, "RULES", replace(search.RULES, stage=20))
     seen = []
 
     def interrupt(iteration, bound, outputs):
@@ -141,7 +137,7 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places():
             raise KeyboardInterrupt
 
     with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m = model(solver=Quick(callback=interrupt, tol=1e-9)).fit(X, Y)
+        m = model(solver=LBFGS(callback=interrupt, tol=1e-9)).fit(X, Y)
     with pytest.warns(ConvergenceWarning, match="still rising"):
         before = model(max_iter=20, solver=LBFGS(tol=1e-9)).fit(X, Y)
     assert seen[-1] == 21

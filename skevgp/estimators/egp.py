@@ -91,6 +91,8 @@ class EGPRegressor(GaussianProcess):
         Draws the restarts.
     verbose : int, default=0
         As of `EVGPRegressor`; its bound is the log marginal likelihood.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------

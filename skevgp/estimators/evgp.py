@@ -98,6 +98,8 @@ class EVGPRegressor(GaussianProcess):
         Source of chance for inducing points, mini-batches and restarts.
     verbose : int, default=0
         Verbosity. 1 shows progress, 2 prints a line for each iteration.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------
