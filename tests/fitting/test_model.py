@@ -131,10 +131,8 @@ def test_a_kernel_that_is_none_is_named_before_anything_is_fitted():
         models(kernel=lambda A, B: A @ B.T - 10.0)
 
 
-_rng = np.random.RandomState(0)
-MANY = data_of(_rng.randn(MAX_SAMPLE + 1, 1), _rng.randint(0, 5, (MAX_SAMPLE + 1, 1)).astype(float)) | {
-    "n_inducing": 10
-}
+_x = np.random.RandomState(0).randint(0, 5, (MAX_SAMPLE + 1, 1)).astype(float)
+MANY = data_of(np.random.RandomState(1).randn(*_x.shape), _x) | {"n_inducing": 10}
 TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np.vstack([Y, Y])}
 
 
