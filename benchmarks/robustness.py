@@ -123,7 +123,7 @@ def nasty(seed: int) -> Data:
         "n_inducing": int(rng.choice([1, 5, 10, 20])),
         "inducing_init": str(rng.choice(["k-means", "greedy"])),
         "sharing": str(rng.choice(["all", "kernel", "none"])),
-        "posterior": str(rng.choice(["full", "diagonal"])),
+        "solver": LBFGS(posterior=str(rng.choice(["full", "diagonal"]))),
         "normalize_y": bool(rng.rand() < 0.5),
     }
     notes += [str(value) for value in arguments.values()]

@@ -7,9 +7,10 @@ import numpy as np
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
 from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
+from skevgp.solvers import LBFGS
 
 from .precise import PreciseModel, cholesky, condition, solved, squared_exponential
 
@@ -57,8 +58,7 @@ class Problem:
         return {
             "feature_map": FunctionTransformer(Features(self.p)) if self.p else None,
             "kernel": kernel + WhiteKernel(self.noise, "fixed"),
-            "coef_mean": COEF_MEAN,
-            "coef_scale": COEF_SCALE,
+            "coef_prior": CoefPrior(mean=COEF_MEAN, scale=COEF_SCALE),
             "max_iter": 0,
         }
 
@@ -96,7 +96,7 @@ def lengthscale_of(points, wanted):
 def sparse(problem, posterior="full", added=0):
     """The last so many rows by `partial_fit`."""
     first = len(problem.y) - added
-    model = EVGPRegressor(inducing_init=problem.points, posterior=posterior, **problem.arguments)
+    model = EVGPRegressor(inducing_init=problem.points, solver=LBFGS(posterior=posterior), **problem.arguments)
     model.fit(problem.X[:first], problem.y[:first])
     return model.partial_fit(problem.X[first:], problem.y[first:]) if added else model
 

@@ -42,7 +42,7 @@ def alone(model, X, y, sample_weight=None, relative_variance=None):
     variance = np.ones(n) if relative_variance is None else np.asarray(relative_variance, dtype=float)
     X = X if hasattr(X, "columns") else np.asarray(X, dtype=float)
     inputs = np.asarray(X if model.kernel_map_ is None else model.kernel_map_.transform(X), dtype=float)
-    predictor, prior, total = model._predictor, model._fitted.units.prior, 0.0
+    predictor, prior, total = model._posterior.predictor, model._fitted.units.prior, 0.0
     kernels = [model.kernel_] if o == 1 else model.kernel_
     H = np.zeros((n, 0))
     if model.feature_map_ is not None:

@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.io import load, save
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 from .interruption import interrupted_at
@@ -35,7 +36,7 @@ MODELS = {
     "calibration": sparse(noise_cv=4),
     "models": sparse(sharing="none"),
     "outliers": sparse(noise="student-t"),
-    "input noise": sparse(input_noise=0.01),
+    "input noise": sparse(noise=Gaussian(inputs=0.01)),
     "exact": EGPRegressor(max_iter=8),
     "network": BayesianMLPRegressor((4, 4), max_iter=8, random_state=0),
     "residual": ResidualRegressor(sparse()),

@@ -8,7 +8,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor
-from skevgp.solvers import Adam
+from skevgp.solvers import LBFGS, Adam
 
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
@@ -36,8 +36,8 @@ VARIANTS = {
     "features": {"feature_map": PolynomialFeatures(1), "normalize_y": True},
     "separate": {"sharing": "none"},
     "kernel": {"sharing": "kernel"},
-    "diagonal": {"posterior": "diagonal"},
-    "auto": {"n_inducing": "auto", "max_inducing": 15},
+    "diagonal": {"solver": LBFGS(posterior="diagonal")},
+    "auto": {"n_inducing": "auto", "solver": LBFGS(max_inducing=15)},
     "threads": {"sharing": "none", "n_jobs": 2},
 }
 

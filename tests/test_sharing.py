@@ -135,7 +135,7 @@ def test_each_group_finds_its_own_number_of_points():
     x = np.linspace(-2.0, 2.0, 200)
     waves = np.column_stack([np.sin(x), np.sin(12.0 * x), 100.0 * np.cos(x)])
     waves += [0.01, 0.01, 1.0] * np.random.RandomState(1).randn(200, 3)
-    options = {"n_inducing": "auto", "max_inducing": 60, "max_iter": 30}
+    options = {"n_inducing": "auto", "solver": LBFGS(max_inducing=60), "max_iter": 30}
     auto = model(sharing="auto", **options).fit(x[:, np.newaxis], waves)
     assert auto.sharing_ == [[0, 2], [1]]
     smooth, rough, other = auto.inducing_points_

@@ -31,7 +31,7 @@ import internals
 from harness import Row
 from skevgp import EVGPRegressor
 from skevgp.metrics import negative_log_predictive_density
-from skevgp.solvers import Adam
+from skevgp.solvers import LBFGS, Adam
 from speed.scaling import N_INDUCING, make_files
 
 # Of Adam: how often it sees all rows.
@@ -71,7 +71,7 @@ def run(cell: Cell) -> dict[str, Any]:
         steps = EPOCHS[cell.fit] * cell.n_rows // BATCH_SIZE
         model.set_params(solver=Adam(batch_size=BATCH_SIZE, natural_gradient=True), max_iter=steps)
     elif cell.fit == "reference":
-        model.set_params(max_iter=cell.max_iter, tol=0.0)
+        model.set_params(solver=LBFGS(tol=0.0), max_iter=cell.max_iter)
     begin = internals.rules(sample=None) if cell.fit == "reference" else nullcontext()
     with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory, begin:
         warnings.simplefilter("always")

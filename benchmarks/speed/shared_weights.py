@@ -29,7 +29,7 @@ from sklearn.preprocessing import FunctionTransformer
 import harness
 from harness import Row
 from internals import watched
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
 
 N_OUTPUTS, N_FEATURES, N_COLUMNS = 6, 40, 3
 SIZES, QUICK_SIZES = ((6000, 40), (6000, 100), (20_000, 100)), ((500, 10),)
@@ -70,7 +70,7 @@ def evaluations(cell: Cell, share_coef: bool) -> Callable[[], None]:
         Waves(),
         kernel_map=FunctionTransformer(own_columns),
         n_inducing=cell.m,
-        share_coef=share_coef,
+        coef_prior=CoefPrior(shared=share_coef),
         sharing="none",
         noise_cv=None,
         max_iter=1,

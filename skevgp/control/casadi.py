@@ -223,5 +223,5 @@ def with_base(function: Any, columns: np.ndarray) -> Any:
     names_in, names_out = function.name_in(), function.name_out()
     given = [ca.MX.sym(name, function.size_in(i)) for i, name in enumerate(names_in)]
     mean, *others = function.call(given, True, False)
-    outputs = [mean + given[0][np.asarray(columns).tolist()], *others]
+    outputs = [sum((given[0][own.tolist()] for own in columns), start=mean), *others]
     return ca.Function(function.name(), given, outputs, names_in, names_out, INLINED)

@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..data.rows import of_outputs
 from ..maps.derivatives import MappedRows, chained, mapped
-from ..maps.maps import maps_of
+from ..maps.elementary import DirectMap
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
 
 _NONE = np.empty((0, 0))
-
-
-class Model(Protocol):
-    """A fitted estimator with explicit features."""
-
-    feature_map_: Any
-    kernel_map_: Any
-    _example: Any
-    _predictor: Predictor
 
 
 class CompiledPredictor:
@@ -34,11 +25,13 @@ class CompiledPredictor:
 
     Parameters
     ----------
-    model : EVGPRegressor or EGPRegressor
-        Fitted.
+    predictor : Predictor
+        Frozen, in the user's units.
+    feature_map, kernel_map : DirectMap or None
+        Of plain arrays.
     include_noise : bool, default=True
         Whether standard deviations are of y, with the learned noise, or of the noise-free g(x).
-    base : ndarray of shape (n_outputs,), default=None
+    base : ndarray of shape (k, n_outputs), default=None
         Indices of columns that are added to the mean (of a `ResidualRegressor`).
 
     Examples
@@ -69,12 +62,19 @@ class CompiledPredictor:
 
     _state: _State
 
-    def __init__(self, model: Model, include_noise: bool = True, base: np.ndarray | None = None):
+    def __init__(
+        self,
+        predictor: Predictor,
+        feature_map: DirectMap | None,
+        kernel_map: DirectMap | None,
+        include_noise: bool = True,
+        base: np.ndarray | None = None,
+    ):
         self.include_noise, self.base = include_noise, base
-        self._feature_map, self._kernel_map = maps_of(model)
-        self.update(model)
+        self._feature_map, self._kernel_map = feature_map, kernel_map
+        self._freeze(predictor)
 
-    def update(self, model: Model) -> None:
+    def update(self, model: Any) -> None:
         """Take on the weights of a model that has seen further rows, by ``partial_fit``.
 
         Calls that run in other threads end with the weights that they began with.
@@ -92,9 +92,12 @@ class CompiledPredictor:
             If it is of none.
         """
         check_fitted(model)
-        predictor = getattr(model, "regressor_", model)._predictor
-        if hasattr(self, "_state") and not _goes_on(self._state[0], predictor):
-            raise ValueError("update takes on the weights of the same fit; compile a model that was fitted anew.")
+        predictor = model._posterior.predictor
+        if not _goes_on(self._state[0], predictor):
+            raise ValueError("update takes on the weights of the same fit; compile a model that was fitted again.")
+        self._freeze(predictor)
+
+    def _freeze(self, predictor: Predictor) -> None:
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
         groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
         self._state = (predictor, groups, noise)
@@ -149,7 +152,8 @@ class CompiledPredictor:
         slopes = [group.slopes(each, behind) for group, each in zip(groups, found, strict=True)]
         jacobian = predictor.in_order([by for by, _ in slopes])
         if self.base is not None:
-            jacobian[np.arange(len(jacobian)), :, self.base] += 1.0
+            for columns in self.base:
+                jacobian[np.arange(len(jacobian)), :, columns] += 1.0
         mean, jacobian = _shaped(X, mean, jacobian)
         if not return_std:
             return mean, jacobian
@@ -164,7 +168,7 @@ class CompiledPredictor:
         found = [group.moments(inputs, features, return_std) for group in groups]
         mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
         if self.base is not None:
-            mean += rows[:, self.base]
+            mean += rows[:, self.base].sum(axis=1)
         if not return_std:
             return found, mean, None
         return found, mean, np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)

@@ -12,8 +12,7 @@ as good as the waves are many. `paths` is exact, but only along paths.
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import index as as_index
 from typing import Any
 
@@ -51,12 +50,6 @@ class FunctionSamples(Sequence["SampledFunction"]):
         common = common_normals(predictor, n, rng)
         self._groups = [_Group.drawn(group, predictor, n, n_waves, common, rng) for group in predictor.groups]
         self._n = n
-
-    def with_base(self, base: np.ndarray) -> FunctionSamples:
-        """The same functions, to which columns of X are added, by index (o,)."""
-        found = copy(self)
-        found._posterior = replace(self._posterior, base=base)
-        return found
 
     def __len__(self) -> int:
         return self._n
@@ -119,7 +112,8 @@ class FunctionSamples(Sequence["SampledFunction"]):
             )
             found = self._posterior.predictor.in_order([own.slopes(behind, which) for own in self._groups])
             if self._posterior.base is not None:
-                found[np.arange(len(found)), :, :, self._posterior.base] += 1.0
+                for columns in self._posterior.base:
+                    found[np.arange(len(found)), :, :, columns] += 1.0
             jacobians.append(found.transpose(1, 2, 0, 3))
         found = np.concatenate(jacobians, axis=1)
         found = found[:, :, 0] if found.shape[2] == 1 else found
@@ -134,7 +128,7 @@ class FunctionSamples(Sequence["SampledFunction"]):
         """Of the groups' values (o, k, n) those of all outputs, (k, n, o), with what is added."""
         predictor = self._posterior.predictor
         values = predictor.in_order(parts).transpose(1, 2, 0) + predictor.intercept
-        return values if self._posterior.base is None else values + rows[:, self._posterior.base]
+        return values if self._posterior.base is None else values + rows[:, self._posterior.base].sum(axis=1)
 
     @staticmethod
     def _shaped(X: np.ndarray, values: np.ndarray) -> np.ndarray:

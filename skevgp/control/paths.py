@@ -127,7 +127,7 @@ class Functions:
     ----------
     predictor : Predictor
     feature_map, kernel_map : DirectMap or None
-    base : ndarray of shape (o,), optional
+    base : ndarray of shape (k, o), optional
         The columns of X that are added to the outputs.
     """
 
@@ -164,6 +164,6 @@ class Functions:
 
         def step(X: np.ndarray) -> np.ndarray:
             values = paths.step(*self.mapped(X))
-            return values if self.base is None else values + X[:, self.base]
+            return values if self.base is None else values + X[:, self.base].sum(axis=1)
 
         return step

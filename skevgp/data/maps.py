@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from threading import Lock
 from typing import Any
 
@@ -12,6 +13,7 @@ from sklearn.gaussian_process.kernels import Kernel
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.utils.validation import has_fit_parameter
 
+from ..utils.frames import FrameColumns
 from ..utils.sklearn import safe_indexing
 from ..utils.validation import LARGEST, as_floats, check_magnitude, is_frame
 from .rows import RawRows
@@ -283,6 +285,38 @@ class MappedRows:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         vars(self).update(state, _lock=Lock())
+
+
+@dataclass(frozen=True)
+class Maps:
+    """The fitted maps of a model, an example of the rows that they were fitted to, and number and names of X's columns.
+
+    ``shapes`` are those of a row's kernel inputs and features, once they are known.
+    """
+
+    feature_map: Any
+    kernel_map: Any
+    example: Any = None
+    n_columns: int = 0
+    columns: np.ndarray | None = None
+    shapes: RowShapes | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # A data frame as arrays: whoever reads it need not have its package.
+        return {**vars(self), "example": FrameColumns.of(self.example) or self.example}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        example = state["example"]
+        vars(self).update(state, example=example.frame() if isinstance(example, FrameColumns) else example)
+
+    def rows(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The kernel's inputs and the features of some rows, given as the maps see them and as the kernel does."""
+        array = take_rows(X, rows)
+        given = array if given is X else take_rows(given, rows)
+        found = map_rows(given, array, self.feature_map, self.kernel_map)
+        if self.shapes is not None:
+            check_shapes(found, self.shapes)
+        return found
 
 
 def map_rows(given: Any, X: Any, feature_map: Any, kernel_map: Any) -> tuple[np.ndarray, np.ndarray]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Protocol
 
 import numpy as np
 
@@ -65,7 +64,7 @@ def _fit_one(turn: tuple[Model, float]) -> FittedModel:
     model, share = turn
     # A copy, with which the blocks of rows are forgotten.
     model = replace(model, monitor=model.monitor.with_time(share))
-    if not model.problem.heavy_tails:
+    if not model.problem.noise.heavy_tails:
         return finished(*_best(model))
     model, fit, doubts = fit_doubting(model, _best)
     return finished(model, fit, doubts)
@@ -213,19 +212,6 @@ class FittedModel:
             known_upper_bound=None,
             is_exact=False,
         )
-
-
-class AnyFitted(Protocol):
-    """What an estimator needs of a fit, sparse or exact."""
-
-    units: Units
-    messages: tuple[str, ...]
-
-    def predictor(self) -> Predictor:
-        """Of all outputs, in the user's units."""
-
-    def limits(self, name: str, output: int) -> np.ndarray:
-        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
 
 
 @dataclass(frozen=True)

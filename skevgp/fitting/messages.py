@@ -100,7 +100,7 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
     if (np.abs(prior.reference) > _FAR_WEIGHT).any():
         return (
             f"Weights of features are more than {_FAR_WEIGHT:g} prior standard deviations away from their prior mean: "
-            "raise coef_scale or, if it is an intercept's, set normalize_y=True."
+            "raise the scale of coef_prior or, if it is an intercept's, set normalize_y=True."
         )
     return ""
 
@@ -134,7 +134,7 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
         f"The noise explains everything that the features leave over of {nothing.sum()} of {len(nothing)} outputs "
         "fitted together, though neighbouring rows are alike: from no start did the Gaussian process learn any of it. "
         f"{cause or 'Raise '}{'n_inducing, or n_restarts of the solver' if sparse else 'n_restarts'}, let kernel or "
-        "noise_variance start elsewhere, or look at the scales of the kernel's columns."
+        "noise start elsewhere, or look at the scales of the kernel's columns."
     )
 
 

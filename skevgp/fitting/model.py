@@ -146,7 +146,10 @@ def models_of(
             and all(are_all_rows(own, sample.of([o]).inputs) for own, o in zip(start, heads, strict=True))
         )
         own_rows = rows.outputs(part.outputs, 1.0 / min(problem.n_threads, len(parts)))
-        n_kernels, exact = len(start) if part.separate else None, stay and not part.separate and not problem.heavy_tails
+        n_kernels, exact = (
+            len(start) if part.separate else None,
+            stay and not part.separate and not problem.noise.heavy_tails,
+        )
         table = starting_table(problem, own_rows, start, variance, n_kernels, exact)
         if stay:
             table = table.with_fixed("inducing_points")
@@ -247,7 +250,7 @@ class Model:
     def exact(self) -> ExactModel | None:
         """The exact model of the rows, where the inducing points are all of them; None where they are not."""
         sparse, separate = self.sparse, self.table["hyperparameters"].start.ndim == 2
-        if not sparse.complete or separate or self.problem.heavy_tails or self.rules.lowest_noise_exact is None:
+        if not sparse.complete or separate or self.problem.noise.heavy_tails or self.rules.lowest_noise_exact is None:
             return None
         rows, kernels = self.rows.some(np.arange(len(self.rows))), None
         if sparse.kernels is not None:

@@ -256,7 +256,7 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
         rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
         if rank < mask.sum():
             raise ValueError(
-                f"coef_scale=inf needs features that are linearly independent on the rows of X: {mask.sum()} features "
+                f"An infinite scale of CoefPrior needs features that are linearly independent on the rows of X: {mask.sum()} features "
                 f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
             )
 

@@ -16,12 +16,13 @@ from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import FeatureUnion, Pipeline
 from sklearn.preprocessing import FunctionTransformer
 
+from ..data.maps import Maps
 from ..utils.sklearn import safe_indexing
 from ..utils.validation import is_frame, words_of
 from .elementary import DirectMap, Foreign, Identity, elementary
 
 
-def maps_of(model: Any) -> tuple[DirectMap | None, DirectMap | None]:
+def direct_maps(maps: Maps) -> tuple[DirectMap | None, DirectMap | None]:
     """Feature map and kernel map of a fitted model, and None for one that it does not have.
 
     Raises
@@ -29,14 +30,13 @@ def maps_of(model: Any) -> tuple[DirectMap | None, DirectMap | None]:
     ValueError
         If columns of X were no numbers.
     """
-    if is_frame(model._example) and (words := words_of(model._example)):
+    if is_frame(maps.example) and (words := words_of(maps.example)):
         raise ValueError(
             f"The columns {words} of X are not numbers: derivatives, functions to be drawn and predictors without "
             "validation need them to be."
         )
     features, inputs = (
-        None if each is None else direct_map(each, example=model._example)
-        for each in (model.feature_map_, model.kernel_map_)
+        None if each is None else direct_map(each, example=maps.example) for each in (maps.feature_map, maps.kernel_map)
     )
     return features, inputs
 

@@ -42,6 +42,15 @@ class Adam(Solver):
         Whether steps fall to zero along half a cosine, over ``max_iter`` steps or over the last ones, or stay as they
         are until the bound does, and only the last ones fall.
 
+    posterior : {"full", "diagonal"}, default="full"
+        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
+    tol : float or "auto", default="auto"
+        Tolerance in nats. Adam goes over to its last steps, as many as before, when the loss stays flat: when its
+        median over the last third of the steps differs from that over the third before by less than this (``"auto"``:
+        0.01), or by no more than chance, which mostly decides.
+    max_time : float, default=None
+        Seconds until steps end, as of `LBFGS`.
+
     Attributes
     ----------
     default_max_iter : int
@@ -74,6 +83,10 @@ class Adam(Solver):
         n_restarts: int = 0,
         callback: Callback | None = None,
         schedule: Literal["cosine", "constant"] = "cosine",
+        *,
+        posterior: Literal["full", "diagonal"] = "full",
+        tol: float | Literal["auto"] = "auto",
+        max_time: float | None = None,
     ):
         self.batch_size = batch_size
         self.learning_rate = learning_rate
@@ -81,6 +94,9 @@ class Adam(Solver):
         self.n_restarts = n_restarts
         self.callback = callback
         self.schedule = schedule
+        self.posterior = posterior
+        self.tol = tol
+        self.max_time = max_time
 
     def check(self) -> None:
         """Refuse options that are out of range."""
@@ -91,6 +107,8 @@ class Adam(Solver):
             raise ValueError(f'schedule of Adam must be "cosine" or "constant"; got {self.schedule!r}.')
         if not isinstance(self.natural_gradient, (bool, np.bool_)):
             raise TypeError(f"natural_gradient of Adam must be True or False; got {self.natural_gradient!r}.")
+        if self.natural_gradient and self.posterior != "full":
+            raise ValueError(f'natural_gradient=True of Adam needs posterior="full"; got posterior={self.posterior!r}.')
 
     def minimise(
         self,

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..utils.state import StatefulEstimator
-from ..utils.validation import check_integer
+from ..utils.validation import check_integer, check_real
 
 # x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
@@ -44,6 +44,9 @@ class Solver(StatefulEstimator):
 
     n_restarts: int
     callback: Callback | None
+    posterior: Literal["full", "diagonal"]
+    tol: float | Literal["auto"]
+    max_time: float | None
 
     def check(self) -> None:
         """Refuse options that are out of range."""
@@ -51,3 +54,9 @@ class Solver(StatefulEstimator):
         check_integer(self.n_restarts, f"n_restarts of {name}", minimum=0)
         if self.callback is not None and not callable(self.callback):
             raise TypeError(f"callback of {name} must be None or a function; got {self.callback!r}.")
+        if self.posterior not in ("full", "diagonal"):
+            raise ValueError(f'posterior of {name} must be "full" or "diagonal"; got {self.posterior!r}.')
+        if self.max_time is not None:
+            check_real(self.max_time, f"max_time of {name}", minimum=0.0, strict=True)
+        if not (isinstance(self.tol, str) and self.tol == "auto"):
+            check_real(self.tol, f"tol of {name}", minimum=0.0)

@@ -9,6 +9,7 @@ from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor
 from skevgp.kernels import Cosine
+from skevgp.noise import Gaussian
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (40, 2))
@@ -32,7 +33,7 @@ KERNELS = {
 
 def start(kernel=2.0 * RBF([1.0, 2.0]), y=Y[:, 0], **arguments):  # noqa: B008
     """A model whose kernel is where the user said."""
-    return EGPRegressor(kernel=kernel, noise_variance=0.1, **{"max_iter": 0} | arguments).fit(X, y)
+    return EGPRegressor(kernel=kernel, noise=Gaussian(variance=0.1), **({"max_iter": 0} | arguments)).fit(X, y)
 
 
 def elsewhere(model, seed=0):

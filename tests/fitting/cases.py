@@ -45,12 +45,11 @@ def problem_of(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
     """What an estimator asks for."""
     units = changes.pop("units", None) or units_of(X, H, Y)
     options = {
-        "data": (X, X, Y, None),
         "source": source_of(X, H, Y),
         "units": units,
         "spec": parse_kernel(kernel, X.shape[1]),
         "vague": np.zeros(units.prior.scale.shape, dtype=bool),
-        "n_columns": X.shape[1],
+        "shapes": (X.shape[1:], H.shape[1:]),
         "placement": Placement("k-means", n_inducing),
         "max_iter": 20,
         "tol": 1.0,

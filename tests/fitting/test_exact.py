@@ -92,7 +92,7 @@ def test_restarts_keep_the_likeliest():
 def test_features_that_rows_cannot_tell_apart_are_refused_if_nothing_is_known_of_their_weights():
     twice = np.column_stack([H[:, 0], 2.0 * H[:, 0]])
     with pytest.raises(
-        ValueError, match=r"coef_scale=inf needs .* 2 features have an infinite scale, but only 1 of them"
+        ValueError, match=r"An infinite scale .* needs .* 2 features have an infinite scale, but only 1 of them"
     ):
         fitted(H=twice, vague=True)
     assert np.isfinite(fitted(H=twice, vague=[[True, False], [False, True]]).log_marginal_likelihood)

@@ -410,7 +410,7 @@ def test_limits_of_the_kernel_are_those_of_the_fit(path):
 
 def _is_mean(content):
     values = np.frombuffer(content[128:])
-    mean = fitted("plain")._predictor.groups[0].mean
+    mean = fitted("plain")._posterior.predictor.groups[0].mean
     return content.startswith(b"\x93NUMPY") and np.array_equal(values, mean.ravel())
 
 

@@ -22,6 +22,8 @@ from skevgp.model.bounds import (
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective
 from skevgp.model.predictor import CoefficientPrior
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
 from ..accuracy import at_the_fit
@@ -291,7 +293,9 @@ def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
     jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
     x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
     kernel = ConstantKernel(1.0, "fixed") * DotProduct(1.0)
-    model = EVGPRegressor(kernel=kernel, inducing_init=x[6:], posterior="diagonal", noise_variance=0.1, max_iter=0)
+    model = EVGPRegressor(
+        kernel=kernel, inducing_init=x[6:], solver=LBFGS(posterior="diagonal"), noise=Gaussian(variance=0.1), max_iter=0
+    )
     one, blocks = at_the_fit(model.fit(x, np.random.RandomState(0).randn(9)))
     objective, start = BoundObjective(one.sparse, one.table, blocks), one.table.start()
     step = 0.01 * np.eye(len(start))[0]

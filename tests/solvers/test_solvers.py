@@ -82,7 +82,7 @@ def test_an_option_out_of_range_is_named(solver, error, message):
 
 def test_natural_gradients_need_the_full_posterior():
     with pytest.raises(ValueError, match=r'natural_gradient=True of Adam needs posterior="full"; got posterior='):
-        model(solver=Adam(natural_gradient=True), posterior="diagonal").fit(X, Y)
+        model(solver=Adam(natural_gradient=True, posterior="diagonal")).fit(X, Y)
 
 
 @few_iterations
@@ -99,8 +99,8 @@ def test_a_subclass_may_have_another_number_of_iterations():
     class Short(LBFGS):
         default_max_iter = 4
 
-    assert model(solver=Short(), max_iter=None, tol=0.0).fit(X, Y).n_iter_ == 4
-    assert model(solver=Short(), max_iter=6, tol=0.0).fit(X, Y).n_iter_ == 6
+    assert model(solver=Short(tol=0.0), max_iter=None).fit(X, Y).n_iter_ == 4
+    assert model(solver=Short(tol=0.0), max_iter=6).fit(X, Y).n_iter_ == 6
 
 
 @few_iterations

@@ -15,13 +15,14 @@ from skevgp.estimators.bnn_training import Training
 from skevgp.features import InertiaForceGravity
 from skevgp.fitting import messages
 from skevgp.metrics import prediction_error, std_norm
+from skevgp.noise import Gaussian
 from skevgp.solvers import Adam
 from skevgp.solvers.base import Minimum
 
 from ..conftest import read
 
 COLUMNS = "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,within_0.1,"
-PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+PAPER = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 
 
 @pytest.fixture
@@ -348,7 +349,10 @@ def test_warnings_tell_how_a_fit_ended():
     assert how_it_ended([str(short[0].message)], 2) == {"converged": False, "unlearned": 0}
     with pytest.warns(ConvergenceWarning) as blind:
         EVGPRegressor(
-            kernel=ConstantKernel(1e-6, "fixed") * RBF(1e3, "fixed"), noise_variance=1.0, n_inducing=3, noise_cv=None
+            kernel=ConstantKernel(1e-6, "fixed") * RBF(1e3, "fixed"),
+            noise=Gaussian(variance=1.0),
+            n_inducing=3,
+            noise_cv=None,
         ).fit(X, y)
     found = how_it_ended([str(warning.message) for warning in blind], 2)
     assert found["unlearned"] == 2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,6 +13,7 @@ from sklearn.pipeline import FeatureUnion, Pipeline
 
 from ..data.maps import transformed
 from ..utils.sklearn import safe_indexing
+from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude
 
 # Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
@@ -21,15 +22,73 @@ _WIDE = 10.0
 _ROUNDING = 1e-8
 
 
-class CoefPrior(NamedTuple):
-    """β ~ N(mean, Σ) for each output; k rows, one for each output, or a single one if they share their weights.
+class CoefPrior(StatefulEstimator):
+    """Prior of the weights β of the explicit features, β ~ N(mean, Σ), for ``coef_prior=`` of the regressors.
 
-    Attributes
+    Parameters
     ----------
-    mean, scale : ndarray of shape (k, p)
-        With ``scale`` the standard deviations.
-    root : ndarray of shape (k, p, p), or None
-        C with Σ = C Cᵀ; None if weights are independent.
+    mean : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
+        Prior mean. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``; for a map without one, it is 0.
+    scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
+        Prior standard deviation. ``"auto"`` asks the feature map; for a map without an opinion it is
+        10 * std(y) / rms(h). A scale of 0 keeps a weight at its mean. `EGPRegressor` takes ``np.inf``: its estimate of
+        such a weight is that of generalised least squares (Rasmussen & Williams 2006, eq. 2.42 to 2.45).
+    cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
+        Prior covariance Σ, of all outputs or of each, instead of ``scale``. The mass and the first moment of a link,
+        for example, are correlated in any honest prior.
+    shared : bool or "auto", default="auto"
+        Whether all outputs have the same weights, as the torques of a robot's joints have one set of inertial
+        parameters. Then ``mean``, ``scale`` and ``coef_`` have no axis of outputs, all outputs are fitted together, and
+        they depend on each other (``predict(X, return_cov="joint")``). ``"auto"`` asks the feature map's attribute
+        ``share_coef``. Not for Adam or the diagonal posterior.
+
+    Examples
+    --------
+    >>> from sklearn.preprocessing import PolynomialFeatures
+    >>> from skevgp import CoefPrior, EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> prior = CoefPrior(mean=0.0, scale=5.0)
+    >>> model = EVGPRegressor(PolynomialFeatures(1), coef_prior=prior, n_inducing=10, random_state=0).fit(X, y)
+    >>> model.coef_prior_scale_
+    array([5., 5.])
+    """
+
+    def __init__(
+        self,
+        mean: ArrayLike | Literal["auto"] = "auto",
+        scale: ArrayLike | Literal["auto"] = "auto",
+        cov: ArrayLike | None = None,
+        shared: bool | Literal["auto"] = "auto",
+    ):
+        self.mean = mean
+        self.scale = scale
+        self.cov = cov
+        self.shared = shared
+
+
+def as_coef_prior(coef_prior: Any) -> CoefPrior:
+    """Return the prior that ``coef_prior=`` names or is.
+
+    Raises
+    ------
+    TypeError
+        If it is none.
+    """
+    if isinstance(coef_prior, CoefPrior):
+        shared = coef_prior.shared
+        if not (isinstance(shared, (bool, np.bool_)) or _word(shared) == "auto"):
+            raise TypeError(f'shared of CoefPrior must be True, False or "auto"; got {shared!r}.')
+        return coef_prior
+    if _word(coef_prior) == "auto":
+        return CoefPrior()
+    raise TypeError(f'coef_prior must be "auto" or a skevgp.CoefPrior(...); got {coef_prior!r}.')
+
+
+class Resolved(NamedTuple):
+    """Mean and standard deviations (k, p), and C (k, p, p) with Σ = C Cᵀ, or None if weights are independent.
+
+    k is the number of outputs, or 1 if they share their weights.
     """
 
     mean: np.ndarray
@@ -37,80 +96,54 @@ class CoefPrior(NamedTuple):
     root: np.ndarray | None
 
 
-def resolve_coef_prior(
-    coef_mean: ArrayLike | str,
-    coef_scale: ArrayLike | str,
-    feature_map: Any,
-    X: Any,
-    wide: np.ndarray,
-    *,
-    coef_cov: ArrayLike | None = None,
-    n_outputs: int | None = None,
-    allow_vague: bool = False,
-) -> CoefPrior:
-    """Prior mean and covariance of the weights.
+def resolved(
+    prior: CoefPrior, feature_map: Any, X: Any, wide: np.ndarray, n_outputs: int, allow_vague: bool = False
+) -> Resolved:
+    """Prior mean and covariance of the weights of a fitted feature map.
 
-    Parameters
-    ----------
-    coef_mean, coef_scale : array-like of shape (k, p), scalar or "auto"
-        ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``, which returns the mean and either the standard
-        deviations or the covariance (k, p, p), or one (p, p) for all; unions concatenate those of their parts. A part
-        without one, and entries of a scale that are NaN, get mean 0 and the scale ``wide``.
-    feature_map : transformer or None
-        Fitted.
-    X : array-like of shape (n, d)
-        What the map takes; only its first row is used, to learn the widths of the parts of a union.
-    wide : ndarray of shape (k, p)
-        `wide_scale`.
-    coef_cov : array-like of shape (p, p) or (k, p, p), default=None
-        In place of ``coef_scale``.
-    n_outputs : int, default=None
-        What ``coef_prior`` is asked for; None is k.
-    allow_vague : bool, default=False
-        Whether a scale may be infinite.
-
-    Returns
-    -------
-    prior : CoefPrior
+    The map's method ``coef_prior(n_outputs)`` returns the mean and either the standard deviations or the covariance
+    (k, p, p), or one (p, p) for all; unions concatenate those of their parts. A part without the method, and entries of
+    a scale that are NaN, get mean 0 and the scale ``wide`` (k, p). Of X only the first row is used, to learn the widths
+    of the parts of a union.
 
     Raises
     ------
     ValueError
         If a shape does not fit, a value is not finite, a scale is negative, or a covariance is none.
     """
-    shape, shared = wide.shape, (n_outputs or len(wide)) > len(wide)
-    given: dict[str, Any] = {"coef_mean": coef_mean, "coef_scale": coef_scale, "coef_cov": coef_cov}
-    for name, value in given.items():
+    shape, shared = wide.shape, n_outputs > len(wide)
+    for name in ("mean", "scale", "cov"):
+        value = getattr(prior, name)
         if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
-            raise ValueError(f"{name} needs a feature_map: without one there are no weights.")
-    if coef_cov is not None and _word(coef_scale) != "auto":
-        raise ValueError(f"coef_cov and coef_scale={coef_scale!r} both say how far weights may be; give one of them.")
+            raise ValueError(f"{name} of CoefPrior needs a feature_map: without one there are no weights.")
+    if prior.cov is not None and _word(prior.scale) != "auto":
+        raise ValueError(
+            f"cov and scale={prior.scale!r} of CoefPrior both say how far weights may be; give one of them."
+        )
     auto_mean, auto_scale, correlation = np.zeros(shape), wide, _independent(shape)
-    if feature_map is not None and "auto" in (_word(coef_mean), _word(coef_scale)):
+    if feature_map is not None and "auto" in (_word(prior.mean), _word(prior.scale)):
         first = safe_indexing(X, slice(0, 1))
-        auto_mean, scale, correlation = _map_prior(feature_map, first, n_outputs or shape[0], shape)
+        auto_mean, scale, correlation = _map_prior(feature_map, first, n_outputs, shape)
         auto_scale = np.where(np.isnan(scale), auto_scale, scale)
-    mean = auto_mean if _word(coef_mean) == "auto" else _as_table(coef_mean, "coef_mean", shape, shared)
-    scale = auto_scale
-    if _word(coef_scale) != "auto":
-        scale, correlation = _as_table(coef_scale, "coef_scale", shape, shared), _independent(shape)
-    if coef_cov is not None:
-        scale, correlation = _of_covariance(coef_cov, "coef_cov", shape)
+    mean = auto_mean if _word(prior.mean) == "auto" else _as_table(prior.mean, "mean of CoefPrior", shape, shared)
+    scale, scale_name = auto_scale, 'scale="auto" of CoefPrior, the feature map\'s or 10 std(y) / rms of a feature,'
+    if _word(prior.scale) != "auto":
+        scale_name = "scale of CoefPrior"
+        scale, correlation = _as_table(prior.scale, scale_name, shape, shared), _independent(shape)
+    if prior.cov is not None:
+        scale, correlation = _of_covariance(prior.cov, "cov of CoefPrior", shape)
     finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
-    scale_name = "coef_scale"
-    if scale is auto_scale:
-        scale_name = "coef_scale='auto', the feature map's or 10 std(y) / rms of a feature,"
-    for name, values in (("coef_mean", mean), (scale_name, finite)):
+    for name, values in (("mean of CoefPrior", mean), (scale_name, finite)):
         if not np.isfinite(values).all():
             raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
         check_magnitude(values, name)
     if (scale < 0).any():
-        raise ValueError(f"coef_scale must not be negative; its smallest value is {scale.min()}.")
+        raise ValueError(f"scale of CoefPrior must not be negative; its smallest value is {scale.min()}.")
     if (correlation == _independent(shape)).all():
-        return CoefPrior(mean.astype(float), scale.astype(float), None)
+        return Resolved(mean.astype(float), scale.astype(float), None)
     eigenvalues, vectors = (np.array(each) for each in zip(*map(eigh, correlation), strict=True))
     root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, np.newaxis]
-    return CoefPrior(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
+    return Resolved(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
 
 
 def _independent(shape: tuple[int, int]) -> np.ndarray:
@@ -174,7 +207,7 @@ def _shapes(shape: tuple[int, int]) -> list[tuple[int, ...]]:
 def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
     """The same for errors."""
     if shared:
-        return f"the shape (n_features_out,) = {shape[1:]}, since the outputs share their weights (share_coef)"
+        return f"the shape (n_features_out,) = {shape[1:]}, since the outputs share their weights"
     alone = f", or {shape[1:]} for the one output" if shape[0] == 1 else ""
     return f"the shape (n_outputs, n_features_out) = {shape}{alone}"
 
