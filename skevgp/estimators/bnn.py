@@ -14,7 +14,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.threads import single_threaded_libraries
-from ..data.weights import Chosen, chosen_rows, rows_of
+from ..data.weights import chosen_rows, rows_of
 from ..exceptions import warn_user
 from ..utils.monitor import monitor_of
 from ..utils.shapes import like_y
@@ -339,7 +339,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         """Inputs (n, d) and targets (n, o) of the rows that count, and how often they do."""
         X, y = validate_numbers(self, X, y, reset=True, dtype=np.float64)
         targets = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
-        chosen: Chosen = chosen_rows(X, targets, sample_weight)
+        chosen = chosen_rows(X, targets, sample_weight)
         X, targets = rows_of(X, chosen.positions), rows_of(targets, chosen.positions)
         for values, name in ((X, "X"), (targets, "y")):
             check_size(values, name)
