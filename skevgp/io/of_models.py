@@ -9,9 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..data.source import RawRows
-from ..estimators.bnn import BayesianMLPRegressor
-from ..estimators.bnn_model import VariationalNetwork
-from ..estimators.bnn_training import Scaling
+from ..estimators.bnn import BayesianMLPRegressor, Scaling, VariationalNetwork
 from ..estimators.egp import EGPRegressor
 from ..estimators.evgp import EVGPRegressor
 from ..estimators.residual import ResidualRegressor
@@ -261,8 +259,14 @@ def _network(found: dict[str, Any]) -> VariationalNetwork:
     if len(sizes) < 2 or len(prior) != sum(first * second for first, second in pairwise(sizes)):
         raise MalformedError(f"a VariationalNetwork of the sizes {sizes} has not {len(prior)} weights")
     network = VariationalNetwork(sizes, np.ones(len(sizes) - 1).tolist(), found["slope"])
-    network._prior_log_std, network._prior_precision = prior, np.exp(-2.0 * prior)
+    # The file has a number for each weight; those of a layer are equal.
+    ends = np.cumsum([first * second for first, second in pairwise(sizes)])
+    network.prior_log_stds = prior[ends - 1]
     return network
+
+
+def _prior_log_std(network: VariationalNetwork) -> np.ndarray:
+    return np.repeat(network.prior_log_stds, [first * second for first, second in pairwise(network.sizes)])
 
 
 _NETWORK = [
@@ -271,7 +275,7 @@ _NETWORK = [
         VariationalNetwork,
         {"sizes": several(integer(1), tuple), "slope": real(least=0.0), "prior_log_std": array("w")},
         frozenset(),
-        lambda own: {"sizes": own.sizes, "slope": own._slope, "prior_log_std": own._prior_log_std},
+        lambda own: {"sizes": own.sizes, "slope": own.slope, "prior_log_std": _prior_log_std(own)},
         _network,
     ),
     plain(Scaling, x_mean=array("d"), x_scale=array("d", above=0.0), y_mean=array("o"), y_scale=array("o", above=0.0)),
