@@ -97,7 +97,7 @@ class EGPRegressor(ExplicitGaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0
-        As of `EVGPRegressor`; its bound is the log marginal likelihood.
+        Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
 
     Attributes
     ----------

@@ -150,9 +150,9 @@ class EVGPRegressor(SparseGaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Places inducing points, draws mini-batches and restarts.
     verbose : int, default=0
-        1 shows one live line: the rows that are fitted, iteration, bound, seconds so far and, once it can be known,
-        about how many are left for these outputs. (What is no terminal gets a line each ten seconds, and the last.) 2
-        prints a line at each iteration.
+        Verbosity. 0 prints nothing. 1 shows the rows that are fitted, the iteration, the bound and the seconds so far:
+        in one live line if tqdm is installed and the output is a terminal or a notebook, else in a line every ten
+        seconds. 2 prints a line at each iteration.
 
     Attributes
     ----------

@@ -125,7 +125,7 @@ class ExactTask:
         table = self.table.started_at(attempt.values)
         n, spent = self.model.rows.total, len(attempt.loss_curve)
         loss = LikelihoodObjective(self.model, table)
-        monitor = self.monitor.seen_as(spent, n, is_last=attempt.is_last and self.options.n_restarts == 0)
+        monitor = self.monitor.seen_as(spent, n)
         if self.options.optimizer is not None and table.size > 0:
             return self._minimised_by(self.options.optimizer, table, loss, monitor)
         minimum = lbfgs(loss, table.start(), table.limits(), attempt.until - spent, self.options.tol / n, monitor)

@@ -100,10 +100,9 @@ def fit_doubting(task: SparseTask, run: Callable[[SparseTask], tuple[SparseTask,
     """
     rows, doubts = task.rows, _first_doubts(task)
     first = task.max_iter - int((1.0 - _BEFORE) * task.max_iter)
-    monitor = task.monitor.seen_as(is_last=False)
     # Where no row stands out, the fit is that with Gaussian noise.
     seen = doubts.weigh(rows) if (doubts.scales.outlier > 0.5).any() else rows
-    weighed, fit = run(replace(task, rows=seen, max_iter=first, monitor=monitor))
+    weighed, fit = run(replace(task, rows=seen, max_iter=first))
     weighed = replace(weighed, max_iter=task.max_iter)
     with task.monitor.keeping_the_best():
         while not task.monitor.stopped:

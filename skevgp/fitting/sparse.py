@@ -324,7 +324,6 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
         task,
         max_iter=_ITERATIONS if task.max_iter > 0 else 0,
         tol=max(task.tol or 0.0, _COARSE * nats),
-        monitor=task.monitor.seen_as(is_last=False),
     )
     fit = search(coarse)
     with task.monitor.keeping_the_best():
@@ -339,7 +338,7 @@ def grown(task: SparseTask) -> tuple[SparseTask, Fit]:
             if larger.bound - fit.bound < _GAIN * nats and not limited:
                 break
             coarse, fit = more, larger
-    task = replace(coarse, max_iter=task.max_iter, tol=task.tol, monitor=task.monitor)
+    task = replace(coarse, max_iter=task.max_iter, tol=task.tol)
     if task.max_iter > 0 and not task.monitor.stopped:
         fit = better(fit, task.minimise(Attempt(fit.values, task.max_iter)))
     return task, fit

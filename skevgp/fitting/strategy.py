@@ -83,8 +83,6 @@ class Attempt:
         Of the sample that is fitted; None means all rows.
     cold : bool, default=False
         Whether the values are a first guess, where the curvature of the bound says little of that at the end.
-    followed : bool, default=False
-        Whether another start follows, however this one ends.
     """
 
     values: Values
@@ -92,12 +90,6 @@ class Attempt:
     after: Fit | None = None
     n_rows: int | None = None
     cold: bool = False
-    followed: bool = False
-
-    @property
-    def is_last(self) -> bool:
-        """Whether a fit that ends well ends with it, restarts aside."""
-        return self.n_rows is None and not self.followed
 
     @property
     def loss_curve(self) -> list[float]:
@@ -270,12 +262,12 @@ class Strategy:
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Attempts:
         """A fit from these values; from other starts too where it may have ended in a bad optimum."""
 
-        def start(values: Values, cold: bool = True, followed: bool = False) -> Attempt:
-            return Attempt(values, until, n_rows=n_rows, cold=cold, followed=followed)
+        def start(values: Values, cold: bool = True) -> Attempt:
+            return Attempt(values, until, n_rows=n_rows, cold=cold)
 
         free = bool(self.table["noise"].free.any())
         much = self.rules.much_noise if free and (self.interpolates or n_rows is not None) else None
-        best = yield start(values, followed=much is not None)
+        best = yield start(values)
         if until == 0 or not free:
             return best
         if much is not None:

@@ -88,7 +88,7 @@ def adam(
             second += (1.0 - _DECAY_SECOND) * (gradient**2 - second)
             scale = np.sqrt(second / (1.0 - _DECAY_SECOND**t)) + _EPSILON
             x = np.clip(x - learning_rate * share / (1.0 - _DECAY_FIRST**t) * first / scale, *limits)
-            monitor.iteration(t, loss, until)
+            monitor.iteration(t, loss)
             if t % _WINDOW == 0 and t >= 3 * _WINDOW:
                 flat_from = (flat_from or t) if is_flat(np.array(minimum.loss_curve), tol) else 0
                 if flat_from > 0 and t >= _FEWEST and t - flat_from >= t // 3 and 2 * t < until:

@@ -105,8 +105,8 @@ class _Guarded:
 class _Watch:
     """Writes down the losses of iterations, tells the monitor, and ends what stalls."""
 
-    def __init__(self, minimum: Minimum, most: int, tolerance: Tolerance, patience: int, monitor: Monitor):
-        self._minimum, self._most, self._monitor = minimum, most, monitor
+    def __init__(self, minimum: Minimum, tolerance: Tolerance, patience: int, monitor: Monitor):
+        self._minimum, self._monitor = minimum, monitor
         self._tolerance, self._patience = tolerance, patience
         self._stalled = 0
 
@@ -115,9 +115,8 @@ class _Watch:
         loss, curve = float(intermediate_result.fun), self._minimum.loss_curve
         before = curve[-1] if curve else np.inf
         curve.append(loss)
-        enough = self._tolerance.at(loss)
-        self._monitor.iteration(len(curve), loss, self._most, enough)
-        self._stalled = self._stalled + 1 if before - loss < enough else 0
+        self._monitor.iteration(len(curve), loss)
+        self._stalled = self._stalled + 1 if before - loss < self._tolerance.at(loss) else 0
         if self._stalled >= self._patience:
             raise StopIteration
 
@@ -168,7 +167,7 @@ def lbfgs(
             before = guarded.loss
             if units is not None:
                 guarded.unit = units(x)
-            watch = _Watch(minimum, max_iter, tolerance, descent.patience, monitor)
+            watch = _Watch(minimum, tolerance, descent.patience, monitor)
             left = max_iter - minimum.n_iter
             ends = {"maxiter": left, "maxfun": 20 * left + 100, "ftol": 0.0, "gtol": descent.gradient}
             box = np.column_stack([limit / guarded.unit for limit in limits])

@@ -136,14 +136,13 @@ class LBFGS(StatefulEstimator):
         rows = "all rows" if attempt.n_rows is None else f"{attempt.n_rows:,} of {len(task.rows):,} rows"
         if task.placement.max_inducing is not None:
             rows = f"{task.n_inducing} points, {rows}"
-        is_last = attempt.is_last and attempt.until >= task.max_iter and self.n_restarts == 0
         minimum = lbfgs(
             self.objective(task, table, attempt.n_rows),
             table.start(),
             table.limits(),
             attempt.until - spent,
             self._tolerance(task, attempt),
-            task.monitor.seen_as(spent, n_rows, about=rows, is_last=is_last),
+            task.monitor.seen_as(spent, n_rows, about=rows),
             self.descent,
             None if attempt.cold else self._units(task, table),
         )
@@ -276,7 +275,7 @@ class Adam(StatefulEstimator):
             attempt.until,
             self.learning_rate,
             tol / n_rows,
-            task.monitor.seen_as(factor=n_rows, is_last=self.n_restarts == 0),
+            task.monitor.seen_as(factor=n_rows),
             elbo.pace,
             constant=self.schedule == "constant",
         )

@@ -12,6 +12,7 @@ _PACKAGES = {
     "dask": ("'dask[array,distributed]'", "dask"),
     "casadi": ("casadi", "casadi"),
     "rosbags": ("rosbags", "logs"),
+    "tqdm": ("tqdm", "progress"),
 }
 
 
