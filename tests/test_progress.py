@@ -330,7 +330,9 @@ def test_both_are_served(verbose, capsys):
         with monitor_of(verbose, callback) as monitor:
             monitor.iteration(1, 5.0)
     assert len(told) == 1
-    assert len(capsys.readouterr().out.splitlines()) == (2 if verbose else 0)
+    printed = capsys.readouterr()
+    assert len(printed.out.splitlines()) == (2 if verbose else 0)
+    assert printed.err == ""
 
 
 def test_a_fit_that_fails_ends_its_line(capsys):

@@ -217,8 +217,9 @@ class Progress:
         if self._tqdm is None:
             print(text, file=self._stream, flush=True)
         elif self._bar is None:
-            # An empty bar fills the line, and cuts off what is longer than the terminal.
-            self._bar = self._tqdm(desc=text, bar_format="{desc}{bar}", file=self._stream, dynamic_ncols=True)
+            # On a terminal, an empty bar fills the line and cuts off what is longer.
+            fills = self._stream.isatty()
+            self._bar = self._tqdm(desc=text, bar_format="{desc}{bar}", file=self._stream, dynamic_ncols=fills)
         else:
             self._bar.set_description_str(text, refresh=False)
             # Not `refresh`: Ctrl-C inside of it would leave the lock that all bars share locked.
