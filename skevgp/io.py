@@ -187,7 +187,20 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
 
     See Also
     --------
-    save : Write the file; it has an example.
+    save : Write the file.
+
+    Examples
+    --------
+    >>> import os, tempfile
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.io import load, save
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "toy.skevgp")
+    ...     save(EVGPRegressor(n_inducing=10, random_state=0).fit(X, y), path)
+    ...     load(path).n_inducing
+    10
     """
     require("skops.io", "Loading a model")
     with open(path, "rb") as file:
@@ -237,8 +250,8 @@ def _read(file: IO[bytes], trusted: list[str]) -> tuple[Any, dict[str, str], boo
         raise ValueError("it does not say that it is one")
     if content["version"] > _VERSION:
         raise ValueError(
-            f"it is of version {content['version']}, and this skevgp ({__version__}) reads files of version {_VERSION}; "
-            "update skevgp"
+            f"it is of version {content['version']}, and this skevgp ({__version__}) reads files of version "
+            f"{_VERSION}; update skevgp"
         )
     model, made_with, trial = content["model"], content["made_with"], content["trial"]
     if not isinstance(model, BaseEstimator):
