@@ -13,7 +13,7 @@ import numpy as np
 from ..data.internal import Rows
 from ..data.source import RawRows, Source
 from ..data.threads import BlockMap
-from ..kernels.covariances import Covariance
+from ..kernels.base import Covariance
 from ..kernels.parse import KernelSpec
 from ..model.bounds import PosteriorFamily
 from ..model.model import SparseModel

@@ -7,7 +7,7 @@ from scipy.spatial import cKDTree
 
 from ..data.internal import Rows
 from ..data.source import Moments, RawRows
-from ..kernels.covariances import Covariance
+from ..kernels.base import Covariance
 from ..kernels.parse import KernelSpec, Start, Starts
 from ..model.parameters import Parameter, ParameterTable
 from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from sklearn.gaussian_process import kernels as sk
 
-from ..kernels import constant, cosine, covariances, dot_product, profiles, stationary
+from ..kernels import base, constant, cosine, dot_product, periodic, stationary
 from ..kernels.parse import KernelSpec, Start, Starts
 from .fields import Field, array, flag, integer, made, nothing, one_of, real, row, several
 from .records import Record, bare, plain
@@ -24,15 +24,15 @@ _BOUNDS = (
     | array("d 2", least=0.0, finite=False)
     | array("2", least=0.0, finite=False)
 )
-TREE, COVARIANCE = made(sk.Kernel), made(covariances.Covariance)
-_ROWS = made(covariances.CentredSquares)
+TREE, COVARIANCE = made(sk.Kernel), made(base.Covariance)
+_ROWS = made(base.CentredSquares)
 _PROFILES = (
-    profiles.Exponential,
-    profiles.Matern12,
-    profiles.Matern32,
-    profiles.Matern52,
-    profiles.RationalQuadratic,
-    profiles.ExpSineSquared,
+    stationary.Exponential,
+    stationary.Matern12,
+    stationary.Matern32,
+    stationary.Matern52,
+    stationary.RationalQuadratic,
+    periodic.ExpSineSquared,
 )
 
 _SK_KERNELS = [
@@ -65,17 +65,17 @@ _SK_KERNELS = [
 ]
 
 _OURS = [
-    plain(covariances.CentredSquares, centre=several(real(), tuple)),
-    plain(covariances.Sum, parts=several(COVARIANCE, tuple)),
-    plain(covariances.Product, parts=several(COVARIANCE, tuple)),
+    plain(base.CentredSquares, centre=several(real(), tuple)),
+    plain(base.Sum, parts=several(COVARIANCE, tuple)),
+    plain(base.Product, parts=several(COVARIANCE, tuple)),
     plain(constant.Constant, "Constant"),
     plain(dot_product.DotProduct, "DotProduct"),
     plain(cosine.Wave, n_columns=integer(1), isotropic=flag, rows=_ROWS),
     *(plain(profile, f"profiles.{profile.__name__}") for profile in _PROFILES),
-    plain(profiles.Matern, "profiles.Matern", nu=real(above=0.0, finite=False)),
+    plain(stationary.Matern, "profiles.Matern", nu=real(above=0.0, finite=False)),
     plain(
         stationary.Stationary,
-        profile=made(*_PROFILES, profiles.Matern),
+        profile=made(*_PROFILES, stationary.Matern),
         n_columns=integer(1),
         isotropic=flag,
         rows=_ROWS,

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from skevgp.kernels import profiles
+from skevgp.kernels import periodic, stationary
 
 PROFILES = [
-    (profiles.Exponential(), []),
-    (profiles.Matern12(), []),
-    (profiles.Matern32(), []),
-    (profiles.Matern52(), []),
-    (profiles.Matern(1.9), []),
-    (profiles.RationalQuadratic(), [0.4]),
-    (profiles.ExpSineSquared(), [-0.3]),
+    (stationary.Exponential(), []),
+    (stationary.Matern12(), []),
+    (stationary.Matern32(), []),
+    (stationary.Matern52(), []),
+    (stationary.Matern(1.9), []),
+    (stationary.RationalQuadratic(), [0.4]),
+    (periodic.ExpSineSquared(), [-0.3]),
 ]
 
 
@@ -34,11 +34,11 @@ def test_a_profile_is_1_at_distance_0(profile, parameters):
 
 
 @pytest.mark.parametrize(
-    ("special", "nu"), [(profiles.Matern12(), 0.5), (profiles.Matern32(), 1.5), (profiles.Matern52(), 2.5)]
+    ("special", "nu"), [(stationary.Matern12(), 0.5), (stationary.Matern32(), 1.5), (stationary.Matern52(), 2.5)]
 )
 def test_the_general_matern_has_the_special_ones(special, nu):
     E, none = -np.geomspace(1e-4, 5.0, 20), np.empty(0)
-    general = profiles.Matern(nu)
+    general = stationary.Matern(nu)
     np.testing.assert_allclose(general.value(E, none), special.value(E, none), rtol=1e-12)
     slopes = (one.derivatives(E, one.value(E, none), none)[0] for one in (general, special))
     np.testing.assert_allclose(next(slopes), next(slopes), rtol=1e-10)
@@ -48,7 +48,7 @@ def test_the_general_matern_has_the_special_ones(special, nu):
 def test_matern_where_bessel_functions_overflow(nu):
     """1 - ν r² / 2(ν - 1) + ν² r⁴ / 8(ν - 1)(ν - 2) - ..., from exact fractions; scikit-learn's is inf there."""
     r, none = np.array([0.0, 1e-8, 1e-4, 1e-3, 1e-2]), np.empty(0)
-    E, profile = -0.5 * r**2, profiles.Matern(nu)
+    E, profile = -0.5 * r**2, stationary.Matern(nu)
     first, second = nu / (2.0 * (nu - 1.0)), nu**2 / (8.0 * (nu - 1.0) * (nu - 2.0))
     expected = 1.0 - first * r**2 + second * r**4
     np.testing.assert_allclose(profile.value(E, none), expected, rtol=1e-12)

@@ -5,8 +5,7 @@ import pytest
 from sklearn.gaussian_process import kernels as sk
 
 from skevgp.kernels.parse import parse_kernel
-from skevgp.kernels.profiles import Exponential, Matern, Matern32
-from skevgp.kernels.stationary import SquaredExponential, Stationary
+from skevgp.kernels.stationary import Exponential, Matern, Matern32, SquaredExponential, Stationary
 
 from ..oracle import central_differences
 from .cases import X, Z, parsed, pulled_back, random_bars, scalar
