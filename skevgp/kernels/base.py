@@ -11,10 +11,10 @@ by hand.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
-from itertools import product
+from itertools import chain, product
 from operator import add, itemgetter, mul
 from typing import Any, Protocol, TypeVar
 
@@ -354,17 +354,53 @@ class Product(_Combination):
 
 
 class _CombinationAt(CovarianceAt):
+    # How values are combined.
+    combine: Callable[[Any, Any], Any]
+
     def __init__(self, parts: list[_Part]):
         self.parts = parts
+
+    def matrix(self) -> np.ndarray:
+        return reduce(self.combine, (part.at.matrix() for part in self.parts))
+
+    def cross(self, prepared: Any) -> np.ndarray:
+        return reduce(self.combine, (part.at.cross(part.own(prepared)) for part in self.parts))
+
+    def diagonal(self, prepared: Any) -> PerRow:
+        return reduce(self.combine, (part.at.diagonal(part.own(prepared)) for part in self.parts))
 
     def start_pullback(self) -> Sums:
         return Sums(part.at.start_pullback() for part in self.parts)
 
-    def _pulled(
-        self, prepared: Any, values: Sequence[Any], U_bars: Sequence[Any], diagonal_bars: Sequence[Any]
-    ) -> Sums:
-        parts = zip(self.parts, values, U_bars, bars, strict=True)
-        return Sums(part.at.cross_pullback(part.own(prepared), U, bar, own) for part, U, bar, own in parts)
+    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+        return self._pulled(prepared, self._values(prepared), U_bar, diagonal_bar)
+
+    def _values(self, prepared: Any) -> list[tuple[np.ndarray, Any]]:
+        """k(X_m, X) of each part and, if the part is a sum or product, the same of its own parts."""
+        found: list[tuple[np.ndarray, Any]] = []
+        for part in self.parts:
+            own = part.own(prepared)
+            if isinstance(part.at, _CombinationAt):
+                within = part.at._values(own)
+                found.append((reduce(part.at.combine, (value for value, _ in within)), within))
+            else:
+                found.append((part.at.cross(own), None))
+        return found
+
+    @abstractmethod
+    def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+        """As `cross_pullback`, with the values of the parts."""
+
+    def _each(self, prepared: Any, values: list[Any], U_bars: Iterable[Any], diagonal_bars: Iterable[Any]) -> Sums:
+        """What each part adds to the sum."""
+        found = []
+        for part, (U, within), *bars in zip(self.parts, values, U_bars, diagonal_bars, strict=True):
+            own = part.own(prepared)
+            if isinstance(part.at, _CombinationAt):
+                found.append(part.at._pulled(own, within, *bars))
+            else:
+                found.append(part.at.cross_pullback(own, U, *bars))
+        return Sums(found)
 
     def _finish(self, total: Sums, K_bars: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         gradients = [part.at.finish_pullback(*own) for part, *own in zip(self.parts, total, K_bars, strict=True)]
@@ -374,14 +410,7 @@ class _CombinationAt(CovarianceAt):
 class SumAt(_CombinationAt):
     """A `Sum` with hyperparameters and inducing points put in."""
 
-    def matrix(self) -> np.ndarray:
-        return reduce(add, (part.at.matrix() for part in self.parts))
-
-    def cross(self, prepared: Any) -> np.ndarray:
-        return reduce(add, (part.at.cross(part.own(prepared)) for part in self.parts))
-
-    def diagonal(self, prepared: Any) -> PerRow:
-        return reduce(add, (part.at.diagonal(part.own(prepared)) for part in self.parts))
+    combine = staticmethod(add)
 
     def slopes(self, prepared: Any) -> np.ndarray:
         return reduce(add, (part.at.slopes(part.own(prepared)) for part in self.parts))
@@ -392,15 +421,10 @@ class SumAt(_CombinationAt):
     def mixed_slopes(self, prepared: Any) -> np.ndarray:
         return reduce(add, (part.at.mixed_slopes(part.own(prepared)) for part in self.parts))
 
-    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+    def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
         # Each part may overwrite what it gets; the last one may have the original.
-        U_bars = [*(U_bar.copy() for _ in self.parts[1:]), U_bar]
-        # A sum or product among the parts does not use its value on the way back.
-        nested = (isinstance(part.at, _CombinationAt) for part in self.parts)
-        values = [
-            None if skip else part.at.cross(part.own(prepared)) for part, skip in zip(self.parts, nested, strict=True)
-        ]
-        return self._pulled(prepared, values, U_bars, [diagonal_bar] * len(self.parts))
+        U_bars = chain((U_bar.copy() for _ in self.parts[1:]), [U_bar])
+        return self._each(prepared, values, U_bars, [diagonal_bar] * len(self.parts))
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._finish(total, [K_bar] * len(self.parts))
@@ -409,14 +433,7 @@ class SumAt(_CombinationAt):
 class ProductAt(_CombinationAt):
     """A `Product` with hyperparameters and inducing points put in."""
 
-    def matrix(self) -> np.ndarray:
-        return reduce(mul, (part.at.matrix() for part in self.parts))
-
-    def cross(self, prepared: Any) -> np.ndarray:
-        return reduce(mul, (part.at.cross(part.own(prepared)) for part in self.parts))
-
-    def diagonal(self, prepared: Any) -> PerRow:
-        return reduce(mul, (part.at.diagonal(part.own(prepared)) for part in self.parts))
+    combine = staticmethod(mul)
 
     def slopes(self, prepared: Any) -> np.ndarray:
         values = [part.at.cross(part.own(prepared))[:, :, np.newaxis] for part in self.parts]
@@ -449,10 +466,10 @@ class ProductAt(_CombinationAt):
     def _by_product_rule(values: Sequence[Any], slopes: Sequence[Any]) -> Any:
         return reduce(add, (reduce(mul, (*values[:i], *values[i + 1 :]), own) for i, own in enumerate(slopes)))
 
-    def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-        values = [part.at.cross(part.own(prepared)) for part in self.parts]
+    def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
         diagonals = [part.at.diagonal(part.own(prepared)) for part in self.parts]
-        return self._pulled(prepared, values, _times_others(U_bar, values), _times_others(diagonal_bar, diagonals))
+        U_bars = _times_others(U_bar, [value for value, _ in values])
+        return self._each(prepared, values, U_bars, _times_others(diagonal_bar, diagonals))
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return self._finish(total, _times_others(K_bar, [part.at.matrix() for part in self.parts]))

@@ -257,7 +257,7 @@ class Matern:
         if n != self.nu - 0.5 or n > _MOST_TERMS:
             raise ValueError(
                 f"The kernel Matern(nu={self.nu:g}) cannot be written in CasADi, which has no Bessel functions: nu "
-                f"must be 0.5, 1.5, ... up to {_MOST_TERMS + 0.5:g}, or inf. {exported_kernels()}"
+                f"must be a half-integer up to {_MOST_TERMS + 0.5:g}, or inf. {exported_kernels()}"
             )
         first = factorial(n) / factorial(2 * n)
         coefficients = [
