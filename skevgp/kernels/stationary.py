@@ -502,6 +502,10 @@ class SquaredExponential(Stationary):
 class SquaredExponentialAt(StationaryAt):
     """A `SquaredExponential` put in: its own derivative, so that k(X_m, X) serves the way back."""
 
+    def matrix(self) -> np.ndarray:
+        scaled = self.points / self.lengthscales
+        return np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
+
     def cross(self, prepared: np.ndarray) -> np.ndarray:
         E = self._exponent @ prepared
         np.minimum(E, 0.0, out=E)
