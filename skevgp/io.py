@@ -43,7 +43,7 @@ _OF_STD, _OF_MEAN, _OF_LARGEST = 1e-2, 1e-6, 1e-4
 # Parts of the package without a class that is part of a fitted model.
 _WITHOUT_MODELS = ("skevgp.datasets", "skevgp.exceptions", "skevgp.io", "skevgp.metrics", "skevgp.plotting")
 # Of a covariance: takes a tuple apart.
-_FUNCTIONS = ("operator.itemgetter", "skevgp.kernels.covariances._all_of_it")
+_FUNCTIONS = ("operator.itemgetter", "skevgp.kernels.base._all_of_it")
 # Parts of ColumnTransformer, SplineTransformer and SimpleImputer, some of them in some versions only.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from ..data.rows import Columns
-from ..kernels.symbolic import cross_and_diagonal
 from ..maps.symbolic import Mapped, mapped
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.casadi import casadi
@@ -153,7 +152,7 @@ class FittedModel:
 def _at(group: PredictorGroup, inputs: Mapped, features: Mapped) -> tuple[Any, Any, Any]:
     """k̃(X_m, x), k̃(x, x) and the features of a group."""
     kernel: Any = group.kernel  # the mathematics names no class
-    own = cross_and_diagonal(kernel, group.hyperparameters, group.points, _of(inputs, group.outputs))
+    own = kernel.expression(np.log(group.hyperparameters), group.points, _of(inputs, group.outputs))
     return *own, _of(features, group.outputs)
 
 

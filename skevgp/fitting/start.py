@@ -9,7 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..data.rows import Moments, RawRows, Rows
-from ..kernels.covariances import Covariance
+from ..kernels.base import Covariance
 from ..kernels.parse import KernelSpec, Start
 from ..model.parameters import Parameter, ParameterTable, Values
 from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup

@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sklearn.gaussian_process import kernels as sk
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, no_columns, sum_of_rows
+from ..utils.casadi import casadi
+from .base import Covariance, CovarianceAt, PerRow, no_columns, reads, sum_of_rows
+from .waves import Planes
 
 
 @dataclass(frozen=True)
@@ -15,18 +18,22 @@ class Constant(Covariance):
     """k̃(x, x') = c: the prior of an unknown offset. Hyperparameter log c."""
 
     n_hyperparameters = 1
-    preparations = (no_columns,)
-
-    @classmethod
-    def of(cls, kernel: Any, n_columns: int) -> Constant:
-        """The covariance of a ConstantKernel."""
-        return cls()
+    rows = staticmethod(no_columns)
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
         return np.full(np.broadcast_shapes(inputs.shape, others.shape)[:-1], np.exp(hyperparameters[0]))
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> ConstantAt:
         return ConstantAt(float(np.exp(hyperparameters[0])), inducing_points.shape)
+
+    def random_terms(
+        self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> list[tuple[Planes]]:
+        return [(Planes(np.zeros(shape), np.full(shape[0], np.exp(0.5 * hyperparameters[0]))),)]
+
+    def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
+        value = float(np.exp(hyperparameters[0]))
+        return casadi().DM.ones(len(points)) * value, value
 
 
 class ConstantAt(CovarianceAt):
@@ -54,11 +61,16 @@ class ConstantAt(CovarianceAt):
     def start_pullback(self) -> np.ndarray:
         return np.zeros(1)
 
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
-            return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, len(prepared)))])
-
-        return self.cross(prepared), pull
+    def cross_pullback(
+        self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow
+    ) -> np.ndarray:
+        return np.array([self.constant * (U_bar.sum() + sum_of_rows(diagonal_bar, len(prepared)))])
 
     def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         return total + self.constant * K_bar.sum(), np.zeros(self.shape)
+
+
+@reads(sk.ConstantKernel)
+def constant(kernel: Any, n_columns: int) -> Constant:
+    """The covariance of a ConstantKernel."""
+    return Constant()

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from sklearn.gaussian_process import kernels as sk
 
-from .covariances import CentredSquares, Covariance, CovarianceAt, PerRow, Pull
-from .stationary import one_lengthscale
+from ..utils.casadi import casadi
+from .base import CentredSquares, Covariance, CovarianceAt, PerRow, one_lengthscale, reads
+from .waves import Waves
 
 
 class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
@@ -121,18 +122,9 @@ class Wave(Covariance):
     isotropic: bool = False
     rows: CentredSquares = field(default=CentredSquares(), compare=False)
 
-    @classmethod
-    def of(cls, kernel: Cosine, n_columns: int) -> Wave:
-        """The covariance of a Cosine."""
-        return cls(n_columns, one_lengthscale(kernel, n_columns))
-
     @property
     def n_hyperparameters(self) -> int:
         return 1 if self.isotropic else self.n_columns
-
-    @property
-    def preparations(self) -> tuple[CentredSquares]:
-        return (self.rows,)
 
     def centred(self, centre: np.ndarray) -> Wave:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
@@ -142,6 +134,17 @@ class Wave(Covariance):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> WaveAt:
         return WaveAt(self.frequencies(hyperparameters), self.rows.centred(inducing_points), self.isotropic)
+
+    def random_terms(
+        self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> list[tuple[Waves]]:
+        frequencies = np.repeat(self.frequencies(hyperparameters)[np.newaxis], shape[0], axis=0)
+        return [(Waves.drawn(frequencies, np.ones(shape[0]), self.rows, rng),)]
+
+    def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
+        ca, frequencies = casadi(), self.frequencies(hyperparameters)
+        phases = ca.DM(self.rows.centred(points) @ frequencies)
+        return ca.cos(phases - ca.dot(ca.DM(np.array(frequencies)), self.rows.symbol(x))), 1.0
 
     def frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
         """2π / ℓ of each column."""
@@ -174,14 +177,11 @@ class WaveAt(CovarianceAt):
     def start_pullback(self) -> np.ndarray:
         return np.zeros((len(self.points), len(self.frequencies) + 1))
 
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        differences = self._differences(prepared)
-
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> np.ndarray:
-            U_bar *= np.sin(differences)
-            return U_bar @ prepared[: len(self.frequencies) + 1].T
-
-        return np.cos(differences), pull
+    def cross_pullback(
+        self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow
+    ) -> np.ndarray:
+        U_bar *= np.sin(self._differences(prepared))
+        return U_bar @ prepared[: len(self.frequencies) + 1].T
 
     def finish_pullback(self, total: np.ndarray, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
@@ -193,3 +193,9 @@ class WaveAt(CovarianceAt):
     def _differences(self, prepared: np.ndarray) -> np.ndarray:
         """Of phases, (m, n)."""
         return np.subtract.outer(self._phases, self.frequencies @ prepared[: len(self.frequencies)])
+
+
+@reads(Cosine)
+def wave(kernel: Cosine, n_columns: int) -> Wave:
+    """The covariance of a Cosine."""
+    return Wave(n_columns, one_lengthscale(kernel, n_columns))

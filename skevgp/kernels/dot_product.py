@@ -6,8 +6,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from sklearn.gaussian_process import kernels as sk
 
-from .covariances import Covariance, CovarianceAt, PerRow, Pull, Sums, as_they_are, sum_of_rows
+from ..utils.casadi import casadi
+from .base import Covariance, CovarianceAt, PerRow, Sums, as_they_are, reads, sum_of_rows
+from .waves import Planes
 
 
 @dataclass(frozen=True)
@@ -15,18 +18,22 @@ class DotProduct(Covariance):
     """k̃(x, x') = σ₀² + xᵀx' (Rasmussen & Williams 2006, section 4.2.2). Hyperparameter log σ₀."""
 
     n_hyperparameters = 1
-    preparations = (as_they_are,)
-
-    @classmethod
-    def of(cls, kernel: Any, n_columns: int) -> DotProduct:
-        """The covariance of a DotProduct."""
-        return cls()
+    rows = staticmethod(as_they_are)
 
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
         return np.einsum("...d,...d->...", inputs, others) + np.exp(2.0 * hyperparameters[0])
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> DotProductAt:
         return DotProductAt(float(np.exp(2.0 * hyperparameters[0])), inducing_points)
+
+    def random_terms(
+        self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> list[tuple[Planes]]:
+        return [(Planes(rng.standard_normal(shape), np.exp(hyperparameters[0]) * rng.standard_normal(shape[0])),)]
+
+    def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, Any]:
+        ca, bias = casadi(), float(np.exp(2.0 * hyperparameters[0]))
+        return ca.mtimes(ca.DM(points), x) + bias, ca.sumsqr(x) + bias
 
 
 class DotProductAt(CovarianceAt):
@@ -60,13 +67,16 @@ class DotProductAt(CovarianceAt):
     def start_pullback(self) -> Sums:
         return Sums((0.0, np.zeros_like(self.inducing_points)))
 
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        def pull(U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-            return Sums((U_bar.sum() + sum_of_rows(diagonal_bar, len(prepared)), U_bar @ prepared))
-
-        return self.cross(prepared), pull
+    def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
+        return Sums((U_bar.sum() + sum_of_rows(diagonal_bar, len(prepared)), U_bar @ prepared))
 
     def finish_pullback(self, total: Sums, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         bias_bar, points_bar = total
         hyper_bar = 2.0 * self.bias * (bias_bar + K_bar.sum())
         return np.array([hyper_bar]), points_bar + 2.0 * K_bar @ self.inducing_points
+
+
+@reads(sk.DotProduct)
+def dot_product(kernel: Any, n_columns: int) -> DotProduct:
+    """The covariance of a DotProduct."""
+    return DotProduct()

@@ -11,31 +11,9 @@ import numpy as np
 from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 
-from . import stationary
-from .constant import Constant
-from .cosine import Cosine, Wave
-from .covariances import Covariance, Product, Sum
-from .dot_product import DotProduct
+from .base import READERS, Covariance, Product, Sum, known_kernels
 from .function import FunctionKernel
-from .stationary import SquaredExponential
-from .traced import Function
 
-# What works: a kernel's type -> its covariance on so many columns, with the kernel's hyperparameters in its order.
-BUILDERS: dict[type[sk.Kernel], Callable[[Any, int], Covariance]] = {
-    sk.ConstantKernel: Constant.of,
-    sk.RBF: stationary.squared_exponential,
-    sk.Matern: stationary.matern,
-    sk.RationalQuadratic: stationary.rational_quadratic,
-    sk.ExpSineSquared: stationary.exp_sine_squared,
-    sk.DotProduct: DotProduct.of,
-    Cosine: Wave.of,
-    FunctionKernel: Function.of,
-}
-# The same for people.
-WORKING = (
-    f"{', '.join(kind.__name__ for kind in BUILDERS)}, sums and products of these, and a WhiteKernel as one of the "
-    "terms of the outermost sum"
-)
 # Their squares neither vanish nor overflow.
 SMALLEST, LARGEST = 1e-100, 1e100
 
@@ -259,13 +237,13 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
     signal = sk.ConstantKernel()
     if kernel is None:
         shape = sk.RBF(np.ones(n_columns) if n_columns > 1 else 1.0)
-        return KernelSpec(SquaredExponential(n_columns), Starts(Start(), Start(), Start()), signal * shape, signal)
+        return KernelSpec(READERS[sk.RBF](shape, n_columns), Starts(Start(), Start(), Start()), signal * shape, signal)
     if callable(kernel) and not isinstance(kernel, sk.Kernel | type):
         kernel = FunctionKernel(kernel)
     if not isinstance(kernel, sk.Kernel):
         raise TypeError(
             "kernel must be a kernel of sklearn.gaussian_process.kernels, a function k(X, Z) in autograd.numpy, or "
-            f"None; got {kernel!r}. These work: {WORKING}."
+            f"None; got {kernel!r}. These work: {known_kernels()}."
         )
     # A copy: the same kernel may be in a tree twice.
     given = clone(kernel)
@@ -329,9 +307,11 @@ def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -
 
 def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
     kind = type(kernel)
-    if kind not in BUILDERS:
-        raise ValueError(f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {WORKING}.")
-    return BUILDERS[kind](kernel, n_columns)
+    if kind not in READERS:
+        raise ValueError(
+            f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {known_kernels()}."
+        )
+    return READERS[kind](kernel, n_columns)
 
 
 def _operands(kernel: Any, operator: Any) -> Iterator[Any]:

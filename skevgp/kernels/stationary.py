@@ -3,35 +3,336 @@
 With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each is a profile φ of the exponent E = -½ r², which for a block of rows is one
 matrix product: E is linear in [x, 1, x²]. So is the way back: with W = Ū φ'(E), all gradients follow from W [x, 1, x²].
 There x is centred: r² is a small difference of squares that would be large far from 0.
+
+In CasADi, distances that a root is taken of are kept from 0, so that no derivative, of any order that a solver asks
+for, is NaN where x is an inducing point.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from typing import Any
+from functools import reduce
+from math import factorial
+from typing import Any, Protocol
 
 import numpy as np
 from scipy.spatial.distance import cdist
+from scipy.special import gammaln, kve
+from sklearn.gaussian_process import kernels as sk
 
-from .covariances import CentredSquares, Covariance, CovarianceAt, PerRow, Pull, Sums
-from .profiles import (
-    LARGEST_NU,
-    Derivatives,
-    Exponential,
-    ExpSineSquared,
-    Matern,
-    Matern12,
-    Matern32,
-    Matern52,
-    Profile,
-    RationalQuadratic,
-)
+from ..utils.casadi import casadi
+from .base import CentredSquares, Covariance, CovarianceAt, PerRow, Sums, exported_kernels, one_lengthscale, reads
+from .waves import Waves, widened
 
+# Of a Matérn covariance by Bessel functions, which overflow beyond it (it is then almost a squared exponential).
+LARGEST_NU = 150.0
 # In units of the largest |x/ℓ|² + |z/ℓ|²: the matrix product leaves r² only 8 digits below this, ...
 _NEAR = 1e-8
 # ... and (x - x') / r only 8 below this: there a profile that is not smooth at r = 0 counts as flat.
 _COINCIDENT = 1e-16
-_MATERN: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
+# In CasADi added to r² under a root: too little to change a value, enough to leave second derivatives their digits.
+TINY = 1e-18
+# In CasADi, of ν - ½: sums of so many terms.
+_MOST_TERMS = 20
+# How much wider than by the spectral density frequencies are drawn too: one that falls fast, or with heavy tails.
+_WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(10)
+# Above this a rational quadratic is as a squared exponential, and its density's Bessel functions overflow.
+_LARGE_ALPHA = 50.0
+
+Derivatives = tuple[np.ndarray, list[np.ndarray]]
+
+
+# --- profiles φ(E), E = -½ r² -------------------------------------------------------------------------------------
+
+
+class Profile(Protocol):
+    """φ(E); parameters of its own come before the lengthscales in the vector of hyperparameters, as logarithms."""
+
+    n_parameters: int
+
+    @property
+    def smooth(self) -> bool:
+        """Whether φ'(E) is finite at E = 0."""
+
+    @property
+    def has_root(self) -> bool:
+        """Whether it takes the root of r², which then has to be known to the last digit."""
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        """φ(E)."""
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        """φ'(E), and the derivative in the logarithm of each parameter; ``value`` is φ(E), which saves exponentials."""
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Frequencies (L, d) for lengthscales of 1, and how much each counts (L,), 1 in the mean."""
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        """φ of symbols r² in CasADi."""
+
+
+@dataclass(frozen=True)
+class Exponential:
+    """φ = exp(E): the squared exponential (Rasmussen & Williams 2006, eq. 4.9)."""
+
+    n_parameters = 0
+    smooth = True
+    has_root = False
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return np.exp(E)
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value, []
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return widened(rng.standard_normal(shape), lambda squares: -0.5 * squares, _WIDER)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        return casadi().exp(-0.5 * squared)
+
+
+@dataclass(frozen=True)
+class Matern12:
+    """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
+
+    n_parameters = 0
+    smooth = False
+    has_root = True
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return np.exp(-np.sqrt(-2.0 * E))
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        return value / np.maximum(np.sqrt(-2.0 * E), 1e-150), []
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return _student_t(0.5, shape, rng)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        # The least r² is not 0, so that no derivative is NaN.
+        ca = casadi()
+        return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
+
+
+@dataclass(frozen=True)
+class Matern32:
+    """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    n_parameters = 0
+    smooth = True
+    has_root = True
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-6.0 * E)
+        decay = np.exp(-t)
+        t += 1.0
+        t *= decay
+        return t
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-6.0 * E)
+        t += 1.0
+        np.divide(value, t, out=t)
+        t *= 3.0
+        return t, []
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return _student_t(1.5, shape, rng)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        ca = casadi()
+        t = ca.sqrt(3.0 * (squared + TINY))
+        return (1.0 + t) * ca.exp(-t)
+
+
+@dataclass(frozen=True)
+class Matern52:
+    """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
+
+    n_parameters = 0
+    smooth = True
+    has_root = True
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        t = np.sqrt(-10.0 * E)
+        decay = np.exp(-t)
+        decay *= self._polynomial(E, t)
+        return decay
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        t = np.sqrt(-10.0 * E)
+        polynomial = self._polynomial(E, t)
+        t += 1.0
+        t *= 5.0 / 3.0
+        t *= value
+        t /= polynomial
+        return t, []
+
+    @staticmethod
+    def _polynomial(E: np.ndarray, t: np.ndarray) -> np.ndarray:
+        polynomial = (-10.0 / 3.0) * E
+        polynomial += t
+        polynomial += 1.0
+        return polynomial
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return _student_t(2.5, shape, rng)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        ca, t2 = casadi(), 5.0 * (squared + TINY)
+        t = ca.sqrt(t2)
+        return (1.0 + t + t2 / 3.0) * ca.exp(-t)
+
+
+@dataclass(frozen=True)
+class Matern:
+    """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r (Rasmussen & Williams 2006, eq. 4.14).
+
+    Its derivative follows from d/dt [t^ν K_ν(t)] = -t^ν K_(ν-1)(t) (DLMF 10.29.4).
+
+    Parameters
+    ----------
+    nu : float
+        At most `LARGEST_NU`.
+    """
+
+    nu: float
+    n_parameters = 0
+    has_root = True
+
+    @property
+    def smooth(self) -> bool:
+        return self.nu > 1.0
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        return self._bessel(E, self.nu, 1.0)
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        slope = self._bessel(E, self.nu - 1.0, 0.5 / (self.nu - 1.0) if self.smooth else 0.0)
+        slope *= 2.0 * self.nu
+        return slope, []
+
+    def _bessel(self, E: np.ndarray, order: float, at_zero: float) -> np.ndarray:
+        """2^(1-ν) / Γ(ν) t^order K_order(t), by logarithms: its factors overflow before it does."""
+        t = np.sqrt(-4.0 * self.nu * E)
+        positive = np.maximum(t, 1e-150)
+        # Beyond 1e3, exp(-t) is 0 and K need not be known.
+        with np.errstate(all="ignore"):
+            log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
+        factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
+        found = np.exp(factor + order * np.log(positive) + log_bessel - positive)
+        overflow = np.isinf(log_bessel) | (t == 0.0)
+        found[overflow] = at_zero * self._near_zero(t[overflow], order)
+        return found
+
+    @staticmethod
+    def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
+        """t^order K_order(t) over its value at 0, where K overflows: the first terms of DLMF 10.27.4 with 10.25.2."""
+        term = total = np.ones_like(t)
+        for k in range(1, min(int(order), 20)):
+            term = term * (0.25 * t**2) / (k * (k - order))
+            total = total + term
+        return total
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        return _student_t(self.nu, shape, rng)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        # exp(-t) times a polynomial (Rasmussen & Williams 2006, eq. 4.16).
+        n = int(self.nu - 0.5)
+        if n != self.nu - 0.5 or n > _MOST_TERMS:
+            raise ValueError(
+                f"The kernel Matern(nu={self.nu:g}) cannot be written in CasADi, which has no Bessel functions: nu "
+                f"must be a half-integer up to {_MOST_TERMS + 0.5:g}, or inf. {exported_kernels()}"
+            )
+        first = factorial(n) / factorial(2 * n)
+        coefficients = [
+            first * factorial(n + i) / (factorial(i) * factorial(n - i)) * 2.0 ** (n - i) for i in range(n + 1)
+        ]
+        ca = casadi()
+        t = ca.sqrt(2.0 * self.nu * (squared + TINY))
+        return reduce(lambda total, coefficient: total * t + coefficient, coefficients) * ca.exp(-t)
+
+
+@dataclass(frozen=True)
+class RationalQuadratic:
+    """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter log α."""
+
+    n_parameters = 1
+    smooth = True
+    has_root = False
+
+    def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
+        alpha = np.exp(parameters[0])
+        log = np.log1p(self._ratio(E, alpha))
+        log *= -alpha
+        return np.exp(log, out=log)
+
+    def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        alpha = np.exp(parameters[0])
+        ratio = self._ratio(E, alpha)
+        from_alpha = ratio / (1.0 + ratio)
+        from_alpha -= np.log1p(ratio)
+        from_alpha *= value
+        from_alpha *= alpha
+        ratio += 1.0
+        return np.divide(value, ratio, out=ratio), [from_alpha]
+
+    @staticmethod
+    def _ratio(E: np.ndarray, alpha: float) -> np.ndarray:
+        """r² / 2α, kept finite."""
+        with np.errstate(over="ignore"):
+            ratio = E / -alpha
+        return np.minimum(ratio, 1e300, out=ratio)
+
+    def spectrum(
+        self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> tuple[np.ndarray, np.ndarray]:
+        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): of normals, with a gamma's variance.
+        (size, d), alpha, normals = shape, float(np.exp(parameters[0])), rng.standard_normal(shape)
+        drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
+        if alpha > _LARGE_ALPHA:
+            return drawn, np.ones(size)
+        return widened(drawn, _variance_gamma(alpha, d), _MUCH_WIDER)
+
+    def expression(self, squared: Any, parameters: np.ndarray) -> Any:
+        ca, alpha = casadi(), float(np.exp(parameters[0]))
+        return ca.exp(-alpha * ca.log1p(squared / (2.0 * alpha)))
+
+
+def _student_t(nu: float, shape: tuple[int, int], rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """Of a Matérn: a Student-t with 2ν degrees of freedom (Rasmussen & Williams 2006, eq. 4.15)."""
+    (size, d), degrees, normals = shape, 2.0 * nu, rng.standard_normal(shape)
+    drawn = normals / np.sqrt(rng.chisquare(degrees, size) / degrees)[:, np.newaxis]
+    return widened(drawn, lambda squares: -0.5 * (degrees + d) * np.log1p(squares / degrees), _MUCH_WIDER)
+
+
+def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
+    """Of normals (d,) with a variance from the gamma distribution of shape and rate α: the density's logarithm."""
+    order = alpha - 0.5 * d
+
+    def log_density(squares: np.ndarray) -> np.ndarray:
+        x = np.sqrt(2.0 * alpha * np.maximum(squares, 1e-12))
+        return order * np.log(x) + np.log(kve(order, x)) - x
+
+    return log_density
+
+
+# --- covariances --------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
@@ -59,10 +360,6 @@ class Stationary(Covariance):
     def n_hyperparameters(self) -> int:
         return self.profile.n_parameters + (1 if self.isotropic else self.n_columns)
 
-    @property
-    def preparations(self) -> tuple[CentredSquares]:
-        return (self.rows,)
-
     def centred(self, centre: np.ndarray) -> Stationary:
         return replace(self, rows=CentredSquares(tuple(centre.tolist())))
 
@@ -73,6 +370,27 @@ class Stationary(Covariance):
 
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> StationaryAt:
         return StationaryAt(self.profile, hyperparameters, self.rows.centred(inducing_points))
+
+    def random_terms(
+        self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
+    ) -> list[tuple[Waves]]:
+        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
+        frequencies, weights = self.profile.spectrum(own, shape, rng)
+        return [(Waves.drawn(frequencies * np.exp(-lengths), weights, self.rows, rng),)]
+
+    def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, float]:
+        ca, x = casadi(), self.rows.symbol(x)
+        own, lengths = np.split(hyperparameters, [self.profile.n_parameters])
+        lengths = np.full(self.n_columns, np.exp(lengths))
+        scaled = self.rows.centred(points) / lengths
+        if self.profile.has_root:
+            # Of differences: to the last digit where r² is small.
+            squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengths)).T, len(scaled), 1)) ** 2)
+        else:
+            # By one product, as predictions have it: linear in [x, x²], and its derivatives are small.
+            factor = np.hstack([-2.0 * scaled / lengths, np.broadcast_to(lengths**-2.0, scaled.shape)])
+            squared = ca.mtimes(ca.DM(factor), ca.vertcat(x, x**2)) + ca.DM((scaled**2).sum(axis=1))
+        return self.profile.expression(squared, own), 1.0
 
 
 class StationaryAt(CovarianceAt):
@@ -111,10 +429,6 @@ class StationaryAt(CovarianceAt):
 
     def start_pullback(self) -> Any:
         return Sums((np.zeros_like(self._exponent), np.zeros(self.profile.n_parameters)))
-
-    def linearised(self, prepared: np.ndarray) -> tuple[np.ndarray, Pull]:
-        U = self.cross(prepared)
-        return U, lambda U_bar, diagonal_bar: self.cross_pullback(prepared, U, U_bar, diagonal_bar)
 
     def cross_pullback(self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
         slopes, others = self._derivatives(*self._exponents(prepared), U)
@@ -188,9 +502,14 @@ class SquaredExponential(Stationary):
 class SquaredExponentialAt(StationaryAt):
     """A `SquaredExponential` put in: its own derivative, so that k(X_m, X) serves the way back."""
 
+    def matrix(self) -> np.ndarray:
+        scaled = self.points / self.lengthscales
+        return np.exp(-0.5 * cdist(scaled, scaled, "sqeuclidean"))
+
     def cross(self, prepared: np.ndarray) -> np.ndarray:
-        U, _ = self._exponents(prepared)
-        return np.exp(U, out=U)
+        E = self._exponent @ prepared
+        np.minimum(E, 0.0, out=E)
+        return np.exp(E, out=E)
 
     def start_pullback(self) -> np.ndarray:
         return np.zeros_like(self._exponent)
@@ -208,36 +527,25 @@ class SquaredExponentialAt(StationaryAt):
 # --- from scikit-learn's kernels ---------------------------------------------------------------------------------
 
 
+@reads(sk.RBF)
 def squared_exponential(kernel: Any, n_columns: int) -> SquaredExponential:
     """The covariance of an RBF (or of a Matern with nu = inf)."""
     return SquaredExponential(n_columns, one_lengthscale(kernel, n_columns))
 
 
+@reads(sk.Matern)
 def matern(kernel: Any, n_columns: int) -> Stationary:
     """The covariance of a Matern."""
     if kernel.nu == np.inf:
         return squared_exponential(kernel, n_columns)
     if not 0.0 < kernel.nu <= LARGEST_NU:
         raise ValueError(f"kernel={kernel!r}: nu must be above 0 and at most {LARGEST_NU:g}, or inf; got {kernel.nu}.")
-    profile = _MATERN.get(kernel.nu, Matern(float(kernel.nu)))
+    special: dict[float, Profile] = {0.5: Matern12(), 1.5: Matern32(), 2.5: Matern52()}
+    profile = special.get(kernel.nu, Matern(float(kernel.nu)))
     return Stationary(profile, n_columns, one_lengthscale(kernel, n_columns))
 
 
+@reads(sk.RationalQuadratic)
 def rational_quadratic(kernel: Any, n_columns: int) -> Stationary:
     """The covariance of a RationalQuadratic."""
     return Stationary(RationalQuadratic(), n_columns, isotropic=True)
-
-
-def exp_sine_squared(kernel: Any, n_columns: int) -> Stationary:
-    """The covariance of an ExpSineSquared, whose periodicity is the lengthscale."""
-    return Stationary(ExpSineSquared(), n_columns, isotropic=True)
-
-
-def one_lengthscale(kernel: Any, n_columns: int) -> bool:
-    """Whether a kernel has one lengthscale for all columns; an error if it has neither one nor one per column."""
-    if kernel.anisotropic and len(kernel.length_scale) != n_columns:
-        raise ValueError(
-            f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
-            "give one length scale, or one per column."
-        )
-    return not kernel.anisotropic

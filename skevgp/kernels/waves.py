@@ -3,7 +3,7 @@
 For a covariance of differences, √2 cos(ωᵀx + b) with ω from its spectral density and b uniform. Sums of covariances
 have the functions of each, products the products. What a sparse model leaves to be drawn is what inducing points cannot
 follow, waves far out in the spectrum; so frequencies are drawn from wider densities too, and count in proportion
-(importance sampling).
+(importance sampling). Each family says in its own file which waves are its own (`Covariance.random_terms`).
 """
 
 from __future__ import annotations
@@ -11,28 +11,12 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import reduce, singledispatch
-from itertools import product
+from functools import reduce
 from operator import mul
-from typing import Any
 
 import numpy as np
-from scipy.special import ive, kve
 
-from .constant import Constant
-from .cosine import Wave
-from .covariances import CentredSquares, Covariance, Product, Sum
-from .dot_product import DotProduct
-from .profiles import Exponential, ExpSineSquared, Matern, Matern12, Matern32, Matern52, RationalQuadratic
-from .stationary import Stationary
-
-# How much wider than by the spectral density frequencies are drawn too: one that falls fast, or with heavy tails.
-_WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(10)
-# Above this a rational quadratic is as a squared exponential, and its density's Bessel functions overflow.
-_LARGE_ALPHA = 50.0
-_NU: dict[type, float] = {Matern12: 0.5, Matern32: 1.5, Matern52: 2.5}
-# Of the Fourier series of a periodic covariance.
-_HARMONICS = 10_000
+from .base import CentredSquares, Covariance
 
 
 class Factor(ABC):
@@ -65,6 +49,13 @@ class Waves(Factor):
     phases: np.ndarray
     frequencies: np.ndarray
     rows: CentredSquares
+
+    @classmethod
+    def drawn(
+        cls, frequencies: np.ndarray, weights: np.ndarray, rows: CentredSquares, rng: np.random.RandomState
+    ) -> Waves:
+        """With frequencies (L, d) that count in proportion to weights (L,), and phases at random."""
+        return cls(np.sqrt(2.0 * weights), rng.uniform(0.0, 2.0 * np.pi, len(weights)), frequencies, rows)
 
     def value(self, X: np.ndarray) -> np.ndarray:
         return self.sizes[:, np.newaxis] * np.cos(self._angles(X))
@@ -144,86 +135,10 @@ def random_functions(
     ValueError
         If the covariance has no spectral density that is known here, as that of a user's function.
     """
-    return RandomFunctions(_terms(covariance, hyperparameters, (size, n_columns), rng))
+    return RandomFunctions(covariance.random_terms(hyperparameters, (size, n_columns), rng))
 
 
-@singledispatch
-def _terms(
-    covariance: Any, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-) -> list[tuple[Factor, ...]]:
-    raise ValueError(
-        f"No functions can be drawn of a kernel with a {type(covariance).__name__}: its spectral density is not known. "
-        "sample_y draws at given rows, and rollout along paths."
-    )
-
-
-@_terms.register
-def _(covariance: Sum, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    return [term for part, own in covariance.own(hyperparameters) for term in _terms(part, own, shape, rng)]
-
-
-@_terms.register
-def _(covariance: Product, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    parts = [_terms(part, own, shape, rng) for part, own in covariance.own(hyperparameters)]
-    return [sum(chosen, ()) for chosen in product(*parts)]
-
-
-@_terms.register
-def _(covariance: Constant, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    return [(Planes(np.zeros(shape), np.full(shape[0], np.exp(0.5 * hyperparameters[0]))),)]
-
-
-@_terms.register
-def _(covariance: DotProduct, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    return [(Planes(rng.standard_normal(shape), np.exp(hyperparameters[0]) * rng.standard_normal(shape[0])),)]
-
-
-@_terms.register
-def _(covariance: Wave, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    frequencies = np.repeat(covariance.frequencies(hyperparameters)[np.newaxis], shape[0], axis=0)
-    return [(_waves(frequencies, np.ones(shape[0]), covariance.rows, rng),)]
-
-
-@_terms.register
-def _(covariance: Stationary, hyperparameters: Any, shape: Any, rng: Any) -> list[tuple[Factor, ...]]:
-    own, lengths = np.split(hyperparameters, [covariance.profile.n_parameters])
-    frequencies, weights = _spectrum(covariance.profile, own, shape, rng)
-    return [(_waves(frequencies * np.exp(-lengths), weights, covariance.rows, rng),)]
-
-
-def _waves(frequencies: np.ndarray, weights: np.ndarray, rows: CentredSquares, rng: np.random.RandomState) -> Waves:
-    return Waves(np.sqrt(2.0 * weights), rng.uniform(0.0, 2.0 * np.pi, len(weights)), frequencies, rows)
-
-
-def _spectrum(
-    profile: Any, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
-) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (L, d) for lengthscales of 1, and how much each counts (L,), 1 in the mean."""
-    (size, d), normals = shape, rng.standard_normal(shape)
-    if isinstance(profile, Exponential):
-        return _widened(normals, lambda squares: -0.5 * squares, _WIDER)
-    if isinstance(profile, Matern12 | Matern32 | Matern52 | Matern):
-        # A Student-t with 2ν degrees of freedom (Rasmussen & Williams 2006, eq. 4.15).
-        degrees = 2.0 * (profile.nu if isinstance(profile, Matern) else _NU[type(profile)])
-        drawn = normals / np.sqrt(rng.chisquare(degrees, size) / degrees)[:, np.newaxis]
-        return _widened(drawn, lambda squares: -0.5 * (degrees + d) * np.log1p(squares / degrees), _MUCH_WIDER)
-    ones = np.ones(size)
-    if isinstance(profile, RationalQuadratic):
-        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): of normals, with a gamma's variance.
-        alpha = float(np.exp(parameters[0]))
-        drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
-        return (drawn, ones) if alpha > _LARGE_ALPHA else _widened(drawn, _variance_gamma(alpha, d), _MUCH_WIDER)
-    if isinstance(profile, ExpSineSquared) and d == 1:
-        share = ive(np.arange(_HARMONICS), float(np.exp(-2.0 * parameters[0])))
-        share[1:] *= 2.0
-        return 2.0 * np.pi * rng.choice(_HARMONICS, size, p=share / share.sum())[:, np.newaxis].astype(float), ones
-    raise ValueError(
-        f"No functions can be drawn of a kernel with a {type(profile).__name__} of {d} columns: its spectral density "
-        "is not known. sample_y draws at given rows, and rollout along paths."
-    )
-
-
-def _widened(
+def widened(
     frequencies: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray], widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Frequencies (L, d) spread by widths in turns, and density over that of the mixture, (L,): at most their number.
@@ -235,14 +150,3 @@ def _widened(
     squares = np.einsum("ld,ld->l", frequencies, frequencies)
     each = log_density(squares[:, np.newaxis] / widths**2) - d * np.log(widths)
     return frequencies, len(widths) * np.exp(log_density(squares) - np.logaddexp.reduce(each, axis=1))
-
-
-def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Of normals (d,) with a variance from the gamma distribution of shape and rate α: the density's logarithm."""
-    order = alpha - 0.5 * d
-
-    def log_density(squares: np.ndarray) -> np.ndarray:
-        x = np.sqrt(2.0 * alpha * np.maximum(squares, 1e-12))
-        return order * np.log(x) + np.log(kve(order, x)) - x
-
-    return log_density

@@ -5,7 +5,8 @@ import numpy as np
 from sklearn.gaussian_process import kernels as sk
 
 from skevgp.kernels import FunctionKernel
-from skevgp.kernels.parse import BUILDERS, parse_kernel
+from skevgp.kernels.base import READERS
+from skevgp.kernels.parse import parse_kernel
 
 _rng = np.random.RandomState(0)
 X, Z = _rng.randn(40, 2), _rng.randn(7, 2)
@@ -32,7 +33,7 @@ _ARGUMENTS = {FunctionKernel: {"function": smooth}, sk.ExpSineSquared: {"periodi
 
 def _registered():
     """Each kernel of the registry, with one lengthscale and, if it can have them, one per column; no value is 1."""
-    for kind in BUILDERS:
+    for kind in READERS:
         kernel = kind(**_ARGUMENTS.get(kind, {}))
         found = {kind.__name__: kernel}
         if hasattr(kernel, "anisotropic"):

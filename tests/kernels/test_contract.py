@@ -1,17 +1,21 @@
-"""What every covariance must do; a kernel gets here by its line in the registry."""
+"""What every covariance must do; a kernel gets here by registering itself."""
 
 import pickle
 
 import autograd.numpy as anp
+import casadi
 import numpy as np
 import pytest
 from autograd import grad
 from sklearn.gaussian_process import kernels as sk
 
 from skevgp.kernels import FunctionKernel
+from skevgp.kernels.base import exported_kernels
+from skevgp.kernels.parse import parse_kernel
+from skevgp.kernels.waves import random_functions
 
 from ..oracle import central_differences, relative_error
-from .cases import KERNELS, REGISTERED, ROUGH, SIMPLE, X, Z, parsed, pulled_back, random_bars, scalar
+from .cases import KERNELS, REGISTERED, ROUGH, SIMPLE, STEP_OF_ROWS, X, Z, parsed, pulled_back, random_bars, scalar
 
 CENTRE = np.array([0.3, -0.2])
 # A covariance of one column, by its distance in any direction.
@@ -46,7 +50,6 @@ def test_values_are_those_of_the_scikit_learn_kernel(name, centre):
     np.testing.assert_allclose(at.matrix(), kernel(Z), **close)
     np.testing.assert_allclose(at.cross(prepared), kernel(Z, X), **close)
     np.testing.assert_allclose(np.broadcast_to(at.diagonal(prepared), 40), kernel.diag(X), **close)
-    np.testing.assert_allclose(at.linearised(prepared)[0], at.cross(prepared), **close)
 
 
 @pytest.mark.parametrize("name", KERNELS)
@@ -205,3 +208,110 @@ def test_extreme_hyperparameters_and_distances_are_finite(name):
                 assert np.isfinite(at.diagonal(prepared)).all()
                 for gradient in pulled_back(covariance, at_corner, points, inputs, random_bars(7, 47)):
                     assert np.isfinite(gradient).all()
+
+
+# --- slopes in the rows, by which predictions are differentiated -----------------------------------------------------
+
+# Nowhere differentiable, or with parts that are not.
+NO_GRADIENT = [name for name in KERNELS if name in {*ROUGH, "matern 0.8", "periodic"}]
+SMOOTH = [name for name in KERNELS if name not in NO_GRADIENT]
+
+
+def differences(function, rows):
+    """Central differences of function(rows), (..., n), in each column of its rows: (..., n, d)."""
+    each = []
+    for column in np.eye(rows.shape[1]):
+        step = STEP_OF_ROWS * column
+        each.append((function(rows + step) - function(rows - step)) / (2.0 * STEP_OF_ROWS))
+    return np.stack(each, axis=-1)
+
+
+def close(actual, expected, share=1e-7):
+    assert actual.shape == expected.shape
+    assert np.abs(actual - expected).max() <= share * max(np.abs(expected).max(), 1.0)
+
+
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", KERNELS)
+def test_slopes_agree_with_differences_of_the_scikit_learn_kernel(name, centre):
+    kernel = KERNELS[name]
+    covariance, hyperparameters = parsed(kernel, centre)
+    at, prepared = covariance.at(hyperparameters, Z), covariance.prepare(X)
+    close(at.slopes(prepared), differences(lambda rows: kernel(Z, rows), X))
+    diagonal = np.broadcast_to(at.diagonal_slopes(prepared), X.shape)
+    close(diagonal, differences(kernel.diag, X))
+
+
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_mixed_slopes_agree_with_differences_of_slopes(name, centre):
+    covariance, hyperparameters = parsed(KERNELS[name], centre)
+    actual = covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))
+    for row, own in zip(X[:10], actual, strict=False):
+        # ∂k(z, x)/∂x at x = row, as a function of z.
+        expected = differences(
+            lambda points, x=row: (
+                covariance.at(hyperparameters, points).slopes(covariance.prepare(x[np.newaxis]))[:, 0].T
+            ),
+            row[np.newaxis],
+        )[:, 0]
+        # Of a function that is differentiable just once, differences across z = x are as good as their step.
+        close(own, expected, 1e-2 if "matern 1.9" in name else 1e-4)
+
+
+@pytest.mark.parametrize("name", NO_GRADIENT)
+def test_functions_that_have_no_gradient_are_named(name):
+    covariance, hyperparameters = parsed(KERNELS[name])
+    with pytest.raises(ValueError, match="Matern kernel with nu up to 1 has no gradient"):
+        covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_slopes_at_the_points_themselves_are_finite(name):
+    covariance, hyperparameters = parsed(KERNELS[name])
+    slopes = covariance.at(hyperparameters, X).slopes(covariance.prepare(np.vstack([X, 1e3 * X])))
+    assert np.isfinite(slopes).all()
+
+
+# --- from and to scikit-learn, in CasADi, and as random functions ----------------------------------------------------
+
+
+@pytest.mark.parametrize("name", KERNELS)
+def test_a_kernel_comes_back_from_its_covariance(name):
+    kernel = sk.ConstantKernel(2.0) * KERNELS[name]
+    spec = parse_kernel(kernel, 2)
+    shape, signal = spec.starts.hyperparameters, spec.starts.signal
+    found = spec.to_sklearn(shape.value, shape.bounds, float(signal.value[0]), signal.bounds)
+    assert repr(found) == repr(kernel)
+    np.testing.assert_array_equal(found.theta, kernel.theta)
+    np.testing.assert_array_equal(found.bounds, kernel.bounds)
+
+
+@pytest.mark.parametrize("name", REGISTERED)
+def test_the_expression_in_casadi_is_the_covariance(name):
+    covariance, hyperparameters = parsed(REGISTERED[name], CENTRE)
+    x = casadi.MX.sym("x", 2)
+    if type(REGISTERED[name]).__name__ not in exported_kernels():
+        with pytest.raises(ValueError, match=r"cannot be written in CasADi. These can be exported: "):
+            covariance.expression(hyperparameters, Z, x)
+        return
+    function = casadi.Function("k", [x], list(covariance.expression(hyperparameters, Z, x)))
+    at = covariance.at(hyperparameters, Z)
+    for row in X[:5]:
+        prepared = covariance.prepare(row[np.newaxis])
+        cross, diagonal = (found.full().ravel() for found in function(row))
+        np.testing.assert_allclose(cross, at.cross(prepared)[:, 0], rtol=1e-12, atol=1e-14)
+        np.testing.assert_allclose(diagonal, np.broadcast_to(at.diagonal(prepared), 1), rtol=1e-12)
+
+
+# A user's function has no spectral density that is known.
+@pytest.mark.parametrize("name", [name for name in REGISTERED if name != "FunctionKernel"])
+def test_the_mean_product_of_random_functions_is_the_covariance(name):
+    d, size = 1 if name in OF_ONE_COLUMN else 2, 40_000
+    rows, kernel = X[:10, :d], REGISTERED[name]
+    spec = parse_kernel(sk.ConstantKernel() * kernel, d)
+    hyperparameters = np.log(spec.starts.hyperparameters.value)
+    Phi = random_functions(spec.covariance, hyperparameters, size, d, np.random.RandomState(1)).value(rows)
+    expected = kernel(rows)
+    # The deviation of a product of two functions is a few times its mean.
+    assert np.abs(Phi.T @ Phi - expected).max() < 25.0 / np.sqrt(size) * np.abs(expected).max()

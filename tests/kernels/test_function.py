@@ -13,6 +13,7 @@ from sklearn.gaussian_process.kernels import WhiteKernel
 
 from skevgp import EVGPRegressor
 from skevgp.kernels import FunctionKernel
+from skevgp.kernels.parse import parse_kernel
 from skevgp.solvers import LBFGS
 
 from .cases import smooth
@@ -173,3 +174,18 @@ def test_warm_starts_know_callable_objects_again():
 def test_bounds_of_a_function_are_pairs(bounds):
     with pytest.raises(ValueError, match="values_bounds"):
         EVGPRegressor(kernel=FunctionKernel(Callable().__call__, values_bounds=bounds)).fit(X, Y)
+
+
+def test_a_function_that_autograd_knows_no_forward_derivative_of_is_named():
+    def traced_backwards_only(X, Z):
+        import autograd.numpy as anp
+        from autograd.extend import defvjp, primitive
+
+        square = primitive(lambda x: x**2)
+        defvjp(square, lambda value, x: lambda bar: 2.0 * x * bar)
+        return anp.exp(-0.5 * anp.sum(square(X[:, None] - Z[None]), axis=2))
+
+    covariance = parse_kernel(traced_backwards_only, 2).covariance
+    at = covariance.at(np.empty(0), X_NEW)
+    with pytest.raises(ValueError, match="cannot be traced by autograd"):
+        at.slopes(covariance.prepare(X))

@@ -40,12 +40,6 @@ def test_their_mean_product_is_the_covariance(name, centre):
     assert np.abs(Phi.T @ Phi - expected).max() < 25.0 / np.sqrt(SIZE) * np.abs(expected).max()
 
 
-def test_of_a_periodic_kernel_of_one_column():
-    kernel, rows = sk.ExpSineSquared(0.7, 2.3), np.linspace(-3.0, 3.0, 15)[:, np.newaxis]
-    Phi = drawn(kernel, 1).value(rows)
-    np.testing.assert_allclose(Phi.T @ Phi, kernel(rows), atol=0.05)
-
-
 @pytest.mark.parametrize("name", KERNELS)
 def test_slopes_agree_with_differences(name):
     functions, h = drawn(KERNELS[name], size=20), 1e-8

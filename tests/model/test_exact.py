@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from skevgp.data.rows import RawRows
+from skevgp.kernels.base import Sum
 from skevgp.kernels.constant import Constant
-from skevgp.kernels.covariances import Sum
 from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.exact import ExactModel

@@ -3,11 +3,10 @@
 import numpy as np
 import pytest
 
+from skevgp.kernels.base import CentredSquares, Product, Sum, Sums, as_they_are, no_columns
 from skevgp.kernels.constant import Constant
-from skevgp.kernels.covariances import CentredSquares, Product, Sum, Sums, as_they_are, no_columns
 from skevgp.kernels.dot_product import DotProduct
-from skevgp.kernels.profiles import Matern32
-from skevgp.kernels.stationary import SquaredExponential, Stationary
+from skevgp.kernels.stationary import Matern32, SquaredExponential, Stationary
 
 from .cases import X, Z
 
