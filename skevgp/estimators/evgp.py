@@ -30,7 +30,15 @@ from ..noise.gaussian import input_covariance, relative_noise
 from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_integer, check_magnitude, check_real, is_dask, is_frame, unchanged_if_it_fails
+from ..utils.validation import (
+    check_integer,
+    check_magnitude,
+    check_real,
+    is_dask,
+    is_frame,
+    unchanged_if_it_fails,
+    words_of,
+)
 from .base import GaussianProcess, refuse_moved
 
 
@@ -470,6 +478,8 @@ class EVGPRegressor(GaussianProcess):
             self.kernel_map_ = data.maps.kernel_map
             return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
         except ValueError as error:
+            if is_frame(data.given) and words_of(data.given):
+                raise
             raise ValueError(
                 "inputs of Gaussian noise needs an X of numbers, none of them missing: others have no slopes."
             ) from error

@@ -49,7 +49,7 @@ def test_settings_are_what_they_say():
     }
     author = built("acrobot", "EVGP-IF", "author")
     assert (author.solver.batch_size, author.solver.learning_rate, author.solver.schedule) == (50, 0.01, "constant")
-    assert (author.noise_variance, author.coef_scale, author.inducing_init.shape) == (1.0, 1.0, (150, 5))
+    assert (author.noise.variance, author.coef_prior.scale, author.inducing_init.shape) == (1.0, 1.0, (150, 5))
     np.testing.assert_allclose(author.kernel.k2.length_scale, 150 ** (-1 / 5))
     assert author.kernel.k1.constant_value == 0.5**2
     assert np.abs(author.inducing_init).max() <= 2.0
