@@ -74,7 +74,7 @@ def evaluation(
 
 def adam_step(n: int, m: int, d: int, n_outputs: int, batch_size: int) -> Callable[[], Minimum]:
     """Make () -> one step of Adam in the paper's setting, over all parameters, on random rows."""
-    model = _model(n, m, d, n_outputs, Adam(), sharing="kernel", posterior="diagonal")
+    model = _model(n, m, d, n_outputs, Adam(posterior="diagonal"), sharing="kernel")
     elbo = ElboObjective(model.sparse, model.table, model.blocks)
     objective = elbo.minibatch(model.rows.batches(model.sparse.kernel, batch_size, np.random.RandomState(0)))
     start, limits = elbo.table.start(), elbo.table.limits()

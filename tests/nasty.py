@@ -372,7 +372,7 @@ def random_case(seed):
     if kind < 0.16:
         names.append("exact")
         case.model = exact_model(rng, n, d, o)
-        if case.model.coef_scale is not None and np.all(case.model.coef_scale == np.inf):
+        if np.all(getattr(case.model.coef_prior, "scale", None) == np.inf):
             case.refused("vague|depend|coef_scale|rows", must=False)
     elif kind < 0.21:
         names.append("network")

@@ -15,7 +15,7 @@ from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
 from skevgp.metrics import containing_ratios, negative_log_predictive_density
-from skevgp.solvers import LBFGS
+from skevgp.solvers import LBFGS, SOLVERS
 
 # A few iterations are enough.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
@@ -91,7 +91,7 @@ def test_what_few_points_cannot_represent_is_not_taken_for_noise():
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["no features", "features"])
 def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
-    settings = {"feature_map": feature_map, "sharing": sharing, "solver": solver}
+    settings = {"feature_map": feature_map, "sharing": sharing, "solver": SOLVERS[solver](posterior=posterior)}
     # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
     settings |= {"max_iter": 10, "X": X[:1900], "Y": Y[:1900], "groups": GROUPS[:1900]}
     plain, calibrated = (fitted(**settings, noise_cv=noise_cv) for noise_cv in (None, 5))
@@ -108,7 +108,7 @@ def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, shari
 @pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
 def test_q_is_at_its_optimum_for_the_new_noise_and_signal(solver, posterior):
     y = Y[:, 0]
-    m = fitted(Y=y, solver=solver)
+    m = fitted(Y=y, solver=SOLVERS[solver](posterior=posterior))
     again = fitted(
         Y=y,
         kernel=m.kernel_ + WhiteKernel(m.noise_variance_, "fixed"),

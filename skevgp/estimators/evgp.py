@@ -479,7 +479,7 @@ class EVGPRegressor(GaussianProcess):
             self.kernel_map_ = data.maps.kernel_map
             return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
         except ValueError as error:
-            if words_of(data.given):
+            if is_frame(data.given) and words_of(data.given):
                 raise
             raise ValueError(
                 "inputs of Gaussian noise needs an X of numbers, none of them missing: others have no slopes."

@@ -32,6 +32,8 @@ _GAIN = 0.01
 _MISSED = 0.02
 # On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
 _ITERATIONS, _COARSE = 60, 2e-4
+# Signal over noise variance above which rows on top of each other are points of their own, for the same reason.
+_HIGH_RATIO = 1e9
 
 
 def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None) -> Fitted:
@@ -135,8 +137,10 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
         upper_bound = sparse.upper_bound(values, statistics, model.blocks)
     else:
         bound = upper_bound = fit.bound if known else float(exact.log_likelihoods(values).sum())
-    if exact is not None:
-        # The jitter of k(X_m, X_m) would show in its std.
+    # The jitter of k(X_m, X_m) would show in the std.
+    distinct = values["inducing_points"].shape[1] == len(model.rows)
+    is_exact = exact is not None and (distinct or bool((values["signal"] > _HIGH_RATIO * values["noise"]).any()))
+    if exact is not None and is_exact:
         predictor = exact.predictor(values)
     elif found is None and not changed and fit.predictor is not None:
         predictor = fit.predictor
@@ -144,7 +148,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
         predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
     message = " ".join(part for part in messages if part)
     one = FittedModel(sparse, model.table, values, statistics, predictor, fit.loss_curve, message, dependent, doubts)
-    one = replace(one, known_bound=bound, known_upper_bound=upper_bound, is_exact=exact is not None)
+    one = replace(one, known_bound=bound, known_upper_bound=upper_bound, is_exact=is_exact)
     return one if doubts is None else doubts.told(one)
 
 

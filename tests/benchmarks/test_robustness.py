@@ -36,7 +36,7 @@ def test_every_fixed_jitter_is_tried(robustness, tmp_path, capsys):
 def test_it_reports_what_fails(robustness, monkeypatch):
     data = robustness.nasty(0)
     assert robustness.fit(data, 0, max_iter=1)["outcome"] == "ok"
-    assert "InvalidParameterError" in robustness.fit(data, 0, noise_variance=-1.0)["outcome"]
+    assert "InvalidParameterError" in robustness.fit(data, 0, n_inducing=-1)["outcome"]
     one = robustness.EVGPRegressor.predict
 
     def broken(self, X, return_std=False):

@@ -49,13 +49,14 @@ def test_successes_are_counted(swing_up):
 @pytest.mark.parametrize("system", ["pendulum", "cartpole"])
 def test_a_firm_prior_doubts_forces_and_gravity_only(swing_up, system):
     prior = swing_up.firm(system)
-    n_states = len(prior["coef_mean"])
-    scale, kinematics = prior["coef_scale"], prior["coef_mean"][:, :n_states]
+    mean, scale = prior["coef_prior"].mean, prior["coef_prior"].scale
+    n_states = len(mean)
+    kinematics = mean[:, :n_states]
     assert scale[:, :n_states].max() < 0.05 < scale[:, n_states:].min()
     half = n_states // 2
     np.testing.assert_allclose(kinematics, np.eye(n_states) + swing_up.mpc.DT * np.eye(n_states, k=half), atol=1e-12)
     learned = swing_up.mpc.learn(system, 1.5, True, 0.01, **prior, n_inducing=5, solver=LBFGS(tol=1e6))
-    assert (np.abs(learned.model.coef_ - prior["coef_mean"]) < 4.0 * scale)[:, :n_states].all()
+    assert (np.abs(learned.model.coef_ - mean) < 4.0 * scale)[:, :n_states].all()
 
 
 def test_the_truth_is_what_is_simulated(swing_up):

@@ -5,7 +5,6 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.utils import check_random_state
 
 from skevgp.datasets import load_robot, make_dynamics, quintic_reference, simulate
-from skevgp.noise import Gaussian
 from skevgp.robots import get_system, layout_of
 
 KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "dt", "DESCR"}
@@ -176,7 +175,7 @@ def test_a_system_works_in_place_of_its_name():
         ({"dt": 0.0}, "dt must be finite and above 0.0; got 0.0"),
         ({"dt": np.inf}, "dt must be finite and above 0.0; got inf"),
         ({"noise": -0.1}, "noise must be finite and at least 0.0; got -0.1"),
-        ({"noise": Gaussian(inputs=np.nan)}, "input_noise must be finite and at least 0.0; got nan"),
+        ({"input_noise": np.nan}, "input_noise must be finite and at least 0.0; got nan"),
     ],
 )
 def test_bad_values_are_named(arguments, message):

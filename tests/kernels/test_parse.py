@@ -213,7 +213,7 @@ def test_outputs_have_their_own_signal_variance_and_share_the_shape():
 
 
 def test_noise_from_two_sides_is_an_error():
-    with pytest.raises(ValueError, match="noise_variance=0.1 or from the WhiteKernel"):
+    with pytest.raises(ValueError, match="variance=0.1 of Gaussian or from the WhiteKernel"):
         fitted(RBF(1.0) + WhiteKernel(0.1), noise=Gaussian(variance=0.1))
 
 

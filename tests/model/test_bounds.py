@@ -296,7 +296,8 @@ def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
     model = EVGPRegressor(
         kernel=kernel, inducing_init=x[6:], solver=LBFGS(posterior="diagonal"), noise=Gaussian(variance=0.1), max_iter=0
     )
-    one, blocks = at_the_fit(model.fit(x, np.random.RandomState(0).randn(9)))
+    y = np.random.RandomState(0).randn(9)
+    one, blocks = at_the_fit(model.fit(x, y), x, y)
     objective, start = BoundObjective(one.sparse, one.table, blocks), one.table.start()
     step = 0.01 * np.eye(len(start))[0]
     slope = 9 * (objective(start + step)[0] - objective(start - step)[0]) / 0.02

@@ -42,14 +42,14 @@ def test_settings_are_what_they_say():
 
     paper = built("acrobot", "VGP", "paper")
     assert (paper.feature_map, paper.kernel_map, paper.max_iter) == (None, None, None)
-    assert {name: paper.get_params()[name] for name in PAPER} == PAPER
+    assert repr({name: paper.get_params()[name] for name in PAPER}) == repr(PAPER)
     plain, defaults = built("acrobot", "EVGP-IF", "skevgp").get_params(deep=False), EVGPRegressor().get_params()
     assert {name for name, value in plain.items() if value != defaults[name]} == {
         *("feature_map", "n_inducing", "random_state")
     }
     author = built("acrobot", "EVGP-IF", "author")
     assert (author.solver.batch_size, author.solver.learning_rate, author.solver.schedule) == (50, 0.01, "constant")
-    assert (author.noise_variance, author.coef_scale, author.inducing_init.shape) == (1.0, 1.0, (150, 5))
+    assert (author.noise.variance, author.coef_prior.scale, author.inducing_init.shape) == (1.0, 1.0, (150, 5))
     np.testing.assert_allclose(author.kernel.k2.length_scale, 150 ** (-1 / 5))
     assert author.kernel.k1.constant_value == 0.5**2
     assert np.abs(author.inducing_init).max() <= 2.0
