@@ -27,8 +27,6 @@ from sklearn.base import BaseEstimator
 from sklearn.gaussian_process import kernels as sklearn_kernels
 from sklearn.pipeline import Pipeline
 
-import skevgp
-
 from . import metrics
 from ._version import __version__
 from .data.maps import take_rows
@@ -74,7 +72,7 @@ _OF_SCIKIT_LEARN = (
 def _names_of_types() -> Iterator[str]:
     """Names of the classes and functions that a fitted model may hold."""
     yield from (*_FUNCTIONS, *_OF_SCIKIT_LEARN)
-    for found in pkgutil.walk_packages(skevgp.__path__, "skevgp."):
+    for found in pkgutil.walk_packages([os.path.dirname(__file__)], "skevgp."):
         if not found.ispkg and not found.name.startswith(_WITHOUT_MODELS):
             module = importlib.import_module(found.name)
             yield from (_name(one) for one in vars(module).values() if _is_class(one) and one.__module__ == found.name)
@@ -206,7 +204,20 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
 
     See Also
     --------
-    save : Write the file; it has an example.
+    save : Write the file.
+
+    Examples
+    --------
+    >>> import os, tempfile
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.io import load, save
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     path = os.path.join(folder, "toy.skevgp")
+    ...     save(EVGPRegressor(n_inducing=10, random_state=0).fit(X, y), path)
+    ...     load(path).n_inducing
+    10
     """
     require("skops.io", "Loading a model")
     with open(path, "rb") as file:

@@ -8,6 +8,7 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.data.dataset import Dataset
 from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
 from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
 from skevgp.solvers import LBFGS
@@ -113,10 +114,10 @@ def in_order(gradient, names=("hyperparameters", "signal", "noise", "inducing_po
     return np.concatenate([np.ravel(gradient[name]) for name in names])
 
 
-def at_the_fit(model):
+def at_the_fit(model, problem):
     """Model, blocks of all rows, and parameters."""
     (fitted,) = model._fitted.models
-    rows = model._fitted.units.rows(model._source(*model._training_data))
+    rows = model._fitted.units.rows(Dataset.further(model, model._posterior.maps, problem.X, problem.y).source)
     return fitted, fitted.sparse.blocks(rows, fitted.values["inducing_points"].shape[1])
 
 
@@ -154,7 +155,7 @@ class Collapsed:
         mean, std = self.model.predict(self.problem.X_new, return_std=True, include_noise=False)
         gradient = None
         if not self.added:
-            fitted, blocks = at_the_fit(self.model)
+            fitted, blocks = at_the_fit(self.model, self.problem)
             terms = partial(bounds_at_optimum, family=self.family)
             gradient = in_order(evaluate(fitted.sparse, fitted.values, blocks, terms)[1])
         return Figures(self.model.lower_bound_, gradient, mean, std**2)
@@ -178,7 +179,7 @@ class Uncollapsed(Collapsed):
 
     def __init__(self, problem):
         super().__init__(problem)
-        self.fitted, self.blocks = at_the_fit(self.model)
+        self.fitted, self.blocks = at_the_fit(self.model, problem)
         self.elbo = ElboObjective(self.fitted.sparse, self.fitted.table, self.blocks)
         values, rng = self.elbo.table.values_at_start(), np.random.RandomState(0)
         (root,) = self.elbo.family.roots(values, [])

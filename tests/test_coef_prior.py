@@ -75,7 +75,7 @@ def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
 
 
 def test_without_features_the_prior_is_empty():
-    mean, scale, _ = resolve_coef_prior("auto", "auto", None, X, np.empty((2, 0)))
+    mean, scale, _ = resolved(CoefPrior(), None, X, np.empty((2, 0)), 2)
     assert mean.shape == scale.shape == (2, 0)
 
 
@@ -105,7 +105,7 @@ def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of
     scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
     parts = make_column_transformer((OneHotEncoder(), ["kind"]), (scaled, names)).fit(frame)
     features = parts.transform(frame)
-    mean, scale, _ = resolve_coef_prior("auto", "auto", parts, frame, wide(features))
+    mean, scale, _ = resolved(CoefPrior(), parts, frame, wide(features), 2)
     assert_array_equal(mean, np.hstack([np.zeros((2, 2)), IF_MEAN]))
     assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 

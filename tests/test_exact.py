@@ -123,7 +123,8 @@ def test_the_likelihood_bounds_every_sparse_models_bound():
 @pytest.mark.parametrize("which", [[True, True, True], [False, True, False]], ids=["all", "one"])
 def test_vague_weights_are_the_limit_of_wide_ones(which):
     def at(scale):
-        return fixed(feature_map=TREND, coef_mean=0.2, coef_scale=np.where(which, scale, 0.7)).fit(X, Y[:, 0])
+        prior = CoefPrior(mean=0.2, scale=np.where(which, scale, 0.7))
+        return fixed(feature_map=TREND, coef_prior=prior).fit(X, Y[:, 0])
 
     def limit(of):
         """Extrapolated in 1 / scale²."""
@@ -142,7 +143,7 @@ def test_vague_weights_are_the_limit_of_wide_ones(which):
 
 
 def test_vague_weights_are_estimated_by_generalised_least_squares():
-    m = fixed(feature_map=TREND, coef_scale=np.inf, noise=0.05).fit(X, Y)
+    m = fixed(feature_map=TREND, coef_prior=CoefPrior(scale=np.inf), noise=0.05).fit(X, Y)
     H, K = TREND.fit_transform(X), FIXED(X) + 0.05 * np.eye(50)
     A = H.T @ np.linalg.solve(K, H)
     np.testing.assert_allclose(m.coef_, np.linalg.solve(A, H.T @ np.linalg.solve(K, Y)).T, rtol=1e-9)
@@ -174,7 +175,9 @@ def test_vague_weights_do_not_depend_on_the_units_of_features():
 @pytest.mark.parametrize("columns", [[0, 0], [0, None]], ids=["twice the same", "a column of zeros"])
 def test_vague_weights_need_independent_features(columns):
     given = np.column_stack([np.zeros(50) if column is None else X[:, column] for column in columns])
-    with pytest.raises(ValueError, match=r"coef_scale=inf needs .* independent .* 3 features .* only 2"):
+    with pytest.raises(
+        ValueError, match=r"An infinite scale of CoefPrior needs .* independent .* 3 features .* only 2"
+    ):
         EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(given, Y)
     EGPRegressor(TREND, coef_prior=CoefPrior(scale=[[np.inf, np.inf, 1.0]]), max_iter=0).fit(given, Y[:, 0])
 
@@ -189,12 +192,12 @@ def test_vague_weights_need_as_many_rows():
 
 @pytest.mark.parametrize("scale", [np.nan, -np.inf, -1.0])
 def test_other_scales_are_refused(scale):
-    with pytest.raises(ValueError, match="coef_scale must"):
+    with pytest.raises(ValueError, match="scale of CoefPrior must"):
         EGPRegressor(TREND, coef_prior=CoefPrior(scale=scale)).fit(X, Y)
 
 
 def test_the_sparse_model_refuses_vague_weights():
-    with pytest.raises(ValueError, match="coef_scale must be finite"):
+    with pytest.raises(ValueError, match="scale=?.* of CoefPrior.* must be finite|scale of CoefPrior must be finite"):
         EVGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y)
 
 
@@ -352,7 +355,7 @@ def test_a_kernel_that_is_none_is_named():
 
 
 def test_the_noise_starts_in_one_place():
-    with pytest.raises(ValueError, match="either from noise_variance=0.1 or from the WhiteKernel"):
+    with pytest.raises(ValueError, match="either from variance=0.1 of Gaussian or from the WhiteKernel"):
         EGPRegressor(kernel=RBF() + WhiteKernel(), noise=Gaussian(variance=0.1)).fit(X, Y)
 
 
@@ -431,7 +434,7 @@ def test_a_failed_refit_leaves_the_model_as_it_was():
 
 
 def test_fitted_models_pickle_and_clone():
-    m = fixed(feature_map=TREND, coef_scale=np.inf).fit(X, Y)
+    m = fixed(feature_map=TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(m)).predict(X_NEW), m.predict(X_NEW))
     with pytest.raises(NotFittedError):
         clone(m).predict(X_NEW)

@@ -128,15 +128,16 @@ def test_bounds_are_ordered(data):
 
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 @pytest.mark.parametrize(
-    "options", [{}, {"solver": LBFGS(posterior="diagonal")}, {"noise_cv": 5}, {"normalize_y": True}], ids=str
+    "options", [{}, {"solver__posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str
 )
 def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, sharing, options):
     X, Y, _ = data
     unit = np.array([1.0, 100.0])
     prior = {"coef_prior": CoefPrior(mean=MEAN * unit[:, np.newaxis], scale=SCALE * unit[:, np.newaxis])}
     model = EVGPRegressor(
-        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, solver=LBFGS(tol=1.0), **prior, **options
-    ).fit(X, Y * unit)
+        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, solver=LBFGS(tol=1.0), **prior
+    )
+    model.set_params(**options).fit(X, Y * unit)
     mean = np.mean(Y, axis=0) if "normalize_y" in options else np.zeros(2)
     likelihood = 0.0
     for o in range(2):

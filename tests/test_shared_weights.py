@@ -200,11 +200,10 @@ def test_the_gradient_is_that_of_finite_differences(data, sharing):
     found = []
 
     class Checked(LBFGS):
-        def objective(self, task, table, n_rows=None):
-            loss = super().objective(task, table, n_rows)
-            x = table.start() + 0.1 * np.random.RandomState(1).randn(table.size)
-            found.append(relative_error(loss(x)[1], central_differences(lambda x: loss(x)[0], x)))
-            return loss
+        def minimise(self, objective, start, *others):
+            x = start + 0.1 * np.random.RandomState(1).randn(len(start))
+            found.append(relative_error(objective(x)[1], central_differences(lambda x: objective(x)[0], x)))
+            return super().minimise(objective, start, *others)
 
     apart = sharing != "all"
     kernel_map = FunctionTransformer(own_columns) if apart else FunctionTransformer(lambda X: X[:, :2])
@@ -356,15 +355,11 @@ def test_dask_agrees(data):
 def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
     X, Y, Sigma, mean, X_new = data
     options = {"kernel_map": FunctionTransformer(own_columns), "max_iter": 0, "noise": Gaussian(variance=0.3)}
-    told = EGPRegressor(Opinionated(prior=(mean, Sigma), coef_prior=CoefPrior(shared=True)), KERNEL, **options).fit(
-        X, Y
-    )
+    told = EGPRegressor(Opinionated(prior=(mean, Sigma), share_coef=True), KERNEL, **options).fit(X, Y)
     given = EGPRegressor(Rows(), KERNEL, coef_prior=CoefPrior(shared=True, mean=mean, cov=Sigma), **options).fit(X, Y)
     assert_allclose(told.predict(X_new), given.predict(X_new), rtol=1e-9)
     assert_allclose(told.coef_prior_scale_, np.sqrt(np.diagonal(Sigma)))
-    union = make_union(
-        Opinionated(prior=(mean, Sigma), coef_prior=CoefPrior(shared=True)), Rows(width=2, per_output=False)
-    )
+    union = make_union(Opinionated(prior=(mean, Sigma), share_coef=True), Rows(width=2, per_output=False))
     with_more = EGPRegressor(union, KERNEL, coef_prior=CoefPrior(shared=True), **options).fit(X, Y)
     assert with_more.coef_.shape == (P + 2,)
     assert_allclose(with_more.coef_prior_scale_[:P], np.sqrt(np.diagonal(Sigma)))
@@ -432,25 +427,28 @@ def _not_symmetric(Sigma):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"coef_prior": CoefPrior(cov=np.eye(3))}, r"coef_cov must be of the shape .* = \(4, 4\)"),
-        ({"coef_prior": CoefPrior(cov=_not_symmetric(np.eye(P)))}, "coef_cov must be symmetric"),
-        ({"coef_prior": CoefPrior(cov=np.eye(P) + 2.0 * (1 - np.eye(P)))}, "coef_cov must be positive semi-definite"),
-        ({"coef_prior": CoefPrior(cov=-np.eye(P))}, "coef_cov must have no negative variance"),
-        ({"coef_prior": CoefPrior(cov=np.full((P, P), np.nan))}, "coef_cov must be finite"),
-        ({"coef_prior": CoefPrior(cov=np.eye(P), scale=1.0)}, "coef_cov and coef_scale=1.0 both say"),
+        ({"coef_prior": CoefPrior(cov=np.eye(3))}, r"cov of CoefPrior must be of the shape .* = \(4, 4\)"),
+        ({"coef_prior": CoefPrior(cov=_not_symmetric(np.eye(P)))}, "cov of CoefPrior must be symmetric"),
+        (
+            {"coef_prior": CoefPrior(cov=np.eye(P) + 2.0 * (1 - np.eye(P)))},
+            "cov of CoefPrior must be positive semi-definite",
+        ),
+        ({"coef_prior": CoefPrior(cov=-np.eye(P))}, "cov of CoefPrior must have no negative variance"),
+        ({"coef_prior": CoefPrior(cov=np.full((P, P), np.nan))}, "cov of CoefPrior must be finite"),
+        ({"coef_prior": CoefPrior(cov=np.eye(P), scale=1.0)}, "cov and scale=1.0 of CoefPrior both say"),
         (
             {"coef_prior": CoefPrior(cov=np.eye(P) + 0.1), "solver": LBFGS(posterior="diagonal")},
-            r'coef_cov\) needs posterior="full"',
+            r'cov of CoefPrior\) needs posterior="full"',
         ),
-        ({"coef_prior": CoefPrior(cov=np.eye(P) + 0.1), "solver": "adam"}, r'coef_cov\) needs solver="lbfgs"'),
+        ({"coef_prior": CoefPrior(cov=np.eye(P) + 0.1), "solver": "adam"}, r'cov of CoefPrior\) needs solver="lbfgs"'),
         (
             {"coef_prior": CoefPrior(shared=True), "solver": LBFGS(posterior="diagonal")},
-            r'share_coef=True needs posterior="full"',
+            r'shared=True of CoefPrior needs posterior="full"',
         ),
-        ({"coef_prior": CoefPrior(shared=True), "solver": "adam"}, r'share_coef=True needs solver="lbfgs"'),
+        ({"coef_prior": CoefPrior(shared=True), "solver": "adam"}, r'shared=True of CoefPrior needs solver="lbfgs"'),
         (
             {"coef_prior": CoefPrior(shared=True, mean=np.ones((O, P)))},
-            r"= \(4,\), since the outputs share .* \(share_coef\)",
+            r"= \(4,\), since the outputs share",
         ),
         (
             {"coef_prior": CoefPrior(shared=True), "feature_map": Opinionated(prior=(np.ones((O, P)),) * 2)},
@@ -459,11 +457,11 @@ def _not_symmetric(Sigma):
         ({"feature_map": Opinionated(prior=(np.full((O, P), "a"),) * 2)}, "coef_prior of .* must be real numbers"),
         ({"feature_map": Opinionated(prior=([[1], [1, 2]], 1))}, "coef_prior of .* must be real numbers"),
         ({"feature_map": Opinionated(prior=3)}, "must return two arrays .* got int"),
-        ({"coef_prior": CoefPrior(cov=[[1], [1, 2]])}, "coef_cov must be real numbers"),
-        ({"feature_map": None, "coef_prior": CoefPrior(cov=np.eye(P))}, "coef_cov needs a feature_map"),
-        ({"feature_map": None, "coef_prior": CoefPrior(mean=[1.0] * P)}, "coef_mean needs a feature_map"),
-        ({"coef_prior": CoefPrior(shared="yes")}, "share_coef"),
-        ({"coef_prior": CoefPrior(shared=True), "feature_map": None}, "share_coef=True needs a feature_map"),
+        ({"coef_prior": CoefPrior(cov=[[1], [1, 2]])}, "cov of CoefPrior must be real numbers"),
+        ({"feature_map": None, "coef_prior": CoefPrior(cov=np.eye(P))}, "cov of CoefPrior needs a feature_map"),
+        ({"feature_map": None, "coef_prior": CoefPrior(mean=[1.0] * P)}, "mean of CoefPrior needs a feature_map"),
+        ({"coef_prior": CoefPrior(shared="yes")}, "shared of CoefPrior must be"),
+        ({"coef_prior": CoefPrior(shared=True), "feature_map": None}, "shared=True of CoefPrior needs a feature_map"),
         ({"sharing": "all"}, "sharing='all' joins outputs by their inducing points"),
         ({"sharing": [[0, 1], [2]]}, "joins outputs by their inducing points"),
         ({"sharing": "kernel", "solver": "adam"}, 'sharing="kernel" of outputs with rows of their own needs'),
@@ -471,7 +469,7 @@ def _not_symmetric(Sigma):
 )
 def test_what_cannot_be_is_refused_by_name(data, options, message):
     X, Y, _, _, _ = data
-    with pytest.raises(ValueError, match=f"(?s){message}"):
+    with pytest.raises((ValueError, TypeError), match=f"(?s){message}"):
         EVGPRegressor(
             **{"feature_map": Rows(), "kernel_map": FunctionTransformer(own_columns), "max_iter": 1, **options}
         ).fit(X, Y)
@@ -536,9 +534,8 @@ def test_a_row_that_counts_twice_is_there_twice(data, kind):
         "coef_prior": CoefPrior(shared=True, cov=Sigma),
         "max_iter": 100,
     }
-    models = [kind(Rows(), solver=LBFGS(tol=1e3), **options) for _ in range(2)]
-    if kind is EVGPRegressor:
-        models = [model.set_params(n_inducing=9, random_state=0) for model in models]
+    options |= {"tol": 1e3} if kind is EGPRegressor else {"solver": LBFGS(tol=1e3), "n_inducing": 9, "random_state": 0}
+    models = [kind(Rows(), **options) for _ in range(2)]
     models[0].fit(X, Y, sample_weight=weights)
     models[1].fit(np.repeat(X, weights, axis=0), np.repeat(Y, weights, axis=0))
     for found, expected in zip(*(model.predict(X_new, return_std=True) for model in models), strict=True):

@@ -19,7 +19,7 @@ from ..utils.validation import (
     validate_numbers,
     words_of,
 )
-from .dask import DaskSource, aligned, dask_example, fit_map_to_chunks
+from .dask import DaskSource, RowWeights, aligned, dask_example, fit_map_to_chunks
 from .maps import MappedRows, Maps, example_of, fit_map
 from .rows import LocalSource, Source
 from .weights import chosen_rows
@@ -67,7 +67,7 @@ class Dataset:
         """Validate X and y as a scikit-learn estimator does, and fit clones of its maps."""
         given, X, y = checked_rows(estimator, X, y, reset=True)
         groups = checked_groups(groups, len(y))
-        chosen = chosen_rows(X, y, sample_weight, relative_variance, groups)
+        chosen = _chosen(X, y, sample_weight, relative_variance, groups)
         fit_to = fit_map_to_chunks if is_dask(X) else partial(fit_map, chosen=chosen)
         feature_map = fit_to(estimator.feature_map, given, y, "feature_map")
         kernel_map = fit_to(estimator.kernel_map, given, y, "kernel_map")
@@ -84,8 +84,16 @@ class Dataset:
     ) -> Dataset:
         """Further rows for a fitted estimator, through the maps that it has."""
         given, X, y = checked_rows(estimator, X, y)
-        chosen = chosen_rows(X, y, sample_weight, relative_variance, ordered=False)
+        chosen = _chosen(X, y, sample_weight, relative_variance, ordered=False)
         return cls(given, X, y, chosen, maps, _source(given, X, y, maps, chosen))
+
+
+def _chosen(
+    X: Any, y: Any, sample_weight: Any, relative_variance: Any, groups: np.ndarray | None = None, ordered: bool = True
+) -> Any:
+    if is_dask(X):
+        return RowWeights.of(X, sample_weight, relative_variance)
+    return chosen_rows(X, y, sample_weight, relative_variance, groups, ordered)
 
 
 def _source(given: Any, X: Any, y: np.ndarray, maps: Maps, chosen: Any) -> Source:

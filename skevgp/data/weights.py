@@ -168,13 +168,13 @@ def chosen_rows(
     relative_variance: Any = None,
     groups: np.ndarray | None = None,
     ordered: bool = True,
-) -> Any:
-    """The rows that count.
+) -> Chosen:
+    """The rows in memory that count.
 
     Parameters
     ----------
-    X : ndarray, data frame or dask.array.Array of shape (n_samples, d)
-    y : ndarray or dask.array.Array of shape (n_samples,) or (n_samples, o)
+    X : ndarray or data frame of shape (n_samples, d)
+    y : ndarray of shape (n_samples,) or (n_samples, o)
     sample_weight, relative_variance : array-like of shape (n_samples,), optional
         As `EVGPRegressor.fit` takes them.
     groups : ndarray of shape (n_samples,), optional
@@ -185,17 +185,12 @@ def chosen_rows(
     Returns
     -------
     chosen : Chosen
-        Of a Dask array: RowWeights.
 
     Raises
     ------
     ValueError
         If they are not one number for each row, weights are negative or all 0, or variances are not positive.
     """
-    if is_dask(X):
-        from .dask import RowWeights
-
-        return RowWeights.of(X, sample_weight, relative_variance, check_weights, check_variances)
     counts = _numbers(sample_weight, "sample_weight", len(y))
     variance = _numbers(relative_variance, "relative_variance", len(y))
     if counts is not None:

@@ -90,7 +90,9 @@ class EGPRegressor(GaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0
-        As of `EVGPRegressor`; its bound is the log marginal likelihood.
+        Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------

@@ -97,7 +97,11 @@ class EVGPRegressor(GaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Source of chance for inducing points, mini-batches and restarts.
     verbose : int, default=0
-        Verbosity. 1 shows progress, 2 prints a line for each iteration.
+        Verbosity. 0 prints nothing. 1 shows the rows that are fitted, the iteration, the bound and the seconds so far:
+        in one live line if tqdm is installed and the output is a terminal or a notebook, else in a line every ten
+        seconds. 2 prints a line at each iteration.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------

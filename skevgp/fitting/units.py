@@ -256,8 +256,9 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
         rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
         if rank < mask.sum():
             raise ValueError(
-                f"An infinite scale of CoefPrior needs features that are linearly independent on the rows of X: {mask.sum()} features "
-                f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
+                "An infinite scale of CoefPrior needs features that are linearly independent on the rows of X: "
+                f"{mask.sum()} features have an infinite scale, but only {rank} of them are independent. Give some a "
+                "finite scale."
             )
 
 

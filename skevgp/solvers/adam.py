@@ -120,7 +120,30 @@ class Adam(Solver):
         monitor: Monitor,
         pace: Callable[[float], None] | None = None,
     ) -> Minimum:
-        """Find a minimum; arguments as of `adam`."""
+        """Find a minimum with steps that become small at the end.
+
+        Parameters
+        ----------
+        objective : callable
+            x -> (loss, gradient) of the next mini-batch at each call.
+        start : ndarray of shape (size,)
+            Where to start.
+        limits : tuple of ndarray of shape (size,)
+            Lower and upper limits, to which steps are clipped.
+        max_iter : int
+            The most steps.
+        tol : float
+            The loss is flat where it changes by less.
+        monitor : Monitor
+            It is told of each step, and may end them.
+        pace : callable, default=None
+            pace(share), called before each step with its size as a share of the first.
+
+        Returns
+        -------
+        minimum : Minimum
+            The last point, the loss of each step, and other points that may be better.
+        """
         constant = self.schedule == "constant"
         return adam(objective, start, limits, max_iter, self.learning_rate, tol, monitor, pace, constant=constant)
 

@@ -143,6 +143,7 @@ class LBFGS(Solver):
         objective : callable
             x -> (loss, gradient). It may raise `NotPositiveDefiniteError` or return NaN away from the start.
         start : ndarray of shape (size,)
+            Where to start.
         limits : tuple of ndarray of shape (size,)
             Lower and upper limits.
         max_iter : int
@@ -151,6 +152,7 @@ class LBFGS(Solver):
             A start ends when each of ``descent.patience`` iterations in a row gains less. The solver ends when a whole
             start gains no more.
         monitor : Monitor
+            It is told of each iteration, and may end them.
         curvature : tuple, default=None
             A function as ``objective``, by whose curvature at the start steps are scaled, and an integer for each
             coordinate, equal for those that share a scale. None leaves the scale of x.
@@ -158,6 +160,7 @@ class LBFGS(Solver):
         Returns
         -------
         minimum : Minimum
+            The best point, its loss and the loss of each iteration.
         """
         guarded, minimum = _Guarded(objective, start), Minimum(start, np.inf)
         stalled = 0

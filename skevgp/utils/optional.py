@@ -13,6 +13,7 @@ _PACKAGES = {
     "casadi": ("casadi", "casadi"),
     "rosbags": ("rosbags", "logs"),
     "skops": ("skops", "io"),
+    "tqdm": ("tqdm", "progress"),
 }
 
 

@@ -12,6 +12,12 @@ N_OUTPUTS, D = 3, 2
 QUICK = {"max_iter": 10, "solver": LBFGS(tol=1e6), "random_state": 0}
 
 
+def quick(model):
+    """The same model with few iterations."""
+    tolerance = "solver__tol" if "solver" in model.get_params() else "tol"
+    return model.set_params(**{"max_iter": 10, "random_state": 0, tolerance: 1e6})
+
+
 def own_columns(X):
     """Of each output other columns."""
     return np.stack([X, X[:, ::-1], X * X], axis=1)

@@ -67,7 +67,7 @@ Z0 = np.array([0.5, -0.2])
 def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, process_noise):
     found = rollout(model, Z0, inputs[:1], n_samples=10_000, process_noise=process_noise, random_state=0)
     # Those whose predict knows no include_noise have it in their std.
-    options = {"include_noise": False} if process_noise == "none" and hasattr(model, "_functions") else {}
+    options = {"include_noise": False} if process_noise == "none" and hasattr(model, "_posterior") else {}
     mean, std = model.predict(np.concatenate([Z0, inputs[0]])[np.newaxis], return_std=True, **options)
     for state in range(2):
         # The largest distance is below this in 999 of 1000 cases.

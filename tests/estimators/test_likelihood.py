@@ -7,7 +7,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, ExpSineSquared, Matern, RationalQuadratic
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EGPRegressor
+from skevgp import CoefPrior, EGPRegressor
 from skevgp.kernels import Cosine
 from skevgp.noise import Gaussian
 
@@ -77,7 +77,7 @@ def dense_likelihood(model, theta, y, scale):
 
 
 def test_with_features_the_likelihood_is_the_dense_one():
-    model = start(feature_map=TREND, coef_mean=0.0, coef_scale=2.0)
+    model = start(feature_map=TREND, coef_prior=CoefPrior(mean=0.0, scale=2.0))
     theta = elsewhere(model)
     value, gradient = model.log_marginal_likelihood(theta, eval_gradient=True)
     expected = dense_likelihood(model, theta, Y[:, 0], 2.0)
@@ -87,7 +87,7 @@ def test_with_features_the_likelihood_is_the_dense_one():
 
 @pytest.mark.parametrize("scale", [2.0, np.inf])
 def test_the_gradient_of_the_likelihood_is_the_numerical_one(scale):
-    model = start(feature_map=TREND, coef_scale=scale, y=100.0 * Y[:, 0])
+    model = start(feature_map=TREND, coef_prior=CoefPrior(scale=scale), y=100.0 * Y[:, 0])
     theta = elsewhere(model)
     _, gradient = model.log_marginal_likelihood(theta, eval_gradient=True)
     expected = numerical_gradient(model.log_marginal_likelihood, theta)

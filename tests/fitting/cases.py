@@ -11,7 +11,6 @@ from skevgp.fitting.problem import Problem
 from skevgp.fitting.units import Units
 from skevgp.kernels.parse import parse_kernel
 from skevgp.model.predictor import CoefficientPrior
-from skevgp.solvers import LBFGS
 from skevgp.utils.monitor import Monitor
 
 _rng = np.random.RandomState(0)
@@ -46,15 +45,14 @@ def problem_of(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
     """What an estimator asks for."""
     units = changes.pop("units", None) or units_of(X, H, Y)
     options = {
-        "data": (X, X, Y, None),
         "source": source_of(X, H, Y),
         "units": units,
         "spec": parse_kernel(kernel, X.shape[1]),
         "vague": np.zeros(units.prior.scale.shape, dtype=bool),
-        "n_columns": X.shape[1],
+        "shapes": (X.shape[1:], H.shape[1:]),
         "placement": Placement("k-means", n_inducing),
         "max_iter": 20,
-        "solver": LBFGS(tol=1.0),
+        "tol": 1.0,
     }
     return Problem(**options | changes)
 

@@ -46,16 +46,6 @@ def test_outputs_share_as_they_are_told(sharing, groups, n_sets):
         assert model.sparse.prior.scale.shape == (n_outputs, 2)
 
 
-def test_models_that_share_nothing_have_their_own_outputs_and_start_alike():
-    found, units = models(sharing="none"), units_of()
-    for o, model in enumerate(found):
-        np.testing.assert_array_equal(model.sparse.prior.scale[0], units.internal_prior().scale[o])
-        internal = units.to_internal(source_of().take(np.arange(N))).targets[:, [o]]
-        np.testing.assert_array_equal(model.rows.some(np.arange(N)).targets, internal)
-    assert len({model.seed for model in found}) == 1
-    np.testing.assert_array_equal(*(model.table["inducing_points"].start for model in found))
-
-
 def test_groups_are_models_of_their_outputs():
     """Of columns that do not follow each other too; a callback is told which, in the user's units."""
     told = []
@@ -77,8 +67,12 @@ def test_groups_are_models_of_their_outputs():
 @pytest.mark.parametrize(
     ("sharing", "n_threads", "share"), [("none", 1, 1.0), ("none", 2, 0.5), ("none", 9, 0.5), ("all", 2, 1.0)]
 )
-def test_fits_at_once_share_the_memory(sharing, n_threads, share):
-    assert {model.rows.share for model in models(sharing=sharing, n_threads=n_threads)} == {share}
+def test_fits_at_once_share_the_memory_and_start_alike(sharing, n_threads, share):
+    found = models(sharing=sharing, n_threads=n_threads)
+    assert {model.rows.share for model in found} == {share}
+    assert len({model.seed for model in found}) == 1
+    for model in found[1:]:
+        np.testing.assert_array_equal(model.table["inducing_points"].start, found[0].table["inducing_points"].start)
 
 
 @pytest.mark.parametrize(
@@ -137,6 +131,8 @@ def test_a_kernel_that_is_none_is_named_before_anything_is_fitted():
         models(kernel=lambda A, B: A @ B.T - 10.0)
 
 
+_x = np.random.RandomState(0).randint(0, 5, (MAX_SAMPLE + 1, 1)).astype(float)
+MANY = data_of(np.random.RandomState(1).randn(*_x.shape), _x) | {"n_inducing": 10}
 TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np.vstack([Y, Y])}
 
 
@@ -151,26 +147,23 @@ TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np
         ({"n_inducing": N, "family": "diagonal"}, False),
         ({"placement": Placement(X[1:], N - 1)}, False),
         ({"placement": Placement(X + 1e-3, N)}, False),
+        (MANY, False),
     ],
-    ids=["all", "kernel", "rounding", "given", "too few", "diagonal", "all rows but one", "next to the rows"],
+    ids=["all", "kernel", "rounding", "given", "too few", "diagonal", "all but one", "next to the rows", "a sample's"],
 )
 def test_points_that_are_all_rows_stay(changes, stay):
-    """There the bound is the likelihood, and no other places are better. Rows that differ by rounding only are one."""
+    """There the bound is the likelihood, and no other places are better. Rows that differ by rounding only are one.
+
+    Of more rows than a sample has nobody has looked whether they are all.
+    """
     model = model_of(**changes)
     assert model.table["inducing_points"].free.any() != stay
     assert model.sparse.complete == stay
+    # A kernel with as many points as rows may explain each row by itself.
+    assert model.interpolates == (model.n_inducing >= N)
     if stay and "placement" not in changes:
         for points in model.table["inducing_points"].start:
             np.testing.assert_array_equal(points, X)
-
-
-def test_points_that_are_all_rows_of_a_sample_move():
-    """Nobody has looked whether they are all rows."""
-    n = MAX_SAMPLE + 1
-    rng = np.random.RandomState(0)
-    model = model_of(**data_of(rng.randn(n, 1), rng.randint(0, 5, (n, 1)).astype(float)), n_inducing=10)
-    assert model.n_inducing == 5
-    assert model.table["inducing_points"].free.all()
 
 
 # --- where another fit ended ------------------------------------------------------------------------------------------
@@ -237,13 +230,6 @@ def test_points_of_another_space_are_left_with_all_else(X):
 # --- what a search asks -----------------------------------------------------------------------------------------------
 
 
-def test_chance_is_the_seeds():
-    model = model_of()
-    first, again = (replace(model).rng.rand() for _ in range(2))
-    assert first == again != replace(model, seed=model.seed + 1).rng.rand()
-    assert model.rng is model.rng
-
-
 def test_a_model_knows_what_the_features_alone_explain():
     """And a fit that ended below that is tried from elsewhere."""
     model = model_of()
@@ -270,11 +256,6 @@ def test_where_features_may_hide_the_noise_it_is_known_which_suits_them(monkeypa
     assert (found.hidden, found.most) == (True, -np.inf)
     fixed = model_of(kernel=ConstantKernel(4.0, "fixed") * RBF([1.0, 1.0])).alone
     assert fixed.most > fixed.bound
-
-
-@pytest.mark.parametrize(("n_inducing", "interpolates"), [(N - 1, False), (N, True), (2 * N, True)])
-def test_the_kernel_may_interpolate_where_points_are_as_many_as_rows(n_inducing, interpolates):
-    assert model_of(n_inducing=n_inducing).interpolates == interpolates
 
 
 @pytest.mark.parametrize("sharing", ["all", "kernel"])
@@ -326,7 +307,7 @@ def growing(most=1000, first=8, **changes):
 
 
 @pytest.mark.parametrize("sharing", ["all", "kernel"])
-def test_half_as_many_points_again_come_after_those_of_a_fit(sharing):
+def test_half_as_many_points_again_come_after_those_of_a_fit_as_far_as_they_may(sharing):
     model = growing(sharing=sharing)
     values = model.table.values_at_start()
     values["inducing_points"] = values["inducing_points"] + 0.1
@@ -336,14 +317,9 @@ def test_half_as_many_points_again_come_after_those_of_a_fit(sharing):
     np.testing.assert_array_equal(start[:, :8], values["inducing_points"])
     assert np.isin(start[:, 8:], X).all()
     assert more.table["inducing_points"].free.all()
-    assert not more.sparse.complete
-
-
-def test_no_more_points_than_allowed_nor_without_leave():
-    first = growing().table.values_at_start()
-    assert growing(most=10).with_more(first).n_inducing == 10
-    assert growing(most=8).with_more(first) is None
-    assert model_of().with_more(first) is None
+    assert growing(most=10, sharing=sharing).with_more(values).n_inducing == 10
+    assert growing(most=8, sharing=sharing).with_more(values) is None
+    assert model_of(sharing=sharing).with_more(values) is None
 
 
 @pytest.mark.parametrize("family", ["full", "diagonal"])

@@ -7,6 +7,7 @@ from skevgp.fitting import outliers
 from skevgp.fitting.fit import finished
 from skevgp.fitting.outliers import Look, RowDoubts, fit_doubting, look_at, settle
 from skevgp.fitting.search import Start, better, search
+from skevgp.noise import StudentT
 from skevgp.noise.student_t import RowScales
 
 from .cases import N, O, Y, data_of, model_of
@@ -18,7 +19,7 @@ def wrong_at_three(**changes):
     """With rows of which three are far off."""
     wrong = Y.copy()
     wrong[BAD] += 6.0 * Y.std(axis=0)
-    return model_of(**data_of(wrong), **changes, heavy_tails=True)
+    return model_of(**data_of(wrong), **changes, noise=StudentT())
 
 
 @pytest.mark.parametrize("changes", [{}, {"family": "diagonal"}, {"sharing": "kernel"}], ids=str)

@@ -3,7 +3,6 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
 from skevgp.data.rows import LocalSource
-from skevgp.fitting.inducing import Placement
 from skevgp.fitting.sharing import found_groups, with_groups
 from skevgp.model.objectives import BoundObjective
 from skevgp.solvers import LBFGS
@@ -41,11 +40,6 @@ def test_outputs_of_like_smoothness_are_joined(seed):
     scaled = data_of(data["Y"] * [1.0, 1e-3, 1e4, 1.0], data["X"])
     assert found(**data) == found(**scaled) == [[0, 2], [1, 3]]
     assert found(**waves([0.5, 0.5, 0.5], seed=seed)) == [[0, 1, 2]]
-
-
-def test_the_groups_do_not_depend_on_threads():
-    data = waves([0.5, 3.0, 0.5, 1.5])
-    assert found(1, **data) == found(3, **data)
 
 
 def test_constant_outputs_and_noise_have_groups_of_their_own():
@@ -90,18 +84,6 @@ def test_a_fit_with_found_groups_is_the_fit_with_these_given():
         auto.predictor().predict(data["X"], data["H"])[0], given.predictor().predict(data["X"], data["H"])[0]
     )
     assert auto.lower_bound == given.lower_bound
-
-
-def test_groups_are_found_whatever_number_of_points_the_fit_begins_with():
-    """The few that it begins with do not tell one kernel from another."""
-    data, given = waves([0.5, 3.0, 0.5]), Placement("k-means", 40)
-    growing = Placement("k-means", 3, max_inducing=40)
-    asked = [
-        with_groups(problem_of(placement=own, sharing="auto", **data), np.random.RandomState(0), Monitor())
-        for own in (given, growing)
-    ]
-    assert asked[0].sharing == asked[1].sharing == [[0, 2], [1]]
-    assert asked[1].placement is growing
 
 
 def test_only_groups_that_were_asked_for_are_looked_for():

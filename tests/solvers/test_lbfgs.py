@@ -32,17 +32,9 @@ def test_lbfgs_finds_the_minimum_and_reports_each_iteration():
     assert (np.diff(minimum.loss_curve) <= 1e-15).all()
 
 
-def test_lbfgs_respects_bounds():
-    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), (np.full(2, -2.0), np.full(2, 0.5)), 200, 1e-12)
-    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-4)
-
-
-def test_lbfgs_says_that_iterations_ran_out():
+def test_lbfgs_says_that_iterations_ran_out_and_none_keep_the_start():
     minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 3, 1e-12)
     assert (minimum.converged, minimum.n_iter) == (False, 3)
-
-
-def test_lbfgs_with_no_iterations_keeps_the_start():
     minimum = lbfgs(rosenbrock, np.array([-1.0, 2.0]), FREE, 0, 1e-12)
     np.testing.assert_array_equal(minimum.x, [-1.0, 2.0])
     assert minimum.converged
@@ -83,16 +75,6 @@ def test_a_start_that_cannot_be_evaluated_has_not_converged():
     minimum = lbfgs(lambda x: (np.nan, np.zeros(2)), np.zeros(2), FREE, 50, 1e-6)
     assert not minimum.converged
     assert minimum.loss == np.inf
-
-
-def test_lbfgs_ends_when_rounding_has_the_last_word():
-    def rough(x):
-        value, gradient = rosenbrock(x)
-        return round(value, 3), gradient
-
-    minimum = lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-6)
-    assert minimum.converged
-    assert minimum.loss < 0.01
 
 
 def test_ctrl_c_keeps_the_best_point_so_far():
@@ -154,10 +136,11 @@ def test_starts_that_gain_without_an_iteration_come_to_an_end():
     assert minimum.loss == -len(looks)
 
 
-def test_limits_hold_in_whatever_units():
+@pytest.mark.parametrize("alike", [None, np.arange(2)], ids=["no units", "units"])
+def test_limits_hold_in_whatever_units(alike):
     limits = np.full(2, -2.0), np.full(2, 0.5)
-    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), limits, 200, 1e-12, alike=np.arange(2))
-    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-5)
+    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), limits, 200, 1e-12, alike=alike)
+    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-4)
 
 
 def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
@@ -224,10 +207,6 @@ def test_where_the_loss_cannot_be_evaluated_units_are_one(gradient):
         return 0.0, np.full(4, gradient)
 
     np.testing.assert_array_equal(curvature_units(objective, np.ones(4), EACH, 2), np.ones(4))
-
-
-def test_nothing_to_move_is_no_error():
-    assert curvature_units(lambda x: (0.0, x), np.empty(0), np.empty(0, dtype=int), 2).shape == (0,)
 
 
 def test_with_units_a_badly_scaled_valley_is_a_few_iterations_long():

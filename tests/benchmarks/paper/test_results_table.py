@@ -5,14 +5,13 @@ from contextlib import nullcontext
 
 import numpy as np
 import pytest
-from skevgp.solvers.minimum import Minimum
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.utils import Bunch
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
-from skevgp.estimators.bnn_training import Training
+from skevgp.estimators import bnn
 from skevgp.features import InertiaForceGravity
 from skevgp.fitting import messages
 from skevgp.metrics import prediction_error, std_norm
@@ -328,9 +327,7 @@ def messages_of_early_ends():
     yield messages.interrupted(9, max_time=1.0)
     yield Adam()._how_it_ended(going, False)
     yield Adam()._how_it_ended(ended, True)
-    for minimum, interrupted, still_falling in ((going, False, False), (ended, True, False), (ended, False, True)):
-        training = Training(np.zeros(1), minimum, np.zeros(1), np.zeros(0), still_falling)
-        yield training.how_it_ended(9, 0.1, interrupted)
+    yield from (bnn._INTERRUPTED, bnn._NOT_FINITE, bnn._STILL_FELL)
 
 
 @pytest.mark.parametrize("message", [*messages_of_early_ends()])
