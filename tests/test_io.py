@@ -163,6 +163,22 @@ def test_a_robots_file_need_not_be_there(path, tmp_path):
         clone(loaded).fit(rows, STATES[:, :2])
 
 
+@pytest.mark.parametrize("name", ["nominal", "inverse-dynamics", "levers", "residual", "words"])
+def test_nothing_but_the_file_is_opened(name, path):
+    save(fitted(name), path)
+    load(path)  # what is imported is imported now
+    opened, watching = [], True
+
+    def watch(event, arguments):
+        if watching and event in ("open", "os.listdir", "subprocess.Popen", "socket.connect", "exec"):
+            opened.append((event, str(arguments[0])))
+
+    sys.addaudithook(watch)
+    load(path)
+    watching = False
+    assert opened == [("open", str(path))]
+
+
 def test_without_pinocchio_a_robot_gets_the_pip_command(path, monkeypatch):
     save(fitted("nominal"), path)
     monkeypatch.setitem(sys.modules, "pinocchio", None)
