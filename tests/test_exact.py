@@ -474,3 +474,13 @@ def test_a_fixed_noise_far_below_the_targets_has_a_finite_likelihood():
         model.fit(X, 1e79 * np.sin(9.0 * X[:, 0]))
     assert np.isfinite(model.log_marginal_likelihood_value_)
     assert np.isfinite(model.predict(X)).all()
+
+
+def test_with_points_at_all_rows_the_std_is_the_exact_models():
+    """Also where features are more than rows: kernel and features then compete for what there is."""
+    rows, trend = RNG.uniform(-1.0, 1.0, (6, 3)), PolynomialFeatures(3)
+    y = np.sin(rows[:, 0])
+    new = RNG.uniform(-1.0, 1.0, (5, 3))
+    sparse = EVGPRegressor(trend, n_inducing=20, random_state=0).fit(rows, y).predict(new, return_std=True)
+    exact = EGPRegressor(trend, random_state=0).fit(rows, y).predict(new, return_std=True)
+    np.testing.assert_allclose(sparse, exact, rtol=1e-6, atol=1e-9)

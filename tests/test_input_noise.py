@@ -198,3 +198,13 @@ def test_so_little_noise_that_it_is_rounded_to_nothing(unit):
     assert np.isfinite(mean).all()
     assert (std > 0.0).all()
     np.testing.assert_allclose(mean / unit, y / unit, atol=0.3)
+
+
+@pytest.mark.parametrize("n_inducing", [30, 200])
+def test_exact_data_are_met_though_inputs_are_said_to_be_noisy(n_inducing):
+    """All the noise is then that of the inputs, and σ² next to nothing: how rows compare must not be ruled by that."""
+    X = np.sort(np.random.RandomState(0).uniform(-3.0, 3.0, (200, 1)), axis=0)
+    y = np.sin(2.0 * X[:, 0])
+    model = EVGPRegressor(n_inducing=n_inducing, noise=Gaussian(inputs=0.01), random_state=0).fit(X, y)
+    assert np.sqrt(np.mean((model.predict(X) - y) ** 2)) < 1e-3
+    assert model.lower_bound_ > 200.0

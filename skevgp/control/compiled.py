@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..data.rows import of_outputs
 from ..maps.derivatives import MappedRows, chained, mapped
@@ -15,6 +16,8 @@ from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
 
 _NONE = np.empty((0, 0))
+# What two points may differ by that are the same but for rounding, as a share of the largest.
+_ROUNDING = 1e-9
 
 
 class CompiledPredictor:
@@ -175,13 +178,28 @@ class CompiledPredictor:
 
 
 def _goes_on(before: Predictor, predictor: Predictor) -> bool:
-    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell."""
+    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell.
+
+    The points of an exact fit are its rows. Its first update leaves some of them out, and those that are left are the
+    same but for rounding.
+    """
     if before.offset.shape != predictor.offset.shape:
         return False
     return all(
-        np.array_equal(old.points, new.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
+        _are_among(new.points, old.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
         for old, new in zip(before.by_output, predictor.by_output, strict=True)
     )
+
+
+def _are_among(points: np.ndarray, others: np.ndarray) -> bool:
+    """Whether each of some points (n, d) is one of the others, but for rounding."""
+    if points.shape == others.shape and np.array_equal(points, others):
+        return True
+    if points.shape[1] != others.shape[1]:
+        return False
+    size = np.maximum(np.abs(others).max(axis=0), np.finfo(float).tiny)
+    distance, _ = cKDTree(others / size).query(points / size)
+    return bool((distance <= _ROUNDING).all())
 
 
 class _Moments(NamedTuple):

@@ -22,7 +22,7 @@ from ..utils.validation import LARGEST, as_floats
 from .messages import far_from_prior, interrupted, lbfgs_ended, learned_too_little
 from .problem import Problem
 from .search import FeaturesAlone, Fit, Rules, Start, drawn, search
-from .start import centred_kernels, checked_variance, starting_table
+from .start import centred_kernels, checked_variance, starting_table, with_signal_of_constants
 from .units import Units, check_independent, may_hide_noise, noise_of_most_evidence
 
 if TYPE_CHECKING:
@@ -311,6 +311,9 @@ def fit_exact(
         units,
     )
     best = search(task)
+    values, changed = with_signal_of_constants(problem, rows, table, best.values)
+    if changed:
+        best = replace(best, values=values, bound=float(model.log_likelihoods(values).sum()))
 
     # What the user should know of it.
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))

@@ -22,6 +22,7 @@ from .outliers import RowDoubts, fit_doubting
 from .problem import Problem
 from .search import Fit, Rules, Start, better, search
 from .sharing import with_groups
+from .start import with_signal_of_constants
 from .units import Units
 
 # Inducing points become more until that raises the bound by less than so many nats per row and output.
@@ -31,8 +32,6 @@ _GAIN = 0.01
 _MISSED = 0.02
 # On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
 _ITERATIONS, _COARSE = 60, 2e-4
-# Signal over noise variance: above it the jitter of k(X_m, X_m), up to 1e-12 and more of the signal, shows in the std.
-_HIGH_RATIO = 1e9
 
 
 def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None) -> Fitted:
@@ -112,6 +111,7 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     """What is kept of a fit; signal and noise are calibrated if the problem says so and Ctrl-C did not."""
     sparse, values, exact, by = model.sparse, fit.values, model.exact, model.problem.noise_cv
     messages, found, dependent = [fit.message, far_from_prior(sparse.prior, model.rows)], None, False
+    values, changed = with_signal_of_constants(model.problem, model.rows, model.table, values)
     statistics = sparse.statistics(values, model.blocks)
     if not model.monitor.stopped and model.max_iter > 0:
         messages.append(model.learned_too_little(values))
@@ -129,22 +129,22 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
         values = values | {"signal": found.signal, "noise": found.noise}
         messages.append(signal_gone(found.gone, len(found.noise)))
     # Else summed row by row, which keeps its digits where the noise is low.
-    known = found is None and np.isfinite(fit.bound) and fit.n_rows is None
+    known = found is None and not changed and np.isfinite(fit.bound) and fit.n_rows is None
     if exact is None:
         bound = fit.bound if known else sparse.bound(values, statistics, model.blocks)
         upper_bound = sparse.upper_bound(values, statistics, model.blocks)
     else:
         bound = upper_bound = fit.bound if known else float(exact.log_likelihoods(values).sum())
-    is_exact = exact is not None and bool((values["signal"] > _HIGH_RATIO * values["noise"]).any())
-    if exact is not None and is_exact:
+    if exact is not None:
+        # The jitter of k(X_m, X_m) would show in its std.
         predictor = exact.predictor(values)
-    elif found is None and fit.predictor is not None:
+    elif found is None and not changed and fit.predictor is not None:
         predictor = fit.predictor
     else:
         predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
     message = " ".join(part for part in messages if part)
     one = FittedModel(sparse, model.table, values, statistics, predictor, fit.loss_curve, message, dependent, doubts)
-    one = replace(one, known_bound=bound, known_upper_bound=upper_bound, is_exact=is_exact)
+    one = replace(one, known_bound=bound, known_upper_bound=upper_bound, is_exact=exact is not None)
     return one if doubts is None else doubts.told(one)
 
 

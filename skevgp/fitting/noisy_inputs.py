@@ -15,6 +15,9 @@ from .fit import Fitted
 
 # Fits and slopes take turns until no output's σ² moves by more than this share, or so often.
 _SETTLED, _TURNS = 0.05, 5
+# The least share of a row's variance that σ² is taken for when the rows' noise is compared: a σ² of next to nothing, as
+# of values of a function without noise, would make it any multiple of that.
+_LEAST_SHARE = 1e-3
 # Rows whose slopes are found at once.
 _ROWS_AT_ONCE = 256
 
@@ -43,7 +46,8 @@ def fit_to_noisy_inputs(
         if before is not None and (np.abs(np.log(own / before)) < _SETTLED).all():
             break
         before = own
-        fitted = refit(relative_noise(by_inputs, own, data.chosen), fitted)
+        least = _LEAST_SHARE * np.average(by_inputs, axis=0, weights=weights[0])
+        fitted = refit(relative_noise(by_inputs, np.maximum(own, least), data.chosen), fitted)
         if monitor.stopped or monitor.out_of_time:
             break
     return fitted

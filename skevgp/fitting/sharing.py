@@ -114,8 +114,6 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
         return bool((own[outputs] - bounds <= bearable[outputs]).all())
 
-    if not learned:
-        return [everything]
     # Rows that were not drawn may show it, and then the others must not rule its kernel: a group of its own.
     unknown = [o for o in everything if o not in learned]
     variance = problem.units.rows(problem.source).residuals.variance if unknown else np.empty(0)
@@ -126,6 +124,8 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
     def completed(groups: list[list[int]]) -> list[list[int]]:
         return [sorted([*groups[0], *constant]), *groups[1:], *(own for own in (hidden, still) if own)]
 
+    if not learned:
+        return [own for own in ([o for o in everything if o not in still], still) if own]
     if suits(learned, fits.further(learned, fits.together)):
         return completed([learned])
     groups, apart = [[o] for o in learned], np.eye(len(everything), dtype=bool)

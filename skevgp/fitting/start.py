@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..data.rows import Moments, RawRows, Rows
 from ..kernels.covariances import Covariance
 from ..kernels.parse import KernelSpec, Start
-from ..model.parameters import Parameter, ParameterTable
+from ..model.parameters import Parameter, ParameterTable, Values
 from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
 from ..model.statistics import Kernel, Whitening
 from ..utils.linalg import NotPositiveDefiniteError, jittered_cholesky
@@ -194,6 +194,20 @@ def starting_table(
             ),
         ]
     )
+
+
+def with_signal_of_constants(
+    problem: Problem, rows: Rows, table: ParameterTable, values: Values
+) -> tuple[Values, bool]:
+    """Values in which constants among other outputs have the signal that they would have alone, and whether any has.
+
+    The fit gave them next to none, so that they do not rule the kernel that they share.
+    """
+    still, start = rows.still(), table["signal"].start
+    if problem.spec.starts.signal.value is not None or not still.any() or still.all():
+        return values, False
+    alone = start / problem.rules.signal_limits[0]
+    return values | {"signal": np.where(still, alone, values["signal"])}, True
 
 
 def parameter_of(

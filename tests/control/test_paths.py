@@ -8,6 +8,8 @@ from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS
 
+from .cases import quick
+
 N = 20_000
 
 
@@ -32,8 +34,7 @@ def model(request):
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (60, 2))
     Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
-    model = MODELS[request.param].set_params(max_iter=10, solver=LBFGS(tol=1e6), random_state=0)
-    return model.fit(X, Y + 0.1 * rng.randn(*Y.shape))
+    return quick(MODELS[request.param]).fit(X, Y + 0.1 * rng.randn(*Y.shape))
 
 
 def test_along_a_given_path_they_have_the_posteriors_joint_covariance(model):
