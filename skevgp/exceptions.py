@@ -37,12 +37,12 @@ class DependentRowsWarning(UserWarning):
 class InconsistentVersionWarning(UserWarning):
     """A model is loaded by another version than it was saved with, and nobody knows whether it predicts the same.
 
-    Given for pickles, and files of skops, of another version of skevgp; and by `skevgp.io.load` for those few models
-    that it cannot try, if they are of another version of scikit-learn. As an error:
+    Given for pickles, and files of `skops.io.dump`, of another version of skevgp; and by `skevgp.io.load` for those few
+    models that it cannot try, if they are of another version of scikit-learn. As an error:
 
     See Also
     --------
-    skevgp.io.save : Its files are checked when they are read.
+    skevgp.io.save : A model of its files has to predict what it did.
 
     Examples
     --------

@@ -1,29 +1,33 @@
 """Models as files, by skops: loading runs no code of the file, and the model has to predict what it did.
 
-A file is what skops makes of the model, and of a few rows with what the model predicted for them when it was saved.
+A file is a zip archive: what skops makes of the model and of a few rows with the model's predictions for them, and
+`skevgp.json` with the versions of the libraries. The versions are read first, so that each error can name them.
 """
 
 from __future__ import annotations
 
 import importlib
+import json
 import os
 import pkgutil
 import platform
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
-from typing import IO, Any
-from zipfile import ZIP_STORED, BadZipFile, ZipFile
+from io import BytesIO
+from typing import Any
+from zipfile import ZIP_DEFLATED, BadZipFile, ZipFile
 
 import numpy as np
 import scipy
 import sklearn
 from joblib import parallel_config
+from sklearn import metrics as sklearn_metrics
+from sklearn import model_selection
 from sklearn.base import BaseEstimator
 from sklearn.gaussian_process import kernels as sklearn_kernels
 from sklearn.pipeline import Pipeline
 
-import skevgp
-
+from . import metrics
 from ._version import __version__
 from .data.maps import take_rows
 from .exceptions import InconsistentVersionWarning, ignored, warn_user
@@ -34,17 +38,22 @@ from .utils.validation import check_fitted
 
 __all__ = ["TRUSTED_TYPES", "load", "save"]
 
-_FORMAT, _VERSION = "skevgp", 2
-# Rows that a model is tried with.
+_ABOUT, _FORMAT = "skevgp.json", 2
+# A file may hold as many times its size, and as many bytes more; those of `save` hold some ten times their size.
+_TIMES, _MORE = 100, 2**24
+# Number of rows that a model has to predict again.
 _ROWS = 4
 # What a prediction may differ by where other libraries compute it: shares of its standard deviation, and of itself; its
 # standard deviation by a share of the largest mean too, since it is rounding where there is no noise.
 _OF_STD, _OF_MEAN, _OF_LARGEST = 1e-2, 1e-6, 1e-4
-# Parts of the package without a class that is part of a fitted model.
-_WITHOUT_MODELS = ("skevgp.datasets", "skevgp.exceptions", "skevgp.io", "skevgp.metrics", "skevgp.plotting")
-# Of a covariance: takes a tuple apart.
-_FUNCTIONS = ("operator.itemgetter", "skevgp.kernels.base._all_of_it")
-# Parts of ColumnTransformer, SplineTransformer and SimpleImputer, some of them in some versions only.
+# Parts of the package whose classes are in no fitted model.
+_WITHOUT_MODELS = (
+    *("skevgp.datasets", "skevgp.exceptions", "skevgp.io", "skevgp.metrics", "skevgp.plotting"),
+    *("skevgp.data.dask", "skevgp.data.threads", "skevgp.utils.files", "skevgp.utils.monitor"),
+)
+# Parts of a covariance: they take a tuple apart. A range is a user's list of outputs.
+_FUNCTIONS = ("builtins.range", "operator.itemgetter", "skevgp.kernels.base._all_of_it")
+# Parts of ColumnTransformer, SplineTransformer, SimpleImputer and searches, some of them in some versions only.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",
     "numpy.number",
@@ -53,26 +62,37 @@ _OF_SCIKIT_LEARN = (
     "scipy.interpolate._bsplines._BSpline",
     "sklearn.compose._column_transformer._RemainderColsList",
     "sklearn.compose._column_transformer.make_column_selector",
-)
-# scikit-learn's kernels are kernel and kernel_.
-_KERNELS = tuple(
-    f"{kind.__module__}.{kind.__name__}"
-    for kind in vars(sklearn_kernels).values()
-    if isinstance(kind, type) and issubclass(kind, sklearn_kernels.Kernel)
+    "sklearn.metrics._scorer._PassthroughScorer",
+    "sklearn.metrics._scorer._Scorer",
+    "sklearn.utils._metadata_requests.MetadataRequest",
+    "sklearn.utils._metadata_requests.MethodMetadataRequest",
 )
 
 
-def _classes() -> Iterator[str]:
-    """The classes of this package whose instances a fitted model may hold: no functions."""
-    for found in pkgutil.walk_packages(skevgp.__path__, "skevgp."):
-        if found.ispkg or found.name.startswith(_WITHOUT_MODELS):
-            continue
-        for value in vars(importlib.import_module(found.name)).values():
-            if isinstance(value, type) and value.__module__ == found.name:
-                yield f"{found.name}.{value.__qualname__}"
+def _names_of_types() -> Iterator[str]:
+    """Names of the classes and functions that a fitted model may hold."""
+    yield from (*_FUNCTIONS, *_OF_SCIKIT_LEARN)
+    for found in pkgutil.walk_packages([os.path.dirname(__file__)], "skevgp."):
+        if not found.ispkg and not found.name.startswith(_WITHOUT_MODELS):
+            module = importlib.import_module(found.name)
+            yield from (_name(one) for one in vars(module).values() if _is_class(one) and one.__module__ == found.name)
+    # Kernels, splitters and scores are parameters of models and searches.
+    yield from (_name(one) for one in vars(sklearn_kernels).values() if _is_class(one, sklearn_kernels.Kernel))
+    yield from (_name(one) for one in vars(model_selection).values() if _is_class(one) and hasattr(one, "split"))
+    of_regression = sklearn_metrics.r2_score.__module__
+    yield from (_name(one) for one in vars(sklearn_metrics).values() if getattr(one, "__module__", "") == of_regression)
+    yield from (_name(one) for one in vars(metrics).values() if getattr(one, "__module__", "") == metrics.__name__)
 
 
-TRUSTED_TYPES: list[str] = sorted({*_classes(), *_FUNCTIONS, *_KERNELS, *_OF_SCIKIT_LEARN})
+def _is_class(value: Any, parent: type = object) -> bool:
+    return isinstance(value, type) and issubclass(value, parent)
+
+
+def _name(value: Any) -> str:
+    return f"{value.__module__}.{value.__qualname__}"
+
+
+TRUSTED_TYPES: list[str] = sorted(set(_names_of_types()))
 """Names of the types that a fitted model of skevgp is made of, for ``skops.io.load(path, trusted=TRUSTED_TYPES)``: its
 own classes, and some of scikit-learn, SciPy and NumPy. None of them runs what a file says. Functions and transformers
 of yours are not among them: ``skops.io.get_untrusted_types(file=path)`` lists these.
@@ -82,8 +102,9 @@ of yours are not among them: ``skops.io.get_untrusted_types(file=path)`` lists t
 def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> None:
     """Write a fitted model to a file from which loading runs no code.
 
-    A loaded model predicts the same to the bit, and goes on with ``partial_fit``. The file is written next to ``path``
-    and read again before it replaces ``path``: if anything fails, the old file is still there.
+    A loaded model predicts the same to the bit, and goes on with ``partial_fit``. What is written is loaded once before
+    it is written. The file is written next to ``path`` and then replaces it: if anything fails, the old file is still
+    there.
 
     Parameters
     ----------
@@ -100,7 +121,7 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
     ImportError
         If skops is not installed; the message gives the pip command.
     ValueError
-        If the model holds other types, which the message names, or its file could not be read.
+        If the model holds other types, which the message names, or could not be loaded again.
     sklearn.exceptions.NotFittedError
         If the model is not fitted.
     OSError
@@ -133,21 +154,17 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
     """
     skops = require("skops.io", "Saving a model")
     check_fitted(model[-1] if isinstance(model, Pipeline) else model)
-    content = {
-        "format": _FORMAT,
-        "version": _VERSION,
-        "made_with": _versions(),
-        "model": model,
-        "trial": _trial(model),
-    }
+    buffer = BytesIO()
+    try:
+        skops.dump({"model": model, "trial": _trial(model)}, buffer, compression=ZIP_DEFLATED)
+        with ZipFile(buffer, "a") as archive:
+            archive.writestr(_ABOUT, json.dumps(_about()))
+        _opened(buffer.getvalue(), trusted)
+    except Exception as error:
+        advice = " Save its best_estimator_ instead." if hasattr(model, "best_estimator_") else ""
+        raise ValueError(f"The model cannot be saved: {_said(error)}.{advice}") from error
     with replacing(path) as file:
-        try:
-            skops.dump(content, file)
-            _loaded(file, os.fspath(path), trusted)
-        except OSError:
-            raise
-        except Exception as error:
-            raise ValueError(f"The model cannot be saved: {error}") from error
+        file.write(buffer.getbuffer())
 
 
 def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
@@ -204,62 +221,65 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     """
     require("skops.io", "Loading a model")
     with open(path, "rb") as file:
-        return _loaded(file, os.fspath(path), trusted)
-
-
-def _loaded(file: IO[bytes], path: str, trusted: Sequence[str]) -> Any:
-    """The model of a file that is open."""
+        data = file.read()
     try:
-        with ignored(), np.errstate(all="ignore"), parallel_config("sequential"):
-            model, made_with, tried = _read(file, [*TRUSTED_TYPES, *trusted])
-    except (ImportError, MemoryError):
+        model, tried, made_with = _opened(data, trusted)
+    except ImportError:
         raise
     except Exception as error:
         # Whatever a damaged file makes of skops, of NumPy and of our classes.
-        raise ValueError(f"{path!r} is not a file of skevgp.io.save, or damaged: {_said(error)}.") from error
-    now = _versions()["scikit-learn"]
-    if not tried and made_with.get("scikit-learn") != now:
+        raise ValueError(f"{os.fspath(path)!r} cannot be loaded: {_said(error)}.") from error
+    if not tried and made_with.get("scikit-learn") != sklearn.__version__:
         warn_user(
-            f"{path!r} was saved with scikit-learn {made_with.get('scikit-learn')}, and this is {now}. What the model "
-            "predicts could not be compared.",
+            f"{os.fspath(path)!r} was saved with {_told(made_with)} (here: {_told(_about())}). What the model predicts "
+            "could not be compared.",
             InconsistentVersionWarning,
         )
     return model
 
 
-def _read(file: IO[bytes], trusted: list[str]) -> tuple[Any, dict[str, str], bool]:
-    """The model, the versions it was made with, and whether it has been tried."""
+def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, Any]]:
+    """The model of a file, whether it has predicted what it did, and the versions that made the file."""
+    with ZipFile(BytesIO(data)) as archive:
+        names, size = archive.namelist(), sum(member.file_size for member in archive.infolist())
+        if "model.json" in names:
+            raise ValueError("it is a file of skevgp 0.1, which this version does not read: fit the model again")
+        if size > _TIMES * len(data) + _MORE:
+            raise ValueError(f"it has {len(data)} bytes and unpacks to {size}, which no file of skevgp.io.save does")
+        about = json.loads(archive.read(_ABOUT)) if _ABOUT in names else None
+    if type(about) is not dict or type(about.get("format")) is not int:
+        raise ValueError("it is not a file of skevgp.io.save")
+    if about["format"] != _FORMAT:
+        raise ValueError(f"it has format {about['format']} of {_told(about)}, and skevgp {__version__} reads {_FORMAT}")
+    try:
+        with ignored(), np.errstate(all="ignore"), parallel_config("sequential"):
+            return *_made(data, [*TRUSTED_TYPES, *trusted]), about
+    except ImportError:
+        raise
+    except Exception as error:
+        if about == _about():
+            raise
+        raise ValueError(f"{_said(error)} (saved with {_told(about)}; here: {_told(_about())})") from error
+
+
+def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
+    """The model of a file, and whether it has predicted what it did."""
     skops = require("skops.io", "Loading a model")
-    file.seek(0)
-    with ZipFile(file) as archive:
-        if "model.json" in archive.namelist():
-            raise ValueError("it is of skevgp 0.1, which this version does not read: fit the model again")
-        # Not compressed, it takes no more memory than the file.
-        if any(member.compress_type != ZIP_STORED for member in archive.infolist()):
-            raise ValueError("it is compressed")
-    file.seek(0)
-    data = file.read()
-    unknown = sorted(set(skops.get_untrusted_types(data=data)) - set(trusted))
-    if unknown:
+    if unknown := sorted(set(skops.get_untrusted_types(data=data)) - set(trusted)):
         raise ValueError(
-            f"it holds {', '.join(unknown)}, of which loading may run code. If you trust that code, name the types in "
+            f"it holds {', '.join(unknown[:20])}, not a type to trust by default. If you trust its code, name it in "
             "trusted=[...]"
         )
     content = skops.loads(data, trusted=trusted)
-    if type(content) is not dict or content.get("format") != _FORMAT or type(content.get("version")) is not int:
-        raise ValueError("it does not say that it is one")
-    if content["version"] > _VERSION:
-        raise ValueError(
-            f"it is of version {content['version']}, and this skevgp ({__version__}) reads files of version "
-            f"{_VERSION}; update skevgp"
-        )
-    model, made_with, trial = content["model"], content["made_with"], content["trial"]
+    if type(content) is not dict or content.keys() != {"model", "trial"}:
+        raise ValueError("it is not a file of skevgp.io.save")
+    model, trial = content["model"], content["trial"]
     if not isinstance(model, BaseEstimator):
-        raise ValueError(f"it has a {type(model).__name__} instead of a model")
+        raise ValueError(f"it holds a {type(model).__name__} instead of a model")
     check_fitted(model[-1] if isinstance(model, Pipeline) else model)
     if trial is not None:
-        _compare(model, trial, made_with)
-    return model, made_with, trial is not None
+        _compare(model, trial)
+    return model, trial is not None
 
 
 def _said(error: Exception) -> str:
@@ -286,6 +306,7 @@ def _trial(model: Any) -> dict[str, Any] | None:
 
 def _rows_for(model: Any) -> Any:
     """A few rows that a fitted model has seen, or that look like them: a data frame if it was fitted to one."""
+    model = getattr(model, "best_estimator_", model)
     posterior = getattr(model, "_posterior", None)
     example = getattr(model, "_example", None) if posterior is None else posterior.maps.example
     if example is not None:
@@ -320,13 +341,14 @@ def _predicted(model: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
     else:
         try:
             mean, std = model.predict(rows, return_std=True)
-        except TypeError:
+        except Exception:
+            # Each estimator refuses return_std in its own way.
             mean, std = model.predict(rows), 0.0
     mean = np.asarray(mean.toarray() if hasattr(mean, "toarray") else mean, dtype=np.float64)
     return mean, np.broadcast_to(np.asarray(std, dtype=np.float64), mean.shape).copy()
 
 
-def _compare(model: Any, trial: Any, made_with: dict[str, str]) -> None:
+def _compare(model: Any, trial: Any) -> None:
     rows, expected, expected_std = trial["rows"], trial["mean"], trial["std"]
     mean, std = _predicted(model, rows.frame() if isinstance(rows, FrameColumns) else rows)
     if mean.shape != expected.shape or std.shape != expected_std.shape:
@@ -335,14 +357,12 @@ def _compare(model: Any, trial: Any, made_with: dict[str, str]) -> None:
     of_std = allowed + _OF_LARGEST * np.abs(expected).max(axis=0, initial=0.0)
     near = (np.abs(mean - expected) <= allowed) & (np.abs(std - expected_std) <= of_std)
     if not (near & np.isfinite(allowed)).all():
-        raise ValueError(
-            f"its model does not predict what it did when it was saved, with {_told(made_with)} (here: "
-            f"{_told(_versions())})"
-        )
+        raise ValueError("its model does not predict what it did when it was saved")
 
 
-def _versions() -> dict[str, str]:
+def _about() -> dict[str, Any]:
     return {
+        "format": _FORMAT,
         "skevgp": __version__,
         "scikit-learn": sklearn.__version__,
         "numpy": np.__version__,
@@ -351,5 +371,5 @@ def _versions() -> dict[str, str]:
     }
 
 
-def _told(versions: dict[str, str]) -> str:
-    return ", ".join(f"{name} {version}" for name, version in list(versions.items())[:5])[:200]
+def _told(about: dict[str, Any]) -> str:
+    return ", ".join(f"{name} {about.get(name, '(unknown)')}" for name in [*_about()][1:])[:200]

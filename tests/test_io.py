@@ -1,25 +1,36 @@
 """Models as files: they predict the same, run no code, and are refused if they are not what was saved."""
 
+import json
+import os
 import pickle
 import sys
 import zipfile
 from contextlib import contextmanager
+from functools import cache
+from importlib import import_module
+from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import skops.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.stats import randint
 from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.compose import TransformedTargetRegressor
 from sklearn.exceptions import NotFittedError
+from sklearn.model_selection import GridSearchCV, GroupKFold, RandomizedSearchCV
+from sklearn.multioutput import MultiOutputRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.exceptions import InconsistentVersionWarning
 from skevgp.features import NominalDynamics
 from skevgp.io import TRUSTED_TYPES, load, save
 from skevgp.kernels import FunctionKernel
+from skevgp.metrics import neg_nlpd
 from skevgp.solvers import LBFGS
 
 from .saved_models import CASES, ROWS, STATES, X_NEW, X, Y, evgp, fitted, new_rows, predictions
@@ -97,6 +108,39 @@ def test_random_states_go_on_where_they_were(path):
     np.testing.assert_array_equal(loaded.random_state.uniform(size=9), model.random_state.uniform(size=9))
 
 
+_SEARCH = GridSearchCV(evgp(), {"n_inducing": [4, 6]}, cv=2)
+_OF_SCIKIT_LEARN = {
+    "search": _SEARCH,
+    "search by name": clone(_SEARCH).set_params(scoring="r2", cv=GroupKFold(2)),
+    "search by likelihood": GridSearchCV(
+        make_pipeline(StandardScaler(), evgp()),
+        {"evgpregressor__n_inducing": [4]},
+        scoring={"nlpd": neg_nlpd, "error": "neg_mean_squared_error"},
+        refit="nlpd",
+        cv=2,
+    ),
+    "search in a residual": ResidualRegressor(_SEARCH),
+    "target": TransformedTargetRegressor(evgp(), transformer=StandardScaler()),
+    "outputs": MultiOutputRegressor(evgp()),
+    "range": evgp(sharing=[range(2)]),
+}
+
+
+@pytest.mark.parametrize("name", _OF_SCIKIT_LEARN)
+def test_what_scikit_learn_makes_of_models_is_saved_too(name, path):
+    groups = {"groups": np.arange(60) // 10} if name == "search by name" else {}
+    model = clone(_OF_SCIKIT_LEARN[name]).fit(X, Y[:, :2], **groups)
+    assert_same([again(model, path).predict(X_NEW)], [model.predict(X_NEW)])
+    assert content_of(path)["trial"] is not None
+
+
+def test_of_a_search_that_cannot_be_saved_the_best_model_is_advised(path):
+    search = RandomizedSearchCV(evgp(), {"n_inducing": randint(3, 6)}, n_iter=1, cv=2, random_state=0).fit(X, Y)
+    with pytest.raises(ValueError, match=r"cannot be saved.*Save its best_estimator_"):
+        save(search, path)
+    save(search.best_estimator_, path)
+
+
 # --- robots ------------------------------------------------------------------------------------------------------
 
 
@@ -117,6 +161,22 @@ def test_a_robots_file_need_not_be_there(path, tmp_path):
     assert loaded.feature_map.robot == str(urdf)
     with pytest.raises(ValueError, match="There is no file"):
         clone(loaded).fit(rows, STATES[:, :2])
+
+
+@pytest.mark.parametrize("name", ["nominal", "inverse-dynamics", "levers", "residual", "words"])
+def test_nothing_but_the_file_is_opened(name, path):
+    save(fitted(name), path)
+    load(path)  # what is imported is imported now
+    opened, watching = [], True
+
+    def watch(event, arguments):
+        if watching and event in ("open", "os.listdir", "subprocess.Popen", "socket.connect", "exec"):
+            opened.append((event, str(arguments[0])))
+
+    sys.addaudithook(watch)
+    load(path)
+    watching = False
+    assert opened == [("open", str(path))]
 
 
 def test_without_pinocchio_a_robot_gets_the_pip_command(path, monkeypatch):
@@ -182,29 +242,62 @@ OWN = [
 @pytest.mark.parametrize(("model", "name"), OWN, ids=[str(number) for number in range(len(OWN))])
 def test_types_of_users_have_to_be_trusted_by_name(model, name, path):
     model = clone(model).fit(X, Y)
+    path.write_bytes(b"before")
     with pytest.raises(ValueError, match=rf"cannot be saved.*{name}.*trusted="):
         save(model, path)
-    assert list(path.parent.iterdir()) == []
+    assert path.read_bytes() == b"before"
+    assert list(path.parent.iterdir()) == [path]
     save(model, path, trusted=[name])
-    with pytest.raises(ValueError, match=rf"model.skevgp' is .*{name}.*trusted="):
+    with pytest.raises(ValueError, match=rf"model.skevgp' cannot be loaded.*{name}.*trusted="):
         load(path)
     assert_same([load(path, trusted=[name]).predict(X_NEW)], [model.predict(X_NEW)])
 
 
-def test_a_file_that_would_run_code_is_refused(path):
-    """What it names is not even imported."""
-    save(fitted("plain"), path)
+def members_of(path):
     with zipfile.ZipFile(path) as archive:
-        members = {name: archive.read(name) for name in archive.namelist()}
-    members["schema.json"] = (
-        members["schema.json"]
-        .replace(b'"EVGPRegressor"', b'"Popen"')
-        .replace(b'"skevgp.estimators.evgp"', b'"subprocess"')
-    )
-    with zipfile.ZipFile(path, "w") as archive:
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def write_members(path, members, compression=zipfile.ZIP_STORED):
+    with zipfile.ZipFile(path, "w", compression) as archive:
         for name, content in members.items():
             archive.writestr(name, content)
-    with pytest.raises(ValueError, match="subprocess.Popen"):
+
+
+def content_of(path):
+    return skops.io.load(path, trusted=TRUSTED_TYPES)
+
+
+def write_content(path, content, **about):
+    """A file of another content or of other versions."""
+    versions = {**json.loads(members_of(path)["skevgp.json"]), **about}
+    skops.io.dump(content, path)
+    write_members(path, {**members_of(path), "skevgp.json": json.dumps(versions)})
+
+
+@pytest.mark.parametrize(
+    ("module", "name"),
+    [
+        ("subprocess", "Popen"),
+        ("builtins", "eval"),
+        ("numpy", "memmap"),
+        ("sklearn.utils", "Bunch"),
+        ("skevgp.utils.files", "replacing"),
+        ("skevgp.io", "save"),
+        ("skevgp.data.threads", "BlockMap"),
+    ],
+)
+def test_a_file_that_would_run_code_is_refused(module, name, path):
+    """What it names is not even imported."""
+    save(fitted("plain"), path)
+    members = members_of(path)
+    members["schema.json"] = (
+        members["schema.json"]
+        .replace(b'"EVGPRegressor"', f'"{name}"'.encode())
+        .replace(b'"skevgp.estimators.evgp"', f'"{module}"'.encode())
+    )
+    write_members(path, members)
+    with pytest.raises(ValueError, match=rf"model.skevgp' cannot be loaded: it holds {module}\.{name}, "):
         load(path)
 
 
@@ -216,16 +309,25 @@ def test_skops_itself_needs_to_trust_no_others(name):
     assert_same(predictions(loaded, new_rows(name)), predictions(fitted(name), new_rows(name)))
 
 
-def content_of(path):
-    return skops.io.load(path, trusted=TRUSTED_TYPES)
-
-
 def test_a_model_that_predicts_something_else_is_refused(path):
     save(fitted("plain"), path)
     content = content_of(path)
     content["trial"]["mean"] = content["trial"]["mean"] + 1.0
-    skops.io.dump(content, path)
-    with pytest.raises(ValueError, match=r"does not predict what it did when it was saved, with skevgp .*scikit-learn"):
+    write_content(path, content)
+    with pytest.raises(ValueError, match=r"model.skevgp' .*does not predict what it did when it was saved\.$"):
+        load(path)
+    write_content(path, content, skevgp="0.2.7", numpy="1.0")
+    with pytest.raises(ValueError, match=r"saved with skevgp 0\.2\.7, scikit-learn .*, numpy 1\.0, .*here: skevgp"):
+        load(path)
+
+
+def test_a_model_whose_numbers_were_changed_is_refused(path):
+    save(fitted("plain"), path)
+    content = content_of(path)
+    posterior = content["model"]._posterior
+    posterior.predictor.groups[0].mean[:] += 1.0
+    write_content(path, content)
+    with pytest.raises(ValueError, match="does not predict what it did"):
         load(path)
 
 
@@ -236,7 +338,7 @@ def test_a_std_that_is_rounding_may_be_rounded_otherwise(path):
     content = content_of(path)
     assert content["trial"]["std"].max() < 1e-3
     content["trial"]["std"] = 2.0 * content["trial"]["std"]
-    skops.io.dump(content, path)
+    write_content(path, content)
     np.testing.assert_array_equal(load(path).predict(rows), model.predict(rows))
 
 
@@ -248,84 +350,99 @@ def test_all_these_models_are_tried(name, path):
 
 def test_another_version_of_scikit_learn_is_told_of_a_model_that_cannot_be_tried(path):
     save(fitted("plain"), path)
-    content = content_of(path)
-    content["made_with"]["scikit-learn"] = "0.1"
-    skops.io.dump(content, path)
+    content, other = content_of(path), {"scikit-learn": "0.1"}
+    write_content(path, content, **other)
     load(path)
-    skops.io.dump({**content, "trial": None}, path)
-    with pytest.warns(InconsistentVersionWarning, match=r"was saved with scikit-learn 0\.1, and this is"):
+    write_content(path, {**content, "trial": None}, **other)
+    with pytest.warns(InconsistentVersionWarning, match=r"was saved with skevgp .*, scikit-learn 0\.1, .*here: "):
         load(path)
 
 
 @pytest.mark.parametrize(
-    ("content", "message"),
+    ("content", "about", "message"),
     [
-        ({"format": "skevgp", "version": 99}, "of version 99.*; update skevgp"),
-        ({"format": "other", "version": 2}, "does not say that it is one"),
-        ([1, 2], "does not say that it is one"),
-        ({"format": "skevgp", "version": 2, "model": 3, "made_with": {}, "trial": None}, "int instead of a model"),
-        ({"format": "skevgp", "version": 2}, "KeyError: 'model'"),
+        (None, {"format": 99, "skevgp": "7.0"}, "format 99 of skevgp 7.0, .* reads 2"),
+        (None, {"format": "2"}, "is not a file of skevgp.io.save"),
+        ([1, 2], {}, "is not a file of skevgp.io.save"),
+        ({"model": 3, "trial": None}, {}, "int instead of a model"),
+        ({"model": EVGPRegressor(), "trial": None}, {}, "NotFittedError"),
+        ({"model": StandardScaler().fit(X), "trial": {}}, {}, "KeyError: 'rows'"),
     ],
 )
-def test_other_contents_are_refused(content, message, path):
-    skops.io.dump(content, path)
-    with pytest.raises(ValueError, match=f"model.skevgp.*{message}"):
+def test_other_contents_are_refused(content, about, message, path):
+    save(fitted("plain"), path)
+    write_content(path, content, **about)
+    with pytest.raises(ValueError, match=f"model.skevgp' cannot be loaded: .*{message}"):
         load(path)
 
 
-def test_files_of_version_0_1_and_compressed_ones_are_refused_by_name(path):
-    with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("model.json", "{}")
-    with pytest.raises(ValueError, match="of skevgp 0.1, which this version does not read"):
+def test_files_of_others_are_refused(path):
+    save(fitted("plain"), path)
+    write_members(path, {**members_of(path), "more": bytes(2**27)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 1344"):
         load(path)
-    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
-        archive.writestr("schema.json", "0" * 1000)
-    with pytest.raises(ValueError, match="compressed"):
+    write_members(path, {"model.json": "{}"})
+    with pytest.raises(ValueError, match=r"model.skevgp' .*of skevgp 0\.1, which this version does not read"):
         load(path)
+    skops.io.dump(fitted("plain"), path)
+    with pytest.raises(ValueError, match=r"model.skevgp' .*is not a file of skevgp\.io\.save"):
+        load(path)
+    path.write_text("no model")
+    with pytest.raises(ValueError, match=r"model.skevgp' cannot be loaded: File is not a zip file\.$"):
+        load(path)
+
+
+@cache
+def saved(name):
+    """The bytes of one file; another has other names of arrays."""
+    with TemporaryDirectory() as folder:
+        save(fitted(name), Path(folder) / "model")
+        return Path(folder, "model").read_bytes()
 
 
 @contextmanager
-def suppress_value_errors_that_name(name):
+def errors_that_name(text):
     try:
         yield
     except ValueError as error:
-        if name not in str(error):
+        if text not in str(error):
             raise
 
 
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_a_damaged_file_is_a_value_error_or_predicts_the_same(path, draws):
-    save(fitted("plain"), path)
-    data = bytearray(path.read_bytes())
+    model, rows = fitted("plain"), new_rows("plain")
+    data = bytearray(saved("plain"))
+    place = st.integers(0, len(data) - 1)
     if draws.draw(st.booleans()):
-        del data[draws.draw(st.integers(0, len(data) - 1)) :]
+        del data[draws.draw(place) :]
     else:
         for _ in range(draws.draw(st.integers(1, 4))):
-            data[draws.draw(st.integers(0, len(data) - 1))] ^= 1 << draws.draw(st.integers(0, 7))
+            data[draws.draw(place)] ^= 1 << draws.draw(st.integers(0, 7))
     path.write_bytes(data)
-    expected, std = fitted("plain").predict(new_rows("plain"), return_std=True)
-    with suppress_value_errors_that_name("model.skevgp"):
+    expected, std = model.predict(rows, return_std=True)
+    with errors_that_name("model.skevgp' cannot be loaded: "):
         # What is not used to predict may differ.
-        np.testing.assert_allclose(load(path).predict(new_rows("plain")), expected, atol=0.05 * std.max())
+        np.testing.assert_allclose(load(path).predict(rows), expected, atol=0.05 * std.max())
 
 
 # --- all or nothing -----------------------------------------------------------------------------------------------
 
 
 def test_a_failure_leaves_the_old_file(path, monkeypatch):
+    """A full disk: also in tests/test_files.py."""
     save(fitted("plain"), path)
     before = path.read_bytes()
 
-    def full(content, file):
-        file.write(b"half")
+    def full(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(skops.io, "dump", full)
+    monkeypatch.setattr(os, "replace", full)
     with pytest.raises(OSError, match="No space left"):
         save(fitted("outputs"), path)
     assert path.read_bytes() == before
-    assert [one.name for one in path.parent.iterdir()] == [path.name]
+    assert list(path.parent.iterdir()) == [path]
 
 
 def test_a_new_file_replaces_the_old_one_and_a_link_stays_a_link(path, tmp_path):
@@ -349,6 +466,7 @@ def test_there_are_no_training_data_in_a_file(name, path):
     for repeats in (2, 60):
         some = clone(model).set_params(sharing="all").fit(np.tile(inputs, (repeats, 1)), np.tile(targets.T, repeats).T)
         save(some, path)
+        assert path.stat().st_size < 60_000
         weights = getattr(some, "weights_", np.empty(0)).nbytes
         sizes.append([size - weights for size in (path.stat().st_size, len(pickle.dumps(some)))])
     few, many = np.array(sizes)
@@ -359,3 +477,16 @@ def test_without_skops_there_is_the_pip_command(path, monkeypatch):
     monkeypatch.setitem(sys.modules, "skops.io", None)
     with pytest.raises(ImportError, match="pip install skops"):
         save(fitted("plain"), path)
+    monkeypatch.undo()
+    save(fitted("plain"), path)
+    monkeypatch.setitem(sys.modules, "skops.io", None)
+    with pytest.raises(ImportError, match=r"pip install skops .*\.\[io\]"):
+        load(path)
+
+
+def test_all_trusted_names_are_there():
+    """Except those that only some versions of their packages have."""
+    some = {"scipy._lib", "scipy.interpolate._bsplines", "sklearn.compose._column_transformer"}
+    for name in TRUSTED_TYPES:
+        module, _, own = name.rpartition(".")
+        assert module.startswith(tuple(some)) or getattr(import_module(module), own) is not None

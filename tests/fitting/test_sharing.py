@@ -49,7 +49,7 @@ def test_constant_outputs_and_noise_have_groups_of_their_own():
     noise = np.random.RandomState(5).randn(len(Y), 1)
     assert found(**data_of(np.hstack([Y, zeros, noise]), X)) == [[0], [1], [3], [2]]
     assert found(**data_of(np.hstack([noise, Y, zeros]), X)) == [[1], [2], [0], [3]]
-    assert found(**data_of(np.hstack([noise, zeros]), X)) == [[0, 1]]
+    assert found(**data_of(np.hstack([noise, zeros]), X)) == [[0], [1]]
     assert sorted(found(**data_of(np.hstack([zeros, zeros + 7.0]), X))) in ([[0, 1]], [[0], [1]])
 
 
