@@ -3,27 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..data.source import of_outputs
-from ..maps.derivatives import MappedRows, chained, mapped
-from ..maps.maps import maps_of
+from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
+from .derivatives import MappedRows, chained, mapped
 
 _NONE = np.empty((0, 0))
-
-
-class Model(Protocol):
-    """A fitted estimator with explicit features."""
-
-    feature_map_: Any
-    kernel_map_: Any
-    _example: Any
-    _predictor: Predictor
 
 
 class CompiledPredictor:
@@ -34,8 +25,8 @@ class CompiledPredictor:
 
     Parameters
     ----------
-    model : EVGPRegressor or EGPRegressor
-        Fitted.
+    predictor : Predictor
+    feature_map, kernel_map : Map or None
     include_noise : bool, default=True
         Whether standard deviations are of y, with the learned noise, or of the noise-free g(x).
     base : ndarray of shape (n_outputs,), default=None
@@ -69,12 +60,19 @@ class CompiledPredictor:
 
     _state: _State
 
-    def __init__(self, model: Model, include_noise: bool = True, base: np.ndarray | None = None):
+    def __init__(
+        self,
+        predictor: Predictor,
+        feature_map: Map | None,
+        kernel_map: Map | None,
+        include_noise: bool = True,
+        base: np.ndarray | None = None,
+    ):
         self.include_noise, self.base = include_noise, base
-        self._feature_map, self._kernel_map = maps_of(model)
-        self.update(model)
+        self._feature_map, self._kernel_map = feature_map, kernel_map
+        self._state = self._made_ready(predictor)
 
-    def update(self, model: Model) -> None:
+    def update(self, model: Any) -> None:
         """Take on the weights of a model that has seen further rows, by ``partial_fit``.
 
         Calls that run in other threads end with the weights that they began with.
@@ -93,11 +91,14 @@ class CompiledPredictor:
         """
         check_fitted(model)
         predictor = getattr(model, "regressor_", model)._predictor
-        if hasattr(self, "_state") and not _goes_on(self._state[0], predictor):
+        if not _goes_on(self._state[0], predictor):
             raise ValueError("update takes on the weights of the same fit; compile a model that was fitted anew.")
+        self._state = self._made_ready(predictor)
+
+    def _made_ready(self, predictor: Predictor) -> _State:
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
         groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
-        self._state = (predictor, groups, noise)
+        return predictor, groups, noise
 
     def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
         """Predict y.

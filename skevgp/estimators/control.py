@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
 
 from ..control.compiled import CompiledPredictor
-from ..control.functions import FunctionSamples
-from ..control.paths import Functions
+from ..control.derivatives import gradient_covariance, mapped
+from ..control.functions import Functions, FunctionSamples
 from ..data.dask import is_dask
-from ..maps.derivatives import gradient_covariance, mapped
-from ..maps.maps import maps_of
+from ..maps import Map, as_maps
 from ..model.predictor import Predictor
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted, check_integer, is_plain
@@ -136,7 +135,7 @@ class ForControl(Intake):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        fast, maps = self.compile(), maps_of(self)
+        fast, maps = self.compile(), self._maps()
         parts, covariances = [], []
         for rows in self._in_pieces(X):
             parts.append(fast.value_and_jacobian(rows)[1])
@@ -224,7 +223,7 @@ class ForControl(Intake):
         array([1.])
         """
         check_fitted(self)
-        return CompiledPredictor(self, include_noise)
+        return CompiledPredictor(self._predictor, *self._maps(), include_noise)
 
     def sample_functions(
         self, n: int = 1, random_state: int | np.random.RandomState | None = 0, *, n_waves: int = 3000
@@ -280,7 +279,11 @@ class ForControl(Intake):
 
     def _functions(self) -> Functions:
         """The posterior as functions to be drawn and followed."""
-        return Functions(self._predictor, *maps_of(self))
+        return Functions(self._predictor, *self._maps())
+
+    def _maps(self) -> tuple[Map | None, Map | None]:
+        """Feature map and kernel map as functions of arrays."""
+        return as_maps(self.feature_map_, self.kernel_map_, self._example)
 
     def _in_pieces(self, X: Any) -> Iterator[np.ndarray]:
         """Rows as floats, few enough at once that derivatives fit into memory."""

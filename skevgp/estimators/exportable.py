@@ -10,6 +10,7 @@ import numpy as np
 
 from ..control.c_code import write_c
 from ..control.casadi import FittedModel
+from ..maps import as_map
 from ..utils.validation import check_fitted
 
 
@@ -146,4 +147,5 @@ class Exportable:
     def _exported(self) -> FittedModel:
         check_fitted(self)
         model: Any = self
-        return FittedModel(model._predictor, model.feature_map_, model.kernel_map_, model.n_features_in_)
+        features, inputs = (None if each is None else as_map(each) for each in (model.feature_map_, model.kernel_map_))
+        return FittedModel(model._predictor, features, inputs, model.n_features_in_)

@@ -150,7 +150,8 @@ class ResidualForControl(StatefulEstimator):
             As of `EVGPRegressor.compile`, of the sum.
         """
         check_is_fitted(self)
-        return CompiledPredictor(self.regressor_, include_noise, self.base_)
+        feature_map, kernel_map = self.regressor_._maps()
+        return CompiledPredictor(self.regressor_._predictor, feature_map, kernel_map, include_noise, self.base_)
 
     @available_if(regressor_has("sample_functions"))
     def sample_functions(self, n: int = 1, random_state: Any = 0, **params: Any) -> FunctionSamples:

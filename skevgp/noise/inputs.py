@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
-from ..control.compiled import CompiledPredictor
 from ..fitting.fitted import FittedOutputs
 from ..model.predictor import Predictor
 from ..utils.monitor import Monitor
@@ -32,10 +31,9 @@ _ROWS_AT_ONCE = 256
 class Model(Protocol):
     """A fitted estimator with explicit features."""
 
-    feature_map_: Any
-    kernel_map_: Any
-    _example: Any
     _predictor: Predictor
+
+    def compile(self, include_noise: bool) -> Any: ...
 
     def _numbers(self, X: Any, *y: Any, reset: bool) -> tuple[np.ndarray, np.ndarray]: ...
 
@@ -79,7 +77,7 @@ def _looked_at(
     model: Model, given: Any, X: Any, y: np.ndarray | None, chosen: Any, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The same, and E(y - g)² (n, o)."""
-    fast = CompiledPredictor(model, include_noise=False)
+    fast = model.compile(include_noise=False)
     try:
         rows = model._numbers(given, reset=False)[0] if is_frame(given) else X
     except ValueError as error:

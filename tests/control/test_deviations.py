@@ -3,7 +3,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skevgp.control.deviations import Deviations
+from skevgp.control.casadi import Deviations
 
 from .export_cases import MODELS, POLYNOMIAL, data, exact, fitted, sparse
 

@@ -9,8 +9,8 @@ from sklearn.gaussian_process.kernels import RBF, Matern, RationalQuadratic
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.kernels import FunctionKernel
 
-from ..maps.test_derivatives import close, differences
 from .cases import N_OUTPUTS, QUICK, D
+from .test_derivatives import close, differences
 
 N = 1500
 
@@ -53,7 +53,7 @@ def test_many_rows_are_evaluated_piece_by_piece(data, monkeypatch):
     X, Y, X_new = data
     functions = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y).sample_functions(2, n_waves=50)
     expected = functions(X_new)
-    monkeypatch.setattr("skevgp.control.functions._NUMBERS", 600)
+    monkeypatch.setattr("skevgp.control.functions._NUMBERS_OF_WAVES", 600)
     np.testing.assert_allclose(functions(X_new), expected, rtol=1e-10, atol=1e-12)
 
 
