@@ -65,7 +65,9 @@ class Change:
     ----------
     rule, variant : str
     rules, descent : dict
-        What replaces fields of the solver's records.
+        What replaces fields of the search's and the solver's records.
+    enough : float, optional
+        What share of its gain an iteration has to gain.
     concerns : callable
         The default's row of a case -> whether the fit could be another one.
     other_seed : int
@@ -76,6 +78,7 @@ class Change:
     variant: str
     rules: dict[str, Any] = field(default_factory=dict)
     descent: dict[str, Any] = field(default_factory=dict)
+    enough: float | None = None
     concerns: Callable[[Row], bool] = everywhere
     other_seed: int = 0
 
@@ -118,7 +121,7 @@ def changes() -> list[Change]:
         *_of("rules", "lengthscale_limits", (1e-4, 1e6), (1e-1, 1e2)),
         *_of("rules", "highest_noise", 1.0),
         *_of("descent", "memory", 30, 300),
-        *_of("descent", "enough", 1e-5, 1e-4),
+        *(Change("enough", str(value), enough=value) for value in (1e-5, 1e-4)),
         *_of("descent", "probes", 2),
         *_of("descent", "gradient", 1e-6),
     ]
@@ -225,8 +228,9 @@ def _data(case: str, seed: int, quick: bool) -> Data:
 def run(cell: Cell) -> dict[str, Any]:
     """The row of a fit."""
     change = next(c for c in (DEFAULT, *changes()) if (c.rule, c.variant) == (cell.rule, cell.variant))
-    data, solver = _data(cell.case, cell.seed, cell.quick), internals.ablated(change.rules, change.descent)
-    values = robustness.fit(data, cell.seed + change.other_seed, solver=solver, noise_cv=None)
+    data = _data(cell.case, cell.seed, cell.quick)
+    with internals.ablated(change.rules, change.descent, change.enough) as solver:
+        values = robustness.fit(data, cell.seed + change.other_seed, solver=solver, noise_cv=None)
     row = {"rule": cell.rule, "variant": cell.variant, "case": cell.case, "seed": cell.seed}
     row |= dict.fromkeys(("outcome", *NUMBERS, "n_iter"), "") | values
     row |= {name: f"{values[name]:.7g}" for name in NUMBERS if name in values}

@@ -31,6 +31,7 @@ from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics, make_toy
 from skevgp.features import InertiaForceGravity
 from skevgp.metrics import negative_log_predictive_density
+from skevgp.noise import Gaussian
 
 # Held-out NLPD that may be lost against the exact model, in nats per row.
 ENOUGH = 0.02
@@ -184,7 +185,7 @@ def likelihood_of(regressor: EVGPRegressor, data: Data) -> float:
     exact = EGPRegressor(
         data.feature_map,
         regressor.kernel_,
-        noise_variance=regressor.noise_variance_,
+        noise=Gaussian(variance=regressor.noise_variance_),
         normalize_y=data.feature_map is None,
         max_iter=0,
     )

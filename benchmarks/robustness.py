@@ -123,7 +123,7 @@ def nasty(seed: int) -> Data:
         "n_inducing": int(rng.choice([1, 5, 10, 20])),
         "inducing_init": str(rng.choice(["k-means", "greedy"])),
         "sharing": str(rng.choice(["all", "kernel", "none"])),
-        "posterior": str(rng.choice(["full", "diagonal"])),
+        "solver": LBFGS(posterior=str(rng.choice(["full", "diagonal"]))),
         "normalize_y": bool(rng.rand() < 0.5),
     }
     notes += [str(value) for value in arguments.values()]
@@ -206,7 +206,8 @@ def fit(data: Data, seed: int, **arguments: Any) -> dict[str, Any]:
 
 def fixed_jitter(data: Data, seed: int, jitter: float, **arguments: Any) -> dict[str, Any]:
     """`fit` with another relative jitter of k(X_m, X_m)."""
-    return fit(data, seed, solver=internals.with_jitter(jitter), **arguments)
+    with internals.with_jitter(jitter):
+        return fit(data, seed, **arguments)
 
 
 def spread(rows: list[dict[str, Any]], case: str, variant: str) -> float:

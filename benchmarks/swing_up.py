@@ -37,6 +37,7 @@ from threadpoolctl import threadpool_limits
 import harness
 import mpc
 from harness import Row
+from skevgp import CoefPrior
 from skevgp.datasets.plant import Plant
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
@@ -116,7 +117,7 @@ def firm(system: str) -> dict[str, np.ndarray]:
     mean, scale = features.coef_prior(2 * n_joints)
     scale = np.array(scale)
     scale[:, : 2 * n_joints] *= 0.01
-    return {"coef_mean": mean, "coef_scale": scale}
+    return {"coef_prior": CoefPrior(mean=mean, scale=scale)}
 
 
 def run(cell: Cell) -> dict[str, Any]:

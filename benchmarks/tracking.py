@@ -40,6 +40,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import load_robot
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.robots import RigidBody
+from skevgp.solvers import LBFGS
 
 PAYLOADS = (0.5, 1.0, 2.0, 3.5, 5.0)
 CHANCE = 0.95
@@ -95,7 +96,7 @@ class WithoutPhysics:
 
     def __init__(self, body: RigidBody, n_inducing: int, seed: int, max_iter: int | None):
         self._body = body
-        self.model = EVGPRegressor(n_inducing=n_inducing, max_iter=max_iter, tol=10.0, random_state=seed)
+        self.model = EVGPRegressor(n_inducing=n_inducing, max_iter=max_iter, solver=LBFGS(tol=10.0), random_state=seed)
 
     def fit(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray) -> WithoutPhysics:
         self.model.fit(X, y - self._forces(X), groups=groups)

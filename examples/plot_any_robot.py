@@ -31,6 +31,7 @@ from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, Nom
 from skevgp.metrics import containing_ratios, prediction_error
 from skevgp.plotting import PosteriorDisplay
 from skevgp.robots import layout_of
+from skevgp.solvers import LBFGS
 
 parser = argparse.ArgumentParser(description="Learn a robot's dynamics from its URDF file and simulated moves.")
 parser.add_argument("--robot", default="ur5", help="a name of list_robots() or the path of a URDF file; default: ur5")
@@ -74,7 +75,7 @@ print(f"{n_trajectories} moves, {len(moves.data)} rows of {moves.data.shape[1]} 
 # output has a kernel and inducing points of its own. ``tol=10`` ends the search for the last few nats of the bound.
 
 wrong = perturb_robot(robot, 0.2, random_state=options.seed)
-settings = {"n_inducing": n_inducing, "sharing": sharing, "tol": 10.0}
+settings = {"n_inducing": n_inducing, "sharing": sharing, "solver": LBFGS(tol=10.0)}
 settings |= {"n_jobs": -1, "random_state": options.seed}
 encoded = settings | {"kernel_map": AngleEncoder(robot)}
 models = {

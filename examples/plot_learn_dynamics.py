@@ -25,6 +25,7 @@ from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.metrics import containing_ratios, prediction_error, std_norm
 from skevgp.plotting import CoefficientDisplay
+from skevgp.solvers import Adam
 
 # Inducing points (the paper's Table 2) of VGP and RES-VGP, and of EVGP.
 INDUCING = {"pendulum": (40, 10), "cartpole": (100, 60), "acrobot": (250, 150)}
@@ -100,7 +101,7 @@ except ValueError as error:
 
 settings = {"solver": options.solver, "random_state": options.seed}
 if options.solver == "adam":
-    settings |= {"posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+    settings |= {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 models = {
     "VGP": EVGPRegressor(n_inducing=m_vgp, **settings),
     "RES-VGP": EVGPRegressor(n_inducing=m_vgp, **settings),

@@ -27,6 +27,7 @@ from skevgp.datasets import make_dynamics, perturb_robot
 from skevgp.features import InertiaForce, InertiaForceGravity, NominalDynamics
 from skevgp.metrics import containing_ratios, prediction_error, std_norm
 from skevgp.plotting import CoefficientDisplay
+from skevgp.solvers import LBFGS
 
 parser = argparse.ArgumentParser(description="Learn the arm iiwa14 with a wrong model as prior.")
 parser.add_argument(
@@ -79,7 +80,7 @@ print(f"{'moves':>5s} {'rows':>6s}  {'':13s}", *(f"{name:>8}" for name in column
 for size in sizes:
     rows = train.groups < size
     for name, feature_map in zip(names, features, strict=True):
-        model = EVGPRegressor(feature_map, tol=10.0, **settings)
+        model = EVGPRegressor(feature_map, solver=LBFGS(tol=10.0), **settings)
         start = time.perf_counter()
         model.fit(train.data[rows], train.target[rows], groups=train.groups[rows])
         seconds = time.perf_counter() - start

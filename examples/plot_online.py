@@ -26,6 +26,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics, simulate
 from skevgp.features import AngleEncoder, InertiaForceGravity
 from skevgp.robots.systems import SYSTEMS
+from skevgp.solvers import LBFGS
 
 parser = argparse.ArgumentParser(description="Follow a system whose mass changes, by partial_fit.")
 parser.add_argument("--mass", type=float, default=5.0, help="of the pole after the change, kg (before: 1)")
@@ -75,7 +76,7 @@ model = EVGPRegressor(
     kernel_map=AngleEncoder("cartpole"),
     n_inducing=20 if quick else 60,
     sharing="all",
-    tol=10.0,  # the last few of some 1e4 nats would take most of the time
+    solver=LBFGS(tol=10.0),
     random_state=options.seed,
 )
 ways = {
@@ -85,8 +86,7 @@ ways = {
 }
 errors, inside = {}, {}
 for name, factor in ways.items():
-    own = clone(model).set_params(forgetting_factor=1.0 if factor is None else factor)
-    own.fit(train.data, train.target, groups=train.groups)
+    own = clone(model).fit(train.data, train.target, groups=train.groups)
     fast, found, seconds = own.compile(), [], 0.0
     for z, u, after in zip(states[:-1], U, measured[1:], strict=True):
         x = np.concatenate([z, u])
@@ -94,7 +94,7 @@ for name, factor in ways.items():
         found.append((after - mean, std))
         if factor is not None:
             start = time.perf_counter()
-            own.partial_fit(x[np.newaxis], after[np.newaxis])
+            own.partial_fit(x[np.newaxis], after[np.newaxis], forgetting_factor=factor)
             fast.update(own)
             seconds += time.perf_counter() - start
     off, std = (np.array(part) for part in zip(*found, strict=True))

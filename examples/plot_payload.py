@@ -26,7 +26,7 @@ import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import FunctionTransformer
 
-from skevgp import EVGPRegressor, InverseDynamics
+from skevgp import CoefPrior, EVGPRegressor, InverseDynamics
 from skevgp.datasets import load_log, load_robot, perturb_robot
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import RigidBodyRegressor
@@ -142,11 +142,9 @@ if online is not None:
         follower = EVGPRegressor(
             RigidBodyRegressor(robot),
             kernel_map=FunctionTransformer(velocities),
-            coef_mean=known.coef_,
-            coef_cov=prior,
+            coef_prior=CoefPrior(mean=known.coef_, cov=prior),
             n_inducing=10 if quick else 20,
             max_iter=20,
-            forgetting_factor=factor,
             random_state=options.seed,
         )
         with warnings.catch_warnings():
@@ -156,7 +154,7 @@ if online is not None:
             follower.fit(unloaded.data[::10], unloaded.target[::10])
         weights = []
         for start in range(0, len(times) * step, step):
-            follower.partial_fit(X[start : start + step], y[start : start + step])
+            follower.partial_fit(X[start : start + step], y[start : start + step], forgetting_factor=factor)
             weights.append((follower.coef_[last] - known.coef_[last], follower.coef_std_[last]))
         followed[factor] = np.array(weights).T
         ends = " to ".join(f"{followed[factor][0, k]:.2f}" for k in (0, -1))

@@ -24,6 +24,7 @@ from skevgp import EVGPRegressor, rollout
 from skevgp.datasets import make_dynamics
 from skevgp.features import AngleEncoder, InertiaForceGravity
 from skevgp.plotting import RolloutDisplay
+from skevgp.solvers import LBFGS
 
 # Inducing points, trajectories of 3 s to learn from, and the position that is drawn.
 SYSTEMS = {
@@ -67,7 +68,7 @@ try:
             InertiaForceGravity(system),
             kernel_map=AngleEncoder(system),
             n_inducing=min(n_inducing, 20) if quick else n_inducing,
-            tol=tol,
+            solver=LBFGS(tol=tol),
             random_state=options.seed,
         ).fit(train.data, train.target, groups=train.groups)
         n_states = train.target.shape[1]

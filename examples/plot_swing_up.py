@@ -23,6 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
+from skevgp.solvers import LBFGS
+
 sys.path.insert(0, str(Path(__file__).resolve().parent))
 from mpc import DT, NEAR, TASKS, learn, swing_up
 
@@ -43,7 +45,7 @@ options = parser.parse_args()
 task, settings = TASKS[options.system], {}
 if os.environ.get("SKEVGP_EXAMPLES_QUICK") == "1":
     task = dataclasses.replace(task, n_steps=134, caution=0.0)
-    settings = {"n_inducing": 50, "tol": 10.0}
+    settings = {"n_inducing": 50, "solver": LBFGS(tol=10.0)}
 seconds = SECONDS[task.system] if options.seconds is None else options.seconds
 
 # %%

@@ -8,16 +8,18 @@ from typing import TYPE_CHECKING, Any
 from ._version import __version__
 
 if TYPE_CHECKING:
-    from . import datasets, exceptions, features, io, kernels, metrics, plotting, solvers
+    from . import datasets, exceptions, features, io, kernels, metrics, noise, plotting, solvers
     from .control.rollout import rollout
     from .estimators.bnn import BayesianMLPRegressor
     from .estimators.egp import EGPRegressor
     from .estimators.evgp import EVGPRegressor
     from .estimators.residual import ResidualRegressor
+    from .fitting.prior import CoefPrior
     from .identification.inverse_dynamics import InverseDynamics
 
 __all__ = [
     "BayesianMLPRegressor",
+    "CoefPrior",
     "EGPRegressor",
     "EVGPRegressor",
     "InverseDynamics",
@@ -29,14 +31,16 @@ __all__ = [
     "io",
     "kernels",
     "metrics",
+    "noise",
     "plotting",
     "rollout",
     "solvers",
 ]
 
-_SUBMODULES = ("datasets", "exceptions", "features", "io", "kernels", "metrics", "plotting", "solvers")
+_SUBMODULES = ("datasets", "exceptions", "features", "io", "kernels", "metrics", "noise", "plotting", "solvers")
 _HOME = {
     "BayesianMLPRegressor": "estimators.bnn",
+    "CoefPrior": "fitting.prior",
     "EGPRegressor": "estimators.egp",
     "EVGPRegressor": "estimators.evgp",
     "InverseDynamics": "identification.inverse_dynamics",

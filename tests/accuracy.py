@@ -7,9 +7,11 @@ import numpy as np
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.data.dataset import Dataset
 from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
 from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
+from skevgp.solvers import LBFGS
 
 from .precise import PreciseModel, cholesky, condition, solved, squared_exponential
 
@@ -57,8 +59,7 @@ class Problem:
         return {
             "feature_map": FunctionTransformer(Features(self.p)) if self.p else None,
             "kernel": kernel + WhiteKernel(self.noise, "fixed"),
-            "coef_mean": COEF_MEAN,
-            "coef_scale": COEF_SCALE,
+            "coef_prior": CoefPrior(mean=COEF_MEAN, scale=COEF_SCALE),
             "max_iter": 0,
         }
 
@@ -96,15 +97,15 @@ def lengthscale_of(points, wanted):
 def sparse(problem, posterior="full", added=0):
     """The last so many rows by `partial_fit`."""
     first = len(problem.y) - added
-    model = EVGPRegressor(inducing_init=problem.points, posterior=posterior, **problem.arguments)
+    model = EVGPRegressor(inducing_init=problem.points, solver=LBFGS(posterior=posterior), **problem.arguments)
     model.fit(problem.X[:first], problem.y[:first])
     return model.partial_fit(problem.X[first:], problem.y[first:]) if added else model
 
 
 def jitter_of(model):
     """What the fit says that it added: a power of ten."""
-    (learned,) = model._fitted.learned
-    (whitening,) = learned.model.whitenings(learned.values)
+    (fitted,) = model._fitted.models
+    (whitening,) = fitted.sparse.whitenings(fitted.values)
     added = whitening.jitter()
     return 10.0 ** np.round(np.log10(added)) if added else 0.0
 
@@ -113,11 +114,11 @@ def in_order(gradient, names=("hyperparameters", "signal", "noise", "inducing_po
     return np.concatenate([np.ravel(gradient[name]) for name in names])
 
 
-def at_the_fit(model):
+def at_the_fit(model, problem):
     """Model, blocks of all rows, and parameters."""
-    (learned,) = model._fitted.learned
-    rows = model._fitted.units.rows(model._source(*model._training_data))
-    return learned, learned.model.blocks(rows, learned.values["inducing_points"].shape[1])
+    (fitted,) = model._fitted.models
+    rows = model._fitted.units.rows(Dataset.further(model, model._posterior.maps, problem.X, problem.y).source)
+    return fitted, fitted.sparse.blocks(rows, fitted.values["inducing_points"].shape[1])
 
 
 @dataclass(frozen=True)
@@ -154,9 +155,9 @@ class Collapsed:
         mean, std = self.model.predict(self.problem.X_new, return_std=True, include_noise=False)
         gradient = None
         if not self.added:
-            learned, blocks = at_the_fit(self.model)
+            fitted, blocks = at_the_fit(self.model, self.problem)
             terms = partial(bounds_at_optimum, family=self.family)
-            gradient = in_order(evaluate(learned.model, learned.values, blocks, terms)[1])
+            gradient = in_order(evaluate(fitted.sparse, fitted.values, blocks, terms)[1])
         return Figures(self.model.lower_bound_, gradient, mean, std**2)
 
     def figures(self, precise, gradient=True):
@@ -178,8 +179,8 @@ class Uncollapsed(Collapsed):
 
     def __init__(self, problem):
         super().__init__(problem)
-        self.learned, self.blocks = at_the_fit(self.model)
-        self.elbo = ElboObjective(self.learned.model, self.learned.table, self.blocks)
+        self.fitted, self.blocks = at_the_fit(self.model, problem)
+        self.elbo = ElboObjective(self.fitted.sparse, self.fitted.table, self.blocks)
         values, rng = self.elbo.table.values_at_start(), np.random.RandomState(0)
         (root,) = self.elbo.family.roots(values, [])
         moved = {"mean": values["mean"] + rng.randn(len(root)) @ root}
@@ -188,13 +189,13 @@ class Uncollapsed(Collapsed):
         (self.root,) = self.elbo.family.roots(self.values, [])
 
     def found(self):
-        learned, values, units = self.learned, self.values, self.model._fitted.units
+        fitted, values, units = self.fitted, self.values, self.model._fitted.units
         terms_of = lambda groups: [_ElboTerms(self.elbo, values, group) for group in groups]  # noqa: E731
-        loss, gradient = evaluate(learned.model, values, self.blocks, terms_of)
-        n, whitenings = len(self.problem.y), list(learned.model.whitenings(values))
+        loss, gradient = evaluate(fitted.sparse, values, self.blocks, terms_of)
+        n, whitenings = len(self.problem.y), list(fitted.sparse.whitenings(values))
         # The loss leaves out what all outputs have in common; and residuals have a unit.
         loss += 0.5 * n * (LOG_2PI + np.log(values["noise"][0])) + n * np.log(units.target_unit[0])
-        by_q = learned.model.predictor(values, whitenings, self.elbo.family.means(values), [self.root])
+        by_q = fitted.sparse.predictor(values, whitenings, self.elbo.family.means(values), [self.root])
         predictor = units.predictor([by_q], [[0]])
         mean, variance = predictor.predict(self.problem.X_new, self.problem.features_new, return_variance=True)
         return Figures(-loss, -in_order(gradient), mean[:, 0], variance[:, 0])

@@ -18,7 +18,7 @@ def lowest_signal_and_noise(model):
     """Of each output, in the user's units: the lower limit of s² and limits of σ², or what they are fixed at."""
     fitted, unit = model._fitted, model._fitted.units.target_unit**2
     models = [(list(range(len(unit))), fitted)] if isinstance(model, EGPRegressor) else None
-    models = models or zip(fitted.outputs, fitted.learned, strict=True)
+    models = models or zip(fitted.outputs, fitted.models, strict=True)
     found = {}
     for outputs, one in models:
         for within, output in enumerate(outputs):
@@ -42,7 +42,7 @@ def alone(model, X, y, sample_weight=None, relative_variance=None):
     variance = np.ones(n) if relative_variance is None else np.asarray(relative_variance, dtype=float)
     X = X if hasattr(X, "columns") else np.asarray(X, dtype=float)
     inputs = np.asarray(X if model.kernel_map_ is None else model.kernel_map_.transform(X), dtype=float)
-    predictor, prior, total = model._predictor, model._fitted.units.prior, 0.0
+    predictor, prior, total = model._posterior.predictor, model._fitted.units.prior, 0.0
     kernels = [model.kernel_] if o == 1 else model.kernel_
     H = np.zeros((n, 0))
     if model.feature_map_ is not None:

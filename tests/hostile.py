@@ -7,7 +7,30 @@ import tempfile
 from contextlib import suppress
 from pathlib import Path
 
-from .io.corruption import cut_out, flipped_bits, overwritten, truncated
+
+def cut_out(data, rng):
+    first, length = rng.randint(len(data)), rng.choice([1, 2, 7, 100, 5000])
+    return data[:first] + data[first + length :]
+
+
+def flipped_bits(data, rng):
+    found = bytearray(data)
+    for _ in range(rng.choice([1, 1, 1, 2, 8, 64])):
+        found[rng.randint(len(found))] ^= 1 << rng.randint(8)
+    return bytes(found)
+
+
+def overwritten(data, rng):
+    first, length = rng.randint(len(data)), rng.choice([1, 4, 64, 1000])
+    length = min(length, len(data) - first)
+    filling = rng.choice(["zeros", "ones", "noise"])
+    new = {"zeros": bytes(length), "ones": b"\xff" * length, "noise": rng.bytes(length)}[filling]
+    return data[:first] + new + data[first + length :]
+
+
+def truncated(data, rng):
+    return data[: rng.randint(len(data))]
+
 
 BYTES = [flipped_bits, truncated, cut_out, overwritten]
 NUMBERS = ["nan", "inf", "-inf", "-1", "0", "1e308", "-1e308", "1e999", "1e-320", "", " ", "1 2", "x", "0x10", "1,5",

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import polars as pl
 from scipy import sparse
-from sklearn.base import BaseEstimator, TransformerMixin
+from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.gaussian_process.kernels import (
     RBF,
     ConstantKernel,
@@ -21,9 +21,10 @@ from sklearn.impute import SimpleImputer
 from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, SplineTransformer, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, RigidBodyRegressor
 from skevgp.kernels import Cosine
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 
@@ -252,17 +253,18 @@ def kernel_map_of(rng, d):
 def solver_of(rng, posterior):
     drawn = rng.rand()
     if drawn < 0.65:
-        return "lbfgs"
+        return LBFGS(posterior=posterior)
     if drawn < 0.75:
-        return LBFGS(n_restarts=1)
+        return LBFGS(n_restarts=1, posterior=posterior)
     if drawn < 0.83:
-        return "adam"
+        return Adam(posterior=posterior)
     natural = bool(posterior == "full" and rng.rand() < 0.6)
     return Adam(
         batch_size=int(pick(rng, 1, 7, 64, 1000)),
         learning_rate=pick(rng, 0.01, 0.1, 1.0),
         natural_gradient=natural,
         schedule=pick(rng, "cosine", "constant"),
+        posterior=posterior,
     )
 
 
@@ -284,48 +286,47 @@ def of_gaussian_process(rng, n, d, o):
         drawn = options["kernel_map"]
         options["kernel"] = kernel_of(rng, d if drawn is None else drawn.fit_transform(np.eye(2, d)).shape[1])
     elif rng.rand() < 0.1:
-        options["noise_variance"] = 10.0 ** rng.uniform(-10, 2)
+        options["noise"] = Gaussian(10.0 ** rng.uniform(-10, 2))
     if options["feature_map"] is not None and rng.rand() < 0.3:
-        options["coef_scale"] = pick(rng, 0.0, 1e-8, 1.0, 1e8)
-        options["coef_mean"] = pick(rng, "auto", 0.0, 3.0)
+        options["coef_prior"] = CoefPrior(scale=pick(rng, 0.0, 1e-8, 1.0, 1e8), mean=pick(rng, "auto", 0.0, 3.0))
     if options["feature_map"] is not None and o > 1 and rng.rand() < 0.1:
-        options["share_coef"] = True
+        options["coef_prior"] = clone(options.get("coef_prior", CoefPrior())).set_params(shared=True)
     return options
 
 
 def sparse_model(rng, n, d, o, case):
     options = of_gaussian_process(rng, n, d, o)
-    options["posterior"] = str(pick(rng, "full", "full", "full", "diagonal"))
-    options["solver"] = solver_of(rng, options["posterior"])
+    posterior = str(pick(rng, "full", "full", "full", "diagonal"))
+    solver = options["solver"] = solver_of(rng, posterior)
     options["sharing"] = share_of(rng, o)
     options["n_inducing"] = pick(rng, 1, 2, 5, 10, 20, n, 200, "auto")
     options["max_iter"] = pick(rng, None, None, 0, 3, 30, 60)
     options["noise_cv"] = pick(rng, 5, None, None, 2)
     options["inducing_init"] = str(pick(rng, "auto", "auto", "k-means", "greedy"))
-    lbfgs = options["solver"] == "lbfgs" or isinstance(options["solver"], LBFGS)
+    lbfgs = isinstance(solver, LBFGS)
     if not lbfgs:
         options["max_iter"] = int(pick(rng, 0, 3, 30, 100))
     elif d > 5 or (options["max_iter"] is None and n > 40):
         options["max_iter"] = 20
     if options["n_inducing"] == "auto":
-        options["max_inducing"] = 30
-        if not lbfgs:
+        if lbfgs:
+            solver.max_inducing = 30
+        else:
             case.refused('n_inducing="auto" needs')
     if rng.rand() < 0.1:
         options["noise"] = "student-t"
     elif rng.rand() < 0.05:
-        options["input_noise"] = pick(rng, 0.01, 0.0)
+        options["noise"] = Gaussian(inputs=pick(rng, 0.01, 0.0))
         options["max_iter"] = 10
-    if not lbfgs and ("noise" in options or "input_noise" in options):
+    noise = options.get("noise")
+    if not lbfgs and (noise == "student-t" or getattr(noise, "inputs", None) is not None):
         case.refused("needs solver=")
-    if options.get("share_coef"):
+    if getattr(options.get("coef_prior"), "shared", False) is True:
         if not lbfgs:
             case.refused("needs solver=")
-        if options["posterior"] == "diagonal":
+        if posterior == "diagonal":
             case.refused("needs posterior=")
         case.refused("share", must=False)
-    if rng.rand() < 0.1 and "noise" not in options:
-        options["forgetting_factor"] = pick(rng, 0.5, 0.99)
     if rng.rand() < 0.1:
         options["warm_start"] = True
     return EVGPRegressor(**options)
@@ -336,7 +337,7 @@ def exact_model(rng, n, d, o):
     options["max_iter"] = int(pick(rng, 0, 5, 200, 200))
     options["n_restarts"] = int(pick(rng, 0, 0, 1))
     if options["feature_map"] is not None and rng.rand() < 0.15:
-        options["coef_scale"] = np.inf
+        options["coef_prior"] = clone(options.get("coef_prior", CoefPrior())).set_params(scale=np.inf)
     if rng.rand() < 0.1:
         options["optimizer"] = None
     return EGPRegressor(**options)
@@ -576,10 +577,12 @@ def _spoil(rng, case, d):
         if len(frame) > 2:
             frame.iloc[where] = np.nan
         filled = [SimpleImputer(keep_empty_features=True)]
-        model.set_params(kernel_map=make_pipeline(*filled), feature_map=None, coef_mean="auto", coef_scale="auto")
+        model.set_params(
+            kernel_map=make_pipeline(*filled), feature_map=None, coef_prior=CoefPrior(mean="auto", scale="auto")
+        )
         # What it was to be refused for may have been these.
         case.must = case.must and model.share_coef is not True
-        model.set_params(share_coef="auto", kernel=None)
+        model.set_params(coef_prior=CoefPrior(shared="auto"), kernel=None)
         case.X, case.rows, case.more = frame, frame, None
         # Columns of one row may be all that is known of one.
         case.refused("input_noise|must not exceed|must be 0 or exceed", must=False)

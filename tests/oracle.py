@@ -1,12 +1,13 @@
 """The bounds written down from the data in plain autograd.numpy: no statistics, no blocks, no hand-written gradient."""
 
+from types import SimpleNamespace
+
 import autograd.numpy as anp
 import numpy as np
 
 from skevgp.data.blocks import LocalBlocks
-from skevgp.data.internal import MakeBlock, Rows
-from skevgp.data.source import LocalSource, Moments
-from skevgp.fitting.rules import Rules
+from skevgp.data.rows import LocalSource, MakeBlock, Moments, RawRows, Rows
+from skevgp.fitting.search import Rules
 from skevgp.fitting.start import starting_table
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
@@ -89,13 +90,24 @@ class ArrayRows:
         return len(self.inputs)
 
     def blocks(self, kernel, size, **options):
-        source, make = LocalSource.of(self.inputs, self.features, self.residuals), MakeBlock((kernel,), lambda raw: raw)
-        return LocalBlocks(lambda rows: make(source.load(rows)), len(self), 6, size=size, **options)
+        raw, make = RawRows(self.inputs, self.features, self.residuals), MakeBlock((kernel,), lambda raw: raw)
+        return LocalBlocks(lambda rows: make(raw[rows]), len(self), 6, size=size, **options)
 
 
 def identity_rows(inputs, residuals):
     """Rows whose internal units are the user's."""
-    return Rows(LocalSource.of(inputs, np.empty((len(inputs), 0)), residuals), lambda raw: raw)
+    return Rows(LocalSource.holding(RawRows(inputs, np.empty((len(inputs), 0)), residuals)), lambda raw: raw)
+
+
+def table_of(inputs, points, starts, scatter, n_hyperparameters, rules=Rules(1e-2), **options):  # noqa: B008
+    """The parameters of a model of rows with such inputs, whose internal units are the user's."""
+    none = np.zeros(len(scatter))
+    units = SimpleNamespace(target_unit=none + 1.0, constant=none > 0.0, rounding=none, target_scatter=none + 1.0)
+    spec = SimpleNamespace(starts=starts, covariance=SimpleNamespace(n_hyperparameters=n_hyperparameters))
+    rows = SimpleNamespace(
+        inputs=Moments.of(inputs), columns=slice(None), mean_precision=1.0, scatter=lambda: np.asarray(scatter)
+    )
+    return starting_table(SimpleNamespace(units=units, spec=spec, rules=rules), rows, points, **options)
 
 
 def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
@@ -109,8 +121,7 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     model = SparseModel(SquaredExponential(d), prior, family, groups)
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
-    table = starting_table(Moments.of(X), Z, np.ones(o), Starts(*starts), np.ones(o), Rules(1e-2), d)
-    return model, rows, table
+    return model, rows, table_of(X, Z, Starts(*starts), np.ones(o), d)
 
 
 def negative_elbo(statistics, signal, noise, prior, mean, root, log_det):

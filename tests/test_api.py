@@ -12,8 +12,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, Matern
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.solvers import Adam
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (40, 2))
@@ -154,7 +154,7 @@ def test_weights_of_an_earlier_fit_do_not_stay(model):
 
 
 @pytest.mark.parametrize(
-    "model", [EVGPRegressor(n_inducing=15, tol=1.0, random_state=0), EGPRegressor(tol=1.0)], ids=str
+    "model", [EVGPRegressor(n_inducing=15, solver=LBFGS(tol=1.0), random_state=0), EGPRegressor(tol=1.0)], ids=str
 )
 def test_columns_are_ranked_by_length_scales(model):
     rng = np.random.RandomState(1)
@@ -272,9 +272,12 @@ SAVED = [
     EVGPRegressor(TREND, kernel_map=StandardScaler(), n_inducing=8, max_iter=3, random_state=0),
     EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver="adam", random_state=0),
     EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver=Adam(natural_gradient=True), random_state=0),
-    EVGPRegressor(TREND, n_inducing=8, max_iter=3, posterior="diagonal", sharing="none", random_state=0),
+    EVGPRegressor(TREND, n_inducing=8, max_iter=3, solver=LBFGS(posterior="diagonal"), sharing="none", random_state=0),
     EGPRegressor(
-        TREND, 2.0 * RBF([0.5, 0.7], "fixed") + Matern(nu=1.5) + WhiteKernel(0.1), coef_scale=np.inf, max_iter=3
+        TREND,
+        2.0 * RBF([0.5, 0.7], "fixed") + Matern(nu=1.5) + WhiteKernel(0.1),
+        coef_prior=CoefPrior(scale=np.inf),
+        max_iter=3,
     ),
     BayesianMLPRegressor((5,), max_iter=3, random_state=0),
     ResidualRegressor(EVGPRegressor(n_inducing=8, max_iter=3, random_state=0)),

@@ -7,7 +7,7 @@ from sklearn.pipeline import FeatureUnion, make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp.features import InertiaForce, InertiaForceGravity
-from skevgp.fitting.coef_prior import resolve_coef_prior, wide_scale
+from skevgp.fitting.prior import CoefPrior, resolved, wide_scale
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(20, 3)) * [1.0, 10.0, 0.1]
@@ -32,9 +32,10 @@ class Opinionated(TransformerMixin, BaseEstimator):
         return self.mean, self.scale
 
 
-def resolve(feature_map, coef_mean="auto", coef_scale="auto", targets=TARGETS):
+def resolve(feature_map, mean="auto", scale="auto", targets=TARGETS):
     fitted = feature_map.fit(X)
-    return resolve_coef_prior(coef_mean, coef_scale, fitted, X, wide(fitted.transform(X), targets))[:2]
+    prior = CoefPrior(mean, scale)
+    return resolved(prior, fitted, X, wide(fitted.transform(X), targets), targets.shape[1])[:2]
 
 
 def wide(features, targets=TARGETS):
@@ -74,7 +75,7 @@ def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
 
 
 def test_without_features_the_prior_is_empty():
-    mean, scale, _ = resolve_coef_prior("auto", "auto", None, X, np.empty((2, 0)))
+    mean, scale, _ = resolved(CoefPrior(), None, X, np.empty((2, 0)), 2)
     assert mean.shape == scale.shape == (2, 0)
 
 
@@ -104,7 +105,7 @@ def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of
     scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
     parts = make_column_transformer((OneHotEncoder(), ["kind"]), (scaled, names)).fit(frame)
     features = parts.transform(frame)
-    mean, scale, _ = resolve_coef_prior("auto", "auto", parts, frame, wide(features))
+    mean, scale, _ = resolved(CoefPrior(), parts, frame, wide(features), 2)
     assert_array_equal(mean, np.hstack([np.zeros((2, 2)), IF_MEAN]))
     assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 
@@ -139,7 +140,7 @@ def test_unions_and_pipelines_nest():
 
 
 def test_a_number_fills_the_table():
-    mean, scale = resolve(FunctionTransformer(), coef_mean=2, coef_scale=0.5)
+    mean, scale = resolve(FunctionTransformer(), mean=2, scale=0.5)
     assert_array_equal(mean, np.full((2, 3), 2.0))
     assert_array_equal(scale, np.full((2, 3), 0.5))
     assert mean.dtype == float
@@ -147,46 +148,46 @@ def test_a_number_fills_the_table():
 
 def test_an_array_is_the_table():
     table = np.arange(6.0).reshape(2, 3)
-    mean, scale = resolve(FunctionTransformer(), coef_mean=-table, coef_scale=table.tolist())
+    mean, scale = resolve(FunctionTransformer(), mean=-table, scale=table.tolist())
     assert_array_equal(mean, -table)
     assert_array_equal(scale, table)
 
 
 def test_one_of_the_two_may_stay_auto():
-    mean, scale = resolve(InertiaForce("pendulum"), coef_scale=7.0)
+    mean, scale = resolve(InertiaForce("pendulum"), scale=7.0)
     assert_array_equal(mean, IF_MEAN)
     assert_array_equal(scale, np.full((2, 3), 7.0))
 
 
 def test_arguments_overrule_a_map_that_fits_no_target():
-    mean, _ = resolve(InertiaForce("pendulum"), coef_mean=1.0, coef_scale=1.0, targets=TARGETS[:, :1])
+    mean, _ = resolve(InertiaForce("pendulum"), mean=1.0, scale=1.0, targets=TARGETS[:, :1])
     assert_array_equal(mean, [[1.0, 1.0, 1.0]])
 
 
 @pytest.mark.parametrize("row", [[1.0, 2.0, 3.0], [[1.0, 2.0, 3.0]]])
 def test_one_output_takes_its_row_alone(row):
-    mean, _ = resolve(FunctionTransformer(), coef_mean=row, targets=TARGETS[:, :1])
+    mean, _ = resolve(FunctionTransformer(), mean=row, targets=TARGETS[:, :1])
     assert_array_equal(mean, [[1.0, 2.0, 3.0]])
 
 
-@pytest.mark.parametrize("name", ["coef_mean", "coef_scale"])
+@pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("shape", [(3,), (2,), (1, 3), (2, 1), (3, 2), (2, 3, 1)])
 def test_a_table_of_another_shape_is_named(name, shape):
-    with pytest.raises(ValueError, match=rf"{name} must be .* \(2, 3\); got the shape \({shape[0]},"):
+    with pytest.raises(ValueError, match=rf"{name} of CoefPrior must be .* \(2, 3\); got the shape \({shape[0]},"):
         resolve(FunctionTransformer(), **{name: np.ones(shape)})
 
 
 def test_one_output_does_not_take_a_row_of_another_width():
-    with pytest.raises(ValueError, match=r"coef_mean must be .* \(1, 3\), or \(3,\) .*; got the shape \(2,\)"):
-        resolve(FunctionTransformer(), coef_mean=[1.0, 2.0], targets=TARGETS[:, :1])
+    with pytest.raises(ValueError, match=r"mean of CoefPrior must be .* \(1, 3\), or \(3,\) .*; got the shape \(2,\)"):
+        resolve(FunctionTransformer(), mean=[1.0, 2.0], targets=TARGETS[:, :1])
 
 
 def test_a_negative_scale_is_an_error():
-    with pytest.raises(ValueError, match=r"coef_scale must not be negative; its smallest value is -2\.0"):
-        resolve(FunctionTransformer(), coef_scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
+    with pytest.raises(ValueError, match=r"scale of CoefPrior must not be negative; its smallest value is -2\.0"):
+        resolve(FunctionTransformer(), scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
 
 
-@pytest.mark.parametrize("name", ["coef_mean", "coef_scale"])
+@pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]])
 def test_values_must_be_finite(name, value):
     with pytest.raises(ValueError, match="must be finite"):
@@ -194,7 +195,7 @@ def test_values_must_be_finite(name, value):
 
 
 def test_a_scale_of_zero_is_allowed():
-    assert_array_equal(resolve(FunctionTransformer(), coef_scale=0.0)[1], np.zeros((2, 3)))
+    assert_array_equal(resolve(FunctionTransformer(), scale=0.0)[1], np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(
@@ -219,7 +220,7 @@ def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
 
 
 def test_a_map_whose_scale_is_negative_is_an_error():
-    with pytest.raises(ValueError, match="coef_scale must not be negative"):
+    with pytest.raises(ValueError, match="scale of CoefPrior must not be negative"):
         resolve(Opinionated(np.zeros((2, 3)), -np.ones((2, 3))))
 
 
@@ -254,7 +255,7 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
 @pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
 def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
     union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
-    mean, scale, _ = resolve_coef_prior("auto", "auto", union.fit(X), X, wide(X))
+    mean, scale, _ = resolved(CoefPrior(), union.fit(X), X, wide(X), 2)
     assert_allclose(mean, factor * IF_MEAN)
     assert_allclose(scale, abs(factor) * IF_SCALE)
 

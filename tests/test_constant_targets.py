@@ -1,8 +1,11 @@
 """Targets that do not vary, or hardly against their mean: the std keeps above the rounding of y, far away it is 1."""
 
+import warnings
+
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
+from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupKFold, cross_val_score
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -76,3 +79,22 @@ def test_scorers_survive_a_constant_output():
     scores = cross_val_score(model, X, Y, groups=GROUPS, cv=GroupKFold(5), scoring=scorer)
     assert np.isfinite(scores).all()
     assert (scores > 5.0).all()
+
+
+@pytest.mark.parametrize("max_iter", [0, 30])
+@pytest.mark.parametrize("model", ["exact", "all", "kernel", "auto"])
+def test_far_from_the_data_a_constant_among_others_has_the_std_of_one_alone(model, max_iter):
+    options = {"normalize_y": True, "max_iter": max_iter, "random_state": 0}
+    model = EGPRegressor(**options) if model == "exact" else EVGPRegressor(sharing=model, n_inducing=20, **options)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        model.fit(X, np.column_stack([WAVE, np.full(100, 3.0)]))
+    std = model.predict(np.vstack([np.full((1, 2), 1e7), X[:5]]), return_std=True)[1][:, 1]
+    assert_allclose(std[0], 1.0, rtol=1e-6)
+    assert std[1:].max() < 0.6
+
+
+def test_a_constant_beside_an_output_of_noise_alone_has_the_std_of_one_alone():
+    model = EVGPRegressor(normalize_y=True, n_inducing=20, random_state=0)
+    model.fit(X, np.column_stack([RNG.standard_normal(100), np.full(100, 3.0)]))
+    assert_allclose(model.predict(np.full((1, 2), 1e7), return_std=True)[1][0, 1], 1.0, rtol=1e-6)

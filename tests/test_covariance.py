@@ -6,7 +6,8 @@ import pytest
 from numpy.testing import assert_allclose
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.solvers import LBFGS
 
 X = np.linspace(0.0, 1.0, 60)[:, np.newaxis]
 X_NEW = np.vstack([X[::4], X[::6] + 0.003, [[1.7], [-3.0]]])
@@ -16,11 +17,14 @@ MODELS = {
     "exact, a parabola": (EGPRegressor(), Y[:, 0]),
     "exact, a line": (EGPRegressor(), Y[:, 1]),
     "exact, several outputs": (EGPRegressor(), Y),
-    "exact, shared weights": (EGPRegressor(PolynomialFeatures(1), share_coef=True), Y),
+    "exact, shared weights": (EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(shared=True)), Y),
     "sparse": (EVGPRegressor(n_inducing=12, random_state=0), Y),
     "sparse, all rows": (EVGPRegressor(random_state=0), Y),
-    "sparse, diagonal": (EVGPRegressor(n_inducing=12, posterior="diagonal", random_state=0), Y),
-    "sparse, shared weights": (EVGPRegressor(PolynomialFeatures(1), n_inducing=12, share_coef=True, random_state=0), Y),
+    "sparse, diagonal": (EVGPRegressor(n_inducing=12, solver=LBFGS(posterior="diagonal"), random_state=0), Y),
+    "sparse, shared weights": (
+        EVGPRegressor(PolynomialFeatures(1), n_inducing=12, coef_prior=CoefPrior(shared=True), random_state=0),
+        Y,
+    ),
     "residual": (ResidualRegressor(EVGPRegressor(n_inducing=12, random_state=0)), Y[:, 0]),
 }
 

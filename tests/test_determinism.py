@@ -16,8 +16,9 @@ from sklearn.base import clone
 from sklearn.gaussian_process.kernels import RBF, DotProduct, Matern
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.io import save
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 pytestmark = [
@@ -37,13 +38,13 @@ def evgp(*maps, **options):
 THREADED = {
     "auto": evgp(),
     "all": evgp(PolynomialFeatures(1), sharing="all", kernel_map=StandardScaler()),
-    "kernel": evgp(sharing="kernel", posterior="diagonal"),
+    "kernel": evgp(sharing="kernel", solver=LBFGS(posterior="diagonal")),
     "none": evgp(sharing="none", solver=LBFGS(n_restarts=1)),
     "groups": evgp(sharing=[[0, 2], [1]], kernel=RBF() + DotProduct(), inducing_init="greedy"),
-    "shared weights": evgp(PolynomialFeatures(1), share_coef=True, sharing="none"),
-    "number of points": evgp(n_inducing="auto", max_inducing=12),
+    "shared weights": evgp(PolynomialFeatures(1), coef_prior=CoefPrior(shared=True), sharing="none"),
+    "number of points": evgp(n_inducing="auto", solver=LBFGS(max_inducing=12)),
     "student-t": evgp(noise="student-t", sharing="none"),
-    "noisy inputs": evgp(input_noise=0.1),
+    "noisy inputs": evgp(noise=Gaussian(inputs=0.1)),
     "adam": evgp(solver=Adam(batch_size=16)),
     "natural": evgp(solver=Adam(batch_size=16, natural_gradient=True), sharing="none"),
 }

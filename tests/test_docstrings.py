@@ -64,7 +64,9 @@ def test_what_a_class_method_returns_is_documented(method):
     assert all(value.desc for value in returned)
 
 
-@pytest.mark.parametrize("thing", [own for own in CLASSES if not issubclass(own, Warning)], ids=qualified_name)
+@pytest.mark.parametrize(
+    "thing", [own for own in CLASSES if hasattr(own, "fit") or "Display" in own.__name__], ids=qualified_name
+)
 def test_attributes_are_documented(thing):
     assert NumpyDocString(inspect.getdoc(thing))["Attributes"]
 

@@ -12,9 +12,11 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Ma
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.datasets import make_dynamics, make_toy
 from skevgp.features import InertiaForceGravity
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (50, 2))
@@ -28,7 +30,7 @@ IDS = ["one output", "one column", "two outputs"]
 
 def fixed(noise=0.01, **arguments):
     """A model whose kernel and noise stay."""
-    return EGPRegressor(**{"kernel": FIXED, "noise_variance": noise, "max_iter": 0} | arguments)
+    return EGPRegressor(**{"kernel": FIXED, "noise": Gaussian(variance=noise), "max_iter": 0} | arguments)
 
 
 # --- agreement with other models ----------------------------------------------------------------------------------
@@ -39,9 +41,9 @@ def fixed(noise=0.01, **arguments):
 @pytest.mark.parametrize("normalize_y", [False, True])
 def test_it_is_the_sparse_model_whose_inducing_points_are_the_rows(y, outputs, n_outputs, feature_map, normalize_y):
     common = {"feature_map": feature_map, "normalize_y": normalize_y, "max_iter": 0}
-    common |= {"kernel": FIXED, "noise_variance": 0.01}
+    common |= {"kernel": FIXED, "noise": Gaussian(variance=0.01)}
     if feature_map is not None:
-        common |= {"coef_mean": 0.3, "coef_scale": np.tile([0.5, 2.0, 0.0], (n_outputs, 1))}
+        common |= {"coef_prior": CoefPrior(mean=0.3, scale=np.tile([0.5, 2.0, 0.0], (n_outputs, 1)))}
     exact = EGPRegressor(**common).fit(X, y)
     sparse = EVGPRegressor(inducing_init=X, **common).fit(X, y)
     assert exact.log_marginal_likelihood_value_ == pytest.approx(sparse.lower_bound_, abs=1e-6)
@@ -59,12 +61,12 @@ def test_it_is_the_sparse_model_whose_inducing_points_are_the_rows(y, outputs, n
 
 def test_it_ends_where_the_sparse_model_whose_inducing_points_are_the_rows_ends():
     exact = EGPRegressor(TREND, tol=1e-4).fit(X, Y[:, 0])
-    sparse = EVGPRegressor(TREND, inducing_init=X, tol=1e-4, noise_cv=None).fit(X, Y[:, 0])
+    sparse = EVGPRegressor(TREND, inducing_init=X, solver=LBFGS(tol=1e-4), noise_cv=None).fit(X, Y[:, 0])
     assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=0.01)
     np.testing.assert_allclose(sparse.predict(X_NEW), exact.predict(X_NEW), atol=0.01)
     # At the same kernel and noise they are the same but for the jitter of the sparse model.
     kernel, noise = exact.kernel_, exact.noise_variance_
-    same = EVGPRegressor(TREND, kernel, inducing_init=X, noise_variance=noise, max_iter=0).fit(X, Y[:, 0])
+    same = EVGPRegressor(TREND, kernel, inducing_init=X, noise=Gaussian(variance=noise), max_iter=0).fit(X, Y[:, 0])
     for actual, expected in zip(same.predict(X, return_std=True), exact.predict(X, return_std=True), strict=True):
         np.testing.assert_allclose(actual, expected, atol=1e-6)
 
@@ -94,7 +96,9 @@ def test_what_it_learns_is_as_likely_as_what_scikit_learn_learns():
 
 def test_with_features_it_is_a_gaussian_process_with_their_covariance():
     kernel, c = 1.4 * RBF([0.9, 1.6]), 2.5
-    m = EGPRegressor(TREND, kernel, noise_variance=0.01, coef_mean=0.4, coef_scale=c, max_iter=0).fit(X, Y[:, 0])
+    m = EGPRegressor(
+        TREND, kernel, noise=Gaussian(variance=0.01), coef_prior=CoefPrior(mean=0.4, scale=c), max_iter=0
+    ).fit(X, Y[:, 0])
     # h = (1, x): h Σ hᵀ = c² (1 + xᵀx').
     g = GaussianProcessRegressor(kernel + c**2 * DotProduct(1.0), alpha=0.01, optimizer=None)
     g.fit(X, Y[:, 0] - 0.4 * (1 + X.sum(axis=1)))
@@ -119,7 +123,8 @@ def test_the_likelihood_bounds_every_sparse_models_bound():
 @pytest.mark.parametrize("which", [[True, True, True], [False, True, False]], ids=["all", "one"])
 def test_vague_weights_are_the_limit_of_wide_ones(which):
     def at(scale):
-        return fixed(feature_map=TREND, coef_mean=0.2, coef_scale=np.where(which, scale, 0.7)).fit(X, Y[:, 0])
+        prior = CoefPrior(mean=0.2, scale=np.where(which, scale, 0.7))
+        return fixed(feature_map=TREND, coef_prior=prior).fit(X, Y[:, 0])
 
     def limit(of):
         """Extrapolated in 1 / scale²."""
@@ -138,7 +143,7 @@ def test_vague_weights_are_the_limit_of_wide_ones(which):
 
 
 def test_vague_weights_are_estimated_by_generalised_least_squares():
-    m = fixed(feature_map=TREND, coef_scale=np.inf, noise=0.05).fit(X, Y)
+    m = fixed(feature_map=TREND, coef_prior=CoefPrior(scale=np.inf), noise=0.05).fit(X, Y)
     H, K = TREND.fit_transform(X), FIXED(X) + 0.05 * np.eye(50)
     A = H.T @ np.linalg.solve(K, H)
     np.testing.assert_allclose(m.coef_, np.linalg.solve(A, H.T @ np.linalg.solve(K, Y)).T, rtol=1e-9)
@@ -151,15 +156,17 @@ def test_vague_weights_are_estimated_by_generalised_least_squares():
 
 
 def test_a_vague_intercept_makes_the_level_of_y_irrelevant():
-    m, raised = (EGPRegressor(TREND, coef_scale=np.inf).fit(X, Y[:, 0] + level) for level in (0.0, 1e6))
+    m, raised = (
+        EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y[:, 0] + level) for level in (0.0, 1e6)
+    )
     np.testing.assert_allclose(raised.predict(X_NEW) - 1e6, m.predict(X_NEW), atol=1e-4)
     assert raised.log_marginal_likelihood_value_ == pytest.approx(m.log_marginal_likelihood_value_, abs=1e-2)
 
 
 def test_vague_weights_do_not_depend_on_the_units_of_features():
     scaled = PolynomialFeatures(1).fit(X)
-    m = EGPRegressor(scaled, coef_scale=np.inf, kernel_map=StandardScaler()).fit(X, Y[:, 0])
-    other = EGPRegressor(scaled, coef_scale=np.inf, kernel_map=StandardScaler()).fit(1e-3 * X, Y[:, 0])
+    m = EGPRegressor(scaled, coef_prior=CoefPrior(scale=np.inf), kernel_map=StandardScaler()).fit(X, Y[:, 0])
+    other = EGPRegressor(scaled, coef_prior=CoefPrior(scale=np.inf), kernel_map=StandardScaler()).fit(1e-3 * X, Y[:, 0])
     np.testing.assert_allclose(other.coef_, m.coef_ * [1, 1e3, 1e3], rtol=1e-4)
     shift = 2 * np.log(1e-3)
     assert other.log_marginal_likelihood_value_ + shift == pytest.approx(m.log_marginal_likelihood_value_, abs=1e-3)
@@ -168,26 +175,30 @@ def test_vague_weights_do_not_depend_on_the_units_of_features():
 @pytest.mark.parametrize("columns", [[0, 0], [0, None]], ids=["twice the same", "a column of zeros"])
 def test_vague_weights_need_independent_features(columns):
     given = np.column_stack([np.zeros(50) if column is None else X[:, column] for column in columns])
-    with pytest.raises(ValueError, match=r"coef_scale=inf needs .* independent .* 3 features .* only 2"):
-        EGPRegressor(TREND, coef_scale=np.inf).fit(given, Y)
-    EGPRegressor(TREND, coef_scale=[[np.inf, np.inf, 1.0]], max_iter=0).fit(given, Y[:, 0])
+    with pytest.raises(
+        ValueError, match=r"An infinite scale of CoefPrior needs .* independent .* 3 features .* only 2"
+    ):
+        EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(given, Y)
+    EGPRegressor(TREND, coef_prior=CoefPrior(scale=[[np.inf, np.inf, 1.0]]), max_iter=0).fit(given, Y[:, 0])
 
 
 def test_vague_weights_need_as_many_rows():
     with pytest.raises(ValueError, match="only 2 of them are independent"):
-        EGPRegressor(TREND, coef_scale=np.inf).fit(X[:2], Y[:2])
-    assert np.isfinite(EGPRegressor(TREND, coef_scale=np.inf, max_iter=0).fit(X[:3], Y[:3]).predict(X_NEW)).all()
+        EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X[:2], Y[:2])
+    assert np.isfinite(
+        EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf), max_iter=0).fit(X[:3], Y[:3]).predict(X_NEW)
+    ).all()
 
 
 @pytest.mark.parametrize("scale", [np.nan, -np.inf, -1.0])
 def test_other_scales_are_refused(scale):
-    with pytest.raises(ValueError, match="coef_scale must"):
-        EGPRegressor(TREND, coef_scale=scale).fit(X, Y)
+    with pytest.raises(ValueError, match="scale of CoefPrior must"):
+        EGPRegressor(TREND, coef_prior=CoefPrior(scale=scale)).fit(X, Y)
 
 
 def test_the_sparse_model_refuses_vague_weights():
-    with pytest.raises(ValueError, match="coef_scale must be finite"):
-        EVGPRegressor(TREND, coef_scale=np.inf).fit(X, Y)
+    with pytest.raises(ValueError, match="scale=?.* of CoefPrior.* must be finite|scale of CoefPrior must be finite"):
+        EVGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y)
 
 
 # --- learning -----------------------------------------------------------------------------------------------------
@@ -344,8 +355,8 @@ def test_a_kernel_that_is_none_is_named():
 
 
 def test_the_noise_starts_in_one_place():
-    with pytest.raises(ValueError, match="either from noise_variance=0.1 or from the WhiteKernel"):
-        EGPRegressor(kernel=RBF() + WhiteKernel(), noise_variance=0.1).fit(X, Y)
+    with pytest.raises(ValueError, match="either from variance=0.1 of Gaussian or from the WhiteKernel"):
+        EGPRegressor(kernel=RBF() + WhiteKernel(), noise=Gaussian(variance=0.1)).fit(X, Y)
 
 
 def test_bounds_and_fixed_values_are_respected():
@@ -409,7 +420,7 @@ def test_ctrl_c_keeps_the_best_parameters_and_warns():
 
 
 def test_verbose_prints_the_likelihood_in_the_users_units(capsys):
-    m = EGPRegressor(TREND, coef_scale=np.inf, verbose=2).fit(X, 1e3 * Y)
+    m = EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf), verbose=2).fit(X, 1e3 * Y)
     printed = [float(line.split()[3]) for line in capsys.readouterr().out.splitlines()]
     assert max(printed) == pytest.approx(-m.loss_curve_.min(), abs=1e-3)
 
@@ -423,7 +434,7 @@ def test_a_failed_refit_leaves_the_model_as_it_was():
 
 
 def test_fitted_models_pickle_and_clone():
-    m = fixed(feature_map=TREND, coef_scale=np.inf).fit(X, Y)
+    m = fixed(feature_map=TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y)
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(m)).predict(X_NEW), m.predict(X_NEW))
     with pytest.raises(NotFittedError):
         clone(m).predict(X_NEW)
@@ -463,3 +474,13 @@ def test_a_fixed_noise_far_below_the_targets_has_a_finite_likelihood():
         model.fit(X, 1e79 * np.sin(9.0 * X[:, 0]))
     assert np.isfinite(model.log_marginal_likelihood_value_)
     assert np.isfinite(model.predict(X)).all()
+
+
+def test_with_points_at_all_rows_the_std_is_the_exact_models():
+    """Also where features are more than rows: kernel and features then compete for what there is."""
+    rows, trend = RNG.uniform(-1.0, 1.0, (6, 3)), PolynomialFeatures(3)
+    y = np.sin(rows[:, 0])
+    new = RNG.uniform(-1.0, 1.0, (5, 3))
+    sparse = EVGPRegressor(trend, n_inducing=20, random_state=0).fit(rows, y).predict(new, return_std=True)
+    exact = EGPRegressor(trend, random_state=0).fit(rows, y).predict(new, return_std=True)
+    np.testing.assert_allclose(sparse, exact, rtol=1e-6, atol=1e-9)

@@ -7,9 +7,12 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
+from skevgp.data.dataset import Dataset
+from skevgp.fitting.noisy_inputs import look_at_slopes
 from skevgp.metrics import containing_ratios, prediction_error
-from skevgp.noise.inputs import variance_by_inputs
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 from tests.nasty import BadMap
 
 
@@ -21,29 +24,34 @@ def waves(n, x_noise, y_noise, seed=0):
     return x + x_noise * rng.randn(n, 1), g + y_noise * rng.randn(n), x, g
 
 
+def variance_by_inputs(model, X, Y, covariance):
+    """∂g Σ ∂gᵀ of each row and output."""
+    data = Dataset.further(model, model._posterior.maps, X, Y)
+    return look_at_slopes(model._posterior, data, X, covariance)[0]
+
+
 def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
     """There ∂g Σ ∂gᵀ is the same of all rows, and σ² what it leaves of the noise."""
     rng = np.random.RandomState(0)
     x = rng.uniform(-1.0, 1.0, (3000, 2))
     X, y = x + [0.1, 0.05] * rng.randn(3000, 2), x @ [2.0, -1.0] + 0.1 * rng.randn(3000)
     kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
-    options = {"kernel": kernel, "n_inducing": 5, "coef_scale": 10.0, "random_state": 0}
+    options = {"kernel": kernel, "n_inducing": 5, "coef_prior": CoefPrior(scale=10.0), "random_state": 0}
     plain = EVGPRegressor(FunctionTransformer(), **options).fit(X, y)
-    found = EVGPRegressor(FunctionTransformer(), input_noise=[0.1, 0.05], **options).fit(X, y)
+    found = EVGPRegressor(FunctionTransformer(), noise=Gaussian(inputs=[0.1, 0.05]), **options).fit(X, y)
     by_inputs = (2.0 * 0.1) ** 2 + 0.05**2
     assert plain.noise_variance_ == pytest.approx(0.01 + by_inputs, rel=0.1)
     # Weights that are learned from noisy X are a little too small, and what they leave counts as noise.
     assert found.noise_variance_ == pytest.approx(0.012, rel=0.4)
     covariance = np.diag([0.1**2, 0.05**2])
-    variance = variance_by_inputs(found, *found._training_data[:2], found._training_data[3], covariance)
-    np.testing.assert_allclose(variance, by_inputs, rtol=0.15)
+    np.testing.assert_allclose(variance_by_inputs(found, X, y, covariance), by_inputs, rtol=0.15)
 
 
 def test_where_the_function_is_steep_rows_count_less():
     X, y, _, _ = waves(600, 0.02, 0.02)
     options = {"n_inducing": 40, "random_state": 0}
     plain = EVGPRegressor(**options).fit(X, y)
-    found = EVGPRegressor(input_noise=0.02, **options).fit(X, y)
+    found = EVGPRegressor(noise=Gaussian(inputs=0.02), **options).fit(X, y)
     assert np.sqrt(found.noise_variance_) == pytest.approx(0.02, rel=0.3)
     assert np.sqrt(plain.noise_variance_) > 0.04
     _, _, x, g = waves(2000, 0.0, 0.0, seed=1)
@@ -56,16 +64,14 @@ def test_where_the_function_is_steep_rows_count_less():
 
 
 def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
-    monkeypatch.setattr("skevgp.noise.inputs._ROWS_AT_ONCE", 7)
+    monkeypatch.setattr("skevgp.fitting.noisy_inputs._ROWS_AT_ONCE", 7)
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (40, 2))
-    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, tol=1e6).fit(
-        X, np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
-    )
+    Y = np.sin(X @ [[2.0, 1.0], [1.0, 3.0]])
+    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=8, max_iter=5, solver=LBFGS(tol=1e6)).fit(X, Y)
     covariance = np.array([[0.04, 0.01], [0.01, 0.02]])
-    given, used, _, chosen = model._training_data
-    found = chosen.as_given(variance_by_inputs(model, given, used, chosen, covariance))
     slopes = model.jacobian(X)
+    found = variance_by_inputs(model, X, Y, covariance)
     np.testing.assert_allclose(found, np.einsum("noi,ij,noj->no", slopes, covariance, slopes), rtol=1e-10)
 
 
@@ -77,10 +83,10 @@ def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
     frame = pd.DataFrame(X, columns=["a", "b"])
     model = EVGPRegressor(
         kernel_map=StandardScaler(),
-        input_noise=np.diag([0.01, 0.0]),
+        noise=Gaussian(inputs=np.diag([0.01, 0.0])),
         sharing=sharing,
         n_inducing=8,
-        tol=1e6,
+        solver=LBFGS(tol=1e6),
     )
     model.fit(frame, Y, sample_weight=np.arange(80) % 3)
     before = model.predict(frame)
@@ -94,7 +100,12 @@ def test_rows_that_are_noisier_say_less_when_they_come_later():
     X, y, _, _ = waves(300, 0.0, 0.05)
     options = {"n_inducing": 15, "random_state": 0, "max_iter": 0}
     exact = EVGPRegressor(**options).fit(X[:100], y[:100]).partial_fit(X[100:], y[100:])
-    noisy = EVGPRegressor(**options).fit(X[:100], y[:100]).set_params(input_noise=0.5).partial_fit(X[100:], y[100:])
+    noisy = (
+        EVGPRegressor(**options)
+        .fit(X[:100], y[:100])
+        .set_params(noise=Gaussian(inputs=0.5))
+        .partial_fit(X[100:], y[100:])
+    )
     grid = np.linspace(-2.0, 2.0, 50)[:, np.newaxis]
     stds = [each.predict(grid, return_std=True, include_noise=False)[1] for each in (exact, noisy)]
     assert (stds[1] >= stds[0] * (1.0 - 1e-9)).all()
@@ -104,20 +115,19 @@ def test_rows_that_are_noisier_say_less_when_they_come_later():
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"input_noise": [0.1, 0.1, 0.1]}, "n_features=2 columns of X"),
-        ({"input_noise": [-0.1, 0.1]}, "must not be negative"),
-        ({"input_noise": np.nan}, "input_noise must be finite"),
-        ({"input_noise": [[1.0, 0.5], [0.0, 1.0]]}, "symmetric and positive semi-definite"),
-        ({"input_noise": [[1.0, 2.0], [2.0, 1.0]]}, "symmetric and positive semi-definite"),
-        ({"input_noise": "much"}, "input_noise"),
-        ({"input_noise": 0.1, "solver": "adam"}, 'input_noise needs solver="lbfgs"'),
-        ({"input_noise": 0.1, "noise": "student-t"}, "do not go together"),
+        ({"noise": Gaussian(inputs=[0.1, 0.1, 0.1])}, "n_features=2 columns of X"),
+        ({"noise": Gaussian(inputs=[-0.1, 0.1])}, "must not be negative"),
+        ({"noise": Gaussian(inputs=np.nan)}, "inputs of Gaussian must be finite"),
+        ({"noise": Gaussian(inputs=[[1.0, 0.5], [0.0, 1.0]])}, "symmetric and positive semi-definite"),
+        ({"noise": Gaussian(inputs=[[1.0, 2.0], [2.0, 1.0]])}, "symmetric and positive semi-definite"),
+        ({"noise": Gaussian(inputs="much")}, "inputs of Gaussian"),
+        ({"noise": Gaussian(inputs=0.1), "solver": "adam"}, 'inputs of Gaussian noise needs solver="lbfgs"'),
     ],
 )
 def test_what_cannot_be_is_refused_by_name(options, message):
     X = np.random.RandomState(0).randn(30, 2)
     with pytest.raises((ValueError, TypeError), match=message):
-        EVGPRegressor(n_inducing=5, max_iter=3, tol=1e6, **options).fit(X, X[:, 0])
+        EVGPRegressor(**{"n_inducing": 5, "max_iter": 3, "solver": LBFGS(tol=1e6), **options}).fit(X, X[:, 0])
 
 
 def test_values_that_are_missing_have_no_slopes():
@@ -125,19 +135,18 @@ def test_values_that_are_missing_have_no_slopes():
     y = X["a"].copy()
     X.loc[3, "b"] = np.nan
     with pytest.raises(ValueError, match="none of them missing"):
-        EVGPRegressor(kernel_map=SimpleImputer(), n_inducing=5, max_iter=3, tol=1e6, input_noise=0.1).fit(X, y)
+        EVGPRegressor(
+            kernel_map=SimpleImputer(), n_inducing=5, max_iter=3, solver=LBFGS(tol=1e6), noise=Gaussian(inputs=0.1)
+        ).fit(X, y)
 
 
-def test_bounds_of_other_kernels_and_dask_arrays_are_refused():
+def test_dask_arrays_are_refused():
     da = pytest.importorskip("dask.array")
     rng = np.random.RandomState(0)
     X, y = rng.randn(30, 2), rng.randn(30)
-    model = EVGPRegressor(n_inducing=5, max_iter=10, tol=1e6, input_noise=0.1)
-    with pytest.raises(ValueError, match="input_noise needs"):
+    model = EVGPRegressor(n_inducing=5, max_iter=10, solver=LBFGS(tol=1e6), noise=Gaussian(inputs=0.1))
+    with pytest.raises(ValueError, match="inputs of Gaussian noise needs"):
         model.fit(da.from_array(X), da.from_array(y))
-    model.fit(X, y)
-    with pytest.raises(ValueError, match="no input_noise"):
-        model.lower_bound(model.kernel_.theta)
 
 
 def test_changes_of_noisy_columns_are_noisy_by_these_too():
@@ -145,7 +154,7 @@ def test_changes_of_noisy_columns_are_noisy_by_these_too():
     rng = np.random.RandomState(0)
     z = rng.uniform(-2.0, 2.0, (800, 1))
     X, y = z + 0.03 * rng.randn(800, 1), z[:, 0] + 0.3 * np.sin(2.0 * z[:, 0]) + 0.01 * rng.randn(800)
-    options = {"n_inducing": 15, "random_state": 0, "input_noise": 0.03}
+    options = {"n_inducing": 15, "random_state": 0, "noise": Gaussian(inputs=0.03)}
     direct = EVGPRegressor(FunctionTransformer(), **options).fit(X, y)
     changes = ResidualRegressor(EVGPRegressor(**options)).fit(X, y)
     assert np.sqrt(direct.noise_variance_) == pytest.approx(0.01, rel=0.4)
@@ -161,7 +170,12 @@ def test_known_differences_between_rows_noise_are_beside_that_of_inputs():
     X, y = x + 0.05 * rng.randn(4000, 1), 2.0 * x[:, 0] + 0.05 * np.sqrt(v) * rng.randn(4000)
     kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
     model = EVGPRegressor(
-        FunctionTransformer(), kernel, n_inducing=5, coef_scale=10.0, input_noise=0.05, random_state=0
+        FunctionTransformer(),
+        kernel,
+        n_inducing=5,
+        coef_prior=CoefPrior(scale=10.0),
+        noise=Gaussian(inputs=0.05),
+        random_state=0,
     )
     model.fit(X, y, relative_variance=v)
     assert model.noise_variance_ == pytest.approx(0.0025, rel=0.25)
@@ -170,7 +184,7 @@ def test_known_differences_between_rows_noise_are_beside_that_of_inputs():
 @pytest.mark.parametrize(("how", "message"), [(how, text) for how, text in BadMap.messages.items() if how != "raises"])
 def test_a_map_that_goes_wrong_on_the_way_is_named(how, message):
     X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
-    model = EVGPRegressor(BadMap(how=how, late=True), input_noise=0.1, n_inducing=3, max_iter=5)
+    model = EVGPRegressor(BadMap(how=how, late=True), noise=Gaussian(inputs=0.1), n_inducing=3, max_iter=5)
     with pytest.raises(ValueError, match=f"feature_map.*{message}"):
         model.fit(X, X[:, 0])
 
@@ -179,8 +193,18 @@ def test_a_map_that_goes_wrong_on_the_way_is_named(how, message):
 def test_so_little_noise_that_it_is_rounded_to_nothing(unit):
     X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
     y = unit * (X[:, 0] + np.sin(9.0 * X[:, 0]))
-    model = EVGPRegressor(input_noise=1e-3, n_inducing=10, max_iter=20, random_state=0).fit(X, y)
+    model = EVGPRegressor(noise=Gaussian(inputs=1e-3), n_inducing=10, max_iter=20, random_state=0).fit(X, y)
     mean, std = model.predict(X, return_std=True)
     assert np.isfinite(mean).all()
     assert (std > 0.0).all()
     np.testing.assert_allclose(mean / unit, y / unit, atol=0.3)
+
+
+@pytest.mark.parametrize("n_inducing", [30, 200])
+def test_exact_data_are_met_though_inputs_are_said_to_be_noisy(n_inducing):
+    """All the noise is then that of the inputs, and σ² next to nothing: how rows compare must not be ruled by that."""
+    X = np.sort(np.random.RandomState(0).uniform(-3.0, 3.0, (200, 1)), axis=0)
+    y = np.sin(2.0 * X[:, 0])
+    model = EVGPRegressor(n_inducing=n_inducing, noise=Gaussian(inputs=0.01), random_state=0).fit(X, y)
+    assert np.sqrt(np.mean((model.predict(X) - y) ** 2)) < 1e-3
+    assert model.lower_bound_ > 200.0

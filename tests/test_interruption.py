@@ -13,6 +13,7 @@ from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.io import load, save
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 from .interruption import interrupted_at
@@ -35,7 +36,7 @@ MODELS = {
     "calibration": sparse(noise_cv=4),
     "models": sparse(sharing="none"),
     "outliers": sparse(noise="student-t"),
-    "input noise": sparse(input_noise=0.01),
+    "input noise": sparse(noise=Gaussian(inputs=0.01)),
     "exact": EGPRegressor(max_iter=8),
     "network": BayesianMLPRegressor((4, 4), max_iter=8, random_state=0),
     "residual": ResidualRegressor(sparse()),
@@ -97,11 +98,11 @@ def test_a_second_ctrl_c_does_not_wait():
     """It ends the fit where it is; the model is as it was."""
 
     class Impatient(LBFGS):
-        def run(self, task, attempt):
-            fit = super().run(task, attempt)
+        def minimise(self, *arguments):
+            minimum = super().minimise(*arguments)
             signal.raise_signal(signal.SIGINT)
             signal.raise_signal(signal.SIGINT)
-            return fit
+            return minimum
 
     model = sparse(solver=Impatient())
     with pytest.raises(KeyboardInterrupt):

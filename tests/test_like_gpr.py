@@ -11,9 +11,10 @@ from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
-from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.datasets import make_toy
 from skevgp.features import InertiaForceGravity
+from skevgp.noise import Gaussian
 from skevgp.plotting import CoefficientDisplay, PosteriorDisplay
 
 RNG = np.random.RandomState(0)
@@ -45,7 +46,9 @@ def test_before_a_fit_it_predicts_what_scikit_learns_model_does(kernel, n_target
 
 
 def test_the_prior_has_weights_and_known_noise():
-    model = EGPRegressor(TREND, 2.0 * BARE, coef_mean=[1.0, 0.0, -1.0], coef_scale=[1.0, 2.0, 0.0], alpha=0.25)
+    model = EGPRegressor(
+        TREND, 2.0 * BARE, coef_prior=CoefPrior(mean=[1.0, 0.0, -1.0], scale=[1.0, 2.0, 0.0]), alpha=0.25
+    )
     mean, cov = model.predict(X_NEW, return_cov=True)
     H = TREND.fit_transform(X_NEW)
     np.testing.assert_allclose(mean, H @ [1.0, 0.0, -1.0], atol=1e-12)
@@ -87,7 +90,7 @@ def test_what_needs_a_fit_says_so():
         lambda: model.to_casadi(),
         lambda: rollout(model, X[0], X),
         lambda: CoefficientDisplay.from_estimator(model),
-        lambda: EGPRegressor(TREND, coef_scale=np.inf).predict(X),
+        lambda: EGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).predict(X),
         lambda: EVGPRegressor().predict(X),
         lambda: ResidualRegressor(model).predict(X),
     ):
@@ -152,7 +155,7 @@ def test_known_noise_of_each_row():
         np.testing.assert_allclose(actual, expected, atol=1e-8)
 
 
-@pytest.mark.parametrize("arguments", [{"noise_variance": 0.1}, {"kernel": RBF() + WhiteKernel()}], ids=str)
+@pytest.mark.parametrize("arguments", [{"noise": Gaussian(variance=0.1)}, {"kernel": RBF() + WhiteKernel()}], ids=str)
 def test_noise_is_known_or_learned(arguments):
     with pytest.raises(ValueError, match=r"alpha=0\.1 is the noise"):
         EGPRegressor(alpha=0.1, **arguments).fit(X, Y)
@@ -277,7 +280,6 @@ def test_few_rows_without_noise_are_met_to_rounding():
     [
         ({"alpha": -1.0}, "alpha"),
         ({"alpha": 0.0}, "alpha"),
-        ({"noise_variance": -1.0}, "noise_variance"),
         ({"optimizer": 5}, "optimizer"),
         ({"n_targets": -1}, "n_targets"),
         ({"n_targets": 1.5}, "n_targets"),

@@ -8,8 +8,9 @@ from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
 from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 
@@ -39,9 +40,8 @@ def nasty(seed):
         "feature_map": [None, PolynomialFeatures(1), PolynomialFeatures(2)][rng.randint(3)],
         "n_inducing": int(rng.choice([1, 5, 20, 200])),
         "sharing": str(rng.choice(["all", "kernel", "none", "auto"])),
-        "posterior": str(rng.choice(["full", "diagonal"])),
+        "solver": [LBFGS, LBFGS, LBFGS, Adam][rng.randint(4)](posterior=str(rng.choice(["full", "diagonal"]))),
         "normalize_y": bool(rng.rand() < 0.5),
-        "solver": str(rng.choice(["lbfgs", "lbfgs", "lbfgs", "adam"])),
     }
     return X, Y, arguments
 
@@ -56,7 +56,7 @@ def test_finite_data_never_fail(seed):
     assert_finite(model, X)
     assert np.isfinite(model.lower_bound_)
     assert np.isfinite(model.upper_bound_)
-    if arguments["solver"] == "lbfgs":
+    if isinstance(arguments["solver"], LBFGS):
         # Adam's lower bound is summed in another way, of which rounding at 1e8 leaves other digits.
         assert_above(model.upper_bound_, model.lower_bound_)
     assert np.isfinite(model.sample_y(X[:3])).all()
@@ -78,7 +78,7 @@ def assert_above(upper, lower):
 @pytest.mark.parametrize("seed", range(30))
 def test_finite_data_never_fail_however_many_points_there_are_to_be(seed):
     X, Y, arguments = nasty(seed)
-    arguments |= {"solver": "lbfgs", "n_inducing": "auto", "max_inducing": 40}
+    arguments |= {"solver": LBFGS(max_inducing=40), "n_inducing": "auto"}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = EVGPRegressor(**arguments, max_iter=20, random_state=0).fit(X, Y)
@@ -89,7 +89,7 @@ def test_finite_data_never_fail_however_many_points_there_are_to_be(seed):
 @pytest.mark.parametrize("seed", range(30))
 def test_finite_data_never_fail_natural_gradients(seed):
     X, Y, arguments = nasty(seed)
-    arguments |= {"solver": Adam(batch_size=64, natural_gradient=True), "posterior": "full"}
+    arguments |= {"solver": Adam(batch_size=64, natural_gradient=True, posterior="full")}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model = EVGPRegressor(**arguments, max_iter=30, random_state=0).fit(X, Y)
@@ -103,7 +103,7 @@ def test_finite_data_never_fail_natural_gradients(seed):
 @pytest.mark.parametrize("scale", [1e-120, 1e-12, 1e12, 1e90])
 def test_targets_of_any_scale(scale):
     X = np.linspace(0, 3, 40)[:, np.newaxis]
-    model = EVGPRegressor(n_inducing=10, random_state=0, tol=1.0).fit(X, scale * np.sin(X[:, 0]))
+    model = EVGPRegressor(n_inducing=10, random_state=0, solver=LBFGS(tol=1.0)).fit(X, scale * np.sin(X[:, 0]))
     mean, std = model.predict(X, return_std=True)
     np.testing.assert_allclose(mean / scale, np.sin(X[:, 0]), atol=0.05)
     assert (std > 0).all()
@@ -119,13 +119,13 @@ def test_numbers_whose_squares_overflow_are_refused():
 
 def test_fewer_rows_than_inducing_points_works_with_fewer_points():
     X = np.random.RandomState(0).randn(7, 2)
-    assert EVGPRegressor(n_inducing=100, tol=1.0).fit(X, X[:, 0]).inducing_points_.shape == (7, 2)
+    assert EVGPRegressor(n_inducing=100, solver=LBFGS(tol=1.0)).fit(X, X[:, 0]).inducing_points_.shape == (7, 2)
 
 
 def test_rows_on_top_of_each_other_count_as_one_place():
     X = np.repeat(np.arange(4.0), 10)[:, np.newaxis]
     y = X[:, 0] + 0.1 * np.random.RandomState(0).randn(40)
-    model = EVGPRegressor(n_inducing=100, tol=1.0).fit(X, y)
+    model = EVGPRegressor(n_inducing=100, solver=LBFGS(tol=1.0)).fit(X, y)
     assert model.inducing_points_.shape == (4, 1)
     np.testing.assert_allclose(model.predict([[0.0], [3.0]]), [0.0, 3.0], atol=0.2)
 
@@ -143,7 +143,7 @@ def test_a_constant_column_may_move_a_little_afterwards(constant):
     rng = np.random.RandomState(0)
     X = np.column_stack([rng.uniform(-2, 2, 1000), np.full(1000, constant)])
     y = np.sin(2 * X[:, 0]) + 0.05 * rng.randn(1000)
-    model = EVGPRegressor(n_inducing=15, random_state=0, tol=1.0).fit(X, y)
+    model = EVGPRegressor(n_inducing=15, random_state=0, solver=LBFGS(tol=1.0)).fit(X, y)
     assert model.score(X * [1.0, 1.0 + 1e-9], y) > 0.99
 
 
@@ -160,7 +160,9 @@ def test_powers_of_columns_far_from_zero_explain_a_line(scale):
     rng = np.random.RandomState(0)
     X = 1e8 + rng.randn(30, 5)
     line = (X - 1e8).sum(axis=1)
-    model = EVGPRegressor(PolynomialFeatures(), coef_scale=scale, random_state=0).fit(X, line + 1e-8 * rng.randn(30))
+    model = EVGPRegressor(PolynomialFeatures(), coef_prior=CoefPrior(scale=scale), random_state=0).fit(
+        X, line + 1e-8 * rng.randn(30)
+    )
     # The weights of 20 products of 1e16, which add up to a line of size 1, leave 1e-7 of it.
     assert np.abs(model.predict(X) - line).max() <= 1e-5
     assert model.noise_variance_ <= 1e-10
@@ -169,7 +171,7 @@ def test_powers_of_columns_far_from_zero_explain_a_line(scale):
 def test_rows_that_differ_by_rounding_share_inducing_points():
     rng = np.random.RandomState(0)
     X = np.repeat([[0.0], [1.0], [2.0]], 20, axis=0) + 1e-14 * rng.randn(60, 1)
-    model = EVGPRegressor(n_inducing=20, random_state=0, tol=1.0).fit(X, X[:, 0] + 0.1 * rng.randn(60))
+    model = EVGPRegressor(n_inducing=20, random_state=0, solver=LBFGS(tol=1.0)).fit(X, X[:, 0] + 0.1 * rng.randn(60))
     assert np.isfinite(model.predict(X)).all()
 
 
@@ -200,19 +202,32 @@ def test_bad_data(X, y, message):
     [
         ({"n_inducing": 0}, "'n_inducing' parameter .* must be an int in the range"),
         ({"sharing": "some"}, "'sharing' parameter .* must be a str among"),
-        ({"posterior": "banded"}, "'posterior' parameter .* must be a str among"),
+        ({"solver": LBFGS(posterior="banded")}, 'posterior of LBFGS must be "full" or "diagonal"'),
         ({"solver": "sgd"}, r"solver must be one of \"lbfgs\", \"adam\", .*LBFGS\(\.\.\.\), .*; got 'sgd'"),
-        ({"noise_variance": 0.0}, "'noise_variance' parameter"),
+        ({"noise": "cauchy"}, r"noise must be one of \"gaussian\", \"student-t\", .*StudentT\(\.\.\.\); got 'cauchy'"),
+        ({"noise": Gaussian(variance=0.0)}, "variance of Gaussian must be finite and above 0"),
         ({"max_iter": -1}, "'max_iter' parameter"),
-        ({"tol": -1.0}, "'tol' parameter"),
+        ({"solver": LBFGS(tol=-1.0)}, "tol of LBFGS must be finite and at least 0"),
         ({"solver": Adam(batch_size=0)}, "batch_size of Adam must be at least 1; got 0"),
         ({"solver": Adam(learning_rate=0.0)}, "learning_rate of Adam must be finite and above 0"),
         ({"solver": LBFGS(n_restarts=-1)}, "n_restarts of LBFGS must be at least 0; got -1"),
-        ({"coef_mean": "prior"}, "'coef_mean' parameter"),
-        ({"feature_map": PolynomialFeatures(1), "coef_mean": [1.0, 2.0]}, r"coef_mean must be .* \(1, 4\)"),
-        ({"feature_map": PolynomialFeatures(1), "coef_scale": -1.0}, "coef_scale must not be negative"),
-        ({"feature_map": PolynomialFeatures(1), "coef_scale": np.inf}, "finite"),
-        ({"feature_map": PolynomialFeatures(1), "coef_mean": 1e300}, "coef_mean must not exceed"),
+        (
+            {"feature_map": PolynomialFeatures(1), "coef_prior": CoefPrior(mean="prior")},
+            "mean of CoefPrior must be real",
+        ),
+        (
+            {"feature_map": PolynomialFeatures(1), "coef_prior": CoefPrior(mean=[1.0, 2.0])},
+            r"mean of CoefPrior must be .* \(1, 4\)",
+        ),
+        (
+            {"feature_map": PolynomialFeatures(1), "coef_prior": CoefPrior(scale=-1.0)},
+            "scale of CoefPrior must not be negative",
+        ),
+        ({"feature_map": PolynomialFeatures(1), "coef_prior": CoefPrior(scale=np.inf)}, "finite"),
+        (
+            {"feature_map": PolynomialFeatures(1), "coef_prior": CoefPrior(mean=1e300)},
+            "mean of CoefPrior must not exceed",
+        ),
         ({"feature_map": FunctionTransformer(lambda X: 1e200 * X)}, "What feature_map=.* must not exceed"),
         ({"kernel_map": FunctionTransformer(lambda X: X[:, :0])}, "kernel_map=.* returned no columns"),
         ({"feature_map": InertiaForceGravity("pendulums")}, "Unknown robot 'pendulums'.*Did you mean 'pendulum'"),
@@ -252,8 +267,8 @@ def test_maps_that_return_nonsense(argument, how, message):
 
 def test_a_failed_fit_leaves_the_data_alone():
     X, y = GOOD.copy(), GOOD[:, 0].copy()
-    with pytest.raises(ValueError, match="coef_scale"):
-        EVGPRegressor(PolynomialFeatures(1), coef_scale=-1.0).fit(X, y)
+    with pytest.raises(ValueError, match="scale of CoefPrior"):
+        EVGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=-1.0)).fit(X, y)
     np.testing.assert_array_equal(X, GOOD)
     np.testing.assert_array_equal(y, GOOD[:, 0])
 
@@ -265,7 +280,13 @@ def test_rows_that_are_equal_but_for_rounding_are_duplicates(posterior, n_induci
     rows, new = rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, 2, (30, 2))
     y = np.tile(np.sin(2 * rows[:, 0]) + rows[:, 1], 2) + 0.05 * rng.randn(80)
     nearly = rows * (1.0 + 4e-16 * rng.choice([-1, 1], rows.shape))
-    model = EVGPRegressor(n_inducing=n_inducing, posterior=posterior, noise_variance=0.01, max_iter=0, random_state=0)
+    model = EVGPRegressor(
+        n_inducing=n_inducing,
+        solver=LBFGS(posterior=posterior),
+        noise=Gaussian(variance=0.01),
+        max_iter=0,
+        random_state=0,
+    )
     same, near = (clone(model).fit(np.vstack([rows, others]), y) for others in (rows, nearly))
     assert (np.vstack([rows, nearly]) != np.vstack([rows, rows])).any()
     for found, expected in zip(near.predict(new, return_std=True), same.predict(new, return_std=True), strict=True):
@@ -288,6 +309,6 @@ def test_features_that_depend_on_each_other_share_what_they_explain(name, coef_s
     X = rng.randn(60, 2)
     y = X @ [1.0, 2.0] + 0.5 + 0.1 * rng.randn(60)
     features = FunctionTransformer(lambda X: np.column_stack([*DEPENDENT[name](X), np.ones(len(X))]))
-    model = EVGPRegressor(features, coef_scale=coef_scale, n_inducing=5, max_iter=0).fit(X, y)
+    model = EVGPRegressor(features, coef_prior=CoefPrior(scale=coef_scale), n_inducing=5, max_iter=0).fit(X, y)
     expected = np.linalg.lstsq(features.transform(X), y, rcond=1e-10)[0]
     np.testing.assert_allclose(model._fitted.units.prior.offset[0], expected, atol=1e-4)

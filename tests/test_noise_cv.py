@@ -10,7 +10,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
@@ -91,7 +91,7 @@ def test_what_few_points_cannot_represent_is_not_taken_for_noise():
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["no features", "features"])
 def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
-    settings = {"feature_map": feature_map, "sharing": sharing, "solver": solver, "posterior": posterior}
+    settings = {"feature_map": feature_map, "sharing": sharing, "solver": solver}
     # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
     settings |= {"max_iter": 10, "X": X[:1900], "Y": Y[:1900], "groups": GROUPS[:1900]}
     plain, calibrated = (fitted(**settings, noise_cv=noise_cv) for noise_cv in (None, 5))
@@ -108,12 +108,12 @@ def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, shari
 @pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
 def test_q_is_at_its_optimum_for_the_new_noise_and_signal(solver, posterior):
     y = Y[:, 0]
-    m = fitted(Y=y, solver=solver, posterior=posterior)
+    m = fitted(Y=y, solver=solver)
     again = fitted(
         Y=y,
         kernel=m.kernel_ + WhiteKernel(m.noise_variance_, "fixed"),
         inducing_init=m.inducing_points_,
-        posterior=posterior,
+        solver=LBFGS(posterior=posterior),
         max_iter=0,
     )
     for part, expected in zip(m.predict(X_NEW, return_std=True), again.predict(X_NEW, return_std=True), strict=True):
@@ -127,9 +127,11 @@ def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
     """Taken from sums over the rows, where digits cancel, it was off by 0.02 nats here, and by 50 at less noise."""
     x = np.linspace(0.0, 1.0, 200)[:, np.newaxis]
     y = 3.0 + 2.0 * x[:, 0]
-    m = EVGPRegressor(n_inducing=10, posterior=posterior, random_state=0).fit(x, y)
+    m = EVGPRegressor(n_inducing=10, solver=LBFGS(posterior=posterior), random_state=0).fit(x, y)
     kernel = m.kernel_ + WhiteKernel(m.noise_variance_, "fixed")
-    same = EVGPRegressor(kernel=kernel, inducing_init=m.inducing_points_, posterior=posterior, max_iter=0).fit(x, y)
+    same = EVGPRegressor(
+        kernel=kernel, inducing_init=m.inducing_points_, solver=LBFGS(posterior=posterior), max_iter=0
+    ).fit(x, y)
     assert m.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-3)
 
 
@@ -143,7 +145,7 @@ def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrate
 
     X, X_new = rng.uniform(-2, 2, (60, 3)), rng.uniform(-2, 2, (300, 3))
     Y, Y_new = targets(X), targets(X_new)
-    arguments = {"feature_map": PolynomialFeatures(4), "share_coef": True, "max_iter": 200}
+    arguments = {"feature_map": PolynomialFeatures(4), "coef_prior": CoefPrior(shared=True), "max_iter": 200}
     plain, calibrated = (model(noise_cv=noise_cv, **arguments).fit(X, Y) for noise_cv in (None, 5))
     assert nlpd(calibrated, X_new, Y_new) < nlpd(plain, X_new, Y_new) + 1.0
 
@@ -234,7 +236,7 @@ def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch
     settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
     settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
     m = fitted(**settings)
-    monkeypatch.setattr("skevgp.data.chosen.ORDERED_ROWS", 0)
+    monkeypatch.setattr("skevgp.data.weights.ORDERED_ROWS", 0)
     np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
 
 

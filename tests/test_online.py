@@ -5,7 +5,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
 
 KERNEL = ConstantKernel(1.5, "fixed") * RBF([1.0, 1.3], "fixed") + WhiteKernel(1e-4, "fixed")
 
@@ -17,7 +17,9 @@ def rows(n):
 
 
 def model(points):
-    return EVGPRegressor(PolynomialFeatures(1), KERNEL, inducing_init=points, coef_scale=3.0, max_iter=0)
+    return EVGPRegressor(
+        PolynomialFeatures(1), KERNEL, inducing_init=points, coef_prior=CoefPrior(scale=3.0), max_iter=0
+    )
 
 
 @pytest.mark.slow

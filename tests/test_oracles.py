@@ -7,7 +7,8 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Kernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
+from skevgp.solvers import LBFGS
 
 NOISE = 0.01
 
@@ -62,8 +63,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(data, sharing, include_no
         fixed_kernel() + WhiteKernel(NOISE, "fixed"),
         n_inducing=70,
         sharing=sharing,
-        coef_mean=MEAN,
-        coef_scale=SCALE,
+        coef_prior=CoefPrior(mean=MEAN, scale=SCALE),
         max_iter=0,
     ).fit(X, Y)
     mean, std = model.predict(X_new, return_std=True, include_noise=include_noise)
@@ -88,8 +88,7 @@ def test_weights_are_those_of_the_exact_model(data):
         PolynomialFeatures(1),
         fixed_kernel() + WhiteKernel(NOISE, "fixed"),
         n_inducing=70,
-        coef_mean=MEAN,
-        coef_scale=SCALE,
+        coef_prior=CoefPrior(mean=MEAN, scale=SCALE),
         max_iter=0,
     ).fit(X, Y)
     H = PolynomialFeatures(1).fit_transform(X)
@@ -116,9 +115,8 @@ def test_bounds_are_ordered(data):
                 PolynomialFeatures(1),
                 fixed_kernel() + WhiteKernel(NOISE, "fixed"),
                 n_inducing=15,
-                posterior=family,
-                coef_mean=MEAN,
-                coef_scale=SCALE,
+                solver=LBFGS(posterior=family),
+                coef_prior=CoefPrior(mean=MEAN, scale=SCALE),
                 max_iter=0,
                 random_state=0,
             )
@@ -129,14 +127,17 @@ def test_bounds_are_ordered(data):
 
 
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
-@pytest.mark.parametrize("options", [{}, {"posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str)
+@pytest.mark.parametrize(
+    "options", [{}, {"solver__posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str
+)
 def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, sharing, options):
     X, Y, _ = data
     unit = np.array([1.0, 100.0])
-    prior = {"coef_mean": MEAN * unit[:, np.newaxis], "coef_scale": SCALE * unit[:, np.newaxis]}
+    prior = {"coef_prior": CoefPrior(mean=MEAN * unit[:, np.newaxis], scale=SCALE * unit[:, np.newaxis])}
     model = EVGPRegressor(
-        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, tol=1.0, **prior, **options
-    ).fit(X, Y * unit)
+        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, solver=LBFGS(tol=1.0), **prior
+    )
+    model.set_params(**options).fit(X, Y * unit)
     mean = np.mean(Y, axis=0) if "normalize_y" in options else np.zeros(2)
     likelihood = 0.0
     for o in range(2):
@@ -185,7 +186,7 @@ def test_the_upper_bound_comes_down_to_the_likelihood_as_points_are_added(data, 
 
 def test_the_fitted_kernel_is_the_exact_counterparts(data):
     X, Y, X_new = data
-    model = EVGPRegressor(n_inducing=70, random_state=0, tol=1.0).fit(X, Y[:, 0])
+    model = EVGPRegressor(n_inducing=70, random_state=0, solver=LBFGS(tol=1.0)).fit(X, Y[:, 0])
     gpr = GaussianProcessRegressor(model.kernel_, alpha=model.noise_variance_, optimizer=None).fit(X, Y[:, 0])
     assert model.lower_bound_ <= gpr.log_marginal_likelihood_value_ + 1e-6
     np.testing.assert_allclose(model.predict(X_new), gpr.predict(X_new), atol=0.05)
@@ -198,8 +199,7 @@ def test_a_vague_prior_gives_generalised_least_squares(data):
         PolynomialFeatures(1),
         fixed_kernel() + WhiteKernel(NOISE, "fixed"),
         n_inducing=70,
-        coef_mean=0.0,
-        coef_scale=1e4,
+        coef_prior=CoefPrior(mean=0.0, scale=1e4),
         max_iter=0,
     ).fit(X, Y[:, 0])
     K_inv = np.linalg.inv(fixed_kernel()(X) + NOISE * np.eye(70))
@@ -218,7 +218,9 @@ def test_predictions_keep_their_digits_at_high_signal_to_noise(relative_noise):
     lengths = np.array([0.5, 0.6])
     kernel = ConstantKernel(1.0, "fixed") * RBF(lengths, "fixed") + WhiteKernel(noise**2, "fixed")
     linear = FunctionTransformer(lambda X: X)
-    model = EVGPRegressor(linear, kernel, n_inducing=40, coef_mean=0.0, coef_scale=1.0, max_iter=0, random_state=0)
+    model = EVGPRegressor(
+        linear, kernel, n_inducing=40, coef_prior=CoefPrior(mean=0.0, scale=1.0), max_iter=0, random_state=0
+    )
     model.fit(X, y)
 
     Z = model.inducing_points_

@@ -10,6 +10,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.metrics import containing_ratios, prediction_error
+from skevgp.solvers import LBFGS, Adam
 
 
 @pytest.fixture(scope="module", params=[0, 3])
@@ -52,7 +53,7 @@ def test_without_physics(data):
 @pytest.mark.slow
 def test_the_papers_setup(data):
     """Adam, diagonal posterior, inducing points per output; a sixteenth of the default steps."""
-    paper = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "max_iter": 1000, "random_state": 0}
+    paper = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "max_iter": 1000, "random_state": 0}
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, **paper)
     assert error(model, data) <= 0.006
     assert model.n_parameters_ == 123
@@ -87,7 +88,7 @@ def small():
 
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_cross_validation_over_trajectories(small):
-    model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0, tol=1.0)
+    model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0, solver=LBFGS(tol=1.0))
     scores = cross_val_score(model, small.data, small.target, groups=small.groups, cv=GroupKFold(3))
     assert scores.min() > 0.999
 
@@ -96,7 +97,7 @@ def test_cross_validation_over_trajectories(small):
 @pytest.mark.slow
 def test_grid_search_over_the_number_of_inducing_points(small):
     search = GridSearchCV(
-        EVGPRegressor(InertiaForceGravity("pendulum"), random_state=0, tol=1.0),
+        EVGPRegressor(InertiaForceGravity("pendulum"), random_state=0, solver=LBFGS(tol=1.0)),
         {"n_inducing": [5, 10], "feature_map__known_scale": [0.1, 0.2]},
         cv=GroupKFold(3),
         n_jobs=2,
@@ -115,7 +116,11 @@ def test_inside_a_pipeline_with_the_scaling_in_kernel_map(small):
             (
                 "evgp",
                 EVGPRegressor(
-                    InertiaForceGravity("pendulum"), kernel_map=StandardScaler(), n_inducing=10, random_state=0, tol=1.0
+                    InertiaForceGravity("pendulum"),
+                    kernel_map=StandardScaler(),
+                    n_inducing=10,
+                    random_state=0,
+                    solver=LBFGS(tol=1.0),
                 ),
             ),
         ]

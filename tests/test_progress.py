@@ -1,7 +1,13 @@
 """What is told while a fit runs, and how it is told to stop."""
 
 import io
+import os
+import re
+import sys
+from functools import partial
 from threading import Thread
+from types import SimpleNamespace
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -143,173 +149,171 @@ class Clock:
         return self.now
 
 
-@pytest.fixture(params=[Terminal, io.StringIO], ids=["terminal", "log"])
-def output(request):
-    return request.param()
+class Bar:
+    """What is used of tqdm, as it is in a notebook: the texts that are shown."""
+
+    made: ClassVar[list] = []
+
+    def __init__(self, desc, **options):
+        self.texts, self.disable, self.closed = [desc], False, False
+        self.made.append(self)
+
+    def set_description_str(self, desc, refresh):
+        self.desc = desc
+
+    def display(self):
+        self.texts.append(self.desc)
+
+    def close(self):
+        self.closed = True
 
 
 @pytest.fixture
-def terminal(monkeypatch):
-    monkeypatch.setenv("COLUMNS", "200")
-    return Terminal()
+def without_tqdm(monkeypatch):
+    for name in ("tqdm", "tqdm.auto", "tqdm.asyncio"):
+        monkeypatch.setitem(sys.modules, name, None)
 
 
-def shown(progress, clock, losses, seconds=1.0, outputs=range(1), first=1, **options):
+@pytest.fixture
+def notebook(monkeypatch):
+    """The bars of a notebook."""
+    monkeypatch.setattr(Bar, "made", [])
+    monkeypatch.setitem(sys.modules, "tqdm.auto", SimpleNamespace(tqdm=Bar))
+    monkeypatch.setitem(sys.modules, "tqdm.asyncio", SimpleNamespace(tqdm=object))
+    return Bar.made
+
+
+def fit(progress, clock, losses, seconds=1.0, about=""):
     """Iterations that take so many seconds each."""
-    monitor = Monitor(progress=progress).seen_as(outputs=outputs)
-    for number, loss in enumerate(losses, first):
+    monitor = Monitor(progress=progress).seen_as(about=about)
+    for number, loss in enumerate(losses, 1):
         clock.now += seconds
-        monitor.iteration(number, loss, **options)
+        monitor.iteration(number, loss)
 
 
-def test_every_iteration_is_printed_if_asked_for_twice(output):
-    progress = Progress(2, output)
-    shown(progress, Clock(), [10.0, 20.0, 30.0])
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_verbose_2_prints_each_iteration(stream):
+    stream = stream()
+    progress = Progress(2, stream)
+    fit(progress, Clock(), [10.0, 20.0, 30.0])
     progress.close()
-    lines = output.getvalue().splitlines()
+    lines = stream.getvalue().splitlines()
     assert [line.split()[:4] for line in lines] == [
         ["iteration", str(number), "bound", f"{-10.0 * number:.3f}"] for number in (1, 2, 3)
     ]
 
 
-def test_on_a_terminal_one_line_is_written_over_and_ended_with_the_fit(terminal):
-    clock = Clock()
+def test_on_a_terminal_tqdm_draws_one_line():
+    pytest.importorskip("tqdm")
+    clock, terminal = Clock(), Terminal()
     progress = Progress(1, terminal, clock)
-    shown(progress, clock, [1234.0, 5.0])
+    fit(progress, clock, [1234.0, 5.0], about="y[:, 2]")
     assert "\n" not in terminal.getvalue()
     progress.close()
-    _, first, second = terminal.getvalue().split("\r")
-    assert first == "iteration 1, bound -1234.000, 1 s"
-    # Nothing of the longer one before is left.
-    assert second == "iteration 2, bound -5.000, 2 s".ljust(len(first)) + "\n"
+    _, first, *_, last = terminal.getvalue().split("\r")
+    assert first.rstrip() == "y[:, 2], iteration 1, bound -1234.000, 1 s"
+    assert last.rstrip(" \n") == "y[:, 2], iteration 2, bound -5.000, 2 s"
+    assert last.endswith("\n")
 
 
-def test_a_live_line_is_written_a_few_times_a_second_and_at_the_end(terminal):
-    clock = Clock()
-    progress = Progress(1, terminal, clock)
-    shown(progress, clock, np.zeros(1000), seconds=0.01)
+@pytest.mark.skipif(not hasattr(os, "openpty"), reason="Windows has no pseudo-terminals.")
+def test_a_live_line_is_no_longer_than_the_terminal():
+    pytest.importorskip("tqdm")
+    termios = pytest.importorskip("termios")
+    ours, theirs = os.openpty()
+    with os.fdopen(theirs, "w") as terminal, os.fdopen(ours, "rb", buffering=0) as screen:
+        termios.tcsetwinsize(theirs, (30, 40))
+        clock = Clock()
+        progress = Progress(1, terminal, clock)
+        fit(progress, clock, [1.0, 2.0], about="the name of a part of the fit")
+        progress.close()
+        lines = screen.read(10_000).decode().split("\r")
+    assert lines[1] == "the name of a part of the fit, iteratio"
+    assert all(len(line) < 40 for line in lines)
+
+
+def test_in_a_notebook_tqdm_draws_one_line_a_few_times_a_second(notebook):
+    clock, stream = Clock(), io.StringIO()
+    progress = Progress(1, stream, clock)
+    fit(progress, clock, np.zeros(1001), seconds=0.01)
     progress.close()
-    lines = terminal.getvalue().split("\r")[1:]
-    assert 10 <= len(lines) <= 21
-    assert lines[-1].startswith("iteration 1000,")
+    (bar,) = notebook
+    assert bar.closed
+    assert 30 <= len(bar.texts) <= 102
+    assert bar.texts[-1] == "iteration 1001, bound -0.000, 10 s"
+    assert stream.getvalue() == ""
 
 
-def test_a_live_line_is_no_longer_than_the_terminal(terminal, monkeypatch):
-    monkeypatch.setenv("COLUMNS", "20")
+def test_disabled_bars_are_not_drawn(monkeypatch):
+    """As by the environment variable TQDM_DISABLE, which tqdm reads when it is imported."""
+    pytest.importorskip("tqdm")
+    clock, terminal = Clock(), Terminal()
+    progress = Progress(1, terminal, clock)
+    monkeypatch.setattr(progress, "_tqdm", partial(progress._tqdm, disable=True))
+    fit(progress, clock, np.zeros(3))
+    progress.close()
+    assert terminal.getvalue() == ""
+
+
+def test_models_fitted_side_by_side_share_a_bar(notebook):
+    """A line is about the model that has just had an iteration."""
     clock = Clock()
-    shown(Progress(1, terminal, clock), clock, [1.0])
-    assert terminal.getvalue() == "\riteration 1, bound "
+    progress = Progress(1, io.StringIO(), clock)
+    monitor = Monitor(progress=progress)
+
+    def work(output):
+        part = monitor.seen_as(about=f"y[:, {output}]")
+        for number in range(1, 51):
+            clock.now += 1.0
+            part.iteration(number, 0.0)
+
+    threads = [Thread(target=work, args=(output,)) for output in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join(60.0)
+    progress.close()
+    (bar,) = notebook
+    for output in range(4):
+        numbers = [int(re.search(r"iteration (\d+)", text)[1]) for text in bar.texts if f"y[:, {output}]" in text]
+        assert numbers == sorted(numbers)
+        assert numbers
 
 
-def test_a_log_gets_a_line_each_ten_seconds_and_the_last():
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_without_tqdm_there_is_a_line_each_ten_seconds_and_the_last(without_tqdm, stream):
+    clock, stream = Clock(), stream()
+    progress = Progress(1, stream, clock)
+    fit(progress, clock, np.ones(25), about="all rows")
+    progress.close()
+    progress.close()
+    assert stream.getvalue().splitlines() == [
+        f"all rows, iteration {number}, bound -1.000, {number} s" for number in (10, 20, 25)
+    ]
+
+
+def test_a_log_has_lines_even_with_tqdm():
+    pytest.importorskip("tqdm")
     clock, log = Clock(), io.StringIO()
-    progress = Progress(1, log, clock)
-    shown(progress, clock, np.zeros(25))
-    progress.close()
-    progress.close()
-    assert [line.split(",")[0] for line in log.getvalue().splitlines()] == [
-        "iteration 10", "iteration 20", "iteration 25"
-    ]  # fmt: skip
+    fit(Progress(1, log, clock), clock, np.ones(12))
+    assert log.getvalue() == "iteration 10, bound -1.000, 10 s\n"
 
 
-def test_a_fit_without_iterations_leaves_no_line(output):
-    Progress(1, output).close()
-    assert output.getvalue() == ""
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_a_fit_without_iterations_leaves_no_line(stream):
+    stream = stream()
+    Progress(1, stream).close()
+    assert stream.getvalue() == ""
 
 
-def test_the_part_of_the_fit_is_told(terminal):
-    clock = Clock()
-    monitor = Monitor(progress=Progress(1, terminal, clock)).seen_as(about="y[:, 2]").seen_as(about="50 of 90 rows")
-    clock.now += 1.0
+def test_the_part_of_the_fit_is_told():
+    clock, log = Clock(), io.StringIO()
+    monitor = Monitor(progress=Progress(1, log, clock)).seen_as(about="y[:, 2]").seen_as(about="50 of 90 rows")
+    clock.now += 10.0
     monitor.iteration(3, 2.0)
+    clock.now += 10.0
     monitor.silent().iteration(4, 2.0)
-    assert terminal.getvalue() == "\ry[:, 2], 50 of 90 rows, iteration 3, bound -2.000, 1 s"
-
-
-def left(terminal):
-    """What the last line says of the time left."""
-    line = terminal.getvalue().split("\r")[-1].strip()
-    return line.rpartition(", about ")[2].removesuffix(" left") if " left" in line else None
-
-
-def test_where_only_the_number_of_steps_ends_them_the_time_left_is_in_proportion(terminal):
-    clock = Clock()
-    shown(Progress(1, terminal, clock), clock, np.zeros(60), most=100)
-    assert left(terminal) == "40 s"
-    shown(Progress(1, terminal, clock), clock, np.zeros(60), seconds=10.0, most=100)
-    assert left(terminal) == "7 min"
-
-
-def test_it_is_that_of_recent_iterations(terminal):
-    clock = Clock()
-    progress = Progress(1, terminal, clock)
-    shown(progress, clock, np.zeros(30), seconds=9.0, most=100)
-    shown(progress, clock, np.zeros(60), first=31, most=100)
-    assert left(terminal) == "10 s"
-
-
-@pytest.mark.parametrize("factor", [1.0, 50.0])
-def test_gains_that_fall_geometrically_tell_when_they_are_small_enough(terminal, factor):
-    """0.9^k of the first after k iterations: a thousandth after 66."""
-    clock, losses = Clock(), 0.9 ** np.arange(41)
-    monitor = Monitor(progress=Progress(1, terminal, clock)).seen_as(100, factor, 7.0)
-    for number, loss in enumerate(losses, 1):
-        clock.now += 1.0
-        monitor.iteration(number, loss, most=1000, enough=0.1 * 1e-3)
-    assert left(terminal) == "30 s"
-
-
-def test_it_is_no_longer_than_the_most_iterations_take(terminal):
-    clock = Clock()
-    shown(Progress(1, terminal, clock), clock, 0.99 ** np.arange(81), most=90, enough=1e-30)
-    assert left(terminal) == "9 s"
-
-
-@pytest.mark.parametrize(
-    ("losses", "is_last", "most"),
-    [
-        (0.9 ** np.arange(12), True, 1000),
-        (-np.arange(40.0), True, 1000),
-        (0.9 ** np.arange(40), False, 1000),
-        (0.9 ** np.arange(40), True, None),
-    ],
-    ids=["too early", "gains do not fall", "others follow", "nobody says"],
-)
-def test_nothing_is_said_that_is_not_known(terminal, losses, is_last, most):
-    clock = Clock()
-    monitor = Monitor(progress=Progress(1, terminal, clock)).seen_as(is_last=is_last).seen_as()
-    for number, loss in enumerate(losses, 1):
-        clock.now += 1.0
-        monitor.iteration(number, loss, most=most, enough=1e-3)
-    assert "iteration" in terminal.getvalue()
-    assert left(terminal) is None
-
-
-def test_a_tolerance_of_nothing_is_no_end(terminal):
-    clock = Clock()
-    shown(Progress(1, terminal, clock), clock, 0.9 ** np.arange(60), most=100, enough=0.0)
-    assert left(terminal) == "40 s"
-
-
-def test_a_new_start_is_not_taken_for_the_old_one(terminal):
-    clock = Clock()
-    progress = Progress(1, terminal, clock)
-    shown(progress, clock, np.zeros(50), most=60)
-    assert left(terminal) == "10 s"
-    shown(progress, clock, np.zeros(5), most=60)
-    assert left(terminal) is None
-
-
-def test_outputs_side_by_side_are_told_apart(terminal):
-    """One is fast and one slow; the line is of the one that has just had an iteration."""
-    clock = Clock()
-    progress = Progress(1, terminal, clock)
-    for number in range(1, 31):
-        shown(progress, clock, [0.0], seconds=0.5, outputs=range(1), first=number, most=60)
-        shown(progress, clock, [0.0], seconds=0.5, outputs=range(1, 2), first=number, most=50)
-    assert left(terminal) == "20 s"
-    shown(progress, clock, [0.0], outputs=range(1), first=31, most=60)
-    assert left(terminal) == "30 s"
+    assert log.getvalue() == "y[:, 2], 50 of 90 rows, iteration 3, bound -2.000, 10 s\n"
 
 
 def test_a_callback_is_told_the_bound():
@@ -326,7 +330,9 @@ def test_both_are_served(verbose, capsys):
         with monitor_of(verbose, callback) as monitor:
             monitor.iteration(1, 5.0)
     assert len(told) == 1
-    assert len(capsys.readouterr().out.splitlines()) == (2 if verbose else 0)
+    printed = capsys.readouterr()
+    assert len(printed.out.splitlines()) == (2 if verbose else 0)
+    assert printed.err == ""
 
 
 def test_a_fit_that_fails_ends_its_line(capsys):

@@ -40,6 +40,7 @@ from skevgp.metrics import (
     neg_nlpd,
     negative_log_predictive_density,
 )
+from skevgp.solvers import LBFGS
 
 X, y = (part[np.random.RandomState(0).permutation(60)] for part in make_toy(60, random_state=0, return_X_y=True))
 Y = np.column_stack([y, 3.0 - 2.0 * X[:, 0]])
@@ -91,7 +92,7 @@ def test_searches_choose_the_noise_that_is_there(search, scorer):
 
 def test_a_column_whose_shuffling_costs_density_is_important():
     rows = np.column_stack([X, np.random.RandomState(0).randn(60)])
-    model = SPARSE.set_params(max_iter=None, tol=1.0)
+    model = SPARSE.set_params(max_iter=None, solver=LBFGS(tol=1.0))
     model = clone(model).fit(rows, y)
     found = permutation_importance(model, rows, y, scoring=neg_nlpd, n_repeats=3, random_state=0)
     assert found.importances_mean[0] > 10 * abs(found.importances_mean[1])

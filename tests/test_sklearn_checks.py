@@ -12,6 +12,7 @@ from skevgp.features import (
     NominalDynamics,
     RigidBodyRegressor,
 )
+from skevgp.solvers import LBFGS
 
 pytestmark = pytest.mark.slow
 MAPS = [
@@ -29,7 +30,7 @@ QUICK_NETWORK = BayesianMLPRegressor((10,), learning_rate_init=0.03, max_iter=50
 SPARSE = [
     EVGPRegressor(),
     EVGPRegressor(noise_cv=3),
-    EVGPRegressor(n_inducing="auto", max_inducing=20),
+    EVGPRegressor(n_inducing="auto", solver=LBFGS(max_inducing=20)),
     EVGPRegressor(sharing="auto"),
     EVGPRegressor(noise="student-t"),
 ]

@@ -15,6 +15,7 @@ from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp import EGPRegressor, EVGPRegressor
+from skevgp.solvers import LBFGS
 
 pyplot.switch_backend("Agg")
 RNG = np.random.RandomState(0)
@@ -26,7 +27,7 @@ JUMP = {"oak": 0.0, "pine": 2.0, "yew": -1.0}
 Y = np.sin(2.0 * NUMBERS[:, 0]) + NUMBERS[:, 1] + np.vectorize(JUMP.get)(KIND) + 0.05 * RNG.randn(N)
 Y2 = np.column_stack([Y, NUMBERS[:, 0] * NUMBERS[:, 1]])
 FRAMES = {"pandas": pd.DataFrame, "polars": pl.DataFrame}
-MODEL = EVGPRegressor(n_inducing=20, tol=0.1, random_state=0)
+MODEL = EVGPRegressor(n_inducing=20, solver=LBFGS(tol=0.1), random_state=0)
 FIXED = EVGPRegressor(n_inducing=20, max_iter=0, random_state=0)
 # One weight for each kind, and a kernel that sees the numbers and the kind.
 WORDS = make_column_transformer((OneHotEncoder(), ["kind"]), (PolynomialFeatures(1), ["height"]))
@@ -50,7 +51,7 @@ def close_figures():
 @each_frame
 def test_words_are_encoded_by_both_maps(package):
     train, test = slice(0, 70), slice(70, N)
-    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, tol=0.1, random_state=0)
+    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, solver=LBFGS(tol=0.1), random_state=0)
     model.fit(frame(package, train), Y[train])
     mean, std = model.predict(frame(package, test), return_std=True)
     assert np.abs(mean - Y[test]).mean() < 0.2
@@ -186,7 +187,7 @@ def test_cross_validation_of_frames(package):
 def test_importance_of_columns_with_words():
     """Of pandas: scikit-learn makes an array of other frames, without names, before it shuffles."""
     rows = frame("pandas")
-    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, tol=0.1, random_state=0).fit(rows, Y)
+    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, solver=LBFGS(tol=0.1), random_state=0).fit(rows, Y)
     found = permutation_importance(model, rows, Y, n_repeats=3, random_state=0)
     assert (found.importances_mean > 0.1).all()
     assert found.importances_mean.shape == (3,)
@@ -205,7 +206,7 @@ def test_partial_dependence_of_numbers(targets):
 
 def test_partial_dependence_display_of_numbers_and_words():
     rows = frame("pandas")
-    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, tol=0.1, random_state=0).fit(rows, Y)
+    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, solver=LBFGS(tol=0.1), random_state=0).fit(rows, Y)
     display = PartialDependenceDisplay.from_estimator(
         model,
         rows,

@@ -10,7 +10,9 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.fitting import search
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 from .alone import alone
@@ -23,7 +25,14 @@ Z = RNG.uniform(-2, 2, (7, 2))
 
 def model(**arguments):
     return EVGPRegressor(
-        **{"n_inducing": 8, "sharing": "all", "random_state": 0, "tol": 0.1, "noise_cv": None, **arguments}
+        **{
+            "n_inducing": 8,
+            "sharing": "all",
+            "random_state": 0,
+            "solver": LBFGS(tol=0.1),
+            "noise_cv": None,
+            **arguments,
+        }
     )
 
 
@@ -40,7 +49,7 @@ def test_restarts_keep_the_best_bound(sharing):
             first_bounds.append(bound)
 
     once = model(sharing=sharing, inducing_init="k-means").fit(X, Y)
-    solver = LBFGS(n_restarts=3, callback=look)
+    solver = LBFGS(n_restarts=3, callback=look, tol=0.1)
     often = model(sharing=sharing, inducing_init="k-means", solver=solver).fit(X, Y)
     assert often.lower_bound_ >= once.lower_bound_
     # None from where another one started.
@@ -57,7 +66,7 @@ def test_restarts_serve_adam_too():
 @pytest.mark.slow
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
-    fits = [model(sharing=sharing, solver=LBFGS(n_restarts=2), n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
+    fits = [model(sharing=sharing, solver=LBFGS(n_restarts=2, tol=0.1), n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
     for other in fits[1:]:
         assert other.lower_bound_ == fits[0].lower_bound_
         np.testing.assert_array_equal(other.inducing_points_, fits[0].inducing_points_)
@@ -67,7 +76,7 @@ def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
 def test_restarts_stay_inside_the_users_bounds():
     kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
     with pytest.warns(ConvergenceWarning, match="close to the specified"):
-        m = model(kernel=kernel, solver=LBFGS(n_restarts=3)).fit(X, Y[:, 0])
+        m = model(kernel=kernel, solver=LBFGS(n_restarts=3, tol=0.1)).fit(X, Y[:, 0])
     lengthscales = m.kernel_.k2.length_scale
     assert 0.9 - 1e-9 <= lengthscales[0] <= 1.1 + 1e-9
     assert 0.2 - 1e-9 <= lengthscales[1] <= 5.0 + 1e-9
@@ -76,7 +85,7 @@ def test_restarts_stay_inside_the_users_bounds():
 
 def test_without_iterations_there_is_nothing_to_restart():
     np.testing.assert_array_equal(
-        model(max_iter=0, solver=LBFGS(n_restarts=5)).fit(X, Y).inducing_points_,
+        model(max_iter=0, solver=LBFGS(n_restarts=5, tol=0.1)).fit(X, Y).inducing_points_,
         model(max_iter=0).fit(X, Y).inducing_points_,
     )
 
@@ -91,7 +100,9 @@ def test_ctrl_c_ends_the_restarts_with_the_best_so_far():
             raise KeyboardInterrupt
 
     with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(inducing_init="k-means", random_state=1, solver=LBFGS(n_restarts=50, callback=interrupt)).fit(X, Y)
+        m = model(
+            inducing_init="k-means", random_state=1, solver=LBFGS(n_restarts=50, callback=interrupt, tol=0.1)
+        ).fit(X, Y)
     # The first start is the best one that a fit without restarts tries.
     assert m.lower_bound_ == model(inducing_init="k-means", random_state=1).fit(X, Y).lower_bound_
     assert calls.count(2) == 2
@@ -117,14 +128,9 @@ def test_points_are_placed_anew_only_where_the_kernel_can_learn():
     assert auto.lower_bound_ == first.lower_bound_
 
 
-class Quick(LBFGS):
-    """Places inducing points anew after a few iterations."""
-
-    rules = replace(LBFGS.rules, stage=20)
-
-
-def test_an_interrupted_fit_keeps_the_best_of_both_places():
+def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
     """Ctrl-C in the first iteration from the new places, whose bound is lower than the one reached before."""
+    monkeypatch.setattr(search, "RULES", replace(search.RULES, stage=20))
     seen = []
 
     def interrupt(iteration, bound, outputs):
@@ -133,9 +139,9 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places():
             raise KeyboardInterrupt
 
     with pytest.warns(ConvergenceWarning, match="interrupted after"):
-        m = model(solver=Quick(callback=interrupt), tol=1e-9).fit(X, Y)
+        m = model(solver=LBFGS(callback=interrupt, tol=1e-9)).fit(X, Y)
     with pytest.warns(ConvergenceWarning, match="still rising"):
-        before = model(max_iter=20, tol=1e-9).fit(X, Y)
+        before = model(max_iter=20, solver=LBFGS(tol=1e-9)).fit(X, Y)
     assert seen[-1] == 21
     assert m.lower_bound_ >= before.lower_bound_ - 1e-6
 
@@ -147,8 +153,8 @@ def test_points_stay_where_they_have_a_reason_to(why):
     """The same fit as from clusters, or from the user's points, which are not placed anew."""
     arguments = {
         "warm start": {"n_inducing": 20, "warm_start": True},
-        "as many points as rows": {"n_inducing": 120, "tol": 1.0},
-        "few iterations": {"max_iter": 25, "tol": 1.0},
+        "as many points as rows": {"n_inducing": 120, "solver": LBFGS(tol=1.0)},
+        "few iterations": {"max_iter": 25, "solver": LBFGS(tol=1.0)},
         "Adam": {"solver": "adam", "max_iter": 150},
         "own points": {"inducing_init": Z},
     }[why]
@@ -167,7 +173,7 @@ def test_random_state_draws_mini_batches():
 
 def test_max_iter_counts_all_iterations(capsys):
     with pytest.warns(ConvergenceWarning, match="max_iter=70 iterations"):
-        m = model(max_iter=70, tol=1e-12, verbose=2, n_inducing=20).fit(X, Y)
+        m = model(max_iter=70, solver=LBFGS(tol=1e-12), verbose=2, n_inducing=20).fit(X, Y)
     assert m.n_iter_ == 70
     assert capsys.readouterr().out.splitlines()[-1].startswith("iteration     70")
 
@@ -208,7 +214,8 @@ def test_restarts_leave_given_points_alone():
     fixed = RBF([1.0, 1.0], "fixed")
     noise = WhiteKernel(1e-4, "fixed")
     once, often = (
-        model(inducing_init=Z, kernel=fixed + noise, solver=LBFGS(n_restarts=n)).fit(X, Y[:, 0]) for n in (0, 2)
+        model(inducing_init=Z, kernel=fixed + noise, solver=LBFGS(n_restarts=n, tol=0.1)).fit(X, Y[:, 0])
+        for n in (0, 2)
     )
     # There is nothing else to start from: all fits are the same.
     np.testing.assert_array_equal(often.inducing_points_, once.inducing_points_)
@@ -216,7 +223,7 @@ def test_restarts_leave_given_points_alone():
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 def test_copies_among_given_points_do_no_harm(posterior):
-    m = model(inducing_init=np.repeat(Z[:4], 3, axis=0), posterior=posterior).fit(X, Y)
+    m = model(inducing_init=np.repeat(Z[:4], 3, axis=0), solver=LBFGS(posterior=posterior, tol=0.1)).fit(X, Y)
     mean, std = m.predict(X, return_std=True)
     assert np.isfinite(mean).all()
     assert (std > 0).all()
@@ -267,11 +274,11 @@ def test_targets_far_from_their_prior_mean_are_told(sharing):
     with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
         model(sharing=sharing).fit(X, Y + [0.0, 1e6])
     with pytest.warns(ConvergenceWarning, match="raise coef_scale"):
-        model(feature_map=PolynomialFeatures(1), tol=1.0, sharing=sharing).fit(X, Y + 1e6)
+        model(feature_map=PolynomialFeatures(1), solver=LBFGS(tol=1.0), sharing=sharing).fit(X, Y + 1e6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert model(n_inducing=30, normalize_y=True).fit(X, Y + 1e6).score(X, Y + 1e6) > 0.99
-        wide = model(n_inducing=30, feature_map=PolynomialFeatures(1), coef_scale=1e8).fit(X, Y + 1e6)
+        wide = model(n_inducing=30, feature_map=PolynomialFeatures(1), coef_prior=CoefPrior(scale=1e8)).fit(X, Y + 1e6)
         assert wide.score(X, Y + 1e6) > 0.99
 
 
@@ -297,7 +304,7 @@ def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
     X = rng.uniform(-2, 2, (60, 3))
     y = np.sin(2 * X[:, 0]) + 0.3 * X.sum(axis=1) + 0.1 * rng.randn(60)
     model = EVGPRegressor(random_state=0).fit(X, y)
-    fewer = EVGPRegressor(n_inducing=50, noise_variance=0.05, random_state=0).fit(X, y)
+    fewer = EVGPRegressor(n_inducing=50, noise=Gaussian(variance=0.05), random_state=0).fit(X, y)
     assert model.lower_bound_ > fewer.lower_bound_ - 1.0
     assert 1e-3 < model.noise_variance_ < 0.1
 
@@ -366,7 +373,9 @@ def test_features_that_interpolate_do_not_hide_the_noise(noise, shift):
     rng = np.random.RandomState(0)
     few = rng.randn(10, 5)
     y = shift + few @ rng.randn(5) + noise * rng.randn(10)
-    fitted = model(feature_map=PolynomialFeatures(), coef_scale=1e3, normalize_y=True, n_inducing=10).fit(few, y)
+    fitted = model(
+        feature_map=PolynomialFeatures(), coef_prior=CoefPrior(scale=1e3), normalize_y=True, n_inducing=10
+    ).fit(few, y)
     assert fitted.lower_bound_ > alone(fitted, few, y) - 0.2
     mean, std = fitted.predict(few, return_std=True)
     assert (np.abs(y - mean) < 4 * std + 1e-9 * shift).all()
@@ -377,7 +386,9 @@ def test_one_large_feature_among_more_than_there_are_rows_hides_no_noise():
     few = rng.randn(40, 45)
     y = few[:, :3] @ rng.randn(3) + 0.3 * rng.randn(40)
     scale = np.append(1e8, np.full(45, 0.3))[np.newaxis]
-    fitted = model(feature_map=PolynomialFeatures(degree=1), coef_scale=scale, n_inducing=8).fit(few, y)
+    fitted = model(feature_map=PolynomialFeatures(degree=1), coef_prior=CoefPrior(scale=scale), n_inducing=8).fit(
+        few, y
+    )
     assert fitted.lower_bound_ > alone(fitted, few, y) - 0.2
 
 

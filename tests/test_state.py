@@ -91,7 +91,7 @@ def test_frames_in_pickles_are_arrays():
     model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=5, max_iter=2, random_state=0).fit(X, X["a"])
     assert b"pandas.core" not in pickle.dumps(model)
     again = pickle.loads(pickle.dumps(model))
-    pd.testing.assert_frame_equal(again._example, model._example)
+    pd.testing.assert_frame_equal(again._posterior.maps.example, model._posterior.maps.example)
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

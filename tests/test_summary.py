@@ -13,9 +13,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor, InverseDynamics
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics
 from skevgp.features import AngleEncoder
 from skevgp.kernels import FunctionKernel
+from skevgp.solvers import LBFGS
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (40, 2))
@@ -92,7 +93,7 @@ def test_one_output_is_not_numbered():
 
 
 def test_weights_that_outputs_share_are_said_once():
-    summary = fitted(share_coef=True).summary()
+    summary = fitted(coef_prior=CoefPrior(shared=True)).summary()
     weights = numbers(summary.to_frame(), "weight")
     assert weights.output.isna().all()
     assert len(weights) == 3
@@ -269,7 +270,7 @@ def test_without_pandas_there_is_text_and_the_pip_command(monkeypatch):
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_a_kernel_of_many_columns_takes_few_lines():
     X = np.random.RandomState(0).randn(60, 300)
-    said = str(EVGPRegressor(n_inducing=5, max_iter=2, tol=1e9).fit(X, X[:, 0]).summary()).splitlines()
+    said = str(EVGPRegressor(n_inducing=5, max_iter=2, solver=LBFGS(tol=1e9)).fit(X, X[:, 0]).summary()).splitlines()
     assert len(said) < 40
     assert sum("more lines: to_frame() has all" in line for line in said) == 2
 

@@ -11,7 +11,7 @@ from sklearn.base import clone
 from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import InertiaForce
 from tests.long.torture import run
 from tests.nasty import BadMap, MapError
@@ -220,7 +220,7 @@ def test_torques_of_any_size_between_are_not(scale):
 def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
     spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
     message = rf"^{spread} must not exceed 1e\+130 in size; "
-    model = kind(PolynomialFeatures(), coef_scale=1e8, max_iter=5)
+    model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)
     with pytest.raises(ValueError, match=message):
         model.fit(1e12 * X, 1e-110 * Y)
     assert np.isfinite(model.fit(1e12 * X, 1e-80 * Y).predict(1e12 * X, return_std=True)).all()
@@ -232,7 +232,7 @@ def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(
     [
         (1e-150, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
         (1e-165, {}, "^What feature_map returns must be 0 or exceed 1e-140 in size; a column's largest value is"),
-        (1e-120, {}, r"^coef_scale='auto', the feature map's or .*, must not exceed 1e\+100 in size"),
+        (1e-120, {}, r'^scale="auto" of CoefPrior, the feature map\'s or .*, must not exceed 1e\+100 in size'),
         (
             1e60,
             EXTREME,
@@ -252,7 +252,7 @@ def test_bumps_so_far_from_all_rows_that_their_squares_vanish_do_no_harm(kind, c
     rows = rng.uniform(0.0, 0.4, (40, 1))
     y = np.sin(9.0 * rows[:, 0]) + 0.05 * rng.randn(40)
     bumps = FunctionTransformer(lambda X: np.exp(-0.5 * ((X - centres) / 0.02) ** 2))
-    assert kind(bumps, coef_scale=coef_scale).fit(rows, y).score(rows, y) > 0.9
+    assert kind(bumps, coef_prior=CoefPrior(scale=coef_scale)).fit(rows, y).score(rows, y) > 0.9
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor, BayesianMLPRegressor])

@@ -21,8 +21,9 @@ import numpy as np
 from sklearn.preprocessing import PolynomialFeatures
 
 from harness import PALETTE, WIDTH, legend, pyplot, save_picture
-from skevgp import EVGPRegressor
+from skevgp import CoefPrior, EVGPRegressor
 from skevgp.datasets import load_robot, make_toy
+from skevgp.solvers import LBFGS
 
 BLUE, ORANGE, GREEN = PALETTE[:3]
 INK, BODY, PALE = "0.2", "0.55", "0.8"
@@ -331,7 +332,11 @@ takes $u_x$, skevgp by default both."""
 def model(path: Path) -> None:
     """The paper's Figures 1 and 2: explicit features and a sparse Gaussian process add up to what is observed."""
     X, y = make_toy(60, random_state=0, return_X_y=True)
-    settings = {"n_inducing": 10, "posterior": "diagonal", "coef_mean": [0.0, 3.0], "coef_scale": [3.0, 1.0]}
+    settings = {
+        "n_inducing": 10,
+        "solver": LBFGS(posterior="diagonal"),
+        "coef_prior": CoefPrior(mean=[0.0, 3.0], scale=[3.0, 1.0]),
+    }
     evgp = EVGPRegressor(PolynomialFeatures(1), random_state=0, **settings).fit(X, y)
     x = np.linspace(-3.0, 9.0, 241)
     H = np.column_stack([np.ones_like(x), x])

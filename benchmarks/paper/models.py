@@ -20,15 +20,16 @@ from sklearn.utils import Bunch
 from threadpoolctl import threadpool_limits
 
 import harness
-from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EVGPRegressor, ResidualRegressor
 from skevgp.datasets import perturb_robot
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, NominalDynamics
 from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error, std_norm
+from skevgp.noise import Gaussian
 from skevgp.robots import layout_of
 from skevgp.solvers import Adam
 
 # What the paper fits: mini-batches, inducing points per output, and the noise where the bound puts it.
-PAPER: dict[str, Any] = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+PAPER: dict[str, Any] = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 SETTINGS = ("paper", "author", "author-100", "skevgp", "skevgp-angles", "skevgp-nominal")
 # Shares of the targets that intervals promise to hold, for a reliability curve.
 PROMISED = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
@@ -110,11 +111,11 @@ def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, A
     length_scale = np.full(n_columns, n_inducing ** (-1.0 / n_columns))
     return {
         **PAPER,
-        "solver": Adam(batch_size=50, learning_rate=0.01, schedule="constant"),
+        "solver": Adam(batch_size=50, learning_rate=0.01, schedule="constant", posterior="diagonal"),
         "kernel": ConstantKernel(0.25) * RBF(length_scale, (1e-5, 1e5)),
-        "noise_variance": 1.0,
+        "noise": Gaussian(variance=1.0),
         "inducing_init": points,
-        **({"coef_scale": AUTHORS_SCALE[fit.setting]} if with_features else {}),
+        **({"coef_prior": CoefPrior(scale=AUTHORS_SCALE[fit.setting])} if with_features else {}),
     }
 
 

@@ -17,18 +17,19 @@ import tempfile
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
 
 import harness
+import internals
 from harness import Row
 from skevgp import EVGPRegressor
-from skevgp.fitting.rules import Rules
 from skevgp.metrics import negative_log_predictive_density
 from skevgp.solvers import LBFGS, Adam
 from speed.scaling import N_INDUCING, make_files
@@ -37,12 +38,6 @@ from speed.scaling import N_INDUCING, make_files
 EPOCHS = {"adam 10": 10, "adam 40": 40, "adam 120": 120}
 FITS = ("default", *EPOCHS, "reference")
 N_TEST, BATCH_SIZE = 10_000, 2000
-
-
-class OnAllRows(LBFGS):
-    """From the first iteration on."""
-
-    rules: ClassVar[Rules] = replace(LBFGS.rules, sample=None)
 
 
 @dataclass(frozen=True)
@@ -76,8 +71,9 @@ def run(cell: Cell) -> dict[str, Any]:
         steps = EPOCHS[cell.fit] * cell.n_rows // BATCH_SIZE
         model.set_params(solver=Adam(batch_size=BATCH_SIZE, natural_gradient=True), max_iter=steps)
     elif cell.fit == "reference":
-        model.set_params(solver=OnAllRows(), max_iter=cell.max_iter, tol=0.0)
-    with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
+        model.set_params(solver=LBFGS(tol=0.0), max_iter=cell.max_iter)
+    begin = internals.rules(sample=None) if cell.fit == "reference" else nullcontext()
+    with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory, begin:
         warnings.simplefilter("always")
         start, cpu_start = time.perf_counter(), time.process_time()
         model.fit(X, y)

@@ -28,8 +28,8 @@ from sklearn.preprocessing import FunctionTransformer
 
 import harness
 from harness import Row
-from skevgp import EVGPRegressor
-from skevgp.solvers import LBFGS
+from internals import watched
+from skevgp import CoefPrior, EVGPRegressor
 
 N_OUTPUTS, N_FEATURES, N_COLUMNS = 6, 40, 3
 SIZES, QUICK_SIZES = ((6000, 40), (6000, 100), (20_000, 100)), ((500, 10),)
@@ -65,31 +65,24 @@ def evaluations(cell: Cell, share_coef: bool) -> Callable[[], None]:
     rng = np.random.RandomState(0)
     X = rng.randn(cell.n_rows, N_OUTPUTS * N_COLUMNS)
     Y = np.sin(X[:, :N_OUTPUTS]) + 0.1 * rng.randn(cell.n_rows, N_OUTPUTS)
-    found = []
-
-    class Caught(LBFGS):
-        def objective(self, task: Any, table: Any, n_rows: int | None = None) -> Any:
-            found.append((task, super().objective(task, table), table.start()))
-            return super().objective(task, table, n_rows)
-
+    found: dict[int, Any] = {}
     model = EVGPRegressor(
         Waves(),
         kernel_map=FunctionTransformer(own_columns),
         n_inducing=cell.m,
-        share_coef=share_coef,
+        coef_prior=CoefPrior(shared=share_coef),
         sharing="none",
         noise_cv=None,
-        solver=Caught(),
         max_iter=1,
         random_state=0,
     )
-    with warnings.catch_warnings():
+    with watched(lambda own, start, fit: found.update({own.rows.columns[0]: own})), warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)
         model.fit(X, Y)
-    last = {task.rows.columns[0]: (objective, start) for task, objective, start in found}
+    each = [(own.objective(own.table), own.table.start()) for own in found.values()]
 
     def evaluate() -> None:
-        for objective, start in last.values():
+        for objective, start in each:
             objective(start)
 
     return evaluate

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import eigh
 
-from ..data.source import Columns
+from ..data.rows import Columns
 from ..kernels.symbolic import cross_and_diagonal
 from ..maps import Map, NoExpressionError
 from ..model.predictor import Predictor, PredictorGroup
@@ -26,7 +26,7 @@ Mapped = Any
 
 
 @dataclass(frozen=True)
-class FittedModel:
+class Exported:
     """What is exported of an estimator.
 
     Attributes
@@ -235,7 +235,7 @@ def with_base(function: Any, columns: np.ndarray) -> Any:
     names_in, names_out = function.name_in(), function.name_out()
     given = [ca.MX.sym(name, function.size_in(i)) for i, name in enumerate(names_in)]
     mean, *others = function.call(given, True, False)
-    outputs = [mean + given[0][np.asarray(columns).tolist()], *others]
+    outputs = [sum((given[0][own.tolist()] for own in columns), start=mean), *others]
     return ca.Function(function.name(), given, outputs, names_in, names_out, INLINED)
 
 

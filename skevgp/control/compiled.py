@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from ..data.source import of_outputs
+from ..data.rows import of_outputs
 from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.shapes import like_y
@@ -15,6 +16,8 @@ from ..utils.validation import check_fitted
 from .derivatives import MappedRows, chained, mapped
 
 _NONE = np.empty((0, 0))
+# What two points may differ by that are the same but for rounding, as a share of the largest.
+_ROUNDING = 1e-9
 
 
 class CompiledPredictor:
@@ -26,10 +29,12 @@ class CompiledPredictor:
     Parameters
     ----------
     predictor : Predictor
+        Frozen, in the user's units.
     feature_map, kernel_map : Map or None
+        Of plain arrays.
     include_noise : bool, default=True
         Whether standard deviations are of y, with the learned noise, or of the noise-free g(x).
-    base : ndarray of shape (n_outputs,), default=None
+    base : ndarray of shape (k, n_outputs), default=None
         Indices of columns that are added to the mean (of a `ResidualRegressor`).
 
     Examples
@@ -70,7 +75,7 @@ class CompiledPredictor:
     ):
         self.include_noise, self.base = include_noise, base
         self._feature_map, self._kernel_map = feature_map, kernel_map
-        self._state = self._made_ready(predictor)
+        self._freeze(predictor)
 
     def update(self, model: Any) -> None:
         """Take on the weights of a model that has seen further rows, by ``partial_fit``.
@@ -90,15 +95,15 @@ class CompiledPredictor:
             If it is of none.
         """
         check_fitted(model)
-        predictor = getattr(model, "regressor_", model)._predictor
+        predictor = model._posterior.predictor
         if not _goes_on(self._state[0], predictor):
-            raise ValueError("update takes on the weights of the same fit; compile a model that was fitted anew.")
-        self._state = self._made_ready(predictor)
+            raise ValueError("update takes on the weights of the same fit; compile a model that was fitted again.")
+        self._freeze(predictor)
 
-    def _made_ready(self, predictor: Predictor) -> _State:
+    def _freeze(self, predictor: Predictor) -> None:
         noise = predictor.noise if self.include_noise else np.zeros_like(predictor.noise)
         groups = tuple(_Group.of(group, predictor.offset[group.outputs]) for group in predictor.groups)
-        return predictor, groups, noise
+        self._state = (predictor, groups, noise)
 
     def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
         """Predict y.
@@ -150,7 +155,8 @@ class CompiledPredictor:
         slopes = [group.slopes(each, behind) for group, each in zip(groups, found, strict=True)]
         jacobian = predictor.in_order([by for by, _ in slopes])
         if self.base is not None:
-            jacobian[np.arange(len(jacobian)), :, self.base] += 1.0
+            for columns in self.base:
+                jacobian[np.arange(len(jacobian)), :, columns] += 1.0
         mean, jacobian = _shaped(X, mean, jacobian)
         if not return_std:
             return mean, jacobian
@@ -165,20 +171,35 @@ class CompiledPredictor:
         found = [group.moments(inputs, features, return_std) for group in groups]
         mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
         if self.base is not None:
-            mean += rows[:, self.base]
+            mean += rows[:, self.base].sum(axis=1)
         if not return_std:
             return found, mean, None
         return found, mean, np.sqrt(predictor.in_order([each.variance for each in found]).T + noise)
 
 
 def _goes_on(before: Predictor, predictor: Predictor) -> bool:
-    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell."""
+    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell.
+
+    The points of an exact fit are its rows. Its first update leaves some of them out, and those that are left are the
+    same but for rounding.
+    """
     if before.offset.shape != predictor.offset.shape:
         return False
     return all(
-        np.array_equal(old.points, new.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
+        _are_among(new.points, old.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
         for old, new in zip(before.by_output, predictor.by_output, strict=True)
     )
+
+
+def _are_among(points: np.ndarray, others: np.ndarray) -> bool:
+    """Whether each of some points (n, d) is one of the others, but for rounding."""
+    if points.shape == others.shape and np.array_equal(points, others):
+        return True
+    if points.shape[1] != others.shape[1]:
+        return False
+    size = np.maximum(np.abs(others).max(axis=0), np.finfo(float).tiny)
+    distance, _ = cKDTree(others / size).query(points / size)
+    return bool((distance <= _ROUNDING).all())
 
 
 class _Moments(NamedTuple):

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..data.source import of_outputs
+from ..data.rows import of_outputs
 from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
 

@@ -7,14 +7,13 @@ along a path that it makes itself, one row after the other.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from copy import copy
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from operator import index as as_index
 from typing import Any
 
 import numpy as np
 
-from ..data.source import of_outputs, times_weights
+from ..data.rows import of_outputs, times_weights
 from ..kernels.waves import RandomFunctions, random_functions
 from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup, Projected
@@ -35,7 +34,7 @@ class Functions:
     ----------
     predictor : Predictor
     feature_map, kernel_map : Map or None
-    base : ndarray of shape (o,), optional
+    base : ndarray of shape (k, o), optional
         The columns of X that are added to the outputs.
     """
 
@@ -72,7 +71,7 @@ class Functions:
 
         def step(X: np.ndarray) -> np.ndarray:
             values = paths.step(*self.mapped(X))
-            return values if self.base is None else values + X[:, self.base]
+            return values if self.base is None else values + X[:, self.base].sum(axis=1)
 
         return step
 
@@ -122,12 +121,6 @@ class FunctionSamples(Sequence["SampledFunction"]):
         common = common_normals(predictor, n, rng)
         self._groups = [_Waves.drawn(group, predictor, n, n_waves, common, rng) for group in predictor.groups]
         self._n = n
-
-    def with_base(self, base: np.ndarray) -> FunctionSamples:
-        """The same functions, to which columns of X are added, by index (o,)."""
-        found = copy(self)
-        found._posterior = replace(self._posterior, base=base)
-        return found
 
     def __len__(self) -> int:
         return self._n
@@ -190,7 +183,8 @@ class FunctionSamples(Sequence["SampledFunction"]):
             )
             found = self._posterior.predictor.in_order([own.slopes(behind, which) for own in self._groups])
             if self._posterior.base is not None:
-                found[np.arange(len(found)), :, :, self._posterior.base] += 1.0
+                for columns in self._posterior.base:
+                    found[np.arange(len(found)), :, :, columns] += 1.0
             jacobians.append(found.transpose(1, 2, 0, 3))
         found = np.concatenate(jacobians, axis=1)
         found = found[:, :, 0] if found.shape[2] == 1 else found
@@ -205,7 +199,7 @@ class FunctionSamples(Sequence["SampledFunction"]):
         """Of the groups' values (o, k, n) those of all outputs, (k, n, o), with what is added."""
         predictor = self._posterior.predictor
         values = predictor.in_order(parts).transpose(1, 2, 0) + predictor.intercept
-        return values if self._posterior.base is None else values + rows[:, self._posterior.base]
+        return values if self._posterior.base is None else values + rows[:, self._posterior.base].sum(axis=1)
 
     @staticmethod
     def _shaped(X: np.ndarray, values: np.ndarray) -> np.ndarray:

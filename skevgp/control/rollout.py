@@ -183,8 +183,9 @@ class _OneStep:
     def __init__(self, regressor: Any, n_states: int, noisy: bool):
         self.regressor, self.n_states, self.noisy = regressor, n_states, noisy
         # The posterior as functions to be drawn, or None.
-        self.functions = regressor._functions() if hasattr(regressor, "_functions") else None
-        self._package = package_of(getattr(getattr(regressor, "regressor_", regressor), "_example", None))
+        posterior = getattr(regressor, "_posterior", None)
+        self.functions = None if posterior is None else posterior.functions()
+        self._package = package_of(None if posterior is None else posterior.maps.example)
         parameters = signature(regressor.predict).parameters
         anything = any(each.kind == each.VAR_KEYWORD for each in parameters.values())
         if "return_std" not in parameters and not anything:

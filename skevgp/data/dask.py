@@ -5,33 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
 from sklearn.utils import check_array
 
 from ..utils.optional import require
-from ..utils.validation import as_floats, check_magnitude
+from ..utils.validation import as_floats, check_magnitude, is_dask
 from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
-from .chosen import Chosen
-from .mapped import MappedRows, RowShapes
-from .maps import EXAMPLE_ROWS, fit_map, fresh_map, spread
-from .source import LocalSource, RawRows
+from .maps import EXAMPLE_ROWS, MappedRows, RowShapes, fit_map, fresh_map, spread
+from .rows import LocalSource, RawRows, made
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
+from .weights import Chosen, check_variances, check_weights
 
 # Sums of so many partitions are added up on a worker at a time.
 _SUMMED_AT_ONCE = 8
 # A map without partial_fit is fitted to so many rows, evenly spread.
 _MAP_SAMPLE = 10_000
-
-# Takes the lowest and the highest of some numbers, and raises an error if they will not do.
-Range = Callable[[float, float], None]
-
-
-def is_dask(values: Any) -> bool:
-    """Whether it is a Dask collection; does not import Dask."""
-    return hasattr(values, "__dask_graph__")
 
 
 def _dask() -> Any:
@@ -109,11 +100,11 @@ class RowWeights:
     kept: np.ndarray | None = None
 
     @classmethod
-    def of(cls, X: Any, counts: Any, variance: Any, check_counts: Range, check_variance: Range) -> RowWeights:
+    def of(cls, X: Any, counts: Any, variance: Any) -> RowWeights:
         """From arrays (n,), Dask arrays or None; checked by their lowest and highest entries."""
         counts, variance = _chunks_like(X, counts, "sample_weight"), _chunks_like(X, variance, "relative_variance")
         kept = None
-        for chunks, check in ((counts, check_counts), (variance, check_variance)):
+        for chunks, check in ((counts, check_weights), (variance, check_variances)):
             if chunks is not None:
                 lowest, highest, positive = zip(*_dask().compute(*map(_dask().delayed(_range), chunks)), strict=True)
                 check(float(np.min(lowest)), float(np.max(highest)))
@@ -321,7 +312,7 @@ def _some(partition: LocalSource, rows: np.ndarray) -> LocalSource:
 
 
 def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:
-    return LocalBlocks(partition.through(make), partition.n_rows, n_inducing, keep=False)
+    return LocalBlocks(partial(made, partition.take, make), partition.n_rows, n_inducing, keep=False)
 
 
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:

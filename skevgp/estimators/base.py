@@ -1,86 +1,75 @@
-"""What the sparse and the exact model share: prediction, samples, what is known of weights, noise and kernel."""
+"""What the sparse and the exact model share: prediction, samples, and the attributes that a fit sets."""
 
 from __future__ import annotations
 
-from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Protocol, Self
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
-from sklearn.base import MultiOutputMixin, RegressorMixin
+from sklearn.base import MultiOutputMixin, RegressorMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.utils import check_random_state
+from sklearn.gaussian_process.kernels import Kernel
 
-from ..data.dask import as_rows, is_dask, predict_chunks
+from ..control.posterior import Posterior, Rows, delegate
+from ..data.dask import as_rows, predict_chunks
+from ..data.dataset import Dataset, checked_numbers, checked_rows
 from ..exceptions import warn_user
-from ..fitting.coef_prior import coef_names
-from ..fitting.units import Units
-from ..model.predictor import Predictor
-from ..utils.shapes import like_y
-from ..utils.sklearn import Interval, StrOptions
-from ..utils.validation import check_fitted, check_integer, is_plain
-from .control import ForControl
-from .exportable import Exportable
-from .summary import ModelSummary, Summarised, of_gaussian_process
+from ..fitting.exact import ExactFit
+from ..fitting.fit import Fitted
+from ..fitting.prior import CoefPrior, coef_names
+from ..fitting.problem import Problem
+from ..kernels.parse import KernelSpec
+from ..noise import Gaussian, StudentT
+from ..solvers import as_solver
+from ..utils.state import StatefulEstimator
+from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
+from .summary import ModelSummary, html_of, of_gaussian_process
+
+# Attributes that there are only if there are weights.
+_OF_WEIGHTS = ("coef_", "coef_std_", "coef_cov_", "coef_names_", "coef_prior_mean_", "coef_prior_scale_")
+# Attributes that are found when somebody asks.
+_AFTER_FIT = ("lower_bound_", "upper_bound_")
+# Arguments of version 0.1, and where they are now.
+_MOVED = {
+    "coef_mean": "coef_prior=skevgp.CoefPrior(mean=...)",
+    "coef_scale": "coef_prior=skevgp.CoefPrior(scale=...)",
+    "coef_cov": "coef_prior=skevgp.CoefPrior(cov=...)",
+    "share_coef": "coef_prior=skevgp.CoefPrior(shared=...)",
+    "noise_variance": "noise=skevgp.noise.Gaussian(variance=...)",
+    "input_noise": "noise=skevgp.noise.Gaussian(inputs=...)",
+    "posterior": "solver=skevgp.solvers.LBFGS(posterior=...), or Adam(posterior=...)",
+    "tol": "solver=skevgp.solvers.LBFGS(tol=...), or Adam(tol=...)",
+    "max_time": "solver=skevgp.solvers.LBFGS(max_time=...), or Adam(max_time=...)",
+    "max_inducing": "solver=skevgp.solvers.LBFGS(max_inducing=...)",
+    "forgetting_factor": "partial_fit(X, y, forgetting_factor=...)",
+}
 
 
-class Fitted(Protocol):
-    """What `ExplicitGaussianProcess` needs of a fit."""
-
-    @property
-    def units(self) -> Units:
-        """The units and the prior."""
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """What the user should know of how the fit ended."""
-
-    def predictor(self) -> Predictor:
-        """Of all outputs, in the user's units."""
-
-    def limits(self, name: str, output: int) -> np.ndarray:
-        """Limits (n, 2) of an output's ``hyperparameters`` or ``signal``, in the user's units."""
+def refuse_moved(estimator: Any, given: dict[str, Any]) -> None:
+    """Refuse arguments that an estimator does not have, and say where those of version 0.1 are now."""
+    for name in given:
+        kind = type(estimator).__name__
+        if name in _MOVED:
+            raise TypeError(f"{kind} has no argument {name!r} since version 0.2: use {_MOVED[name]}.")
+        raise TypeError(f"{kind}.__init__() got an unexpected keyword argument {name!r}")
 
 
-class _OfWeights:
-    """An attribute that a fit sets if there are weights, and an AttributeError that says so if there are none."""
+class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
+    """A Gaussian process with explicit features: a shell around the `Posterior` that a fit leaves."""
 
-    def __set_name__(self, owner: type, name: str) -> None:
-        self._name = name
+    feature_map: TransformerMixin | None
+    kernel: Kernel | Callable[..., Any] | None
+    kernel_map: TransformerMixin | None
+    coef_prior: CoefPrior | Literal["auto"]
+    noise: Literal["gaussian", "student-t"] | Gaussian | StudentT
+    normalize_y: bool
+    max_iter: Any
+    solver: Any
 
-    def __get__(self, model: Any, owner: type) -> Any:
-        # Python looks into the instance first.
-        if model is None:
-            return self
-        raise AttributeError(
-            f"{owner.__name__} has {self._name} only after a fit with a feature_map: without one there are no weights."
-        )
-
-
-class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Exportable, ForControl):
-    """A Gaussian process with explicit features, however it is fitted."""
-
-    _parameter_constraints: ClassVar[dict[str, Any]] = {
-        "feature_map": "no_validation",
-        "kernel": "no_validation",
-        "kernel_map": "no_validation",
-        "coef_mean": ["array-like", Real, StrOptions({"auto"})],
-        "coef_scale": ["array-like", Real, StrOptions({"auto"})],
-        "coef_cov": ["array-like", None],
-        "share_coef": ["boolean", StrOptions({"auto"})],
-        "noise_variance": [Interval(Real, 0, None, closed="neither"), None],
-        "normalize_y": ["boolean"],
-        "max_iter": [Interval(Integral, 0, None, closed="left")],
-        "max_time": [Interval(Real, 0, None, closed="neither"), None],
-        "tol": [Interval(Real, 0, None, closed="left")],
-        "random_state": ["random_state"],
-        "verbose": ["verbose"],
-    }
-
-    coef_, coef_std_, coef_cov_, coef_prior_mean_, coef_prior_scale_, coef_names_ = (_OfWeights() for _ in range(6))
-
-    _fitted: Fitted
-    _predictor: Predictor
+    _posterior: Posterior
+    _fitted: Fitted | ExactFit
 
     def predict(
         self,
@@ -94,30 +83,31 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            For a Dask array the results are lazy Dask arrays of the same chunks.
+            For a Dask array, the results are lazy Dask arrays of the same chunks.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool or "joint", default=False
-            Whether to return the covariance between rows too, of each output; ``"joint"`` also between outputs, which
-            depend on each other if they share their weights.
+            Whether to return the covariance between rows too, for each output. ``"joint"`` also returns that between
+            outputs, which depend on each other if they share their weights.
         include_noise : bool, default=True
-            Whether they are of y, with the learned noise, or of the noise-free g(x).
+            Whether standard deviation and covariance include the learned noise of y, or are those of the noise-free
+            g(x).
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            Of y and of g(x) alike.
+            Posterior mean.
         std : ndarray of the same shape
-            If ``return_std``.
+            Standard deviation. Only if ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            If ``return_cov``. If that is ``"joint"``, of shape (n_samples * n_outputs, n_samples * n_outputs), in the
-            order of ``mean.ravel()``.
+            Covariance. Only if ``return_cov``. For ``"joint"``, of shape (n_samples * n_outputs, n_samples *
+            n_outputs), in the order of ``mean.ravel()``.
 
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, both std and covariance are asked for, or the covariance
-            of the rows of a Dask array.
+            If X does not fit the training data or is not finite, if both standard deviation and covariance are asked
+            for, or if the covariance of the rows of a Dask array is.
 
         Notes
         -----
@@ -128,36 +118,16 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        if not hasattr(self, "_predictor"):
+        if not self.__sklearn_is_fitted__():
             return self._before_fit(X).predict(X, return_std, return_cov, include_noise)
         if is_dask(X):
             if return_cov:
                 raise ValueError("return_cov needs all rows at once: not for Dask arrays. Give it X.compute().")
             X = as_rows(X, "X", known=False)
-            self._validated(X)
-            shape = () if self._single_output else (self._n_outputs,)
+            checked_rows(self, X)
+            shape = () if self._n_outputs == 1 else (self._n_outputs,)
             return predict_chunks(self, X, return_std, include_noise, shape)
-        given: Any = X
-        array: Any = X
-        if not is_plain(self, X):
-            given, array, _ = self._validated(X)
-        noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
-        if return_cov is not False:
-            rows = self._inputs_and_features(given, array, slice(None))
-            mean, cov = self._predictor.covariance(*rows, noise)
-            if return_cov == "joint":
-                return like_y(mean), self._predictor.jointly(cov, *rows)
-            return like_y(mean), like_y(cov)
-        means, deviations = [], []
-        size = self._predictor.rows_at_once
-        for first in range(0, len(array), size):
-            rows = self._inputs_and_features(given, array, slice(first, first + size))
-            mean, variance = self._predictor.predict(*rows, return_std)
-            means.append(mean)
-            if variance is not None:
-                deviations.append(np.sqrt(variance + noise))
-        mean = like_y(np.concatenate(means))
-        return (mean, like_y(np.concatenate(deviations))) if return_std else mean
+        return self._posterior.predict(self._checked(X), return_std, return_cov, include_noise)
 
     def sample_y(
         self,
@@ -171,11 +141,11 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
-            Where the functions are evaluated.
+            Rows at which the functions are evaluated.
         n_samples : int, default=1
-            How many functions.
+            Number of functions.
         random_state : int, RandomState instance or None, default=0
-            Draws them: an integer gives the same at each call.
+            Source of chance. An integer gives the same functions at each call.
         include_noise : bool, default=True
             Whether samples are of y, with the learned noise, or of the noise-free g(x).
 
@@ -191,95 +161,149 @@ class ExplicitGaussianProcess(MultiOutputMixin, RegressorMixin, Summarised, Expo
             integer.
         """
         check_integer(n_samples, "n_samples", minimum=1)
-        if is_dask(X):
-            raise ValueError("sample_y needs all rows at once: not for Dask arrays. Give it X.compute().")
-        if not hasattr(self, "_predictor"):
+        if not is_dask(X) and not self.__sklearn_is_fitted__():
             return self._before_fit(X).sample_y(X, n_samples, random_state, include_noise)
-        given, array, _ = self._validated(X)
-        rows = self._inputs_and_features(given, array, slice(None))
-        noise = self._predictor.noise if include_noise else np.zeros_like(self._predictor.noise)
-        samples = self._predictor.sample(*rows, noise, n_samples, check_random_state(random_state))
-        return samples[:, 0] if samples.shape[1] == 1 else samples
+        return self._posterior.sample_y(self._checked(X, "sample_y"), n_samples, random_state, include_noise)
 
-    def _check_gradient_of(self, theta: ArrayLike | None, eval_gradient: bool) -> None:
+    value_and_jacobian = delegate("value_and_jacobian")
+    jacobian = delegate("jacobian")
+    predict_gradient = delegate("predict_gradient")
+    novelty = delegate("novelty")
+    compile = delegate("compile")
+    sample_functions = delegate("sample_functions")
+    to_casadi = delegate("to_casadi")
+    to_casadi_parameters = delegate("to_casadi_parameters")
+    to_c = delegate("to_c")
+
+    def summary(self) -> ModelSummary:
+        """Summarise what was learned: kernel, noise, bounds on the likelihood, and weights next to their prior.
+
+        Returns
+        -------
+        summary : ModelSummary
+            It prints as text, shows as tables in notebooks, and has ``to_frame()``.
+        """
         check_fitted(self)
-        if theta is None and eval_gradient:
-            raise ValueError("Gradient can only be evaluated for theta!=None: give theta=kernel_.theta.")
+        return of_gaussian_process(self)
 
-    def _numbers_of_kernels(self) -> list[np.ndarray]:
-        """Of each output k̃'s hyperparameters and s², as fitted, in the user's units."""
-        signal = self._predictor.signal
-        return [np.append(group.hyperparameters, signal[o]) for o, group in enumerate(self._predictor.by_output)]
+    @property
+    def _repr_html_(self) -> Callable[[], str]:
+        # scikit-learn has it only if its option ``display`` is "diagram".
+        diagram: Callable[[], str] = super()._repr_html_
+        return lambda: diagram() + html_of(self)
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+        bundle: dict[str, str] = super()._repr_mimebundle_(**kwargs)
+        if "text/html" in bundle:
+            bundle["text/html"] += html_of(self)
+        return bundle
+
+    def set_params(self, **params: Any) -> Self:
+        """Set parameters; by ``solver__...`` a solver that is a string becomes the solver that it names.
+
+        Parameters
+        ----------
+        **params : dict
+            Parameters of the estimator, and of what it is made of.
+
+        Returns
+        -------
+        self : object
+            The estimator itself.
+        """
+        if isinstance(getattr(self, "solver", None), str) and any(name.startswith("solver__") for name in params):
+            self.solver = as_solver(self.solver)
+        return super().set_params(**params)
+
+    def __sklearn_is_fitted__(self) -> bool:
+        return hasattr(self, "_posterior")
+
+    def __getattr__(self, name: str) -> Any:
+        kind = type(self).__name__
+        if name in _OF_WEIGHTS:
+            raise AttributeError(
+                f"{kind} has {name} only after a fit with a feature_map: without one there are no weights."
+            )
+        if name in _AFTER_FIT and not self.__sklearn_is_fitted__():
+            raise AttributeError(f"{kind} has {name} only after fit.")
+        raise AttributeError(f"{kind!r} object has no attribute {name!r}")
+
+    # --- what fits and predictions begin and end with -----------------------------------------------------------------
 
     def _before_fit(self, X: Any) -> Self:
-        """What predicts as long as there was no fit: nothing, but for a model with a prior of its own."""
+        """What predicts as long as there was no fit: nothing, except a model with a prior of its own."""
         check_fitted(self)
         raise AssertionError
 
-    def __sklearn_is_fitted__(self) -> bool:
-        return hasattr(self, "_predictor")
+    def _checked(self, X: Any, asked: str = "predict") -> Rows:
+        """X for a prediction: as the maps see it, and as the kernel sees it without a map."""
+        if is_plain(self, X):
+            return Rows(X, X)
+        if is_dask(X):
+            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+        return Rows(*checked_rows(self, X)[:2])
 
-    def _described(self) -> ModelSummary:
-        return of_gaussian_process(self)
-
-    def _set_posterior(self) -> None:
-        """What is known of weights, if there are any, and noise."""
-        self._predictor = self._fitted.predictor()
-        if self.feature_map_ is not None:
-            mean, covariance = self._predictor.coefficients()
-            first = self._of_weights
-            self.coef_, self.coef_cov_ = mean[first], covariance[first]
-            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
-        self.noise_variance_ = float(self._predictor.noise[0]) if self._single_output else self._predictor.noise.copy()
-
-    @property
-    def _of_weights(self) -> int | slice:
-        """Which rows of arrays (n_outputs, ...) of weights attributes hold."""
-        return 0 if self._single_output or self._predictor.shared else slice(None)
-
-    def _set_common_attributes(self) -> None:
-        """The same, and what stays as it is when there are more rows: the prior of weights, and the kernel."""
-        for name, attribute in vars(ExplicitGaussianProcess).items():
-            if isinstance(attribute, _OfWeights):
-                self.__dict__.pop(name, None)
-        self._set_posterior()
-        fitted, prior = self._fitted, self._fitted.units.prior
-        if self.feature_map_ is not None:
-            columns, first = getattr(self, "feature_names_in_", None), self._of_weights
-            self.coef_names_ = coef_names(self.feature_map_, columns, self.coef_.shape[-1])
-            self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
-        kernels = [
-            self._spec.to_sklearn(
-                group.hyperparameters,
-                fitted.limits("hyperparameters", o),
-                float(self._predictor.signal[o]),
-                fitted.limits("signal", o),
-            )
-            for o, group in enumerate(self._predictor.by_output)
-        ]
-        self.kernel_ = kernels[0] if self._single_output else kernels
-
-    def _warn_of(self, messages: tuple[str, ...]) -> None:
-        """Tell the user of ``fit`` how it ended."""
-        for message in (*messages, *(self._at_bounds() if self.max_iter != 0 else ())):
-            warn_user(message, ConvergenceWarning)
-
-    def _at_bounds(self) -> list[str]:
-        """Which parameters of the user's kernel ended at its bounds; what outputs share, once."""
-        signal, noise = self._predictor.signal, self._predictor.noise
-        return list(
-            dict.fromkeys(
-                message
-                for o, group in enumerate(self._predictor.by_output)
-                for message in self._spec.at_bounds(group.hyperparameters, float(signal[o]), float(noise[o]))
-            )
-        )
+    def _checked_numbers(self, X: Any, asked: str) -> np.ndarray:
+        """X as numbers, in which derivatives are."""
+        if is_plain(self, X):
+            return X
+        if is_dask(X):
+            raise ValueError(f"{asked} needs rows in memory: not for Dask arrays. Give it X.compute().")
+        return checked_numbers(self, X)[0]
 
     @property
     def _n_outputs(self) -> int:
-        return len(self._predictor.noise)
+        # A y of one column is one output without an axis, as in scikit-learn's GPR.
+        return len(self._posterior.predictor.noise)
 
-    @property
-    def _single_output(self) -> bool:
-        """Whether nothing has an axis of outputs: for a y of one column too, as in scikit-learn's GPR."""
-        return self._n_outputs == 1
+    def _set_posterior(self, data: Dataset, problem: Problem, spec: KernelSpec, fitted: Fitted | ExactFit) -> None:
+        """Keep a fit: its posterior, and the attributes that describe it."""
+        for name in _OF_WEIGHTS:
+            self.__dict__.pop(name, None)
+        maps = replace(data.maps, shapes=problem.shapes)
+        self.feature_map_, self.kernel_map_, self._fitted = maps.feature_map, maps.kernel_map, fitted
+        self._posterior = Posterior(fitted.predictor(), maps)
+        self._set_weights_and_noise()
+        predictor, prior = self._posterior.predictor, fitted.units.prior
+        if self.feature_map_ is not None:
+            first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
+            self.coef_names_ = coef_names(self.feature_map_, maps.columns, self.coef_.shape[-1])
+            self.coef_prior_mean_, self.coef_prior_scale_ = prior.mean[first].copy(), prior.scale[first].copy()
+        kernels = [
+            spec.to_sklearn(
+                group.hyperparameters,
+                fitted.limits("hyperparameters", o),
+                float(predictor.signal[o]),
+                fitted.limits("signal", o),
+            )
+            for o, group in enumerate(predictor.by_output)
+        ]
+        self.kernel_ = kernels[0] if self._n_outputs == 1 else kernels
+
+    def _set_weights_and_noise(self) -> None:
+        """The attributes that new rows change."""
+        predictor = self._posterior.predictor
+        if self.feature_map_ is not None:
+            mean, covariance = predictor.coefficients()
+            first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
+            self.coef_, self.coef_cov_ = mean[first], covariance[first]
+            self.coef_std_ = np.sqrt(np.diagonal(self.coef_cov_, axis1=-2, axis2=-1))
+        self.noise_variance_: Any = float(predictor.noise[0]) if self._n_outputs == 1 else predictor.noise.copy()
+
+    def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
+        """Tell the user how the fit ended, and which parameters of the given kernel ended at their bounds."""
+        predictor = self._posterior.predictor
+        at_bounds = (
+            []
+            if self.max_iter == 0
+            else [
+                message
+                for o, group in enumerate(predictor.by_output)
+                for message in spec.at_bounds(
+                    group.hyperparameters, float(predictor.signal[o]), float(predictor.noise[o])
+                )
+            ]
+        )
+        # What outputs share is said once.
+        for message in (*messages, *dict.fromkeys(at_bounds)):
+            warn_user(message, ConvergenceWarning)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from numbers import Integral, Real
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -13,15 +15,16 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from ..data.chosen import Chosen, rows_of
-from ..data.row_weights import chosen_rows
 from ..data.threads import single_threaded_libraries
+from ..data.weights import Chosen, chosen_rows, rows_of
 from ..exceptions import warn_user
-from ..utils.monitor import monitor_of
+from ..solvers.adam import adam, is_flat
+from ..utils.monitor import Monitor, monitor_of
 from ..utils.shapes import like_y
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.state import StatefulEstimator
 from ..utils.validation import (
+    LARGEST,
     as_floats,
     check_integer,
     check_magnitude,
@@ -30,79 +33,99 @@ from ..utils.validation import (
     unchanged_if_it_fails,
     validate_numbers,
 )
-from .bnn_model import VariationalNetwork
-from .bnn_training import Scaling, train
 
-# Without max_iter: so many epochs, or more if they make fewer steps than this.
+# If max_iter is None: this many epochs, or more if they make fewer steps than this.
 _EPOCHS, _STEPS = 100, 5000
-_BATCH_SIZE = 200  # "auto"
-# Numbers held at once for each layer of a prediction.
+# Rows per step if batch_size is "auto".
+_BATCH_SIZE = 200
+# Numbers that a layer of a prediction holds at once.
 _NUMBERS_AT_ONCE = 2**21
+# A column is constant if its entries differ by no more than this many rounding errors.
+_ROUNDING = 8.0 * np.finfo(float).eps
+# Added to the variance of a pre-activation: a row of zeros has none, and its square root needs a slope there.
+_TINY = 1e-32
+# Bounds of the standard deviations, in units of the prior's, and of the noise variances of standardised targets.
+_STD, _NOISE_VARIANCE = (1e-9, 1e3), (1e-12, 1e6)
+# Standard deviations start at this share of the prior's. Those of weights that the data do not determine grow later.
+_FIRST_STD = 0.01
+# Messages of warnings.
+_INTERRUPTED = "The fit was interrupted in epoch {}; the best parameters so far are kept."
+_NOT_FINITE = "The loss did not stay finite; the best parameters so far are kept. Lower learning_rate_init."
+_STILL_FELL = (
+    "The loss still fell when max_iter={max_iter} epochs were used up. Raise max_iter, or stop earlier on purpose with "
+    "a larger tol (now {tol})."
+)
 
 
 class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
-    r"""Neural network with normal variational weights (a deep Bayesian neural network, the paper's DBNN).
+    r"""Neural network with uncertain weights: a deep Bayesian neural network, the DBNN of the paper.
 
-    Layers of LeakyReLU units; each weight is normal, :math:`q(w) = N(\mu, s^2)`, independent of the others, its prior
-    is :math:`N(0, \text{prior\_scale}^2)`, and biases are numbers. Each output has a learned noise variance. Adam
-    minimises minus the evidence lower bound on mini-batches, through pre-activations drawn row by row (the local
-    reparameterisation trick of Kingma et al. 2015). Inputs and targets are standardised inside.
+    The hidden layers are LeakyReLU units. Each weight has a normal variational distribution :math:`q(w) = N(\mu, s^2)`,
+    independent of the other weights, and the prior :math:`N(0, \text{prior\_scale}^2)`. Biases are numbers. The noise
+    variance of each output is learned. Adam maximises the evidence lower bound on mini-batches. It draws
+    pre-activations row by row instead of weights, the local reparameterisation trick of Kingma et al. (2015). Inputs
+    and targets are standardised internally.
 
     Parameters
     ----------
     hidden_layer_sizes : array-like of int or int, default=(50, 50)
-        Units of each hidden layer. ``()`` is Bayesian linear regression by variational inference.
+        Number of units of each hidden layer. ``()`` is Bayesian linear regression by variational inference.
     negative_slope : float, default=0.01
-        Of LeakyReLU, in [0, 1].
+        Slope of LeakyReLU for negative inputs, in [0, 1].
     prior_scale : float or array-like of shape (n_layers,), default=None
-        Prior standard deviation of the weights of all layers or of each, for standardised inputs and targets. None is
-        1 / sqrt(fan in): what a layer passes on is then of the size of what it receives, whatever its width.
+        Prior standard deviation of the weights of all layers, or of each layer, for standardised inputs and targets.
+        If None, it is 1 / sqrt(fan in): the outputs of a layer then are of the size of its inputs, whatever its width.
     batch_size : int or "auto", default="auto"
-        Rows per step; ``"auto"`` is 200. No more than there are rows.
+        Number of rows per step. ``"auto"`` is 200, or all rows if there are fewer.
     learning_rate_init : float, default=0.01
-        Adam's first step size; it falls to zero along half a cosine: over ``max_iter`` epochs, or over the last steps.
+        First step size of Adam. It falls to zero along half a cosine: over ``max_iter`` epochs, or over the last steps.
     max_iter : int, default=None
-        The most epochs (passes over the rows). None is 100, or more where that makes fewer than 5000 steps.
+        Largest number of epochs, which are passes over the rows. If None, it is 100, or more where 100 epochs are fewer
+        than 5000 steps.
     tol : float, default=0.01
-        In nats per row. Adam goes over to its last steps, as many as before, when the loss stays flat: when its median
-        over the last third of the steps differs from that over the third before by less than this, or by no more than
-        chance. With ``early_stopping``, also the least gain that counts.
+        Tolerance of the loss, in nats per row. When the loss stays flat, Adam begins its last steps, which are as many
+        as the steps before. The loss is flat if its medians over the last third of the steps and over the third before
+        differ by less than ``tol``, or by no more than chance. With ``early_stopping``, ``tol`` also is the least gain
+        that counts.
     early_stopping : bool, default=False
-        Whether to hold rows back and to keep the parameters that explain those best.
+        Whether to hold out rows and to keep the parameters that predict those best.
     validation_fraction : float, default=0.1
-        Share of the rows held back, in (0, 1). Only with ``early_stopping``.
+        Share of the rows that is held out, in (0, 1). Only with ``early_stopping``.
     n_iter_no_change : int, default=10
-        Epochs in a row without a gain on the rows held back that end the fit. Only with ``early_stopping``.
+        Number of successive epochs without a gain on the held-out rows after which the fit ends. Only with
+        ``early_stopping``.
     n_samples : int, default=100
-        Draws of the weights behind predictions, made once at the end of `fit`. They take 8 bytes per weight each.
+        Number of draws of the weights for predictions. They are drawn once, at the end of `fit`, and each takes 8 bytes
+        per weight.
     warm_start : bool, default=False
-        Whether to start from the last fit's parameters, where shapes agree.
+        Whether to start from the parameters of the last fit, if it had the same layers.
     random_state : int, RandomState instance or None, default=None
-        Draws first weights, mini-batches, pre-activations, rows held back and the weights behind predictions.
+        Draws the first weights, mini-batches, pre-activations, held-out rows and the weights for predictions.
     verbose : int, default=0
-        As of `EVGPRegressor`: iterations are steps, and the bound is that per row.
+        Progress messages, as in `EVGPRegressor`. An iteration is a step, and the bound is per row.
 
     Attributes
     ----------
     coefs_, coefs_std_ : list of ndarray of shape (fan_in, fan_out)
-        Means and standard deviations of each layer's weights, in the units of ``X - X_mean_`` and y.
+        Means and standard deviations of the weights of each layer, in the units of ``X - X_mean_`` and y.
     intercepts_ : list of ndarray of shape (fan_out,)
         Biases of each layer.
     X_mean_ : ndarray of shape (n_features,)
-        What is subtracted from the inputs.
+        Means of the inputs, which are subtracted.
     noise_variance_ : float or ndarray of shape (n_outputs,)
-        σ², in squared units of y.
+        Noise variance of each output, in squared units of y.
     loss_curve_ : ndarray of shape (n_iter,)
         Minus the evidence lower bound per row, in nats: its mean over the mini-batches of each epoch.
     validation_scores_ : ndarray of shape (n_iter,) or None
-        Expected log likelihood per row held back, in nats, after each epoch; None without ``early_stopping``.
+        Expected log likelihood per held-out row, in nats, after each epoch. None without ``early_stopping``.
     n_iter_ : int
-        Epochs, the last one perhaps in part.
+        Number of epochs. The last one may be incomplete.
     n_parameters_ : int
-        Two per weight, one per bias, and each output's noise.
+        Number of parameters: two for each weight, one for each bias and one for the noise of each output.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it had any.
 
     See Also
     --------
@@ -110,8 +133,8 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     Notes
     -----
-    Weights are independent, a mean field: far from the data, predicted standard deviations are too small. Weights that
-    the data do not need return to their prior; with few rows and much noise that may be all of them.
+    The weights are independent (mean field). Therefore, predicted standard deviations are too small far from the data.
+    Weights that the data do not need return to their prior. With few rows and much noise, all of them may.
 
     References
     ----------
@@ -132,6 +155,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     _network: VariationalNetwork
     _scaling: Scaling
     _theta: np.ndarray
+    _weights: list[np.ndarray]
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         "hidden_layer_sizes": ["array-like", Interval(Integral, 1, None, closed="left")],
@@ -190,11 +214,11 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+            Inputs, up to 1e100 in size. The largest of a column must be 0 or above 1e-140.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            The same of y.
+            Targets, with the same limits.
         sample_weight : array-like of shape (n_samples,), default=None
-            What each row's log likelihood is multiplied by: 0 removes the row, 2 is the row twice.
+            Factor of the log likelihood of each row. 0 removes the row, and 2 counts it twice.
 
         Returns
         -------
@@ -209,10 +233,43 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Warns
         -----
         ConvergenceWarning
-            If the loss still fell in the last epoch, or Ctrl-C ended the fit. It says what to change.
+            If the loss still fell in the last epoch, did not stay finite, or Ctrl-C ended the fit.
         """
         with unchanged_if_it_fails(self), single_threaded_libraries():
-            message = self._fit(X, y, sample_weight)
+            inputs, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64)
+            targets = np.asarray(targets, dtype=np.float64).reshape(len(inputs), -1)
+            # Rows of weight 0 are left out. counts (n,) are the weights of the others, or None if all are 1.
+            chosen: Chosen = chosen_rows(inputs, targets, sample_weight)
+            inputs, targets = rows_of(inputs, chosen.positions), rows_of(targets, chosen.positions)
+            check_size(inputs, "X")
+            check_size(targets, "y")
+            scaling = Scaling.of(inputs, targets, chosen.counts)
+            inputs, targets = scaling.inputs(inputs), scaling.targets(targets)
+            sizes = self._layer_sizes(inputs.shape[1], targets.shape[1])
+            network = VariationalNetwork(sizes, self._prior_scales(sizes), self.negative_slope)
+            rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
+            theta = network.start(rng)
+            if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
+                theta = scaling.from_users(network, self._scaling.to_users(network, self._theta), self._scaling.x_mean)
+            with monitor_of(self.verbose) as monitor:
+                # A row's log density of y is that of the standardised y minus Σ_o log(scale_o).
+                log_unit = float(np.log(scaling.y_scale).sum())
+                monitor = monitor.seen_as(shift=log_unit)
+                trained = self._train(network, theta, inputs, targets, chosen.counts, rng, monitor)
+                theta, losses, scores, message = trained
+                self._network, self._scaling, self._theta = network, scaling, theta
+                self._weights = network.draw(theta, self.n_samples, rng, mirrored=True)
+                layers, log_noise = network.split(scaling.to_users(network, theta))
+                self.coefs_ = [layer.mean for layer in layers]
+                self.coefs_std_ = [np.exp(layer.log_std) for layer in layers]
+                self.intercepts_ = [layer.bias for layer in layers]
+                self.X_mean_ = scaling.x_mean.copy()
+                self.noise_variance_ = np.exp(log_noise) if len(log_noise) > 1 else float(np.exp(log_noise[0]))
+                self.loss_curve_, self.n_iter_ = losses + log_unit, len(losses)
+                self.validation_scores_ = scores - log_unit if self.early_stopping else None
+                self.n_parameters_ = network.n_parameters
+            if monitor.interrupted:
+                message = _INTERRUPTED.format(self.n_iter_)
         if message:
             warn_user(message, ConvergenceWarning)
         return self
@@ -220,25 +277,25 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     def predict(
         self, X: ArrayLike, return_std: bool = False, return_cov: bool = False, include_noise: bool = True
     ) -> Any:
-        """Predict y by the mean over draws of the weights, the same draws for all rows and at each call.
+        """Predict the mean over draws of the weights. All rows and all calls use the same draws.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
             Rows with the columns of `fit`.
         return_std, return_cov : bool, default=False
-            Whether to return the standard deviation, or the covariance between rows, too.
+            Whether to return the standard deviation, or the covariance between rows, also.
         include_noise : bool, default=True
-            Whether they are of y, with the learned noise, or of the noise-free function.
+            Whether the standard deviation and the covariance include the learned noise.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            Of y at each row.
+            Predicted mean of y at each row.
         std : ndarray of the same shape
-            If ``return_std``.
+            Standard deviation, if ``return_std``.
         cov : ndarray of shape (n_samples, n_samples) or (n_samples, n_samples, n_outputs)
-            If ``return_cov``.
+            Covariance between rows, if ``return_cov``.
 
         Raises
         ------
@@ -247,17 +304,17 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        X = self._validated(X)
+        blocks = self._functions(self._validated(X), self._weights)
         scale, offset = self._scaling.y_scale, self._scaling.y_mean
         noise = self._noise if include_noise else np.zeros_like(self._noise)
         if return_cov:
-            functions = self._values_of(X, self._weights)
+            functions = np.concatenate(list(blocks), axis=1)
             mean = functions.mean(axis=0)
-            deviations = np.moveaxis(functions - mean, 2, 0)  # (n_outputs, n_samples, rows)
-            cov = np.moveaxis(deviations.transpose(0, 2, 1) @ deviations, 0, 2) / len(functions)
-            cov = (cov + np.eye(len(X))[:, :, np.newaxis] * noise) * scale**2
+            deviations = np.moveaxis(functions - mean, 2, 0)  # (o, n_draws, n)
+            cov = np.moveaxis(deviations.transpose(0, 2, 1) @ deviations, 0, 2) / len(functions)  # (n, n, o)
+            cov = (cov + np.eye(len(mean))[:, :, np.newaxis] * noise) * scale**2
             return like_y(mean * scale + offset), like_y(cov)
-        moments = [self._moments(X[rows]) for rows in self._blocks(len(X))]
+        moments = [(functions.mean(axis=0), functions.var(axis=0)) for functions in blocks]
         mean, variance = (np.concatenate(parts) for parts in zip(*moments, strict=True))
         mean = like_y(mean * scale + offset)
         return (mean, like_y(np.sqrt(variance + noise) * scale)) if return_std else mean
@@ -276,11 +333,11 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         X : array-like of shape (n_rows, n_features)
             Rows with the columns of `fit`.
         n_samples : int, default=1
-            How many functions.
+            Number of functions.
         random_state : int, RandomState instance or None, default=0
             Draws weights and noise.
         include_noise : bool, default=True
-            Whether samples are of y, with the learned noise, or of the noise-free function.
+            Whether to add the learned noise.
 
         Returns
         -------
@@ -290,69 +347,22 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         X = self._validated(X)
         check_integer(n_samples, "n_samples", minimum=1)
         rng = np.random.default_rng(check_random_state(random_state).randint(2**31))
-        samples = self._values_of(X, self._network.draw(self._theta, n_samples, rng))
+        weights = self._network.draw(self._theta, n_samples, rng)
+        samples = np.concatenate(list(self._functions(X, weights)), axis=1)
         if include_noise:
             samples = samples + np.sqrt(self._noise) * rng.standard_normal(samples.shape)
         samples = np.moveaxis(samples * self._scaling.y_scale + self._scaling.y_mean, 0, 2)
         return samples[:, 0] if samples.shape[1] == 1 else samples
 
-    def _fit(self, X: Any, y: Any, sample_weight: Any) -> str:
-        """Fit, and say what the user should know of how it went."""
-        inputs, targets, counts = self._intake(X, y, sample_weight)
-        scaling = Scaling.of(inputs, targets, counts)
-        network = self._network_of(inputs.shape[1], targets.shape[1])
-        n_held_back = max(1, round(self.validation_fraction * len(inputs))) if self.early_stopping else 0
-        n_kept = len(inputs) - n_held_back
-        if n_kept == 0:
-            raise ValueError(
-                f"validation_fraction={self.validation_fraction!r} of {len(inputs)} rows leaves none to learn from."
-            )
-        batch_size = min(_BATCH_SIZE if isinstance(self.batch_size, str) else self.batch_size, n_kept)
-        max_iter = self.max_iter or max(_EPOCHS, -(-_STEPS // -(-n_kept // batch_size)))
-        rng = np.random.default_rng(check_random_state(self.random_state).randint(2**31))
-        start = network.start(rng)
-        if self.warm_start and hasattr(self, "_theta") and self._network.sizes == network.sizes:
-            scaling.take_over(self._scaling, self._network.split(self._theta), network.split(start))
-        with monitor_of(self.verbose) as monitor:
-            training = train(
-                network,
-                start,
-                scaling.inputs(inputs),
-                scaling.targets(targets),
-                rng,
-                n_held_back=n_held_back,
-                max_iter=max_iter,
-                batch_size=batch_size,
-                learning_rate=self.learning_rate_init,
-                tol=self.tol,
-                patience=self.n_iter_no_change,
-                monitor=monitor.seen_as(shift=scaling.log_unit),
-                counts=counts,
-            )
-            self._network, self._scaling, self._theta = network, scaling, training.theta
-            self._weights = network.draw(self._theta, self.n_samples, rng, mirrored=True)
-            self.n_iter_, self.loss_curve_ = len(training.losses), training.losses + scaling.log_unit
-            self.validation_scores_ = training.scores - scaling.log_unit if self.early_stopping else None
-            self._set_attributes()
-        return training.how_it_ended(max_iter, self.tol, monitor.stopped)
-
-    def _intake(self, X: Any, y: Any, sample_weight: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
-        """Inputs (n, d) and targets (n, o) of the rows that count, and how often they do."""
-        X, y = validate_numbers(self, X, y, reset=True, dtype=np.float64)
-        targets = np.asarray(y, dtype=np.float64).reshape(len(X), -1)
-        chosen: Chosen = chosen_rows(X, targets, sample_weight)
-        X, targets = rows_of(X, chosen.positions), rows_of(targets, chosen.positions)
-        for values, name in ((X, "X"), (targets, "y")):
-            check_size(values, name)
-        return X, targets, chosen.counts
-
-    def _network_of(self, n_features: int, n_outputs: int) -> VariationalNetwork:
+    def _layer_sizes(self, n_features: int, n_outputs: int) -> tuple[int, ...]:
         hidden = np.atleast_1d(np.asarray(self.hidden_layer_sizes))
         if hidden.ndim != 1 or (hidden.size and (hidden.dtype.kind not in "iu" or hidden.min() < 1)):
             raise ValueError(f"hidden_layer_sizes must be integers of at least 1; got {self.hidden_layer_sizes!r}.")
-        sizes = [n_features, *hidden.tolist(), n_outputs]
+        return (n_features, *hidden.tolist(), n_outputs)
+
+    def _prior_scales(self, sizes: Sequence[int]) -> np.ndarray:
         if self.prior_scale is None:
-            return VariationalNetwork(sizes, [size**-0.5 for size in sizes[:-1]], self.negative_slope)
+            return np.array([size**-0.5 for size in sizes[:-1]])
         scales = as_floats(self.prior_scale, "prior_scale")
         if scales.ndim > 1 or (scales.ndim == 1 and len(scales) != len(sizes) - 1):
             raise ValueError(
@@ -360,19 +370,68 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             )
         if not ((scales >= 1e-30) & (scales <= 1e30)).all():
             raise ValueError(f"prior_scale must be from 1e-30 to 1e30; got {self.prior_scale!r}.")
-        return VariationalNetwork(sizes, np.broadcast_to(scales, len(sizes) - 1).tolist(), self.negative_slope)
+        return np.broadcast_to(scales, len(sizes) - 1)
 
-    def _set_attributes(self) -> None:
-        layers, log_noise = self._scaling.to_users(*self._network.split(self._theta))
-        self.coefs_ = [layer.mean for layer in layers]
-        self.coefs_std_ = [np.exp(layer.log_std) for layer in layers]
-        self.intercepts_ = [layer.bias for layer in layers]
-        self.X_mean_ = self._scaling.x_mean.copy()
-        self.noise_variance_ = np.exp(log_noise) if len(log_noise) > 1 else float(np.exp(log_noise[0]))
-        self.n_parameters_ = self._network.n_parameters
+    def _train(
+        self,
+        network: VariationalNetwork,
+        start: np.ndarray,
+        X: np.ndarray,
+        Y: np.ndarray,
+        counts: np.ndarray | None,
+        rng: np.random.Generator,
+        monitor: Monitor,
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
+        """Adam on mini-batches: parameters, loss and score of each epoch, and a message if it ended badly."""
+        n_held_back = max(1, round(self.validation_fraction * len(X))) if self.early_stopping else 0
+        if n_held_back == len(X):
+            raise ValueError(
+                f"validation_fraction={self.validation_fraction!r} of {len(X)} rows leaves none to learn from."
+            )
+        held_back = np.zeros(len(X), dtype=np.bool_)
+        held_back[rng.permutation(len(X))[:n_held_back]] = True
+        n_rows = float((~held_back).sum() if counts is None else counts[~held_back].sum())
+        (X_held, Y_held, weights_held), (X, Y, weights) = (
+            (X[rows], Y[rows], None if counts is None or not rows.any() else counts[rows] / counts[rows].mean())
+            for rows in (held_back, ~held_back)
+        )
+        batch_size = min(_BATCH_SIZE if isinstance(self.batch_size, str) else self.batch_size, len(X))
+        steps = -(-len(X) // batch_size)
+        max_iter = self.max_iter or max(_EPOCHS, -(-_STEPS // steps))
+        order = np.empty(0, dtype=int)
+
+        def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
+            """Minus the bound per row, on the next mini-batch. Rows are shuffled at the beginning of each epoch."""
+            nonlocal order
+            if len(order) == 0:
+                order = rng.permutation(len(X))
+            batch, order = order[:batch_size], order[batch_size:]
+            draws = rng.standard_normal((len(batch), network.n_hidden))
+            own = None if weights is None else weights[batch]
+            return network.loss_and_gradient(theta, X[batch], Y[batch], draws, n_rows, own)
+
+        watch = None
+        if n_held_back > 0:
+            # The same draws in each epoch: scores differ only because parameters differ.
+            draws = rng.standard_normal((n_held_back, network.n_hidden))
+            watch = _EarlyStopping(
+                lambda theta: network.expected_log_likelihood(theta, X_held, Y_held, draws, weights_held),
+                steps,
+                self.tol,
+                self.n_iter_no_change,
+            )
+        limits, rate = network.limits(), self.learning_rate_init
+        minimum = adam(objective, start, limits, max_iter * steps, rate, self.tol, monitor, stop=watch)
+        theta = minimum.x if watch is None or watch.theta is None else watch.theta
+        losses, scores = np.array(minimum.loss_curve), np.array([] if watch is None else watch.scores)
+        epochs = np.array([losses[first : first + steps].mean() for first in range(0, len(losses), steps)])
+        still_falls = minimum.n_iter == max_iter * steps and not is_flat(losses, self.tol)
+        message = _STILL_FELL.format(max_iter=max_iter, tol=self.tol) if still_falls else ""
+        return theta, epochs, scores, message if minimum.converged else _NOT_FINITE
 
     @property
     def _noise(self) -> np.ndarray:
+        """Noise variances (o,) of standardised targets."""
         return np.exp(self._network.split(self._theta)[1])
 
     def __sklearn_is_fitted__(self) -> bool:
@@ -385,16 +444,263 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             check_magnitude(X, "X")
         return X
 
-    def _blocks(self, n_rows: int) -> list[slice]:
-        size = max(1, _NUMBERS_AT_ONCE // (len(self._weights[0]) * max(w.shape[2] for w in self._weights)))
-        return [slice(first, first + size) for first in range(0, n_rows, size)]
+    def _functions(self, X: np.ndarray, weights: list[np.ndarray]) -> Iterator[np.ndarray]:
+        """Standardised outputs (n_draws, rows, o) without noise, for one block of rows after the other."""
+        size = max(1, _NUMBERS_AT_ONCE // (len(weights[0]) * max(drawn.shape[2] for drawn in weights)))
+        for first in range(0, len(X), size):
+            yield self._network.functions(self._theta, weights, self._scaling.inputs(X[first : first + size]))
 
-    def _values_of(self, X: np.ndarray, weights: list[np.ndarray]) -> np.ndarray:
-        """Standardised outputs (n_draws, rows, n_outputs) without noise."""
-        inputs = self._scaling.inputs(X)
-        parts = [self._network.functions(self._theta, weights, inputs[rows]) for rows in self._blocks(len(X))]
-        return np.concatenate(parts, axis=1)
 
-    def _moments(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        functions = self._network.functions(self._theta, self._weights, self._scaling.inputs(X))
-        return functions.mean(axis=0), functions.var(axis=0)
+class _EarlyStopping:
+    """Score the parameters after each epoch, keep the best, and stop after ``patience`` epochs without a gain."""
+
+    def __init__(self, score: Callable[[np.ndarray], float], steps_per_epoch: int, tol: float, patience: int):
+        self._score, self._steps, self._tol, self._patience = score, steps_per_epoch, tol, patience
+        self._n_steps, self._since_gain, self._best, self._bar = 0, 0, -np.inf, -np.inf
+        self.theta: np.ndarray | None = None
+        self.scores: list[float] = []
+
+    def __call__(self, theta: np.ndarray) -> bool:
+        self._n_steps += 1
+        if self._n_steps % self._steps:
+            return False
+        score = self._score(theta)
+        self.scores.append(score)
+        if score > self._best:
+            self._best, self.theta = score, theta
+        self._since_gain += 1
+        if score > self._bar + self._tol:
+            self._bar, self._since_gain = score, 0
+        return self._since_gain >= self._patience
+
+
+class Layer(NamedTuple):
+    """Weights (fan in, fan out) with means and log standard deviations, and biases (fan out,)."""
+
+    mean: np.ndarray
+    log_std: np.ndarray
+    bias: np.ndarray
+
+
+@dataclass(frozen=True)
+class Scaling:
+    """Means and scales of the columns of X and y: between the user's units and standardised ones."""
+
+    x_mean: np.ndarray  # (d,)
+    x_scale: np.ndarray
+    y_mean: np.ndarray  # (o,)
+    y_scale: np.ndarray
+
+    @classmethod
+    def of(cls, X: np.ndarray, Y: np.ndarray, counts: np.ndarray | None = None) -> Scaling:
+        """The scaling of a training set, whose rows count ``counts`` times, or once."""
+        return cls(*_mean_and_scale(X, counts), *_mean_and_scale(Y, counts))
+
+    def inputs(self, X: np.ndarray) -> np.ndarray:
+        """Standardised inputs, clipped where their squares would overflow."""
+        return np.clip((X - self.x_mean) / self.x_scale, -LARGEST, LARGEST)
+
+    def targets(self, Y: np.ndarray) -> np.ndarray:
+        """Standardised targets."""
+        return (Y - self.y_mean) / self.y_scale
+
+    # With D = diag(x_scale), S = diag(y_scale) and standardised inputs (x - x_mean) D⁻¹, the first layer's weights are
+    # D⁻¹ W as weights of x - x_mean. The last layer's weights are W S, and its biases b S + y_mean, as those of y.
+
+    def to_users(self, network: VariationalNetwork, theta: np.ndarray) -> np.ndarray:
+        """Parameters of the same network as a function of ``X - x_mean``, in units of X and y."""
+        theta = theta.copy()
+        layers, log_noise = network.split(theta)
+        first, last, columns = layers[0], layers[-1], self.x_scale[:, np.newaxis]
+        first.mean[:] /= columns
+        first.log_std[:] -= np.log(columns)
+        last.mean[:] *= self.y_scale
+        last.log_std[:] += np.log(self.y_scale)
+        last.bias[:] = last.bias * self.y_scale + self.y_mean
+        log_noise += 2.0 * np.log(self.y_scale)
+        return theta
+
+    def from_users(self, network: VariationalNetwork, theta: np.ndarray, x_mean: np.ndarray) -> np.ndarray:
+        """The inverse, of a network that is a function of ``X - x_mean`` for another ``x_mean``."""
+        theta = theta.copy()
+        layers, log_noise = network.split(theta)
+        first, last, columns = layers[0], layers[-1], self.x_scale[:, np.newaxis]
+        # (x - x_mean) W = (x - self.x_mean) W + (self.x_mean - x_mean) W
+        first.bias[:] += (self.x_mean - x_mean) @ first.mean
+        first.mean[:] *= columns
+        first.log_std[:] += np.log(columns)
+        last.mean[:] /= self.y_scale
+        last.log_std[:] -= np.log(self.y_scale)
+        last.bias[:] = (last.bias - self.y_mean) / self.y_scale
+        log_noise -= 2.0 * np.log(self.y_scale)
+        return theta
+
+
+def _mean_and_scale(values: np.ndarray, counts: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """Mean and standard deviation of each column. A constant column has its size as its scale, or 1."""
+    largest = np.abs(values).max(axis=0)
+    constant = np.ptp(values, axis=0) <= _ROUNDING * largest
+    mean = values.mean(axis=0) if counts is None else counts @ values / counts.sum()
+    mean = np.where(constant, values[0], mean)
+    deviations = values - mean
+    std = deviations.std(axis=0) if counts is None else np.sqrt(counts @ deviations**2 / counts.sum())
+    scale = np.where(constant, largest, std)
+    return mean, np.where(scale > 0.0, scale, 1.0)
+
+
+class VariationalNetwork:
+    """LeakyReLU layers with independent weights w ~ N(mean, std²) and biases that are numbers.
+
+    The parameters θ are one flat vector: the means of all layers, their log standard deviations, their biases, and a
+    log noise variance for each output. ``sizes`` are the units of each layer, inputs first and outputs last. The prior
+    of a layer's weights is N(0, prior_scale²).
+    """
+
+    def __init__(self, sizes: Sequence[int], prior_scales: Sequence[float] | np.ndarray, negative_slope: float):
+        self.sizes, self.slope, self.prior_log_stds = tuple(sizes), negative_slope, np.log(prior_scales)
+        matrices, vectors = list(pairwise(self.sizes)), [(size,) for size in self.sizes[1:]]
+        self.n_hidden = sum(self.sizes[1:-1])
+        self.n_weights = sum(fan_in * fan_out for fan_in, fan_out in matrices)
+        self.n_parameters = 0
+        self._parts: list[tuple[slice, tuple[int, ...]]] = []
+        for shape in [*matrices, *matrices, *vectors, vectors[-1]]:
+            first, self.n_parameters = self.n_parameters, self.n_parameters + int(np.prod(shape))
+            self._parts.append((slice(first, self.n_parameters), shape))
+
+    def split(self, vector: np.ndarray) -> tuple[list[Layer], np.ndarray]:
+        """Views of a flat vector: the layers, and the log noise variances (o,)."""
+        parts = [vector[part].reshape(shape) for part, shape in self._parts]
+        n_layers = len(self.sizes) - 1
+        # Means, then log standard deviations, then biases: each third has one part a layer.
+        return [Layer(*parts[k : 3 * n_layers : n_layers]) for k in range(n_layers)], parts[-1]
+
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper bounds of θ, far from anything sensible."""
+        lower, upper = np.full(self.n_parameters, -np.inf), np.full(self.n_parameters, np.inf)
+        for bound, std, noise in zip((lower, upper), _STD, _NOISE_VARIANCE, strict=True):
+            layers, log_noise = self.split(bound)
+            for layer, prior_log_std in zip(layers, self.prior_log_stds, strict=True):
+                layer.log_std[:] = prior_log_std + np.log(std)
+            log_noise[:] = np.log(noise)
+        return lower, upper
+
+    def start(self, rng: np.random.Generator) -> np.ndarray:
+        """First θ: means as in He et al. (2015), near 0 for the outputs, small deviations, biases 0, noise 1."""
+        theta = np.zeros(self.n_parameters)
+        layers, _ = self.split(theta)
+        gain = np.sqrt(2.0 / (1.0 + self.slope**2))
+        for k, layer in enumerate(layers):
+            draws, fan_in = rng.standard_normal(layer.mean.shape), len(layer.mean)
+            is_hidden = k < len(layers) - 1
+            layer.mean[:] = gain / np.sqrt(fan_in) * draws if is_hidden else draws * 0.1 / np.sqrt(fan_in)
+            layer.log_std[:] = self.prior_log_stds[k] + np.log(_FIRST_STD)
+        return theta
+
+    def loss_and_gradient(
+        self,
+        theta: np.ndarray,
+        X: np.ndarray,
+        Y: np.ndarray,
+        draws: np.ndarray,
+        n_rows: float,
+        weights: np.ndarray | None = None,
+    ) -> tuple[float, np.ndarray]:
+        """Minus the evidence lower bound per row, in nats, as b rows of a training set of ``n_rows`` rows estimate it.
+
+        ``draws`` (b, n_hidden) are standard normal. ``weights`` (b,) are how often rows count; None means once.
+        """
+        # loss = ½ Σ_o [log 2π + log σ_o² + e_o / σ_o²] + KL[q(w) | p(w)] / n_rows,
+        # e_o = mean over rows of (y - m)² + v: the expected squared error, with moments m and v of the outputs.
+        layers, log_noise = self.split(theta)
+        gradient = np.empty_like(theta)
+        slopes, noise_slope = self.split(gradient)
+        inputs, variances, spreads, mean, variance = self._forward(layers, X, draws)
+        error, precision = Y - mean, np.exp(-log_noise)
+        misfit = _mean(error**2 + variance, weights)
+        loss = _log_loss(misfit, log_noise)
+        noise_slope[:] = 0.5 - 0.5 * precision * misfit
+        # ∂loss/∂m and ∂loss/∂v, (b, o) at first, then of the pre-activations of the layer before.
+        to_mean = error * (-precision / len(X))
+        to_variance = np.broadcast_to(0.5 * precision / len(X), error.shape)
+        if weights is not None:
+            to_mean *= weights[:, np.newaxis]
+            to_variance = to_variance * weights[:, np.newaxis]
+        ends = np.cumsum(self.sizes[1:-1])
+        for k in reversed(range(len(layers))):
+            layer, slope = layers[k], slopes[k]
+            # m = X M + b and v = X² V, with the layer's inputs X (b, i), means M and variances V = exp(2 log s) (i, j).
+            np.matmul(inputs[k].T, to_mean, out=slope.mean)
+            np.matmul((inputs[k] ** 2).T, to_variance, out=slope.log_std)
+            to_mean.sum(axis=0, out=slope.bias)
+            if k > 0:
+                # X = LeakyReLU(z), z = m + √v ε of the layer before: ∂z/∂m = 1, ∂z/∂v = ε / (2 √v).
+                to_z = to_mean @ layer.mean.T + 2.0 * inputs[k] * (to_variance @ variances[k].T)
+                to_z *= np.where(inputs[k] > 0.0, 1.0, self.slope)
+                noise = draws[:, ends[k - 1] - self.sizes[k] : ends[k - 1]]
+                to_mean, to_variance = to_z, 0.5 * to_z * noise / spreads[k - 1]
+            # KL = Σ [log(p / s) + (s² + M²) / (2 p²) - ½], with the prior's standard deviation p; ∂V/∂(log s) = 2 V.
+            prior_log_std, prior_precision = self.prior_log_stds[k], np.exp(-2.0 * self.prior_log_stds[k])
+            divergence = 0.5 * (layer.mean**2 + variances[k]) * prior_precision + prior_log_std - layer.log_std - 0.5
+            loss += float(divergence.sum()) / n_rows
+            slope.mean[:] += layer.mean * prior_precision / n_rows
+            slope.log_std[:] *= 2.0 * variances[k]
+            slope.log_std[:] += (variances[k] * prior_precision - 1.0) / n_rows
+        return loss, gradient
+
+    def expected_log_likelihood(
+        self, theta: np.ndarray, X: np.ndarray, Y: np.ndarray, draws: np.ndarray, weights: np.ndarray | None = None
+    ) -> float:
+        """Expected log likelihood per row, in nats; arguments as of `loss_and_gradient`."""
+        layers, log_noise = self.split(theta)
+        *_, mean, variance = self._forward(layers, X, draws)
+        return -_log_loss(_mean((Y - mean) ** 2 + variance, weights), log_noise)
+
+    def draw(
+        self, theta: np.ndarray, n_draws: int, rng: np.random.Generator, mirrored: bool = False
+    ) -> list[np.ndarray]:
+        """Weights (n_draws, fan in, fan out) of each layer, if ``mirrored`` in pairs M ± s ε.
+
+        In the mean over pairs, what is odd in the deviations cancels: a few draws have a good mean.
+        """
+        weights = []
+        for layer in self.split(theta)[0]:
+            deviations = rng.standard_normal(((n_draws + 1) // 2 if mirrored else n_draws, *layer.mean.shape))
+            if mirrored:
+                deviations = np.concatenate([deviations, -deviations])[:n_draws]
+            weights.append(layer.mean + np.exp(layer.log_std) * deviations)
+        return weights
+
+    def functions(self, theta: np.ndarray, weights: list[np.ndarray], X: np.ndarray) -> np.ndarray:
+        """Outputs (n_draws, b, o) at rows X (b, d), without noise, of each draw of the weights."""
+        layers, _ = self.split(theta)
+        outputs = X[np.newaxis]
+        for k, (layer, drawn) in enumerate(zip(layers, weights, strict=True)):
+            outputs = outputs @ drawn + layer.bias
+            if k < len(layers) - 1:
+                outputs = np.maximum(outputs, self.slope * outputs)
+        return outputs
+
+    def _forward(self, layers: list[Layer], X: np.ndarray, draws: np.ndarray) -> tuple[Any, ...]:
+        """Inputs and variances of weights of each layer, √v of the hidden ones, and moments m and v of the outputs."""
+        # A pre-activation is a sum of normal weights times inputs, so it is normal: z ~ N(X M + b, X² V). It is drawn
+        # row by row in place of the weights (Kingma, Salimans & Welling 2015, section 2.2). The outputs' are not drawn:
+        # the normal likelihood is integrated over them in closed form.
+        inputs, variances, spreads, first = [X], [np.exp(2.0 * layer.log_std) for layer in layers], [], 0
+        for layer, variance in zip(layers[:-1], variances, strict=False):
+            noise = draws[:, first : first + len(layer.bias)]
+            first += len(layer.bias)
+            spreads.append(np.sqrt(inputs[-1] ** 2 @ variance + _TINY))
+            z = inputs[-1] @ layer.mean + layer.bias + spreads[-1] * noise
+            inputs.append(np.maximum(z, self.slope * z))
+        mean = inputs[-1] @ layers[-1].mean + layers[-1].bias
+        return inputs, variances, spreads, mean, inputs[-1] ** 2 @ variances[-1]
+
+
+def _mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
+    """Mean over rows, with weights of mean 1."""
+    return values.mean(axis=0) if weights is None else weights @ values / len(values)
+
+
+def _log_loss(misfit: np.ndarray, log_noise: np.ndarray) -> float:
+    """Minus the expected log density of a row: ½ Σ_o [log 2π + log σ_o² + e_o / σ_o²]."""
+    return 0.5 * float((np.log(2.0 * np.pi) + log_noise + misfit * np.exp(-log_noise)).sum())

@@ -14,26 +14,25 @@ from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
-from ..data.dask import is_dask
+from ..control.posterior import Posterior
+from ..data.dataset import Dataset
 from ..data.threads import single_threaded_libraries
-from ..fitting.advice import interrupted
-from ..fitting.exact import ExactFit, ExactOptions, fit_exact
-from ..fitting.rules import LOWEST_NOISE_EXACT
+from ..fitting.exact import ExactFit, fit_exact, value_at
+from ..fitting.messages import interrupted
+from ..fitting.prior import CoefPrior, as_coef_prior
+from ..fitting.problem import Problem
 from ..fitting.start import prior_predictor
-from ..fitting.theta import value_at
-from ..solvers.solvers import LBFGS
+from ..noise import Gaussian, as_noise
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import unchanged_if_it_fails
-from .base import ExplicitGaussianProcess
-from .intake import Problem
+from ..utils.validation import check_fitted, is_dask, unchanged_if_it_fails
+from .base import GaussianProcess, refuse_moved
 
-_RULES = replace(LBFGS.rules, lowest_noise=LOWEST_NOISE_EXACT)
 # Of so many, an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
 
 
-class EGPRegressor(ExplicitGaussianProcess):
+class EGPRegressor(GaussianProcess):
     r"""Exact Gaussian process with explicit features (EGP).
 
     The model of each output is that of `EVGPRegressor`,
@@ -56,17 +55,11 @@ class EGPRegressor(ExplicitGaussianProcess):
     kernel_map : transformer, default=None
         x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
         It may return a row for each output, (n, n_outputs, d).
-    coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
-        Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
-        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean; with the scale
-        ``np.inf`` nothing is known of it (Rasmussen & Williams 2006, eq. 2.42 to 2.45): its estimate is that of
-        generalised least squares.
-    coef_cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
-        Prior covariance of the weights, as of `EVGPRegressor`.
-    share_coef : bool or "auto", default="auto"
-        Whether all outputs have the same weights, as of `EVGPRegressor`.
-    noise_variance : float, default=None
-        Where the noise variance starts; None takes it from the data.
+    coef_prior : skevgp.CoefPrior or "auto", default="auto"
+        Prior of the weights β. ``"auto"`` asks the feature map. ``CoefPrior(scale=np.inf)`` says that nothing is known
+        of the weights before.
+    noise : "gaussian" or `skevgp.noise.Gaussian`, default="gaussian"
+        Model of the noise. ``Gaussian(variance=...)`` is where its variance starts.
     alpha : float, default=None
         A noise variance that is known, in place of one that is learned; ``std`` has it. If each row has its own, give
         their mean here, and to `fit` what they are in units of it, ``relative_variance``.
@@ -97,7 +90,9 @@ class EGPRegressor(ExplicitGaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Draws the restarts.
     verbose : int, default=0
-        As of `EVGPRegressor`; its bound is the log marginal likelihood.
+        Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------
@@ -145,10 +140,10 @@ class EGPRegressor(ExplicitGaussianProcess):
 
     >>> import numpy as np
     >>> from sklearn.preprocessing import PolynomialFeatures
-    >>> from skevgp import EGPRegressor
+    >>> from skevgp import CoefPrior, EGPRegressor
     >>> from skevgp.datasets import make_toy
     >>> X, y = make_toy(random_state=0, return_X_y=True)
-    >>> model = EGPRegressor(PolynomialFeatures(1), coef_scale=np.inf).fit(X, y)
+    >>> model = EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=np.inf)).fit(X, y)
     >>> mean, std = model.predict(X, return_std=True)
     >>> round(model.score(X, y), 2)
     0.96
@@ -163,12 +158,21 @@ class EGPRegressor(ExplicitGaussianProcess):
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
-        **ExplicitGaussianProcess._parameter_constraints,
+        "feature_map": "no_validation",
+        "kernel": "no_validation",
+        "kernel_map": "no_validation",
+        "coef_prior": "no_validation",
+        "noise": "no_validation",
         "alpha": [Interval(Real, 0, None, closed="neither"), None],
+        "normalize_y": ["boolean"],
         "optimizer": [StrOptions({"fmin_l_bfgs_b"}), callable, None],
+        "max_iter": [Interval(Integral, 0, None, closed="left")],
+        "max_time": [Interval(Real, 0, None, closed="neither"), None],
         "n_restarts": [Interval(Integral, 0, None, closed="left")],
-        "n_targets": [Interval(Integral, 1, None, closed="left"), None],
         "tol": [Interval(Real, 0, None, closed="left"), StrOptions({"auto"})],
+        "n_targets": [Interval(Integral, 1, None, closed="left"), None],
+        "random_state": ["random_state"],
+        "verbose": ["verbose"],
     }
 
     _fitted: ExactFit
@@ -179,11 +183,8 @@ class EGPRegressor(ExplicitGaussianProcess):
         kernel: Kernel | Callable[..., Any] | None = None,
         *,
         kernel_map: TransformerMixin | None = None,
-        coef_mean: ArrayLike | Literal["auto"] = "auto",
-        coef_scale: ArrayLike | Literal["auto"] = "auto",
-        coef_cov: ArrayLike | None = None,
-        share_coef: bool | Literal["auto"] = "auto",
-        noise_variance: float | None = None,
+        coef_prior: CoefPrior | Literal["auto"] = "auto",
+        noise: Literal["gaussian"] | Gaussian = "gaussian",
         alpha: float | None = None,
         normalize_y: bool = False,
         optimizer: Callable[..., Any] | Literal["fmin_l_bfgs_b"] | None = "fmin_l_bfgs_b",
@@ -194,15 +195,14 @@ class EGPRegressor(ExplicitGaussianProcess):
         n_targets: int | None = None,
         random_state: int | np.random.RandomState | None = None,
         verbose: int = 0,
+        **moved: Any,
     ):
+        refuse_moved(self, moved)
         self.feature_map = feature_map
         self.kernel = kernel
         self.kernel_map = kernel_map
-        self.coef_mean = coef_mean
-        self.coef_scale = coef_scale
-        self.coef_cov = coef_cov
-        self.share_coef = share_coef
-        self.noise_variance = noise_variance
+        self.coef_prior = coef_prior
+        self.noise = noise
         self.alpha = alpha
         self.normalize_y = normalize_y
         self.optimizer = optimizer
@@ -255,56 +255,54 @@ class EGPRegressor(ExplicitGaussianProcess):
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
-        with (
-            unchanged_if_it_fails(self),
-            single_threaded_libraries(),
-            monitor_of(self.verbose, max_time=self.max_time) as monitor,
-        ):
-            problem = self._exact_problem(X, y, sample_weight, relative_variance)
-            rows = problem.units.rows(problem.source)
-            options = ExactOptions(
-                _RULES,
-                0 if self.optimizer is None else self.max_iter,
-                self._tolerance(len(rows)),
-                self.n_restarts,
-                self.optimizer if callable(self.optimizer) else None,
-            )
-            self._fitted = fit_exact(
-                problem.units,
-                rows,
-                problem.spec,
-                problem.vague,
-                options,
+        progress = monitor_of(self.verbose, max_time=self.max_time)
+        with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
+            data = Dataset.from_user(self, X, y, sample_weight, relative_variance)
+            problem = self._problem(data)
+            fitted = fit_exact(
+                replace(problem, max_iter=0 if self.optimizer is None else self.max_iter),
                 check_random_state(self.random_state),
                 monitor,
+                self.n_restarts,
+                self._tolerance(data.source.n_rows),
+                self.optimizer if callable(self.optimizer) else None,
             )
-            self._set_common_attributes()
+            self._set_posterior(data, problem, problem.spec, fitted)
             if problem.vague.any():
                 self.coef_prior_scale_[problem.vague[0] if self.coef_prior_scale_.ndim == 1 else problem.vague] = np.inf
-            self.log_marginal_likelihood_value_ = self._fitted.log_marginal_likelihood
-            self.loss_curve_ = self._fitted.loss_curve
+            self._spec = problem.spec
+            self.log_marginal_likelihood_value_ = fitted.log_marginal_likelihood
+            self.loss_curve_ = fitted.loss_curve
             self.n_iter_ = len(self.loss_curve_)
-        self._warn_of((interrupted(self.n_iter_),) if monitor.interrupted else self._fitted.messages)
+        self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
         return self
 
-    def _exact_problem(self, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None) -> Problem:
-        """What a fit to rows starts from; arguments as of `fit`."""
-        problem = self._problem(X, y, sample_weight, relative_variance, allow_vague=True)
-        n_outputs = len(problem.units.target_unit)
-        if self.n_targets not in (None, n_outputs):
+    def _problem(self, data: Dataset) -> Problem:
+        """What a fit to a data set starts from."""
+        noise = as_noise(self.noise)
+        if noise.heavy_tails or noise.inputs is not None:
+            raise ValueError(f"The exact model has Gaussian noise of y only; got noise={self.noise!r}.")
+        problem = Problem.from_data(
+            data,
+            kernel=self.kernel,
+            coef_prior=as_coef_prior(self.coef_prior),
+            noise=noise,
+            normalize_y=self.normalize_y,
+            allow_vague=True,
+        )
+        if self.n_targets not in (None, problem.n_outputs):
             raise ValueError(
                 "The number of targets seen in `y` is different from the parameter `n_targets`. "
-                f"Got {n_outputs} != {self.n_targets}."
+                f"Got {problem.n_outputs} != {self.n_targets}."
             )
         spec = problem.spec if self.optimizer is not None else problem.spec.as_given()
         if self.alpha is not None:
             if spec.starts.noise.value is not None:
                 raise ValueError(
-                    f"alpha={self.alpha!r} is the noise, but a WhiteKernel or noise_variance says that it is to be "
-                    "learned; give one of them."
+                    f"alpha={self.alpha!r} is the noise, but a WhiteKernel or Gaussian(variance=...) says that it is "
+                    "to be learned; give one of them."
                 )
             spec = spec.with_noise(self.alpha, fixed=True)
-        self._spec = spec
         return replace(problem, spec=spec)
 
     def _tolerance(self, n_rows: int) -> float:
@@ -318,14 +316,16 @@ class EGPRegressor(ExplicitGaussianProcess):
         model._validate_params()
         # What is no table has one row, until it is refused in scikit-learn's words.
         n_rows = len(X) if isinstance(X, list | tuple) else np.shape(X)[0] if np.ndim(X) else 1
-        problem = model._exact_problem(X, np.zeros((n_rows, self.n_targets or 1)))
+        data = Dataset.from_user(model, X, np.zeros((n_rows, self.n_targets or 1)))
+        problem = model._problem(data)
         if problem.vague.any():
             raise NotFittedError(
-                f"This {type(self).__name__} is not fitted yet, and with coef_scale=inf nothing is known before."
+                f"This {type(self).__name__} is not fitted yet, and with an infinite scale of CoefPrior nothing is "
+                "known before."
             )
-        model._predictor = prior_predictor(
-            problem.units.rows(problem.source), problem.spec.as_given(), problem.units.prior
-        )
+        rows, spec, prior = problem.units.rows(data.source), problem.spec.as_given(), problem.units.prior
+        model.kernel_map_ = data.maps.kernel_map
+        model._posterior = Posterior(prior_predictor(rows, spec, prior), replace(data.maps, shapes=problem.shapes))
         return model
 
     def __sklearn_tags__(self) -> Any:
@@ -364,13 +364,20 @@ class EGPRegressor(ExplicitGaussianProcess):
         ValueError
             If ``theta`` has another shape or is out of range, or a gradient is asked for without it.
         """
-        self._check_gradient_of(theta, eval_gradient)
+        check_fitted(self)
+        if theta is None and eval_gradient:
+            raise ValueError("Gradient can only be evaluated for theta!=None: give theta=kernel_.theta.")
         if theta is None:
             return self.log_marginal_likelihood_value_
-        if self._predictor.shared:
-            raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: no share_coef.")
+        predictor = self._posterior.predictor
+        if predictor.shared:
+            raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: not shared ones.")
         order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
-        fitted = [np.append(*own) for own in zip(self._numbers_of_kernels(), self._predictor.noise, strict=True)]
+        # Of each output k̃'s hyperparameters, s² and σ², as fitted, in the user's units.
+        fitted = [
+            np.append(group.hyperparameters, [predictor.signal[o], predictor.noise[o]])
+            for o, group in enumerate(predictor.by_output)
+        ]
         if clone_kernel and width == (len(given),) != (len(order),):
             order = given
             if self._spec.adds_signal:

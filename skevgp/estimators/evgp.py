@@ -3,29 +3,38 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from numbers import Integral, Real
+from dataclasses import replace
+from numbers import Integral
 from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
+from joblib import effective_n_jobs
 from numpy.typing import ArrayLike
 from sklearn.base import TransformerMixin
 from sklearn.gaussian_process.kernels import Kernel
 from sklearn.utils import check_random_state
 
+from ..control.posterior import Posterior
+from ..data.dataset import Dataset, checked_numbers
 from ..data.threads import single_threaded_libraries
 from ..exceptions import DependentRowsWarning, warn_user
-from ..fitting.advice import DEPENDENT_ROWS, interrupted
-from ..fitting.outputs import fit_outputs
-from ..fitting.plan import Sharing
-from ..fitting.sharing import with_groups
-from ..solvers.solvers import LBFGS, Adam, check_weights, resolved
+from ..fitting.calibration import CrossValidation
+from ..fitting.fit import Fitted, fit_model
+from ..fitting.inducing import Placement
+from ..fitting.messages import DEPENDENT_ROWS, interrupted
+from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
+from ..fitting.prior import CoefPrior, as_coef_prior
+from ..fitting.problem import Problem, Sharing
+from ..noise import Gaussian, StudentT, as_noise
+from ..noise.gaussian import input_covariance, relative_noise
+from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_integer, unchanged_if_it_fails
-from .sparse import SparseGaussianProcess
+from ..utils.validation import check_integer, check_magnitude, check_real, is_dask, is_frame, unchanged_if_it_fails
+from .base import GaussianProcess, refuse_moved
 
 
-class EVGPRegressor(SparseGaussianProcess):
+class EVGPRegressor(GaussianProcess):
     r"""Sparse variational Gaussian process with explicit features (EVGP).
 
     The model of each output is
@@ -33,126 +42,66 @@ class EVGPRegressor(SparseGaussianProcess):
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
               f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
 
-    where the features h say what is known (rough physics, a trend) and f, a Gaussian process with ``n_inducing``
-    inducing points, learns the rest. Time is linear in the number of rows. Without a feature map it is the sparse
-    Gaussian process of Titsias (2009) and Hensman et al. (2013).
+    where the features h are known (rough physics, a trend) and f, a Gaussian process with ``n_inducing`` inducing
+    points, learns the residual. Time is linear in the number of rows. Without a feature map it is the sparse Gaussian
+    process of Titsias (2009) and Hensman et al. (2013).
 
     Parameters
     ----------
     feature_map : transformer, default=None
-        x -> h(x), for example `InertiaForceGravity("pendulum")`, of X as given: do not scale its columns. None: none.
-        It may return a row for each output, (n, n_outputs, n_h), as the regressor matrix of a robot's torques.
+        Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given, so do not scale the
+        columns of X. It may return a row for each output, (n, n_outputs, n_h). If None, there are no explicit features.
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them; a WhiteKernel as
-        a term of the outermost sum sets the noise. Starts, bounds and ``"fixed"`` are respected. The outermost constant
-        factor is the signal variance, which each output has of its own; if there is none, one is put in front, with its
-        start and bounds from the data. A callable is a covariance function in autograd.numpy, as of a `FunctionKernel`.
-        None is an RBF with a length scale per column, all starts and bounds taken from the data.
+        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them. Starts, bounds
+        and ``"fixed"`` are respected. The outermost constant factor is the signal variance, one for each output; if
+        there is none, one is added. A WhiteKernel as a term of the outermost sum sets the noise. A callable is a
+        covariance function in autograd.numpy (`FunctionKernel`). If None, an RBF with a length scale per column.
     kernel_map : transformer, default=None
-        x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
-        It may return a row for each output, (n, n_outputs, d): the kernel of output j then sees row j.
+        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel sees its result: scale
+        columns here. It may return a row for each output, (n, n_outputs, d).
+    coef_prior : skevgp.CoefPrior or "auto", default="auto"
+        Prior of the weights β. ``"auto"`` asks the feature map.
     n_inducing : int or "auto", default=100
-        Inducing points; fewer if there are fewer distinct rows. ``"auto"``, for L-BFGS, begins with 10 (or those of
-        ``inducing_init``; in a warm start those of the last fit) and adds half as many again until that raises the
-        bound by less than 0.01 nats per row and output, and no better kernel is known: up to 1,000 rows are fitted
-        exactly, for few points can hide what there is to learn.
-    max_inducing : int, default=1000
-        The most that ``n_inducing="auto"`` adds points up to.
+        Number of inducing points; fewer if there are fewer distinct rows. ``"auto"``, for L-BFGS, starts with 10 and
+        adds points until they raise the bound by less than 0.01 nats per row and output.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
-        Where inducing points start. ``"k-means"``: at cluster centres of the kernel's inputs. ``"greedy"``: one after
-        the other at the row that the kernel, as it starts, knows least from those before (Burt et al. 2020).
-        ``"auto"``: at cluster centres, and with L-BFGS after 25 iterations once more, greedily under the kernel
-        learned so far; 25 iterations later the better of the two fits goes on (``loss_curve_`` jumps where points are
-        placed). They are not placed anew with ``max_iter`` up to 25, a kernel that is fixed, or a warm start. Or at
-        given points in the space of ``kernel_map``, whose number then replaces ``n_inducing`` (with ``"auto"``, more
-        are added). With ``max_iter=0``, or where they are all rows (and ``posterior="full"``), they stay where they
-        start.
+        Where inducing points start: at cluster centres, one after the other at the row that the kernel knows least
+        (``"greedy"``, Burt et al. 2020), or at given points in the space of ``kernel_map``. ``"auto"`` starts at
+        cluster centres, and with L-BFGS places the points again, greedily, under the kernel learned in 25 iterations;
+        the better of the two fits goes on.
     sharing : {"auto", "all", "kernel", "none"} or list of list of int, default="auto"
-        What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape only
-        (``"kernel"``, the paper's), or nothing. Groups, as ``[[0, 1], [2, 3]]``, share as ``"all"`` inside, and nothing
-        with each other. ``"auto"`` finds them by short fits to up to 1,000 rows: on these it costs no output more than
-        1 % of what its own Gaussian process gains, in nats, over features and noise; each group takes about the time of
-        ``"all"``. Signal variance and noise are always per output, and so are
-        weights but for ``share_coef``. Where a map returns a row for each output, ``"auto"`` is ``"none"``.
-    posterior : {"full", "diagonal"}, default="full"
-        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
-    coef_mean, coef_scale : array-like of shape (n_outputs, n_h), float or "auto", default="auto"
-        Prior mean and standard deviation of the weights. ``"auto"`` asks the feature map's ``coef_prior(n_outputs)``;
-        for a map without one, mean 0 and scale 10 * std(y) / rms(h). Scale 0 keeps a weight at its mean. If y is far
-        from 0 compared with its scatter, an intercept among the features needs a wider scale than that, or
-        ``normalize_y=True``.
-    coef_cov : array-like of shape (n_h, n_h) or (n_outputs, n_h, n_h), default=None
-        Prior covariance of the weights, of all outputs or of each, in place of ``coef_scale``: a link's mass and its
-        first moment are correlated in any honest prior. ``coef_prior`` of a feature map may return one as its second
-        array, of shape (n_outputs, n_h, n_h) or (n_h, n_h); where that would be the shape of a scale too, it is one.
-    share_coef : bool or "auto", default="auto"
-        Whether all outputs have the same weights, as torques of a robot's joints have one set of inertial parameters:
-        then ``coef_mean``, ``coef_scale`` and what ``coef_prior`` returns have no axis of outputs, and outputs depend
-        on each other (``predict(X, return_cov="joint")``, `sample_y`). ``"auto"``: if the fitted ``feature_map`` has
-        an attribute ``share_coef`` that is true (a pipeline's last step, all parts of a union). Each output keeps its
-        own f, noise and kernel (by ``sharing``), and all are fitted together; with ``solver="adam"`` or
-        ``posterior="diagonal"`` it is an error, as are correlations.
-    noise : {"gaussian", "student-t"}, default="gaussian"
-        ``"student-t"``: with a Student-t's tails, for rows of which a few are wrong (a collision, a sensor's glitch).
-        Rows off by more than about six standard deviations are outliers, whose noise is a Student-t with 4 degrees of
-        freedom, thirty times as wide; the others' is Gaussian. A row is doubted as a whole by the outputs that are
-        fitted together, and ``weights_`` says how much it still counts; kernel, noise and doubts take turns. ``std``
-        and ``noise_variance_`` are those of rows that are no outliers, and no ``upper_bound_`` is known (inf). With
-        L-BFGS only, not for Dask arrays; `partial_fit` doubts new rows, and leaves what was doubted before. Memory
-        grows with the rows: by some ten numbers for each during the fit, and then by one (not in pickles) and
-        ``weights_``.
-    input_noise : float or array-like of shape (n_features,) or (n_features, n_features), default=None
-        Standard deviations, or the covariance, of noise in X itself: to first order a row's noise variance is then σ² +
-        ∂g Σ ∂gᵀ (McHutchon & Rasmussen 2011), the mean of outputs fitted together. Fits follow each other until σ²
-        settles; it and ``std`` are of rows that are known exactly. Not for Dask arrays, Adam or Student-t noise.
-    noise_variance : float, default=None
-        Where the noise variance starts; None takes it from the data.
+        What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape
+        (``"kernel"``, the paper's), or nothing. Groups such as ``[[0, 1], [2, 3]]`` share as ``"all"`` inside each
+        group. ``"auto"`` finds groups by short fits to up to 1,000 rows. Signal variance and noise variance are always
+        per output.
+    noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
+        Model of the noise. ``"student-t"`` is for data of which a few rows are wrong.
+        ``Gaussian(inputs=...)`` is for noise in X.
     noise_cv : int, default=5
-        Folds, 2 or more: whole ``groups`` of `fit`, else random. After the iterations each is predicted from the others
-        (Rasmussen & Williams 2006, section 5.4.2), with kernel shape and inducing points as they are, and signal and
-        noise variance of each output are where log density and, half as much, the logarithm of the rms error are best,
-        within their bounds. (The bound takes what inducing points cannot represent for noise: ``std`` of rows of a
-        table is then too large. And it takes rows of a trajectory for independent: on new ones ``std`` is too small.)
-        Up to 2,000 rows are predicted, and random folds are of 50,000 rows at most; it takes a few passes over these,
-        and memory for a few times as many matrices (m + n_h, m + n_h) as folds. With hundreds of features it takes
-        longer than 20 iterations. q is then at its optimum, after Adam too. It is left out
-        with None, with ``max_iter=0``, of fewer than 50 rows, with inducing points at all rows and no ``groups`` (the
-        model is then the exact one), and when a fit is interrupted or out of time;
-        `partial_fit` keeps what the first call found.
+        Number of folds by which signal and noise variance are calibrated after the iterations: whole ``groups`` of
+        `fit`, or else random rows. Without it, the bound takes what inducing points cannot represent for noise, and
+        rows of a trajectory for independent ones. If None, or with fewer than 50 rows, there is no calibration.
     normalize_y : bool, default=False
-        Whether the prior mean is the training mean of y, in place of 0. Of a y that is then constant nothing is known
-        but the constant: its signal stays at a standard deviation of 1.
+        Whether the prior mean is the training mean of y instead of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
-        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters, those of q
-        among them. The strings are the solvers with their defaults; what only one of them understands is said there:
-        ``Adam(batch_size=1000)``, ``LBFGS(n_restarts=2)``, and ``solver__batch_size`` in a grid search.
+        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters. Solver
+        objects have further options, such as ``LBFGS(n_restarts=2)`` and ``Adam(batch_size=1000)``, which a grid search
+        reaches as ``solver__batch_size``.
     max_iter : int, default=None
-        The most iterations of L-BFGS, on all rows and on each sample of them, or steps of Adam; None means 1000 or
-        16000. With 0 nothing is optimised: kernel and inducing points stay where they start, and q is at its optimum.
-        Those on the way to the number of points of ``n_inducing="auto"``, up to 60 for each number, do not count.
-    max_time : float, default=None
-        Seconds until iterations end, those of each independent model when its share is over: the best so far is kept,
-        with a ConvergenceWarning, and ``noise_cv`` left out. Half of them is the most for finding groups
-        (``sharing="auto"``; if it is not enough, all outputs share). The passes before and after are not cut short.
-    tol : float or "auto", default="auto"
-        In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the bound by less
-        than this, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained over
-        features and noise alone, and at least 0.01. Adam goes over to its last steps, as many as before, when the loss
-        stays flat: when its median over the last third of the steps differs from that over the third before by less
-        than this (``"auto"``: 0.01), or by no more than chance, which mostly decides.
-    forgetting_factor : float, default=1.0
-        What the log likelihood of the rows seen so far is multiplied by at each `partial_fit`, in (0, 1]: 1 remembers
-        all of them, 0.99 those of about the last hundred calls (exponential forgetting, for a system that drifts).
+        Maximum number of iterations of L-BFGS, on all rows and on each sample of them, or of steps of Adam. None means
+        1000 or 16000. With 0, kernel and inducing points stay where they start, and q is at its optimum.
     warm_start : bool, default=False
-        Whether to start from the last fit's kernel, noise and inducing points, and groups it found, where shapes agree.
+        Whether to start from the kernel, noise, inducing points and groups of the last fit, where shapes agree.
     n_jobs : int, default=None
-        Threads; None means 1, -1 all cores. The result does not depend on it.
+        Number of threads; None means 1, -1 all cores. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Places inducing points, draws mini-batches and restarts.
+        Source of chance for inducing points, mini-batches and restarts.
     verbose : int, default=0
-        1 shows one live line: the rows that are fitted, iteration, bound, seconds so far and, once it can be known,
-        about how many are left for these outputs. (What is no terminal gets a line each ten seconds, and the last.) 2
-        prints a line at each iteration.
+        Verbosity. 0 prints nothing. 1 shows the rows that are fitted, the iteration, the bound and the seconds so far:
+        in one live line if tqdm is installed and the output is a terminal or a notebook, else in a line every ten
+        seconds. 2 prints a line at each iteration.
+    **moved : dict
+        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------
@@ -232,33 +181,38 @@ class EVGPRegressor(SparseGaussianProcess):
 
     >>> import numpy as np
     >>> from sklearn.preprocessing import FunctionTransformer
+    >>> from skevgp import CoefPrior
     >>> def gravity(X):
     ...     own, both = np.sin(X[:, 0]), np.sin(X[:, 0] + X[:, 1])
     ...     return np.stack([np.column_stack([own, both]), np.column_stack([0.0 * own, both])], axis=1)
     >>> X = np.random.default_rng(0).uniform(-3.0, 3.0, (200, 2))
     >>> y = gravity(X) @ [20.0, 5.0] + np.cos(2.0 * X)
-    >>> model = EVGPRegressor(FunctionTransformer(gravity), share_coef=True, n_inducing=20, random_state=0).fit(X, y)
+    >>> prior = CoefPrior(shared=True)
+    >>> model = EVGPRegressor(FunctionTransformer(gravity), coef_prior=prior, n_inducing=20, random_state=0).fit(X, y)
     >>> model.coef_.round(1)
     array([20.,  5.])
     """
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
-        **SparseGaussianProcess._parameter_constraints,
+        "feature_map": "no_validation",
+        "kernel": "no_validation",
+        "kernel_map": "no_validation",
+        "coef_prior": "no_validation",
         "n_inducing": [Interval(Integral, 1, None, closed="left"), StrOptions({"auto"})],
-        "max_inducing": [Interval(Integral, 1, None, closed="left")],
         "inducing_init": [StrOptions({"auto", "k-means", "greedy"}), "array-like"],
         "sharing": [StrOptions({"all", "kernel", "none", "auto"}), "array-like"],
-        "posterior": [StrOptions({"full", "diagonal"})],
-        "noise": [StrOptions({"gaussian", "student-t"})],
+        "noise": "no_validation",
         "noise_cv": [Interval(Integral, 2, None, closed="left"), None],
-        "input_noise": ["array-like", Real, None],
+        "normalize_y": ["boolean"],
         "solver": "no_validation",
         "max_iter": [Interval(Integral, 0, None, closed="left"), None],
-        "tol": [StrOptions({"auto"}), Interval(Real, 0, None, closed="left")],
-        "forgetting_factor": [Interval(Real, 0, 1, closed="right")],
         "warm_start": ["boolean"],
         "n_jobs": [Integral, None],
+        "random_state": ["random_state"],
+        "verbose": ["verbose"],
     }
+
+    _fitted: Fitted
 
     def __init__(
         self,
@@ -266,52 +220,34 @@ class EVGPRegressor(SparseGaussianProcess):
         kernel: Kernel | Callable[..., Any] | None = None,
         *,
         kernel_map: TransformerMixin | None = None,
+        coef_prior: CoefPrior | Literal["auto"] = "auto",
         n_inducing: int | Literal["auto"] = 100,
-        max_inducing: int = 1000,
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Sharing = "auto",
-        posterior: Literal["full", "diagonal"] = "full",
-        coef_mean: ArrayLike | Literal["auto"] = "auto",
-        coef_scale: ArrayLike | Literal["auto"] = "auto",
-        coef_cov: ArrayLike | None = None,
-        share_coef: bool | Literal["auto"] = "auto",
-        noise: Literal["gaussian", "student-t"] = "gaussian",
-        input_noise: ArrayLike | None = None,
-        noise_variance: float | None = None,
+        noise: Literal["gaussian", "student-t"] | Gaussian | StudentT = "gaussian",
         noise_cv: int | None = 5,
         normalize_y: bool = False,
         solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
         max_iter: int | None = None,
-        max_time: float | None = None,
-        tol: float | Literal["auto"] = "auto",
-        forgetting_factor: float = 1.0,
         warm_start: bool = False,
         n_jobs: int | None = None,
         random_state: int | np.random.RandomState | None = None,
         verbose: int = 0,
+        **moved: Any,
     ):
+        refuse_moved(self, moved)
         self.feature_map = feature_map
         self.kernel = kernel
         self.kernel_map = kernel_map
+        self.coef_prior = coef_prior
         self.n_inducing = n_inducing
-        self.max_inducing = max_inducing
         self.inducing_init = inducing_init
         self.sharing = sharing
-        self.posterior = posterior
-        self.coef_mean = coef_mean
-        self.coef_scale = coef_scale
-        self.coef_cov = coef_cov
-        self.share_coef = share_coef
         self.noise = noise
-        self.input_noise = input_noise
-        self.noise_variance = noise_variance
         self.noise_cv = noise_cv
         self.normalize_y = normalize_y
         self.solver = solver
         self.max_iter = max_iter
-        self.max_time = max_time
-        self.tol = tol
-        self.forgetting_factor = forgetting_factor
         self.warm_start = warm_start
         self.n_jobs = n_jobs
         self.random_state = random_state
@@ -376,27 +312,186 @@ class EVGPRegressor(SparseGaussianProcess):
             slowly, and none is sorted) and their log density would be lower by 0.1: ``groups`` should say which belong
             together.
         """
-        solver = resolved(self.solver, self.posterior)
-        if not isinstance(self.n_inducing, str):
-            check_integer(self.n_inducing, "n_inducing", minimum=1)
-        if isinstance(self.n_inducing, str) and isinstance(solver, Adam):
-            raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        self._check_noise(solver, X)
-        progress = monitor_of(self.verbose, solver.callback, self.max_time)
+        solver, noise = as_solver(self.solver), as_noise(self.noise)
+        self._check_together(solver, noise, X)
+        progress = monitor_of(self.verbose, solver.callback, solver.max_time)
         with unchanged_if_it_fails(self), single_threaded_libraries(), progress as monitor:
-            problem = self._problem(X, y, sample_weight, relative_variance, groups)
-            self._training_data = problem.data
-            request = self._request(problem, solver)
-            check_weights(solver, self.posterior, problem.units.prior, self.sharing, problem.per_output)
+            data = Dataset.from_user(self, X, y, sample_weight, relative_variance, groups)
+            problem = self._problem(data, solver, noise)
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
-            request = with_groups(request, rng, monitor, previous)
-            self._fitted = fit_outputs(request, rng, monitor, previous)
-            if self.input_noise is not None:
-                self._fitted = self._with_noisy_inputs(request, rng, monitor)
-            self._set_attributes()
-            self._set_weights(problem.data[-1])
-        self._warn_of((interrupted(self.n_iter_),) if monitor.interrupted else self._fitted.messages)
-        if self._fitted.dependent:
+            fitted = fit_model(problem, rng, monitor, previous)
+            if noise.inputs is not None:
+
+                def refit(variance: np.ndarray, before: Fitted) -> Fitted:
+                    return fit_model(replace(problem, row_variance=variance), rng, monitor, before)
+
+                numbers, covariance = self._numbers(data), input_covariance(noise.inputs, data.maps.n_columns)
+                posterior_of = self._posterior_of(data, problem)
+                fitted = fit_to_noisy_inputs(
+                    fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
+                )
+            self._set_posterior(data, problem, problem.spec, fitted)
+            self._set_attributes(fitted, data)
+        self._warn((interrupted(self.n_iter_),) if monitor.interrupted else fitted.messages, problem.spec)
+        if fitted.dependent:
             warn_user(DEPENDENT_ROWS, DependentRowsWarning)
         return self
+
+    @fit_context(prefer_skip_nested_validation=False)
+    def partial_fit(
+        self,
+        X: ArrayLike,
+        y: ArrayLike,
+        sample_weight: ArrayLike | None = None,
+        *,
+        relative_variance: ArrayLike | None = None,
+        forgetting_factor: float = 1.0,
+    ) -> Self:
+        """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
+
+        The first call is a `fit`. After Adam, q moves to its optimum. The rows seen before are known by their sums
+        only: where the noise is below 1e-8 of the signal, ``lower_bound_`` and ``upper_bound_`` are good to about a
+        nat.
+
+        Parameters
+        ----------
+        X : array-like or dask.array.Array of shape (n_samples, n_features)
+            New rows. The first rows should be like all: they place the inducing points (no more than there are rows),
+            kernel and noise.
+        y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
+            With as many outputs as in the first call.
+        sample_weight, relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
+            Those of the new rows, as for `fit`.
+        forgetting_factor : float, default=1.0
+            Factor on the log likelihood of the rows seen so far, in (0, 1]: 1 remembers all of them, 0.99 those of
+            about the last hundred calls (exponential forgetting, for a system that drifts).
+
+        Returns
+        -------
+        self : object
+            The estimator itself, with the new rows in its posterior.
+
+        Raises
+        ------
+        ValueError, TypeError
+            As `fit`, and if y does not have the outputs of the first call.
+        """
+        fading = check_real(forgetting_factor, "forgetting_factor", minimum=0.0, strict=True)
+        if fading > 1.0:
+            raise ValueError(f"forgetting_factor must be at most 1; got {forgetting_factor!r}.")
+        if not self.__sklearn_is_fitted__():
+            return self.fit(X, y, sample_weight, relative_variance=relative_variance)
+        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        noise = as_noise(self.noise)
+        if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
+            raise ValueError(
+                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (what '
+                f"changes would be taken for outliers); got forgetting_factor={forgetting_factor!r}."
+            )
+        with unchanged_if_it_fails(self), single_threaded_libraries():
+            maps, fitted = self._posterior.maps, self._fitted
+            data = Dataset.further(self, maps, X, y, sample_weight, relative_variance)
+            n_outputs = 1 if data.y.ndim == 1 else data.y.shape[1]
+            if n_outputs != self._n_outputs:
+                raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
+            residuals = fitted.units.rows(data.source).residuals
+            check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
+            noisier = None
+            if noise.inputs is not None:
+                covariance, numbers = input_covariance(noise.inputs, maps.n_columns), self._numbers(data)
+                by_inputs, _ = look_at_slopes(self._posterior, data, numbers, covariance, self._columns_changed)
+                noisier = relative_noise(by_inputs, self._posterior.predictor.noise, data.chosen)
+            self._fitted = fitted.updated(data.source, fading, noisier)
+            self._posterior = replace(self._posterior, predictor=self._fitted.predictor())
+            self._set_weights_and_noise()
+            self._set_weights_of_rows(data)
+        return self
+
+    @property
+    def lower_bound_(self) -> float:
+        """Lower bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
+        # After partial_fit it is found when somebody asks.
+        with single_threaded_libraries():
+            return float(self._fitted.lower_bound)
+
+    @property
+    def upper_bound_(self) -> float:
+        """Upper bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
+        with single_threaded_libraries():
+            return float(self._fitted.upper_bound)
+
+    # If y is what was added to columns of X, which ones: `ResidualRegressor` says so, since their noise is in y too.
+    _columns_changed: np.ndarray | None = None
+
+    def _check_together(self, solver: LBFGS | Adam, noise: Gaussian | StudentT, X: Any) -> None:
+        """Refuse arguments that do not go together."""
+        if not isinstance(self.n_inducing, str):
+            check_integer(self.n_inducing, "n_inducing", minimum=1)
+        elif solver.stochastic:
+            raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
+        asked = 'noise="student-t"' if noise.heavy_tails else "inputs of Gaussian noise"
+        if (noise.heavy_tails or noise.inputs is not None) and (solver.stochastic or is_dask(X)):
+            raise ValueError(
+                f'{asked} needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
+                f"solver={self.solver!r} and X of type {type(X).__name__}."
+            )
+
+    def _problem(self, data: Dataset, solver: LBFGS | Adam, noise: Gaussian | StudentT) -> Problem:
+        prior = as_coef_prior(self.coef_prior)
+        problem = Problem.from_data(
+            data, kernel=self.kernel, coef_prior=prior, noise=noise, normalize_y=self.normalize_y
+        )
+        folds, tol, most = self.noise_cv, solver.tol, getattr(solver, "max_inducing", None)
+        problem = replace(
+            problem,
+            sharing=self.sharing,
+            family=solver.posterior,
+            placement=Placement.of(self.inducing_init, self.n_inducing, most, problem.n_columns),
+            solver=solver,
+            max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,
+            tol=None if isinstance(tol, str) else tol,
+            noise_cv=None
+            if folds is None
+            else CrossValidation(folds, problem.groups, problem.spec.starts.signal.bounds is None),
+            n_threads=effective_n_jobs(self.n_jobs),
+        )
+        problem.check()
+        return problem
+
+    def _posterior_of(self, data: Dataset, problem: Problem) -> Callable[[Fitted], Posterior]:
+        maps = replace(data.maps, shapes=problem.shapes)
+        return lambda fitted: Posterior(fitted.predictor(), maps)
+
+    def _numbers(self, data: Dataset) -> np.ndarray:
+        """X as numbers, whose noise is known."""
+        try:
+            # While a model is fitted, its maps are not yet attributes.
+            self.kernel_map_ = data.maps.kernel_map
+            return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
+        except ValueError as error:
+            raise ValueError(
+                "inputs of Gaussian noise needs an X of numbers, none of them missing: others have no slopes."
+            ) from error
+
+    def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
+        points = [group.points for group in self._posterior.predictor.by_output]
+        same = len({len(own) for own in points}) == 1
+        self.inducing_points_: Any = np.array(points) if same else points
+        if sum(len(one.values["inducing_points"]) for one in fitted.models) == 1:
+            self.inducing_points_ = points[0]
+        self.sharing_ = fitted.sharing
+        self.loss_curve_ = fitted.loss_curve
+        self.n_iter_ = fitted.n_iter
+        self.n_parameters_ = fitted.n_parameters
+        self._set_weights_of_rows(data)
+
+    def _set_weights_of_rows(self, data: Dataset) -> None:
+        """How much each of the user's rows counts, if the noise doubts rows."""
+        scales, outputs = self._fitted.row_scales, self._fitted.outputs
+        if scales is None:
+            self.__dict__.pop("weights_", None)
+            return
+        model_of = [next(i for i, own in enumerate(outputs) if o in own) for o in range(self._n_outputs)]
+        weights = data.chosen.as_given(scales[:, model_of])
+        self.weights_ = weights[:, 0] if self._n_outputs == 1 else weights

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from numbers import Integral
 from typing import Any, ClassVar, Self
 
@@ -14,13 +15,51 @@ from sklearn.utils.metadata_routing import MetadataRouter, MethodMapping, proces
 from sklearn.utils.metaestimators import available_if
 from sklearn.utils.validation import check_is_fitted, validate_data
 
-from ..data.dask import aligned, as_rows, is_dask
-from ..utils.sklearn import HasMethods, fit_context
-from ..utils.validation import FLOATS, is_frame, unchanged_if_it_fails, validate_frame, validate_numbers
-from .residual_control import ResidualForControl, columns_of, regressor_has
+from ..control.posterior import Posterior, delegate
+from ..data.dask import aligned, as_rows
+from ..utils.sklearn import HasMethods, fit_context, safe_indexing
+from ..utils.state import StatefulEstimator
+from ..utils.validation import (
+    FLOATS,
+    as_floats,
+    is_dask,
+    is_frame,
+    unchanged_if_it_fails,
+    validate_frame,
+    validate_numbers,
+)
 
 
-class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
+def regressor_has(method: str) -> Callable[[Any], bool]:
+    """For `available_if`: the fitted regressor has a method or, before `fit`, the one that is given."""
+
+    def has(self: Any) -> bool:
+        getattr(self.regressor_ if hasattr(self, "regressor_") else self.regressor, method)
+        return True
+
+    return has
+
+
+def _delegate(name: str) -> Any:
+    """What the posterior of the sum is asked for, if the regressor has one."""
+    return available_if(regressor_has(name))(delegate(name))
+
+
+def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
+    """Columns of an array or a data frame as numbers, (n, len(indices)), or (n,) of a single one."""
+    if ndim == 1:
+        return columns_of(X, indices)[:, 0]
+    if not is_frame(X):
+        return X[:, indices]
+    columns = np.column_stack(
+        [as_floats(safe_indexing(X, index, axis=1), f"Column {index} of X, a base,") for index in indices.tolist()]
+    )
+    if not np.isfinite(columns).all():
+        raise ValueError("The base columns of X must be finite; they contain NaN or infinity.")
+    return columns
+
+
+class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     """Fit a regressor to what y adds to some columns of X, and predict the sum.
 
     For x = (state, input) and y the next state, the regressor learns the change of state: RES-VGP and RES-DBNN of the
@@ -177,6 +216,29 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
         return samples + columns_of(X, self.base_).reshape(*samples.shape[:-1], 1)
 
+    value_and_jacobian = _delegate("value_and_jacobian")
+    jacobian = _delegate("jacobian")
+    predict_gradient = _delegate("predict_gradient")
+    novelty = _delegate("novelty")
+    compile = _delegate("compile")
+    sample_functions = _delegate("sample_functions")
+    to_casadi = _delegate("to_casadi")
+    to_casadi_parameters = _delegate("to_casadi_parameters")
+    to_c = _delegate("to_c")
+
+    @property
+    def _posterior(self) -> Posterior | None:
+        """Of the sum, if the regressor has one."""
+        posterior = getattr(self.regressor_, "_posterior", None)
+        return None if posterior is None else posterior.with_base(self.base_)
+
+    def _checked(self, X: Any, asked: str) -> Any:
+        return self.regressor_._checked(self._validated(X), asked)
+
+    def _checked_numbers(self, X: Any, asked: str) -> np.ndarray:
+        numbers: np.ndarray = self.regressor_._checked_numbers(self._validated(X), asked)
+        return numbers
+
     def get_metadata_routing(self) -> MetadataRouter:
         """Tell scikit-learn's metadata routing which methods pass what on.
 
@@ -222,7 +284,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, ResidualForControl):
         if get_config()["enable_metadata_routing"]:
             routed = process_routing(self, method, **params).get("regressor", Bunch())
         residuals = y - columns_of(X, base, y.ndim)
-        if getattr(regressor, "input_noise", None) is not None:
+        if hasattr(regressor, "_columns_changed"):
             # The noise of these columns is in what is learned too.
             regressor._columns_changed = base
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))

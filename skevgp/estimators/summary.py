@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from html import escape
 from textwrap import wrap
 from typing import Any, NamedTuple
 
 import numpy as np
-from sklearn.base import BaseEstimator
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process.kernels import ConstantKernel, Product
 
-from ..fitting.coef_prior import coef_names
+from ..fitting.prior import coef_names
 from ..utils.optional import require
-from ..utils.validation import check_fitted
 
 # What the Gaussian process of a joint's torque sees.
 _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
@@ -77,11 +75,12 @@ class ModelSummary:
     --------
     >>> from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     >>> from sklearn.preprocessing import PolynomialFeatures
-    >>> from skevgp import EGPRegressor
+    >>> from skevgp import CoefPrior, EGPRegressor
     >>> from skevgp.datasets import make_toy
     >>> X, y = make_toy(random_state=0, return_X_y=True)
     >>> kernel = ConstantKernel(25.0) * RBF(0.6) + WhiteKernel(2.8)
-    >>> model = EGPRegressor(PolynomialFeatures(1), kernel, coef_scale=[[2.0, 5.0]], max_iter=0).fit(X, y)
+    >>> prior = CoefPrior(scale=[[2.0, 5.0]])
+    >>> model = EGPRegressor(PolynomialFeatures(1), kernel, coef_prior=prior, max_iter=0).fit(X, y)
     >>> print(model.summary())
     EGPRegressor, exact, for 1 output
     log marginal likelihood: -410.85 nats
@@ -180,49 +179,13 @@ class ModelSummary:
             yield *first, one.name, _plus_minus(one.prior_mean, one.prior_std), _plus_minus(one.value, one.std)
 
 
-class Summarised(BaseEstimator):
-    """An estimator that says what it has learned, and shows it in notebooks below scikit-learn's diagram."""
-
-    def _described(self) -> ModelSummary:
-        """Of a fitted model."""
-        raise NotImplementedError
-
-    def summary(self) -> ModelSummary:
-        """Say what was learned: kernel, noise, what is known of the likelihood, and weights beside their prior.
-
-        Returns
-        -------
-        summary : ModelSummary
-            ``print`` shows it as text and a notebook as tables; ``to_frame()`` makes a data frame of it, and
-            ``lower_bound`` and ``upper_bound`` are what is known of the log marginal likelihood.
-
-        Raises
-        ------
-        sklearn.exceptions.NotFittedError
-            If the model is not fitted.
-        """
-        check_fitted(self)
-        return self._described()
-
-    @property
-    def _repr_html_(self) -> Callable[[], str]:
-        """What IPython asks for; scikit-learn has it only if its option ``display`` is "diagram"."""
-        diagram: Callable[[], str] = super()._repr_html_
-        return lambda: diagram() + self._html_of_summary()
-
-    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
-        """The same for Jupyter."""
-        bundle: dict[str, str] = super()._repr_mimebundle_(**kwargs)
-        if "text/html" in bundle:
-            bundle["text/html"] += self._html_of_summary()
-        return bundle
-
-    def _html_of_summary(self) -> str:
-        try:
-            said = self.summary()._repr_html_()
-        except NotFittedError:
-            return ""
-        return f"<details open><summary>What was learned</summary>{said}</details>"
+def html_of(model: Any) -> str:
+    """The summary of a fitted model, folded, for notebooks; empty before a fit."""
+    try:
+        said = model.summary()._repr_html_()
+    except NotFittedError:
+        return ""
+    return f"<details open><summary>What was learned</summary>{said}</details>"
 
 
 def of_gaussian_process(model: Any) -> ModelSummary:
@@ -293,7 +256,7 @@ def _kernel_columns(model: Any) -> Sequence[str]:
     """What the columns that the kernel sees are called."""
     columns = getattr(model, "feature_names_in_", None)
     if model.kernel_map_ is not None:
-        return list(coef_names(model.kernel_map_, columns, model._row_shapes[0][-1], "k"))
+        return list(coef_names(model.kernel_map_, columns, model._posterior.maps.shapes[0][-1], "k"))
     return [f"x{index}" for index in range(model.n_features_in_)] if columns is None else list(columns)
 
 

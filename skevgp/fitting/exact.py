@@ -2,111 +2,87 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from ..data.internal import Rows
-from ..data.source import RawRows
-from ..kernels.parse import KernelSpec
 from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.parameters import ParameterTable, Values
-from ..model.predictor import CoefficientPrior, Predictor
-from ..model.statistics import Kernel
-from ..solvers.lbfgs import lbfgs
-from ..solvers.minimum import Minimum
+from ..model.predictor import Predictor
+from ..solvers import LBFGS
+from ..solvers.base import Minimum
+from ..solvers.lbfgs import Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
-from .advice import far_from_prior, how_it_ended, interrupted, learned_too_little
-from .rules import Rules
-from .start import centred_kernels, checked_variance, starting_table
-from .strategy import Attempt, Fit, Strategy, drawn, search
+from ..utils.validation import LARGEST, as_floats
+from .messages import far_from_prior, interrupted, lbfgs_ended, learned_too_little
+from .problem import Problem
+from .search import FeaturesAlone, Fit, Rules, Start, drawn, search
+from .start import centred_kernels, checked_variance, starting_table, with_signal_of_constants
 from .units import Units, check_independent, may_hide_noise, noise_of_most_evidence
+
+if TYPE_CHECKING:
+    from .model import Model
 
 # (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
 # On so many rows it is seen whether a user's kernel works.
 _CHECKED_ROWS = 500
+# Of a second opinion on the kernel of a sparse model.
+_SAMPLE = 1000
 # A signal that is as good as none, as a share of one that the user fixes.
 _NO_SIGNAL = 1e-12
 
 
 @dataclass(frozen=True)
-class ExactOptions:
-    """How to optimise.
-
-    Attributes
-    ----------
-    rules : Rules
-    max_iter : int
-    tol : float
-        In nats.
-    n_restarts : int
-    optimizer : callable, optional
-        The user's, in place of L-BFGS.
-    """
-
-    rules: Rules
-    max_iter: int
-    tol: float
-    n_restarts: int
-    optimizer: Optimizer | None = None
-
-
-@dataclass(frozen=True)
 class ExactTask:
-    """An exact model to be fitted: what all attempts have in common.
+    """An exact model of some rows, as a search needs it.
 
-    Attributes
-    ----------
-    model : ExactModel
-    table : ParameterTable
-    scatter : ndarray of shape (o,)
-        Variance of what the features leave over.
-    options : ExactOptions
-    rng : RandomState
-        Draws the restarts.
-    monitor : Monitor
-    units : Units, optional
-        Those in which a user's optimizer is asked.
+    ``scatter`` is the variance (o,) of what the features leave over. ``rng`` draws the restarts. With ``optimizer``,
+    the user's takes the place of L-BFGS, and is asked in the units of ``units``.
     """
 
     model: ExactModel
     table: ParameterTable
     scatter: np.ndarray
-    options: ExactOptions
+    rules: Rules
+    max_iter: int
+    tol: float
     rng: np.random.RandomState
     monitor: Monitor
+    n_restarts: int = 0
+    optimizer: Optimizer | None = None
     units: Units | None = None
 
+    # Of sparse models only: samples of the rows, inducing points, and the fit before.
+    interpolates: ClassVar[bool] = True
+    samples: ClassVar[tuple[int, ...]] = ()
+    warm: ClassVar[None] = None
+    placed: ClassVar[bool] = False
+    place: ClassVar[None] = None
+
     @property
-    def strategy(self) -> Strategy:
-        """From where the model is fitted."""
-        precision, signal = self.model.rows.precision, self.table["signal"]
-        alone, noise_alone, most_alone, hidden = -np.inf, None, -np.inf, False
-        if self.options.optimizer is None and self.options.max_iter > 0:
-            hidden = may_hide_noise(self.model.prior, len(self.model.rows.inputs))
-            little = np.where(signal.free, signal.value_limits()[:, 0], signal.start)
-            alone, noise_alone = self._best_with(little, hidden)
-            if hidden and not signal.free.all():
-                # What a signal that stays costs depends on where the kernel ends.
-                most_alone, _ = self._best_with(_NO_SIGNAL * signal.start, hidden)
-        return Strategy(
-            self.options.rules,
-            self.table,
-            self.options.max_iter,
-            self.options.n_restarts,
-            self.scatter,
-            alone=alone,
-            noise_alone=noise_alone,
-            most_alone=most_alone,
-            noise_hidden=hidden,
-            mean_precision=1.0 if precision is None else float(precision.sum() / self.model.rows.total),
-            interpolates=True,
-            restart=lambda: drawn(self.table, self.options.rules, self.rng),
-        )
+    def mean_precision(self) -> float:
+        """Of the rows, where a row with the noise variance itself has 1."""
+        precision = self.model.rows.precision
+        return 1.0 if precision is None else float(precision.sum() / self.model.rows.total)
+
+    @cached_property
+    def alone(self) -> FeaturesAlone:
+        """The likelihood of the features with as little Gaussian process as the parameters allow."""
+        if self.optimizer is not None or self.max_iter == 0:
+            return FeaturesAlone()
+        signal, hidden = self.table["signal"], may_hide_noise(self.model.prior, len(self.model.rows.inputs))
+        bound, noise = self._best_with(np.where(signal.free, signal.value_limits()[:, 0], signal.start), hidden)
+        most = -np.inf
+        if hidden and not signal.free.all():
+            # What a signal that stays costs depends on where the kernel ends.
+            most, _ = self._best_with(_NO_SIGNAL * signal.start, hidden)
+        return FeaturesAlone(bound, noise, most, hidden)
 
     def _best_with(self, signal: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
         """The likelihood with such a signal (o,), and the noise variances (o,), perhaps hidden, with the highest."""
@@ -120,21 +96,25 @@ class ExactTask:
 
         return noise_of_most_evidence(evidence, least, highest, self.model.prior.shared)
 
-    def minimise(self, attempt: Attempt) -> Fit:
-        """L-BFGS on the log marginal likelihood per row."""
-        table = self.table.started_at(attempt.values)
-        n, spent = self.model.rows.total, len(attempt.loss_curve)
-        loss = LikelihoodObjective(self.model, table)
-        monitor = self.monitor.seen_as(spent, n, is_last=attempt.is_last and self.options.n_restarts == 0)
-        if self.options.optimizer is not None and table.size > 0:
-            return self._minimised_by(self.options.optimizer, table, loss, monitor)
-        minimum = lbfgs(loss, table.start(), table.limits(), attempt.until - spent, self.options.tol / n, monitor)
+    def restart(self) -> Values:
+        """First values drawn at random."""
+        return drawn(self.table, self.rules, self.rng)
+
+    def minimise(self, start: Start) -> Fit:
+        """Run L-BFGS, or the user's optimizer, on minus the log marginal likelihood per row."""
+        table = self.table.started_at(start.values)
+        n, spent = self.model.rows.total, len(start.loss_curve)
+        loss, monitor = LikelihoodObjective(self.model, table), self.monitor.seen_as(spent, n)
+        if self.optimizer is not None and table.size > 0:
+            return self._minimised_by(self.optimizer, table, loss, monitor)
+        most, tolerance = start.until - spent, Tolerance(self.tol / n)
+        minimum = LBFGS().minimise(loss, table.start(), table.limits(), most, tolerance, monitor)
         return Fit(
             table.values(minimum.x),
             -n * minimum.loss,
-            attempt.loss_curve + [n * value for value in minimum.loss_curve],
+            start.loss_curve + [n * value for value in minimum.loss_curve],
             minimum.converged,
-            how_it_ended(minimum, spent + minimum.n_iter, self.options.max_iter, self.options.tol, sparse=False),
+            lbfgs_ended(minimum, spent + minimum.n_iter, self.max_iter, self.tol, sparse=False),
         )
 
     def _minimised_by(
@@ -189,44 +169,35 @@ class ExactTask:
 
 @dataclass(frozen=True)
 class Unhindered:
-    """What a kernel would be without inducing points: the exact model of some rows, fitted.
-
-    Attributes
-    ----------
-    model : ExactModel
-    fit : Fit
-    n_parameters : int
-        That were fitted.
-    """
+    """What a kernel would be without inducing points: the exact model of some rows, fitted."""
 
     model: ExactModel
     fit: Fit
     n_parameters: int
 
-    @classmethod
-    def of(
-        cls,
-        kernel: Kernel,
-        prior: CoefficientPrior,
-        rows: RawRows,
-        table: ParameterTable,
-        scatter: np.ndarray,
-        options: ExactOptions,
-        rng: np.random.RandomState,
-        monitor: Monitor,
-    ) -> Unhindered:
-        """Fit it; arguments as of `ExactModel` and `ExactTask`."""
-        model = ExactModel(kernel, prior, np.zeros(prior.scale.shape, dtype=bool), rows)
-        return cls(model, search(ExactTask(model, table, scatter, options, rng, monitor)), table.size)
-
     def missed_by(self, values: Values) -> float:
         """How much less likely the rows are under other values, in nats per row and output.
 
-        Less what the fit has gained by chance, on average half a nat for each parameter (Wilks 1938).
+        Less half a nat for each parameter: that much a fit gains by chance.
         """
         likelihood = float(self.model.log_likelihoods(values).sum())
         nats = self.model.rows.total * self.model.rows.targets.shape[1]
         return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
+
+
+def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:
+    """Fit the exact model of a sample of a model's rows, ``tol`` in nats per row and output.
+
+    None if the kernel is fixed, or groups have kernels of their own.
+    """
+    if model.max_iter == 0 or not model.table["hyperparameters"].free.any() or model.sparse.kernels is not None:
+        return None
+    sample, prior = model.rows.sample(_SAMPLE, model.rng), model.sparse.prior
+    exact = ExactModel(model.sparse.kernel, prior, np.zeros(prior.scale.shape, dtype=bool), sample)
+    table, tol = model.table.without("inducing_points"), tol * sample.total * sample.targets.shape[1]
+    tol = max(model.tol or 0.0, tol)
+    task = ExactTask(exact, table, model.scatter, model.rules, max_iter, tol, model.rng, model.monitor.silent())
+    return Unhindered(exact, search(task), table.size)
 
 
 @dataclass(frozen=True)
@@ -305,71 +276,49 @@ class ExactFit:
 
 
 def fit_exact(
-    units: Units,
-    rows: Rows,
-    spec: KernelSpec,
-    vague: np.ndarray,
-    options: ExactOptions,
+    problem: Problem,
     rng: np.random.RandomState,
     monitor: Monitor,
+    n_restarts: int,
+    tol: float,
+    optimizer: Optimizer | None = None,
 ) -> ExactFit:
-    """Maximise the log marginal likelihood.
-
-    Parameters
-    ----------
-    units : Units
-    rows : Rows
-        In internal units.
-    spec : KernelSpec
-        What the user says of kernel and noise.
-    vague : ndarray of shape (o, p)
-        Weights with an infinite prior scale.
-    options : ExactOptions
-    rng : RandomState
-        Draws the restarts.
-    monitor : Monitor
-        Told of each iteration's loss, in the user's units.
-
-    Returns
-    -------
-    fitted : ExactFit
-
-    Raises
-    ------
-    ValueError
-        If features with vague weights depend on each other, or the kernel does not work.
-    """
-    n, starts = len(rows), spec.starts
+    """Maximise the log marginal likelihood of all rows."""
+    units, rows, vague = problem.units, problem.units.rows(problem.source), problem.vague
+    n, first, variance = len(rows), problem.spec.starts.hyperparameters.value, 1.0
     everything = rows.some(np.arange(n))
     check_independent(everything.features, vague, units.prior.shared)
-    kernel, *others = kernels = centred_kernels(spec.covariance, rows.inputs)
-    first, variance = starts.hyperparameters.value, 1.0
+    kernel, *others = kernels = centred_kernels(problem.spec.covariance, rows.inputs)
     if first is not None:
         some = np.unique(np.linspace(0, n - 1, _CHECKED_ROWS).astype(int))
         variance = checked_variance(kernel, first, everything.of(slice(0, 1)).inputs[some])
-    table = starting_table(
-        rows.inputs,
-        np.empty((1, 0, everything.inputs.shape[-1])),
-        units.target_unit,
-        starts,
-        rows.scatter(),
-        options.rules,
-        kernel.n_hyperparameters,
-        variance,
-        rows.mean_precision,
-        target_scatter=units.target_scatter,
-        rounding=0.0 if units.rounding is None else units.rounding,
-        constant=False if units.constant is None else units.constant,
-    )
-    if options.optimizer is not None:
+    table = starting_table(problem, rows, np.empty((1, 0, everything.inputs.shape[-1])), variance, exact=True)
+    if optimizer is not None:
         # It is the user's when to go where.
         table = table.widened(("signal", "noise"))
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
-    monitor = monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum()))
-    best = search(ExactTask(model.with_fewer_features(), table, rows.scatter(), options, rng, monitor, units))
+    task = ExactTask(
+        model.with_fewer_features(),
+        table,
+        rows.scatter(),
+        problem.rules,
+        problem.max_iter,
+        tol,
+        rng,
+        monitor.seen_as(shift=float(log_units_of_contrasts(units, model).sum())),
+        n_restarts,
+        optimizer,
+        units,
+    )
+    best = search(task)
+    values, changed = with_signal_of_constants(problem, rows, table, best.values)
+    if changed:
+        best = replace(best, values=values, bound=float(model.log_likelihoods(values).sum()))
+
+    # What the user should know of it.
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
-    advice = [best.message, far_from_prior(proper, rows)]
-    if options.max_iter > 0:
+    messages = [best.message, far_from_prior(proper, rows)]
+    if problem.max_iter > 0:
         each = [(rows, best.values["noise"])]
         if others:
             each = [(rows.within(slice(o, o + 1)), best.values["noise"][[o]]) for o in range(len(kernels))]
@@ -377,8 +326,8 @@ def fit_exact(
             learned_too_little(own, best.values | {"noise": noise}, table, own_rows, sparse=False)
             for own, (own_rows, noise) in zip(kernels, each, strict=True)
         ]
-        advice.append(max(told))
-    message = " ".join(part for part in advice if part)
+        messages.append(max(told))
+    message = " ".join(part for part in messages if part)
     if monitor.stopped:
         message = interrupted(best.n_iter, monitor.max_time if monitor.out_of_time else None)
     return ExactFit(units, model, table, best, (message,) if message else ())
@@ -390,3 +339,52 @@ def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
     if model.prior.shared:
         n_vague[1:] = 0
     return (model.rows.total - n_vague) * np.log(units.target_unit)
+
+
+# (output, numbers) -> a value, and its gradient in the logarithms of these.
+OfKernel = Callable[[int, np.ndarray], tuple[float, np.ndarray]]
+
+
+def value_at(
+    theta: ArrayLike, eval_gradient: bool, order: np.ndarray, fitted: Sequence[np.ndarray], of_kernel: OfKernel
+) -> Any:
+    """The sum over outputs of what each has at its theta and, if asked for, its gradient, of the shape of theta.
+
+    It is -inf, as in scikit-learn's GaussianProcessRegressor, for a kernel whose matrix cannot be factorised.
+
+    Parameters
+    ----------
+    theta : array-like of shape (n_theta,) or, for several outputs, (o, n_theta)
+    eval_gradient : bool
+    order : ndarray of shape (n_theta,)
+        Where in the numbers each entry of theta is: `KernelSpec.order`.
+    fitted : sequence of ndarray
+        Of each output the numbers (k̃'s hyperparameters, s², perhaps σ²), in the user's units: what theta does not have
+        stays as it is there.
+    of_kernel : callable
+        In the user's units.
+
+    Raises
+    ------
+    ValueError
+        If theta has another shape or is out of range.
+    """
+    n_outputs, thetas = len(fitted), as_floats(theta, "theta")
+    shape = (len(order),) if n_outputs == 1 else (n_outputs, len(order))
+    if thetas.shape != shape:
+        each = "" if n_outputs == 1 else " of each of the kernels"
+        raise ValueError(f"theta must be of shape {shape}, as kernel_.theta{each}; got {thetas.shape}.")
+    if not (np.abs(thetas) <= np.log(LARGEST)).all():
+        raise ValueError(f"theta must be logarithms of numbers from {1 / LARGEST:g} to {LARGEST:g}; got {theta!r}.")
+    total, gradient = 0.0, np.zeros((n_outputs, len(order)))
+    for o, own in enumerate(fitted):
+        numbers = own.copy()
+        numbers[order] = np.exp(thetas.reshape(gradient.shape)[o])
+        try:
+            with np.errstate(over="ignore", invalid="ignore"):
+                value, bars = of_kernel(o, numbers)
+        except NotPositiveDefiniteError:
+            return (-np.inf, np.zeros(shape)) if eval_gradient else -np.inf
+        total += value
+        gradient[o] = bars[order]
+    return (total, gradient.reshape(shape)) if eval_gradient else total

@@ -9,7 +9,7 @@ import numpy as np
 from sklearn.cluster import KMeans
 from sklearn.exceptions import ConvergenceWarning
 
-from ..data.source import Moments
+from ..data.rows import Moments
 from ..exceptions import ignored
 from ..model.statistics import Kernel, Whitening
 from ..utils.validation import as_floats, check_magnitude
@@ -46,10 +46,10 @@ class Placement:
     max_inducing: int | None = None
 
     @classmethod
-    def of(cls, inducing_init: Any, n_inducing: int | str, max_inducing: int, n_columns: int) -> Placement:
+    def of(cls, inducing_init: Any, n_inducing: int | str, max_inducing: int | None, n_columns: int) -> Placement:
         """What the arguments of these names say, for inputs of so many columns; points are checked."""
         most = max_inducing if isinstance(n_inducing, str) else None
-        first = min(_FIRST, max_inducing) if isinstance(n_inducing, str) else n_inducing
+        first = min(_FIRST, max_inducing or _FIRST) if isinstance(n_inducing, str) else n_inducing
         if isinstance(inducing_init, str):
             return cls(cast(Literal["auto", "k-means", "greedy"], inducing_init), first, most)
         points = as_floats(inducing_init, "inducing_init")

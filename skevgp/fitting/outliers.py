@@ -4,18 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..data.internal import Rows
-from ..data.source import LocalSource
+from ..data.rows import LocalSource, Rows
 from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.student_t import RowScales
-from ..solvers.lbfgs import DESCENT
-from .learned import Learned
-from .sparse import SparseTask
-from .strategy import Attempt, Fit, better, search
+from .model import ENOUGH, LEAST_TOL, Model
+from .search import Fit, Start, better, search
+
+if TYPE_CHECKING:
+    from .fit import FittedModel
 
 # The first look at the rows: a fit of so many iterations to so many of them, or so many per inducing point.
 _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10
@@ -57,18 +58,18 @@ class RowDoubts:
             raise TypeError("Rows of Dask arrays cannot be doubted.")
         return replace(rows, source=source.weighed(self.scales.mean, self.scales.log_variance))
 
-    def told(self, learned: Learned) -> Learned:
+    def told(self, fitted: FittedModel) -> FittedModel:
         """What is said of the noise is that of rows that are no outliers; no upper bound is known."""
-        predictor = replace(learned.predictor, noise=learned.values["noise"] * self.noise_factor)
-        return replace(learned, known_upper_bound=np.inf, predictor=predictor)
+        predictor = replace(fitted.predictor, noise=fitted.values["noise"] * self.noise_factor)
+        return replace(fitted, known_upper_bound=np.inf, predictor=predictor)
 
-    def updated(self, learned: Learned, rows: Rows) -> Learned:
+    def updated(self, fitted: FittedModel, rows: Rows) -> FittedModel:
         """Fold new rows in, which are doubted first for what is predicted of them, and then by turns with q.
 
         What was doubted of the rows before stays.
         """
-        noise, plain = learned.values["noise"], replace(learned, doubts=None)
-        look = look_at(rows, of_residuals(learned.predictor))
+        noise, plain = fitted.values["noise"], replace(fitted, doubts=None)
+        look = look_at(rows, of_residuals(fitted.predictor))
         predicted = look.latent + np.multiply.outer(look.variance, noise)
         doubts = replace(self, scales=RowScales(len(noise), (look.errors**2 / predicted).sum(axis=1)))
         for _ in range(_TURNS):
@@ -84,47 +85,34 @@ class RowDoubts:
         return bool(np.abs(self.scales.mean - before.scales.mean).max() >= _SETTLED)
 
 
-def fit_doubting(task: SparseTask, run: Callable[[SparseTask], tuple[SparseTask, Fit]]) -> Learned:
-    """Fit a model whose noise has heavy tails by coordinate ascent: no turn lowers the bound.
-
-    Parameters
-    ----------
-    task : SparseTask
-        With rows of which none is doubted yet.
-    run : callable
-        Finds the best of all fits to a task's rows; returns the task that it is of, and the fit.
-
-    Returns
-    -------
-    learned : Learned
-    """
-    rows, doubts = task.rows, _first_doubts(task)
-    first = task.max_iter - int((1.0 - _BEFORE) * task.max_iter)
-    monitor = task.monitor.seen_as(is_last=False)
+def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, RowDoubts]:
+    """Fit a model whose noise has heavy tails by coordinate ascent: no turn lowers the bound."""
+    rows, doubts = model.rows, _first_doubts(model)
+    first = model.max_iter - int((1.0 - _BEFORE) * model.max_iter)
     # Where no row stands out, the fit is that with Gaussian noise.
     seen = doubts.weigh(rows) if (doubts.scales.outlier > 0.5).any() else rows
-    weighed, fit = run(replace(task, rows=seen, max_iter=first, monitor=monitor))
-    weighed = replace(weighed, max_iter=task.max_iter)
-    with task.monitor.keeping_the_best():
-        while not task.monitor.stopped:
+    weighed, fit = run(replace(model, rows=seen, max_iter=first))
+    weighed = replace(weighed, max_iter=model.max_iter)
+    with model.monitor.keeping_the_best():
+        while not model.monitor.stopped:
             weighed, settled, now = settle(weighed, fit, rows, doubts)
             moved, fit, doubts = now.differ_from(doubts), settled, now
-            if fit.n_iter >= task.max_iter or (fit.converged and not moved):
+            if fit.n_iter >= model.max_iter or (fit.converged and not moved):
                 break
-            until = min(fit.n_iter + _BETWEEN, task.max_iter)
-            further = better(fit, weighed.minimise(Attempt(fit.values, until, fit)))
+            until = min(fit.n_iter + _BETWEEN, model.max_iter)
+            further = better(fit, weighed.minimise(Start(fit.values, until, fit)))
             enough = _PATIENCE * _tolerance(weighed, further)
             fit, gained = further, further.bound - fit.bound
             if gained < enough:
                 fit = replace(fit, converged=True, message="")
-    return Learned.of(weighed, fit, doubts)
+    return weighed, fit, doubts
 
 
-def _first_doubts(task: SparseTask) -> RowDoubts:
+def _first_doubts(model: Model) -> RowDoubts:
     """From a short fit to some rows, by whose errors' median all are judged."""
-    rows, size = task.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * task.n_inducing)
-    some = rows.sampled(size, task.rng) if size < len(rows) else rows
-    short = replace(task, rows=some, max_iter=min(_LOOK_ITERATIONS, task.max_iter), monitor=task.monitor.silent())
+    rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
+    some = rows.sampled(size, model.rng) if size < len(rows) else rows
+    short = replace(model, rows=some, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
     look = look_at(rows, predictor_at(short, search(short).values))
     n_outputs = look.errors.shape[1]
     scales = RowScales(n_outputs, look.distances(look.typical))
@@ -133,44 +121,44 @@ def _first_doubts(task: SparseTask) -> RowDoubts:
     return RowDoubts(scales, np.ones(n_outputs))
 
 
-def settle(task: SparseTask, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[SparseTask, Fit, RowDoubts]:
+def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model, Fit, RowDoubts]:
     """Kernel, noise and inducing points stay; doubts and q move until they hardly do.
 
     Parameters
     ----------
-    task : SparseTask
+    model : Model
         With rows that are doubted.
     fit : Fit
     rows : Rows
         As they are.
     doubts : RowDoubts
-        Of the task's rows.
+        Of the model's rows.
 
     Returns
     -------
-    task, fit, doubts
-        The task with its rows doubted anew, the fit with the bound that it then has, and the doubts.
+    model, fit, doubts
+        The model with its rows doubted anew, the fit with the bound that it then has, and the doubts.
     """
     noise = fit.values["noise"]
     for _ in range(_TURNS):
-        look = look_at(rows, predictor_at(task, fit.values))
-        factor = np.where(task.table["noise"].free, look.clean_variance() / noise, 1.0)
+        look = look_at(rows, predictor_at(model, fit.values))
+        factor = np.where(model.table["noise"].free, look.clean_variance() / noise, 1.0)
         before, doubts = doubts, RowDoubts(RowScales(len(noise), look.distances(noise)), factor)
-        task = replace(task, rows=doubts.weigh(rows))
+        model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break
     # Where nothing is optimised.
-    return task, replace(fit, bound=task.minimise(Attempt(fit.values, 0)).bound), doubts
+    return model, replace(fit, bound=model.minimise(Start(fit.values, 0)).bound), doubts
 
 
-def _tolerance(task: SparseTask, fit: Fit) -> float:
+def _tolerance(model: Model, fit: Fit) -> float:
     """In nats: an iteration that gains less is not worth it."""
-    return max(0.01, DESCENT.enough * (fit.bound - task.alone)) if task.tol is None else task.tol
+    return max(LEAST_TOL, ENOUGH * (fit.bound - model.bound_alone)) if model.tol is None else model.tol
 
 
-def predictor_at(task: SparseTask, values: Values) -> Predictor:
+def predictor_at(model: Model, values: Values) -> Predictor:
     """With q at its optimum; of residuals."""
-    return of_residuals(task.model.at_optimum(values, task.model.statistics(values, task.blocks)))
+    return of_residuals(model.sparse.at_optimum(values, model.sparse.statistics(values, model.blocks)))
 
 
 def of_residuals(predictor: Predictor) -> Predictor:

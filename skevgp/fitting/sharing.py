@@ -6,20 +6,23 @@ from copy import deepcopy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..data.internal import Rows
-from ..data.source import LocalSource
+from ..data.rows import LocalSource, Rows
 from ..data.threads import BlockMap, side_by_side
 from ..model.parameters import ParameterTable, Values
-from ..solvers.lbfgs import lbfgs
+from ..solvers import LBFGS
+from ..solvers.lbfgs import Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
-from .fitted import FittedOutputs
 from .inducing import Placement
-from .plan import Request, plan
-from .sparse import SparseTask
+from .model import Model, models_of
+from .problem import Problem
+
+if TYPE_CHECKING:
+    from .fit import Fitted
 
 # Of what its own Gaussian process gains an output over features and noise.
 _LARGEST_LOSS = 0.01
@@ -33,44 +36,44 @@ _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
 
 
 def with_groups(
-    request: Request, rng: np.random.RandomState, monitor: Monitor, previous: FittedOutputs | None = None
-) -> Request:
-    """With ``sharing="auto"`` the same request with groups, those that ``previous`` found if there are any.
+    problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None
+) -> Problem:
+    """With ``sharing="auto"`` the same problem with groups, those that ``previous`` found if there are any.
 
     Parameters
     ----------
-    request : Request
+    problem : Problem
     rng : RandomState
         Which stays as it is: a fit with these groups given is the same fit.
     monitor : Monitor
         Which Ctrl-C stops, and which is told of no iteration.
-    previous : FittedOutputs, default=None
+    previous : Fitted, default=None
         A fit to other rows.
 
     Returns
     -------
-    request : Request
+    problem : Problem
 
     Raises
     ------
     KeyboardInterrupt
         There is nothing yet to keep.
     """
-    if not (isinstance(request.sharing, str) and request.sharing == "auto"):
-        return request
-    if request.per_output:
-        return replace(request, sharing="none")
-    if previous is not None and previous.found and len(previous.units.target_unit) == len(request.units.target_unit):
-        return replace(request, sharing=previous.sharing, found=True)
-    groups = found_groups(request, deepcopy(rng), part := monitor.silent().with_time(_SHARE_OF_TIME))
+    if not (isinstance(problem.sharing, str) and problem.sharing == "auto"):
+        return problem
+    if problem.per_output:
+        return replace(problem, sharing="none")
+    if previous is not None and previous.found and len(previous.units.target_unit) == len(problem.units.target_unit):
+        return replace(problem, sharing=previous.sharing, found=True)
+    groups = found_groups(problem, deepcopy(rng), part := monitor.silent().with_time(_SHARE_OF_TIME))
     if monitor.stopped:
         raise KeyboardInterrupt
     if part.stopped:
-        return replace(request, sharing="all")
-    return replace(request, sharing=groups, found=True)
+        return replace(problem, sharing="all")
+    return replace(problem, sharing=groups, found=True)
 
 
-def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
+def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
     """Which outputs to fit together: those that one kernel serves, each of them nearly as well as one of its own.
 
     (The sum of their bounds, which a fit maximises, does not show it: outputs with little noise rule it.) What a kernel
@@ -83,7 +86,7 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
 
     Parameters
     ----------
-    request : Request
+    problem : Problem
     rng : RandomState
     monitor : Monitor
         Which Ctrl-C stops.
@@ -93,13 +96,13 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
     groups : list of list of int
         A partition of the outputs.
     """
-    everything = list(range(len(request.units.target_unit)))
-    if len(everything) == 1 or request.max_iter == 0:
+    everything = list(range(len(problem.units.target_unit)))
+    if len(everything) == 1 or problem.max_iter == 0:
         return [everything]
-    fits = _ShortFits.of(request, rng, monitor)
+    fits = _ShortFits.of(problem, rng, monitor)
     if fits.n_free == 0:
         return [everything]
-    found = side_by_side(fits.alone, everything, request.n_threads, monitor)
+    found = side_by_side(fits.alone, everything, problem.n_threads, monitor)
     own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
     # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978): of what gains less, the
     # sample shows nothing.
@@ -111,18 +114,18 @@ def found_groups(request: Request, rng: np.random.RandomState, monitor: Monitor)
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
         return bool((own[outputs] - bounds <= bearable[outputs]).all())
 
-    if not learned:
-        return [everything]
     # Rows that were not drawn may show it, and then the others must not rule its kernel: a group of its own.
     unknown = [o for o in everything if o not in learned]
-    variance = request.units.rows(request.source).residuals.variance if unknown else np.empty(0)
-    still = [o for o in unknown if request.units.constant is not None and request.units.constant[o]]
+    variance = problem.units.rows(problem.source).residuals.variance if unknown else np.empty(0)
+    still = [o for o in unknown if problem.units.constant is not None and problem.units.constant[o]]
     hidden = [o for o in unknown if variance[o] > _CONSTANT and o not in still]
     constant = [o for o in unknown if o not in (*hidden, *still)]
 
     def completed(groups: list[list[int]]) -> list[list[int]]:
         return [sorted([*groups[0], *constant]), *groups[1:], *(own for own in (hidden, still) if own)]
 
+    if not learned:
+        return [own for own in ([o for o in everything if o not in still], still) if own]
     if suits(learned, fits.further(learned, fits.together)):
         return completed([learned])
     groups, apart = [[o] for o in learned], np.eye(len(everything), dtype=bool)
@@ -155,35 +158,35 @@ class _ShortFits:
 
     Attributes
     ----------
-    request : Request
+    problem : Problem
         Of the sample and the points.
     together : list of dict
         Where the first ended.
     monitor : Monitor
     """
 
-    request: Request
+    problem: Problem
     together: list[Values]
     monitor: Monitor
 
     @classmethod
-    def of(cls, request: Request, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
+    def of(cls, problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
         """With the first fit."""
-        raw = Rows(request.source, lambda rows: rows).sample(_SAMPLE, rng)
+        raw = Rows(problem.source, lambda rows: rows).sample(_SAMPLE, rng)
         source = LocalSource.holding(raw)
-        most = request.placement.max_inducing or request.placement.n_inducing
+        most = problem.placement.max_inducing or problem.placement.n_inducing
         placement = Placement("k-means", min(most, _POINTS))
         # Each output has weights of its own here, if it shares them or not: what is asked is which kernel it wants.
-        units = replace(request.units, prior=replace(request.units.prior, shared=False))
-        request = replace(request, source=source, units=units, placement=placement, sharing="all", family="full")
-        (task,) = plan(request, rng, monitor, BlockMap())
-        together = _short_fit(task, task.table, _FIRST_ITERATIONS, monitor)
+        units = replace(problem.units, prior=replace(problem.units.prior, shared=False))
+        problem = replace(problem, source=source, units=units, placement=placement, sharing="all", family="full")
+        (model,) = models_of(problem, rng, monitor, BlockMap())
+        together = _short_fit(model, model.table, _FIRST_ITERATIONS, monitor)
         points = together[0]["inducing_points"][0]
-        return cls(replace(request, placement=Placement(points, len(points))), together, monitor)
+        return cls(replace(problem, placement=Placement(points, len(points))), together, monitor)
 
     @property
     def n_rows(self) -> int:
-        return self.request.source.n_rows
+        return self.problem.source.n_rows
 
     @property
     def n_free(self) -> int:
@@ -193,7 +196,7 @@ class _ShortFits:
     @property
     def without(self) -> np.ndarray:
         """The bound (o,) of each output without a Gaussian process."""
-        return np.array([task.alone for task in self._each])
+        return np.array([model.bound_alone for model in self._each])
 
     def alone(self, output: int) -> Values:
         """An output, from where the first fit ended."""
@@ -202,40 +205,40 @@ class _ShortFits:
     def further(self, outputs: list[int], starts: list[Values]) -> list[Values]:
         """Some outputs, from the values of all: from the mean of their kernels."""
         others = [[o] for o in range(len(starts)) if o not in outputs]
-        (task,) = (task for task in self._planned([outputs, *others]) if task.rows.columns == outputs)
+        (model,) = (own for own in self._planned([outputs, *others]) if own.rows.columns == outputs)
         own = [starts[o] for o in outputs]
         values = {name: np.concatenate([one[name] for one in own]) for name in ("signal", "noise")}
         values["hyperparameters"] = np.exp(np.mean([np.log(one["hyperparameters"]) for one in own], axis=0))
-        return _short_fit(task, task.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
+        return _short_fit(model, model.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
 
     def bound(self, output: int, values: Values) -> float:
         """Of an output with its values; very low where it cannot be computed."""
-        task = self._each[output]
+        model = self._each[output]
         try:
-            loss, _ = task.objective(task.table)(task.table.started_at(values).start())
+            loss, _ = model.objective(model.table)(model.table.started_at(values).start())
         except NotPositiveDefiniteError:
             loss = np.inf
-        return -task.rows.total * loss if np.isfinite(loss) else -np.finfo(float).max
+        return -model.rows.total * loss if np.isfinite(loss) else -np.finfo(float).max
 
     def shape(self, values: Values) -> np.ndarray:
         """k̃ at the points, as a vector of length 1: products are alignments (Cristianini et al. 2001)."""
-        kernel, (points,) = self._each[0].model.kernel, values["inducing_points"]
+        kernel, (points,) = self._each[0].sparse.kernel, values["inducing_points"]
         K = kernel.at(np.log(values["hyperparameters"]), points).matrix()
         return np.ravel(K) / np.linalg.norm(K)
 
     @cached_property
-    def _each(self) -> list[SparseTask]:
+    def _each(self) -> list[Model]:
         return self._planned([[o] for o in range(len(self.together))])
 
-    def _planned(self, groups: list[list[int]]) -> list[SparseTask]:
-        tasks = plan(replace(self.request, sharing=groups), np.random.RandomState(0), self.monitor, BlockMap())
-        return [replace(task, table=task.table.with_fixed("inducing_points")) for task in tasks]
+    def _planned(self, groups: list[list[int]]) -> list[Model]:
+        models = models_of(replace(self.problem, sharing=groups), np.random.RandomState(0), self.monitor, BlockMap())
+        return [replace(model, table=model.table.with_fixed("inducing_points")) for model in models]
 
 
-def _short_fit(task: SparseTask, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
+def _short_fit(model: Model, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
     """The values of each output where so many iterations lead."""
-    n_rows = task.rows.total
-    objective = task.objective(table)
-    values = table.values(lbfgs(objective, table.start(), table.limits(), n_iter, _SHORT_TOL / n_rows, monitor).x)
+    tolerance = Tolerance(_SHORT_TOL / model.rows.total)
+    minimum = LBFGS().minimise(model.objective(table), table.start(), table.limits(), n_iter, tolerance, monitor)
+    values = table.values(minimum.x)
     each = range(len(values["noise"]))
     return [values | {name: values[name][[o]] for name in ("signal", "noise")} for o in each]

@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..data.internal import Rows
-from ..data.source import Moments, RawRows
+from ..data.rows import Moments, RawRows, Rows
 from ..kernels.covariances import Covariance
-from ..kernels.parse import KernelSpec, Start, Starts
-from ..model.parameters import Parameter, ParameterTable
+from ..kernels.parse import KernelSpec, Start
+from ..model.parameters import Parameter, ParameterTable, Values
 from ..model.predictor import CoefficientPrior, Predictor, PredictorGroup
 from ..model.statistics import Kernel, Whitening
 from ..utils.linalg import NotPositiveDefiniteError, jittered_cholesky
-from .rules import Rules
 from .units import SMALLEST_UNIT
+
+if TYPE_CHECKING:
+    from .problem import Problem
 
 # Of squared target units, however little they scatter: about the rounding error of the residuals.
 LOWEST_NOISE = 1e-20
@@ -123,70 +127,37 @@ def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawR
 
 
 def starting_table(
-    inputs: Moments,
+    problem: Problem,
+    rows: Rows,
     inducing_points: np.ndarray,
-    target_unit: np.ndarray,
-    starts: Starts,
-    scatter: np.ndarray,
-    rules: Rules,
-    n_hyperparameters: int,
     mean_variance: float = 1.0,
-    precision: float = 1.0,
     n_kernels: int | None = None,
-    target_scatter: np.ndarray | None = None,
-    rounding: np.ndarray | float = 0.0,
-    constant: np.ndarray | bool = False,
+    exact: bool = False,
 ) -> ParameterTable:
-    """The parameters of a model: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
+    """The parameters of a model of some outputs: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
-    Parameters
-    ----------
-    inputs : Moments
-        Of the kernel's d columns, or of those of each group.
-    inducing_points : ndarray of shape (g, m, d)
-        One set per group of outputs.
-    target_unit : ndarray of shape (o,)
-        The size of what the features alone leave over.
-    starts : Starts
-        What the user says of them.
-    scatter : ndarray of shape (o,)
-        Variance of the residuals, in squared target units: 1, but for targets far from 0 (`Rows.scatter`).
-    rules : Rules
-        Starts and limits where the user does not say.
-    n_hyperparameters : int
-        1 or d, unless the user says where they start.
-    mean_variance : float, default=1.0
-        Of k̃(x, x), with the hyperparameters where they start.
-    precision : float, default=1.0
-        The mean of 1 / v over rows with noise variances σ² v.
-    n_kernels : int, default=None
-        How many sets of hyperparameters there are, if each group of outputs has its own.
-    target_scatter : ndarray of shape (o,), optional
-        Variance of the targets, in squared target units: so high may the noise become where the features explain all.
-    rounding : ndarray of shape (o,), default=0.0
-        Variance of the targets' rounding, in squared target units: the noise does not fall below it.
-    constant : ndarray of bool of shape (o,), default=False
-        Targets that do not vary. Their noise starts at its lowest. Where all outputs of the model are such, nothing
-        says how far they may vary: the signal stays at one target unit, and the noise where it is.
-
-    Returns
-    -------
-    table : ParameterTable
-        With the parameters ``hyperparameters``, ``signal``, ``noise``, ``inducing_points``.
+    ``rows`` are those of the outputs; inducing points are (g, m, d); ``mean_variance`` is the mean of k̃(x, x) where it
+    starts; ``n_kernels`` is the number of kernels where groups of outputs have one each; ``exact`` allows the lower
+    noise of the exact model.
     """
+    units, starts, rules = problem.units, problem.spec.starts, problem.rules
+    if exact and rules.lowest_noise_exact is not None:
+        rules = replace(rules, lowest_noise=rules.lowest_noise_exact)
+    inputs, own, precision, scatter = rows.inputs, rows.columns, rows.mean_precision, rows.scatter()
+    target_unit, constant, rounding = units.target_unit[own], units.constant[own], units.rounding[own]
     o, scale = np.ones(len(target_unit)), column_scale(inputs)
     # Outputs may have columns of their own, and groups of them kernels of their own.
-    own = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
-    typical = own if n_hyperparameters > 1 else np.sqrt(np.mean(own**2, axis=-1, keepdims=True))
+    typical = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
+    if problem.spec.covariance.n_hyperparameters <= 1:
+        typical = np.sqrt(np.mean(typical**2, axis=-1, keepdims=True))
     root_d = np.sqrt(scale.shape[-1])
     lower, upper = rules.lengthscale_limits
     default = rules.lengthscale * root_d * typical
-    first, centre = starts.hyperparameters.value, column_centre(inputs)
-    if first is not None:
-        default = first
+    if starts.hyperparameters.value is not None:
+        default = starts.hyperparameters.value
     if n_kernels is not None:
         default = np.broadcast_to(default, (n_kernels, default.shape[-1]))
-    signal, highest = o / mean_variance, rules.highest_noise * precision * o
+    signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, column_centre(inputs)
     lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
     still = bool(np.all(constant))
     return ParameterTable(
@@ -212,7 +183,7 @@ def starting_table(
                 lowest_noise,
                 highest,
                 target_unit**2,
-                None if target_scatter is None else np.maximum(highest, target_scatter * precision),
+                np.maximum(highest, units.target_scatter[own] * precision),
                 still and starts.noise.value is None,
             ),
             Parameter(
@@ -223,6 +194,20 @@ def starting_table(
             ),
         ]
     )
+
+
+def with_signal_of_constants(
+    problem: Problem, rows: Rows, table: ParameterTable, values: Values
+) -> tuple[Values, bool]:
+    """Values in which constants among other outputs have the signal that they would have alone, and whether any has.
+
+    The fit gave them next to none, so that they do not rule the kernel that they share.
+    """
+    still, start = rows.still(), table["signal"].start
+    if problem.spec.starts.signal.value is not None or not still.any() or still.all():
+        return values, False
+    alone = start / problem.rules.signal_limits[0]
+    return values | {"signal": np.where(still, alone, values["signal"])}, True
 
 
 def parameter_of(

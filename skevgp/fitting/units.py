@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import svd
 
-from ..data.internal import Rows
-from ..data.source import Columns, Moments, RawRows, Source, times_weights
+from ..data.rows import Columns, Moments, RawRows, Rows, Source, times_weights
 from ..data.threads import BlockMap
 from ..model.predictor import CoefficientPrior, Predictor
 from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
@@ -257,8 +256,9 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
         rank = np.linalg.matrix_rank(scaled[:, mask]) if mask.any() else 0
         if rank < mask.sum():
             raise ValueError(
-                f"coef_scale=inf needs features that are linearly independent on the rows of X: {mask.sum()} features "
-                f"have an infinite scale, but only {rank} of them are independent. Give some a finite scale."
+                "An infinite scale of CoefPrior needs features that are linearly independent on the rows of X: "
+                f"{mask.sum()} features have an infinite scale, but only {rank} of them are independent. Give some a "
+                "finite scale."
             )
 
 
@@ -300,19 +300,18 @@ class Units:
         The size of what the features alone leave over.
     prior : CoefficientPrior
         In the user's units.
-    target_scatter, rounding : ndarray of shape (o,), optional
-        The targets' variance, and that of the rounding of their largest value, in squared target units; not known of a
-        model from a file.
-    constant : ndarray of bool of shape (o,), optional
-        Targets that do not vary and of which nothing is left over (`unit_of`); not known of a model from a file.
+    target_scatter, rounding : ndarray of shape (o,)
+        The targets' variance, and that of the rounding of their largest value, in squared target units.
+    constant : ndarray of bool of shape (o,)
+        Targets that do not vary and of which nothing is left over (`unit_of`).
     """
 
     target_mean: np.ndarray
     target_unit: np.ndarray
     prior: CoefficientPrior
-    target_scatter: np.ndarray | None = None
-    rounding: np.ndarray | None = None
-    constant: np.ndarray | None = None
+    target_scatter: np.ndarray
+    rounding: np.ndarray
+    constant: np.ndarray
 
     @classmethod
     def of(

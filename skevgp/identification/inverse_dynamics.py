@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from numbers import Integral, Real
 from typing import Any, ClassVar, Literal, Self
 
@@ -13,7 +14,7 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Tags, check_random_state
 from sklearn.utils.validation import check_is_fitted
 
-from ..estimators.summary import ModelSummary, Summarised, of_inverse_dynamics
+from ..estimators.summary import ModelSummary, html_of, of_inverse_dynamics
 from ..exceptions import RobotModelWarning, ignored, warn_user
 from ..features import RigidBodyRegressor
 from ..features.robot_map import joints_named
@@ -41,7 +42,7 @@ _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
 _SHARP = 0.01
 
 
-class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
+class InverseDynamics(RegressorMixin, IdentifiedRobot):
     r"""Joint torques of a robot with bands, and its masses and friction with their uncertainty, from logs.
 
     .. math::
@@ -401,5 +402,25 @@ class InverseDynamics(RegressorMixin, Summarised, IdentifiedRobot):
     def _like_y(self, values: np.ndarray) -> np.ndarray:
         return like_y(values) if self._one_dimensional else values
 
-    def _described(self) -> ModelSummary:
+    def summary(self) -> ModelSummary:
+        """Summarise what was learned: weights next to their prior, noise, and the residual of each joint.
+
+        Returns
+        -------
+        summary : ModelSummary
+            It prints as text, shows as tables in notebooks, and has ``to_frame()``.
+        """
+        check_is_fitted(self)
         return of_inverse_dynamics(self, self._outputs)
+
+    @property
+    def _repr_html_(self) -> Callable[[], str]:
+        # scikit-learn has it only if its option ``display`` is "diagram".
+        diagram: Callable[[], str] = super()._repr_html_
+        return lambda: diagram() + html_of(self)
+
+    def _repr_mimebundle_(self, **kwargs: Any) -> dict[str, str]:
+        bundle: dict[str, str] = super()._repr_mimebundle_(**kwargs)
+        if "text/html" in bundle:
+            bundle["text/html"] += html_of(self)
+        return bundle

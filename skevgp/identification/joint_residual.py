@@ -9,7 +9,8 @@ import numpy as np
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 
 from ..estimators.evgp import EVGPRegressor
-from ..fitting.advice import signal_gone
+from ..fitting.messages import signal_gone
+from ..kernels.parse import KernelSpec
 from .stiction import JointNoise, likeliest_noise, noise_at
 
 # What is left of a torque, squared: less is nothing, and no kernel's variance.
@@ -26,7 +27,7 @@ _LEAST = 1e-6
 class QuietRegressor(EVGPRegressor):
     """Its limits are not the user's, who is not told that fits end at them."""
 
-    def _warn_of(self, messages: tuple[str, ...]) -> None:
+    def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
         self._held_for_no_group = signal_gone(1, 1) in messages
 
 

@@ -11,7 +11,7 @@ from sklearn.base import clone
 
 from ..exceptions import RobotModelWarning, ignored
 from ..features import RigidBodyRegressor
-from ..fitting.coef_prior import wide_scale
+from ..fitting.prior import wide_scale
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_magnitude, checked_groups
 from .rows_of_logs import blocks_of, groups_of

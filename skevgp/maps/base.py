@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from scipy.sparse import issparse
 
+from ..data.maps import Maps
 from ..utils.frames import as_fitted, package_of
 from ..utils.sklearn import safe_indexing
 from ..utils.validation import is_frame, words_of
@@ -206,20 +207,22 @@ def as_map(transformer: Any, *, example: Any = None) -> Map:
     return Map(transformer, example)
 
 
-def as_maps(feature_map: Any, kernel_map: Any, example: Any) -> tuple[Map | None, Map | None]:
-    """Read the fitted maps of a model, of which each may be None, for rows that are arrays of numbers.
+def as_maps(maps: Maps) -> tuple[Map | None, Map | None]:
+    """Read the feature map and the kernel map of a fitted model; None stays None.
 
     Raises
     ------
     ValueError
-        If columns of the example, some rows that the model was fitted to, are not numbers.
+        If columns of X were not numbers.
     """
-    if is_frame(example) and (words := words_of(example)):
+    if is_frame(maps.example) and (words := words_of(maps.example)):
         raise ValueError(
             f"The columns {words} of X are not numbers: derivatives, functions to be drawn and predictors without "
             "validation need them to be."
         )
-    features, inputs = (None if each is None else as_map(each, example=example) for each in (feature_map, kernel_map))
+    features, inputs = (
+        None if each is None else as_map(each, example=maps.example) for each in (maps.feature_map, maps.kernel_map)
+    )
     return features, inputs
 
 

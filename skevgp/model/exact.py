@@ -11,8 +11,8 @@ n - k contrasts (eq. 2.45 there; the infinite log |Σ_β| left out). A QR factor
 its condition. Outputs that share their weights are stacked: W and z are then those of all of them, one below the other.
 
 Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
-2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|², with
-V = L⁻¹ k̃(X, x) and B = RᵀR.
+2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|²,
+with V = L⁻¹ k̃(X, x) and B = RᵀR.
 
 A row with the noise variance σ² v has ρ v in place of ρ on its diagonal. One that counts w times is a row with the
 noise variance σ² v / w, but for what w copies of it have beside exp(-½ w e² / (σ² v)):
@@ -29,7 +29,7 @@ from typing import Any
 import numpy as np
 from scipy.linalg import lapack
 
-from ..data.source import RawRows
+from ..data.rows import RawRows
 from ..utils.linalg import (
     NotPositiveDefiniteError,
     diagonal_of,

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..data.blocks import Blocks
-from ..data.internal import Rows
+from ..data.rows import Rows
 from ..utils.linalg import JITTER, Jitter
 from .bounds import (
     Group,

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..data.source import Columns, of_outputs, times_weights
+from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, times_lower
 from .statistics import Kernel, Whitening
 

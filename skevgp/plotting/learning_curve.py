@@ -50,7 +50,7 @@ class LearningCurveDisplay:
     >>> from skevgp.plotting import LearningCurveDisplay
     >>> train, test = (make_dynamics("pendulum", 4, 50, random_state=seed) for seed in (0, 1))
     >>> display = LearningCurveDisplay.from_estimator(
-    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, tol=1e-3, random_state=0),
+    ...     EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0),
     ...     *(train.data, train.target, test.data, test.target),
     ...     sizes=[1, 4],
     ...     groups=train.groups,

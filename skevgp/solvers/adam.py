@@ -1,22 +1,151 @@
-"""Adam for the noisy loss of mini-batches: when to slow down, when to stop, which point to keep."""
+"""Adam: minimise the noisy loss of mini-batches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import numpy as np
 
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
-from .minimum import Limits, Minimum, Objective
+from ..utils.validation import check_integer, check_real
+from .base import Callback, Limits, Minimum, Objective, Solver
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
 # Of a gradient: the square of a larger one overflows, and no step moves after that.
 _LARGEST = 1e150
 # A plateau is looked for this often, and not before so many steps.
 _WINDOW, _FEWEST = 50, 1500
+
+
+class Adam(Solver):
+    """The paper's solver: Adam on mini-batches, over all parameters, those of q among them.
+
+    Parameters
+    ----------
+    batch_size : int, default=512
+        Rows per step.
+    learning_rate : float, default=0.1
+        The first step size.
+    natural_gradient : bool, default=False
+        Only with ``posterior="full"``: whether q moves by natural gradients (Hensman et al. 2013), the last one on all
+        rows, so that Adam is left with kernel, noise and inducing points. For a million rows this is the fastest way to
+        a good bound: ``Adam(batch_size=2000, natural_gradient=True)`` with ``max_iter=20000``, 40 epochs.
+    n_restarts : int, default=0
+        As of `LBFGS`.
+    callback : callable, default=None
+        callback(step, lower_bound, outputs), once per step, with a mini-batch's estimate; as of `LBFGS`.
+    schedule : {"cosine", "constant"}, default="cosine"
+        Whether steps fall to zero along half a cosine, over ``max_iter`` steps or over the last ones, or stay as they
+        are until the bound does, and only the last ones fall.
+
+    posterior : {"full", "diagonal"}, default="full"
+        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
+    tol : float or "auto", default="auto"
+        Tolerance in nats. Adam goes over to its last steps, as many as before, when the loss stays flat: when its
+        median over the last third of the steps differs from that over the third before by less than this (``"auto"``:
+        0.01), or by no more than chance, which mostly decides.
+    max_time : float, default=None
+        Seconds until steps end, as of `LBFGS`.
+
+    Attributes
+    ----------
+    default_max_iter : int
+        What ``max_iter=None`` means.
+
+    References
+    ----------
+    - D. P. Kingma, J. Ba (2015): Adam: A Method for Stochastic Optimization.
+    - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
+
+    Examples
+    --------
+    >>> from skevgp import EVGPRegressor
+    >>> from skevgp.datasets import make_toy
+    >>> from skevgp.solvers import Adam
+    >>> X, y = make_toy(random_state=0, return_X_y=True)
+    >>> model = EVGPRegressor(n_inducing=10, solver=Adam(50), max_iter=500, noise_cv=None).fit(X, y)
+    >>> model.get_params()["solver__batch_size"]
+    50
+    """
+
+    default_max_iter: ClassVar[int] = 16_000
+    stochastic: ClassVar[bool] = True
+
+    def __init__(
+        self,
+        batch_size: int = 512,
+        learning_rate: float = 0.1,
+        natural_gradient: bool = False,
+        n_restarts: int = 0,
+        callback: Callback | None = None,
+        schedule: Literal["cosine", "constant"] = "cosine",
+        *,
+        posterior: Literal["full", "diagonal"] = "full",
+        tol: float | Literal["auto"] = "auto",
+        max_time: float | None = None,
+    ):
+        self.batch_size = batch_size
+        self.learning_rate = learning_rate
+        self.natural_gradient = natural_gradient
+        self.n_restarts = n_restarts
+        self.callback = callback
+        self.schedule = schedule
+        self.posterior = posterior
+        self.tol = tol
+        self.max_time = max_time
+
+    def check(self) -> None:
+        """Refuse options that are out of range."""
+        super().check()
+        check_integer(self.batch_size, "batch_size of Adam", minimum=1)
+        check_real(self.learning_rate, "learning_rate of Adam", minimum=0.0, strict=True)
+        if self.schedule not in ("cosine", "constant"):
+            raise ValueError(f'schedule of Adam must be "cosine" or "constant"; got {self.schedule!r}.')
+        if not isinstance(self.natural_gradient, (bool, np.bool_)):
+            raise TypeError(f"natural_gradient of Adam must be True or False; got {self.natural_gradient!r}.")
+        if self.natural_gradient and self.posterior != "full":
+            raise ValueError(f'natural_gradient=True of Adam needs posterior="full"; got posterior={self.posterior!r}.')
+
+    def minimise(
+        self,
+        objective: Objective,
+        start: np.ndarray,
+        limits: Limits,
+        max_iter: int,
+        tol: float,
+        monitor: Monitor,
+        pace: Callable[[float], None] | None = None,
+    ) -> Minimum:
+        """Find a minimum with steps that become small at the end.
+
+        Parameters
+        ----------
+        objective : callable
+            x -> (loss, gradient) of the next mini-batch at each call.
+        start : ndarray of shape (size,)
+            Where to start.
+        limits : tuple of ndarray of shape (size,)
+            Lower and upper limits, to which steps are clipped.
+        max_iter : int
+            The most steps.
+        tol : float
+            The loss is flat where it changes by less.
+        monitor : Monitor
+            It is told of each step, and may end them.
+        pace : callable, default=None
+            pace(share), called before each step with its size as a share of the first.
+
+        Returns
+        -------
+        minimum : Minimum
+            The last point, the loss of each step, and other points that may be better.
+        """
+        constant = self.schedule == "constant"
+        return adam(objective, start, limits, max_iter, self.learning_rate, tol, monitor, pace, constant=constant)
 
 
 def adam(
@@ -44,7 +173,7 @@ def adam(
     objective : callable
         x -> (loss, gradient), of the next mini-batch at each call.
     start, limits
-        As in `lbfgs`; steps are clipped to the limits.
+        Steps are clipped to the limits.
     max_iter : int
         The most steps.
     learning_rate : float
@@ -88,7 +217,7 @@ def adam(
             second += (1.0 - _DECAY_SECOND) * (gradient**2 - second)
             scale = np.sqrt(second / (1.0 - _DECAY_SECOND**t)) + _EPSILON
             x = np.clip(x - learning_rate * share / (1.0 - _DECAY_FIRST**t) * first / scale, *limits)
-            monitor.iteration(t, loss, until)
+            monitor.iteration(t, loss)
             if t % _WINDOW == 0 and t >= 3 * _WINDOW:
                 flat_from = (flat_from or t) if is_flat(np.array(minimum.loss_curve), tol) else 0
                 if flat_from > 0 and t >= _FEWEST and t - flat_from >= t // 3 and 2 * t < until:

@@ -12,6 +12,8 @@ _PACKAGES = {
     "dask": ("'dask[array,distributed]'", "dask"),
     "casadi": ("casadi", "casadi"),
     "rosbags": ("rosbags", "logs"),
+    "skops": ("skops", "io"),
+    "tqdm": ("tqdm", "progress"),
 }
 
 

@@ -5,6 +5,7 @@ Data frames and Pinocchio's models, which skops cannot hold, are arrays there.
 
 from __future__ import annotations
 
+from pathlib import PurePath
 from typing import Any
 
 from sklearn.base import BaseEstimator
@@ -43,6 +44,9 @@ def _is_ours(estimator: object) -> bool:
 
 
 def _as_data(value: Any) -> Any:
+    if isinstance(value, PurePath):
+        # Paths of another system cannot be made here.
+        return str(value)
     data = FrameColumns.of(value)
     return RobotNumbers.of(value) or value if data is None else data
 

@@ -63,6 +63,11 @@ def check_fitted(estimator: Any) -> None:
     check_is_fitted(estimator)
 
 
+def is_dask(values: Any) -> bool:
+    """Whether it is a Dask collection; does not import Dask."""
+    return hasattr(values, "__dask_graph__")
+
+
 def is_frame(values: Any) -> bool:
     """Whether it is a data frame: of pandas, polars or (scikit-learn 1.7 or later takes its rows) pyarrow."""
     return hasattr(type(values), "columns") and hasattr(type(values), "shape")

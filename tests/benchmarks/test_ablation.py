@@ -26,14 +26,21 @@ def test_it_runs_resumes_and_writes_its_page(ablation, tmp_path):
     assert read(output) == rows
 
 
-def test_each_change_makes_another_solver(ablation):
+def test_each_change_makes_another_fit(ablation):
     from internals import ablated
+    from skevgp.fitting import model, search
     from skevgp.solvers import LBFGS
 
-    seen = [(ablated(change.rules, change.descent), change.other_seed) for change in ablation.changes()]
-    keys = {repr((solver.rules, solver.descent, other)) for solver, other in seen}
-    assert repr((LBFGS.rules, LBFGS.descent, 0)) not in keys
-    assert len(keys) == len(seen) == len({(change.rule, change.variant) for change in ablation.changes()})
+    def key_of(solver, seed):
+        return repr((search.RULES, solver.descent, model.ENOUGH, seed))
+
+    default, keys, changes = key_of(LBFGS(), 0), [], ablation.changes()
+    for change in changes:
+        with ablated(change.rules, change.descent, change.enough) as solver:
+            keys.append(key_of(solver, change.other_seed))
+    assert default not in keys
+    assert len(set(keys)) == len(keys) == len({(change.rule, change.variant) for change in changes})
+    assert key_of(LBFGS(), 0) == default
 
 
 def test_the_page_counts_what_is_better_and_what_is_worse(ablation):

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 
+from skevgp.solvers import LBFGS
+
 from .conftest import BENCHMARKS, read
 
 
@@ -52,7 +54,7 @@ def test_a_firm_prior_doubts_forces_and_gravity_only(swing_up, system):
     assert scale[:, :n_states].max() < 0.05 < scale[:, n_states:].min()
     half = n_states // 2
     np.testing.assert_allclose(kinematics, np.eye(n_states) + swing_up.mpc.DT * np.eye(n_states, k=half), atol=1e-12)
-    learned = swing_up.mpc.learn(system, 1.5, True, 0.01, **prior, n_inducing=5, tol=1e6)
+    learned = swing_up.mpc.learn(system, 1.5, True, 0.01, **prior, n_inducing=5, solver=LBFGS(tol=1e6))
     assert (np.abs(learned.model.coef_ - prior["coef_mean"]) < 4.0 * scale)[:, :n_states].all()
 
 
@@ -73,7 +75,9 @@ def test_plans_keep_the_limit_and_become_cheaper(swing_up, caution):
     from dataclasses import replace
 
     task = replace(swing_up.mpc.TASKS["pendulum"], horizon=20, caution=caution)
-    model = swing_up.mpc.learn("pendulum", 1.5, True, n_inducing=20, tol=10.0).model.compile(include_noise=False)
+    model = swing_up.mpc.learn("pendulum", 1.5, True, n_inducing=20, solver=LBFGS(tol=10.0)).model.compile(
+        include_noise=False
+    )
     planner = swing_up.mpc.Planner(model, task)
     z = np.array([0.3, -0.2])
     planner.start(z, np.random.RandomState(0), n_starts=1, n_iter=0)

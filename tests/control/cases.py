@@ -5,10 +5,17 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, Ma
 from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.solvers import LBFGS
 
 N_OUTPUTS, D = 3, 2
-QUICK = {"max_iter": 10, "tol": 1e6, "random_state": 0}
+QUICK = {"max_iter": 10, "solver": LBFGS(tol=1e6), "random_state": 0}
+
+
+def quick(model):
+    """The same model with few iterations."""
+    tolerance = "solver__tol" if "solver" in model.get_params() else "tol"
+    return model.set_params(**{"max_iter": 10, "random_state": 0, tolerance: 1e6})
 
 
 def own_columns(X):
@@ -28,7 +35,9 @@ KERNEL = ConstantKernel(2.0) * RBF([0.9, 1.2])
 MODELS = {
     "plain": EVGPRegressor(n_inducing=20),
     "a group each": EVGPRegressor(PolynomialFeatures(2), sharing=[[0, 2], [1]], n_inducing=15),
-    "diagonal": EVGPRegressor(PolynomialFeatures(1), KERNEL, posterior="diagonal", sharing="kernel", n_inducing=15),
+    "diagonal": EVGPRegressor(
+        PolynomialFeatures(1), KERNEL, solver=LBFGS(posterior="diagonal"), sharing="kernel", n_inducing=15
+    ),
     "maps": EVGPRegressor(
         make_union(PolynomialFeatures(2), StandardScaler()),
         kernel_map=make_pipeline(StandardScaler(), PolynomialFeatures(2, include_bias=False)),
@@ -39,7 +48,9 @@ MODELS = {
     "rows per output": EVGPRegressor(
         FunctionTransformer(own_features), kernel_map=FunctionTransformer(own_columns), n_inducing=20
     ),
-    "shared weights": EVGPRegressor(FunctionTransformer(own_features), share_coef=True, n_inducing=20),
+    "shared weights": EVGPRegressor(
+        FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), n_inducing=20
+    ),
     "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=2.5), n_inducing=20),
     "exact": EGPRegressor(PolynomialFeatures(1)),
 }

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 
-from .cases import MODELS, QUICK, D
+from .cases import MODELS, D, quick
 
 
 @pytest.fixture(scope="module")
@@ -18,4 +18,4 @@ def data():
 @pytest.fixture(scope="module", params=MODELS)
 def model(request, data):
     X, Y, _ = data
-    return clone(MODELS[request.param]).set_params(**QUICK).fit(X, Y)
+    return quick(clone(MODELS[request.param])).fit(X, Y)

@@ -7,8 +7,10 @@ from sklearn.gaussian_process import kernels as sk
 from sklearn.pipeline import make_pipeline, make_union
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 
 
 class Rows(TransformerMixin, BaseEstimator):
@@ -38,12 +40,12 @@ def fitted(model, **arguments):
 
 
 def sparse(*arguments, **others):
-    given = {"n_inducing": 15, "max_iter": 0, "random_state": 0, "noise_variance": 0.05}
+    given = {"n_inducing": 15, "max_iter": 0, "random_state": 0, "noise": Gaussian(variance=0.05)}
     return EVGPRegressor(*arguments, **{**given, **others})
 
 
 def exact(*arguments, **others):
-    return EGPRegressor(*arguments, **{"max_iter": 0, "random_state": 0, "noise_variance": 0.05, **others})
+    return EGPRegressor(*arguments, **{"max_iter": 0, "random_state": 0, "noise": Gaussian(variance=0.05), **others})
 
 
 POLYNOMIAL = make_union(PolynomialFeatures(1), StandardScaler())
@@ -53,25 +55,25 @@ CORRELATED = np.array([[1.0, 0.5], [0.5, 2.0]])
 MODELS = {
     "no maps": sparse(),
     "features": sparse(POLYNOMIAL),
-    "cartpole": sparse(CARTPOLE, kernel_map=ENCODER, coef_mean=0.1, coef_scale=1.0, normalize_y=True),
+    "cartpole": sparse(CARTPOLE, kernel_map=ENCODER, coef_prior=CoefPrior(mean=0.1, scale=1.0), normalize_y=True),
     "all": sparse(POLYNOMIAL, sharing="all"),
     "kernel": sparse(POLYNOMIAL, sharing="kernel"),
     "none": sparse(POLYNOMIAL, sharing="none"),
     "groups": sparse(POLYNOMIAL, sharing=[[2, 0], [1]], normalize_y=True),
     "rows of features": sparse(Rows(), sharing="kernel"),
     "rows of inputs": sparse(kernel_map=Rows(), sharing="none"),
-    "rows of both": sparse(Rows(), kernel_map=Rows(), coef_cov=CORRELATED),
-    "shared weights": sparse(Rows(), share_coef=True, sharing="none"),
-    "shared weights, all": sparse(POLYNOMIAL, share_coef=True, sharing="all", normalize_y=True),
-    "correlated weights": sparse(PolynomialFeatures(1), coef_cov=np.eye(6) + 0.3),
-    "pinned weights": sparse(PolynomialFeatures(1), coef_scale=0.0, coef_mean=0.5),
-    "diagonal": sparse(POLYNOMIAL, posterior="diagonal"),
+    "rows of both": sparse(Rows(), kernel_map=Rows(), coef_prior=CoefPrior(cov=CORRELATED)),
+    "shared weights": sparse(Rows(), coef_prior=CoefPrior(shared=True), sharing="none"),
+    "shared weights, all": sparse(POLYNOMIAL, coef_prior=CoefPrior(shared=True), sharing="all", normalize_y=True),
+    "correlated weights": sparse(PolynomialFeatures(1), coef_prior=CoefPrior(cov=np.eye(6) + 0.3)),
+    "pinned weights": sparse(PolynomialFeatures(1), coef_prior=CoefPrior(scale=0.0, mean=0.5)),
+    "diagonal": sparse(POLYNOMIAL, solver=LBFGS(posterior="diagonal")),
     "student-t": sparse(POLYNOMIAL, noise="student-t"),
     "all rows": sparse(n_inducing=80, kernel=sk.RBF(0.5)),
-    "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1), noise_variance=None),
+    "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1)),
     "exact": exact(),
     "exact, features": exact(POLYNOMIAL, normalize_y=True),
-    "exact, shared weights": exact(Rows(), share_coef=True),
+    "exact, shared weights": exact(Rows(), coef_prior=CoefPrior(shared=True)),
     "exact, rows": exact(Rows(), kernel_map=Rows()),
 }
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from sklearn.pipeline import make_union
 
-from skevgp import ResidualRegressor
+from skevgp import CoefPrior, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 
 from .export_cases import MODELS, POLYNOMIAL, data, fitted, jacobians, predicted, sparse
@@ -71,7 +71,9 @@ def test_c_predicts_rows_that_end_with_their_time_step(tmp_path):
     X = np.column_stack([X, np.linspace(0.005, 0.05, len(X))])
     columns = {"dt": "column"}
     union = make_union(InertiaForceGravity("cartpole", **columns), NominalDynamics("cartpole", **columns))
-    model = sparse(union, kernel_map=AngleEncoder("cartpole", **columns), coef_mean=0.1, coef_scale=1.0).fit(X, y)
+    model = sparse(
+        union, kernel_map=AngleEncoder("cartpole", **columns), coef_prior=CoefPrior(mean=0.1, scale=1.0)
+    ).fit(X, y)
     library = compiled(model.to_c(tmp_path)[0])
     for x in X[::30]:
         found, (mean, slopes) = called(library, "evgp", x, 3), model.value_and_jacobian(x.reshape(1, -1))

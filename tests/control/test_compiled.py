@@ -54,9 +54,11 @@ def test_one_output_has_no_axis_of_outputs(data):
     assert [part.shape for part in compiled.predict(X_new[0], return_std=True)] == [(), ()]
 
 
-def test_it_is_frozen_until_it_is_told_of_new_weights(data):
+@pytest.mark.parametrize("n_inducing", [15, 100])
+def test_it_is_frozen_until_it_is_told_of_new_weights(data, n_inducing):
+    """With points at all rows the fit is exact, and an update makes it a sparse one."""
     X, Y, X_new = data
-    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=15, **QUICK).fit(X[:100], Y[:100])
+    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=n_inducing, **QUICK).fit(X[:100], Y[:100])
     compiled, before = model.compile(), model.predict(X_new, return_std=True)
     model.partial_fit(X[100:], Y[100:] + 1.0)
     same(compiled.predict(X_new, return_std=True), before)

@@ -13,7 +13,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteK
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.noise import Gaussian
 
 from .cases import N_OUTPUTS, QUICK, D
 
@@ -67,7 +68,7 @@ def test_the_gradient_of_the_exact_model_is_the_formula(data):
     X, Y, X_new = data
     scale, s2, noise, lengths = 1.5, 2.0, 0.01, np.array([0.9, 1.2])
     kernel = ConstantKernel(s2, "fixed") * RBF(lengths, "fixed") + WhiteKernel(noise, "fixed")
-    model = EGPRegressor(PolynomialFeatures(1), kernel, coef_scale=scale).fit(X, Y[:, 0])
+    model = EGPRegressor(PolynomialFeatures(1), kernel, coef_prior=CoefPrior(scale=scale)).fit(X, Y[:, 0])
     gradient, cov = model.predict_gradient(X_new, return_cov=True)
     K = model.kernel_(X) + scale**2 * (1.0 + X @ X.T) + noise * np.eye(len(X))
     for x, own_gradient, own_cov in zip(X_new, gradient, cov, strict=True):
@@ -175,7 +176,7 @@ def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
 
     model = EVGPRegressor(kernel_map=encoder, n_inducing=10, **QUICK).fit(frame_of(X), Y[:, 0])
     _, std = model.predict(frame_of(X_new), return_std=True, include_noise=False)
-    expected = std**2 / model._predictor.signal
+    expected = std**2 / model._posterior.predictor.signal
     np.testing.assert_allclose(model.novelty(frame_of(X_new)), expected, rtol=1e-6, atol=1e-9)
     many = model.novelty(frame_of(np.repeat(X_new, 1000, axis=0)))
     np.testing.assert_allclose(many, np.repeat(expected, 1000), rtol=1e-6, atol=1e-9)
@@ -187,7 +188,7 @@ def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
         with pytest.raises(ValueError, match=message):
             method()
     with pytest.raises(ValueError, match=message):
-        model.set_params(input_noise=0.1).fit(frame_of(X), Y[:, 0])
+        model.set_params(noise=Gaussian(inputs=0.1)).fit(frame_of(X), Y[:, 0])
     numbers = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=10, **QUICK)
     numbers.fit(pd.DataFrame(X, columns=["a", "c"]), Y[:, 0])
     with pytest.raises(ValueError, match=message):

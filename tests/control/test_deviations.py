@@ -11,7 +11,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceW
 
 
 def group_of(model, which=0):
-    return fitted(model)._predictor.groups[which]
+    return fitted(model)._posterior.predictor.groups[which]
 
 
 def variances(group, deviations, V, H):
@@ -76,7 +76,7 @@ def test_little_noise_leaves_the_variances_their_digits():
     """Of outputs with very different noise, the eigenvectors of the best are taken."""
     X, y = data(n_outputs=3)
     y[:, 0] = np.sin(X[:, 0])
-    model = sparse(n_inducing=40, sharing="all", max_iter=40, noise_cv=None, noise_variance=None).fit(X, y)
-    (group,) = model._predictor.groups
+    model = sparse(n_inducing=40, sharing="all", max_iter=40, noise_cv=None).fit(X, y)
+    (group,) = model._posterior.predictor.groups
     by_roots, found = variances(group, Deviations.of(group), *some(group))
     np.testing.assert_allclose(found, by_roots, rtol=1e-6, atol=1e-10 * group.signal.max())

@@ -9,7 +9,7 @@ import pytest
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor
-from skevgp.data.mapped import MappedRows, map_rows
+from skevgp.data.maps import MappedRows, map_rows
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -47,7 +47,7 @@ def test_without_maps_the_kernel_sees_X_and_there_are_no_features():
 @pytest.mark.parametrize("kept", [True, False])
 def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
     if not kept:
-        monkeypatch.setattr("skevgp.data.mapped.MAPPED_BYTES", 0)
+        monkeypatch.setattr("skevgp.data.maps.MAPPED_BYTES", 0)
     scaler, trend = StandardScaler().fit(X), PolynomialFeatures(1).fit(X)
     raw = mapped(trend, scaler)(rows)
     np.testing.assert_allclose(raw.inputs, scaler.transform(X)[rows], rtol=1e-15)
@@ -61,7 +61,7 @@ def test_what_fits_is_mapped_once_and_what_does_not_at_each_pass(monkeypatch):
         own(slice(0, 400))
     assert kept.n_rows_ == 400
     # Two features of 400 rows: a byte less, and they are not kept.
-    monkeypatch.setattr("skevgp.data.mapped.MAPPED_BYTES", 8 * 2 * 400 - 1)
+    monkeypatch.setattr("skevgp.data.maps.MAPPED_BYTES", 8 * 2 * 400 - 1)
     own = mapped(again := Counting())
     for _ in range(3):
         own(slice(0, 400))
@@ -88,9 +88,9 @@ def test_a_frame_is_for_the_maps():
 @pytest.fixture
 def in_pieces(monkeypatch):
     """As if there were so many rows that nothing of them can be kept."""
-    monkeypatch.setattr("skevgp.data.mapped.MAPPED_BYTES", 0)
+    monkeypatch.setattr("skevgp.data.maps.MAPPED_BYTES", 0)
     monkeypatch.setattr("skevgp.data.blocks.CACHE_BYTES", 0)
-    monkeypatch.setattr("skevgp.data.source.PASS_ROWS", 70)
+    monkeypatch.setattr("skevgp.data.rows.PASS_ROWS", 70)
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 30)
     monkeypatch.setattr("skevgp.data.blocks._BLOCK_NUMBERS", 30)
     monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
@@ -109,7 +109,7 @@ def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver
 
 
 def test_a_map_whose_width_changes_from_piece_to_piece_is_named(in_pieces, monkeypatch):
-    monkeypatch.setattr("skevgp.data.mapped.MAP_ROWS", 70)
+    monkeypatch.setattr("skevgp.data.maps.MAP_ROWS", 70)
     widening = FunctionTransformer(lambda rows: np.ones((len(rows), 1 if len(rows) == 70 else 2)))
     with pytest.raises(ValueError, match=r"same number of columns for all rows; they returned \(2, 1\) and \(2, 2\)"):
         model(feature_map=widening, kernel_map=None).fit(X, Y)
@@ -123,9 +123,9 @@ def test_pieces_in_threads_have_the_same_bits(in_pieces):
 
 @pytest.fixture
 def little_memory(monkeypatch):
-    for name in ("rows.mapped.MAPPED_BYTES", "rows.blocks.CACHE_BYTES", "rows.blocks.KEEP_BYTES"):
-        monkeypatch.setattr(f"skevgp.{name}", 2**20)
-    monkeypatch.setattr("skevgp.fitting.rules.LARGEST_SAMPLE", 2**17)
+    for name in ("maps.MAPPED_BYTES", "blocks.CACHE_BYTES", "blocks.KEEP_BYTES"):
+        monkeypatch.setattr(f"skevgp.data.{name}", 2**20)
+    monkeypatch.setattr("skevgp.fitting.search.LARGEST_SAMPLE", 2**17)
 
 
 @pytest.mark.slow

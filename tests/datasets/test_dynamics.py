@@ -5,6 +5,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from sklearn.utils import check_random_state
 
 from skevgp.datasets import load_robot, make_dynamics, quintic_reference, simulate
+from skevgp.noise import Gaussian
 from skevgp.robots import get_system, layout_of
 
 KEYS = {"data", "target", "groups", "trajectories", "feature_names", "target_names", "robot", "dt", "DESCR"}
@@ -175,7 +176,7 @@ def test_a_system_works_in_place_of_its_name():
         ({"dt": 0.0}, "dt must be finite and above 0.0; got 0.0"),
         ({"dt": np.inf}, "dt must be finite and above 0.0; got inf"),
         ({"noise": -0.1}, "noise must be finite and at least 0.0; got -0.1"),
-        ({"input_noise": np.nan}, "input_noise must be finite and at least 0.0; got nan"),
+        ({"noise": Gaussian(inputs=np.nan)}, "input_noise must be finite and at least 0.0; got nan"),
     ],
 )
 def test_bad_values_are_named(arguments, message):
@@ -322,7 +323,7 @@ def test_the_number_of_jobs_does_not_change_a_bit():
 
 
 def test_wrapped_angles_keep_what_changed():
-    turning = {"system": "cartpole", "n_trajectories": 20, "n_steps": 50, "noise": 0.01, "input_noise": 0.01}
+    turning = {"system": "cartpole", "n_trajectories": 20, "n_steps": 50}
     free, wrapped = (make_dynamics(**turning, wrap_angles=wrap, random_state=0) for wrap in (False, True))
     assert (np.abs(free.data[:, 1]) > np.pi).any()
     assert (wrapped.data[:, 1] >= -np.pi).all()

@@ -13,7 +13,7 @@ from sklearn.pipeline import FeatureUnion
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics, perturb_robot, simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
-from skevgp.fitting.coef_prior import resolve_coef_prior
+from skevgp.fitting.prior import CoefPrior, resolved
 from skevgp.metrics import prediction_error
 from skevgp.robots import System, get_system, layout_of, load_robot
 from skevgp.robots.systems import Link
@@ -131,7 +131,7 @@ def test_the_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, 
     X, n = rows(robot), layout_of(robot).n_joints
     features = union(robot, NominalDynamics(robot, terms=terms))
     H = features.fit_transform(X)
-    mean, *_ = resolve_coef_prior("auto", "auto", features, X, np.ones((2 * n, H.shape[1])))
+    mean, *_ = resolved(CoefPrior(), features, X, np.ones((2 * n, H.shape[1])), 2 * n)
     _, v, _ = parts(robot, X)
     step = np.hstack([v, by_pinocchio(robot, "acceleration", X)])
     assert_allclose(H @ mean.T, X[:, : 2 * n] + DT * step, rtol=1e-9, atol=1e-10 * np.abs(step).max())
@@ -141,7 +141,7 @@ def test_the_prior_mean_is_what_a_short_step_does():
     dt, X = 1e-4, rows("acrobot")
     features = FeatureUnion([("if", InertiaForce("acrobot", dt=dt)), ("nominal", NominalDynamics("acrobot", dt=dt))])
     H = features.fit_transform(X)
-    mean, *_ = resolve_coef_prior("auto", "auto", features, X, np.ones((4, H.shape[1])))
+    mean, *_ = resolved(CoefPrior(), features, X, np.ones((4, H.shape[1])), 4)
     after = simulate("acrobot", X[:, :4], X[:, np.newaxis, 4:], dt)[:, 1]
     assert_allclose(H @ mean.T, after, rtol=0, atol=2e-6)
     assert np.abs(X[:, :4] - after).max() > 1e-4

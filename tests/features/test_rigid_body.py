@@ -11,6 +11,7 @@ from skevgp import EVGPRegressor
 from skevgp.datasets import load_robot
 from skevgp.features import RigidBodyRegressor
 from skevgp.robots import RigidBody
+from skevgp.solvers import LBFGS
 
 from .test_jacobians import LIFT, name_of
 
@@ -90,7 +91,9 @@ def test_all_joints_share_weights_in_the_regressor():
     body = RigidBodyRegressor("acrobot", friction=["viscous"])
     mean, _ = body.coef_prior(2)
     y = body.fit_transform(X) @ mean + 0.01 * np.random.default_rng(0).normal(size=(200, 2))
-    fitted = EVGPRegressor(body, n_inducing=5, max_iter=5, noise_cv=None, random_state=0, tol=1e9).fit(X, y)
+    fitted = EVGPRegressor(body, n_inducing=5, max_iter=5, noise_cv=None, random_state=0, solver=LBFGS(tol=1e9)).fit(
+        X, y
+    )
     assert fitted.coef_.shape == (22,)
     assert np.sqrt(np.mean((fitted.predict(X) - y) ** 2)) < 0.02
 

@@ -13,7 +13,7 @@ from sklearn.pipeline import make_union
 from skevgp import EVGPRegressor, rollout
 from skevgp.datasets import simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
-from skevgp.fitting.coef_prior import resolve_coef_prior
+from skevgp.fitting.prior import CoefPrior, resolved
 from skevgp.maps import Map, as_map
 from skevgp.robots import layout_of
 
@@ -246,7 +246,7 @@ def test_the_prior_mean_beside_inertia_force_is_eulers_step_of_each_row():
     X[:, -1] /= 100.0
     union = make_union(InertiaForce("acrobot", dt="column"), NominalDynamics("acrobot", dt="column"))
     H = union.fit_transform(X)
-    mean, *_ = resolve_coef_prior("auto", "auto", union, X, np.ones((4, H.shape[1])))
+    mean, *_ = resolved(CoefPrior(), union, X, np.ones((4, H.shape[1])), 4)
     after = np.vstack([simulate("acrobot", x[:4], x[np.newaxis, 4:5], x[5])[1:] for x in X])
     moved = np.abs(after - X[:, :4]).max()
     assert_allclose(H @ mean.T, after, rtol=0, atol=1e-2 * moved)

@@ -1,14 +1,17 @@
-"""A small problem as an estimator hands it over: rows in the user's units, units, and a request."""
+"""A small problem as an estimator hands it over: rows in the user's units, units, and how they are fitted."""
 
 import numpy as np
 
-from skevgp.data.source import LocalSource, Moments
+from skevgp.data.rows import LocalSource, Moments, RawRows
+from skevgp.data.threads import BlockMap
+from skevgp.fitting.fit import fit_model
 from skevgp.fitting.inducing import Placement
-from skevgp.fitting.plan import Request
+from skevgp.fitting.model import models_of
+from skevgp.fitting.problem import Problem
 from skevgp.fitting.units import Units
 from skevgp.kernels.parse import parse_kernel
 from skevgp.model.predictor import CoefficientPrior
-from skevgp.solvers import LBFGS
+from skevgp.utils.monitor import Monitor
 
 _rng = np.random.RandomState(0)
 N, O = 60, 2  # noqa: E741
@@ -21,7 +24,7 @@ COEF_MEAN, COEF_SCALE = np.array([[0.5, 0.0], [0.0, 10.0]]), np.array([[2.0, 1.0
 
 
 def source_of(X=X, H=H, Y=Y):
-    return LocalSource.of(X, H, Y)
+    return LocalSource.holding(RawRows(X, H, Y))
 
 
 def units_of(X=X, H=H, Y=Y, target_mean=0.0):
@@ -38,19 +41,34 @@ def data_of(Y, X=X):
     return {"X": X, "H": H, "Y": Y, "units": units_of(X, H, Y)}
 
 
-def request(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
+def problem_of(X=X, H=H, Y=Y, kernel=None, n_inducing=8, **changes):
     """What an estimator asks for."""
+    units = changes.pop("units", None) or units_of(X, H, Y)
     options = {
         "source": source_of(X, H, Y),
-        "units": units_of(X, H, Y),
+        "units": units,
         "spec": parse_kernel(kernel, X.shape[1]),
-        "sharing": "all",
-        "family": "full",
+        "vague": np.zeros(units.prior.scale.shape, dtype=bool),
+        "shapes": (X.shape[1:], H.shape[1:]),
         "placement": Placement("k-means", n_inducing),
-        "solver": LBFGS(),
         "max_iter": 20,
         "tol": 1.0,
-        "noise_cv": None,
-        "n_threads": 1,
     }
-    return Request(**options | changes)
+    return Problem(**options | changes)
+
+
+def models(monitor=None, seed=0, previous=None, **changes):
+    """The models of a problem, each to be fitted."""
+    monitor = Monitor() if monitor is None else monitor
+    return models_of(problem_of(**changes), np.random.RandomState(seed), monitor, BlockMap(), previous)
+
+
+def model_of(monitor=None, seed=0, **changes):
+    """The one model of a problem whose outputs share everything."""
+    (model,) = models(monitor, seed, **changes)
+    return model
+
+
+def fitted(monitor=None, seed=0, previous=None, **changes):
+    monitor = Monitor() if monitor is None else monitor
+    return fit_model(problem_of(**changes), np.random.RandomState(seed), monitor, previous)

@@ -3,52 +3,47 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from skevgp.data.threads import BlockMap
 from skevgp.fitting import outliers
+from skevgp.fitting.fit import finished
 from skevgp.fitting.outliers import Look, RowDoubts, fit_doubting, look_at, settle
-from skevgp.fitting.outputs import _best
-from skevgp.fitting.plan import plan
-from skevgp.fitting.strategy import Attempt, better
+from skevgp.fitting.search import Start, better, search
+from skevgp.noise import StudentT
 from skevgp.noise.student_t import RowScales
-from skevgp.utils.monitor import Monitor
 
-from .cases import N, O, Y, data_of, request
+from .cases import N, O, Y, data_of, model_of
 
 BAD = np.array([3, 17, 40])
 
 
-def task_of(**changes):
+def wrong_at_three(**changes):
     """With rows of which three are far off."""
     wrong = Y.copy()
     wrong[BAD] += 6.0 * Y.std(axis=0)
-    (task,) = plan(
-        request(**data_of(wrong), **changes, heavy_tails=True), np.random.RandomState(0), Monitor(), BlockMap()
-    )
-    return task
+    return model_of(**data_of(wrong), **changes, noise=StudentT())
 
 
 @pytest.mark.parametrize("changes", [{}, {"family": "diagonal"}, {"sharing": "kernel"}], ids=str)
 def test_no_turn_lowers_the_bound(changes):
-    task = task_of(max_iter=10, **changes)
-    rows = task.rows
+    model = wrong_at_three(max_iter=10, **changes)
+    rows = model.rows
     doubts = RowDoubts(RowScales(O, np.random.RandomState(1).uniform(0.0, 60.0, N)), np.ones(O))
-    weighed = replace(task, rows=doubts.weigh(rows))
-    fit = weighed.minimise(Attempt(task.table.values_at_start(), 10))
+    weighed = replace(model, rows=doubts.weigh(rows))
+    fit = weighed.minimise(Start(model.table.values_at_start(), 10))
     for _ in range(4):
         weighed, settled, doubts = settle(weighed, fit, rows, doubts)
         assert settled.bound >= fit.bound - 1e-8 * abs(fit.bound)
-        further = better(settled, weighed.minimise(Attempt(settled.values, settled.n_iter + 5, settled)))
+        further = better(settled, weighed.minimise(Start(settled.values, settled.n_iter + 5, settled)))
         assert further.bound >= settled.bound
         fit = further
 
 
 def test_a_turn_of_the_doubts_alone_does_not_lower_the_bound_either(monkeypatch):
     monkeypatch.setattr(outliers, "_TURNS", 1)
-    task = task_of()
-    rows, values = task.rows, task.table.values_at_start()
+    model = wrong_at_three()
+    rows, values = model.rows, model.table.values_at_start()
     doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
-    weighed = replace(task, rows=doubts.weigh(rows))
-    fit, bounds = weighed.minimise(Attempt(values, 0)), []
+    weighed = replace(model, rows=doubts.weigh(rows))
+    fit, bounds = weighed.minimise(Start(values, 0)), []
     for _ in range(6):
         bounds.append(fit.bound)
         weighed, fit, doubts = settle(weighed, fit, rows, doubts)
@@ -58,16 +53,16 @@ def test_a_turn_of_the_doubts_alone_does_not_lower_the_bound_either(monkeypatch)
 
 def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
     """With q(τ) at its optimum the terms with τ are the evidence: the bound from matrices, less what stands for it."""
-    task = task_of()
-    rows = task.rows
-    fit = task.minimise(Attempt(task.table.values_at_start(), 0))
+    model = wrong_at_three()
+    rows = model.rows
+    fit = model.minimise(Start(model.table.values_at_start(), 0))
     doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
     for _ in range(20):
-        task, fit, doubts = settle(task, fit, rows, doubts)
+        model, fit, doubts = settle(model, fit, rows, doubts)
     scales, noise = doubts.scales, fit.values["noise"]
-    (statistics,) = task.model.statistics(fit.values, task.blocks)
+    (statistics,) = model.sparse.statistics(fit.values, model.blocks)
     assert statistics.log_variance == pytest.approx(scales.log_variance.sum())
-    look = look_at(rows, outliers.predictor_at(task, fit.values))
+    look = look_at(rows, outliers.predictor_at(model, fit.values))
     # Less the divergence of q(g): what depends on the rows.
     expected = scales.evidence.sum() - 0.5 * N * np.log(2.0 * np.pi * noise).sum()
     found = -0.5 * (scales.mean @ look.distances(noise) + N * np.log(2.0 * np.pi * noise).sum())
@@ -75,20 +70,20 @@ def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
 
 
 def test_outliers_are_found():
-    task = task_of(max_iter=60, tol=0.01)
-    learned = fit_doubting(task, _best)
-    weights = learned.doubts.scales.mean
+    model = wrong_at_three(max_iter=60, tol=0.01)
+    done = finished(*fit_doubting(model, lambda own: (own, search(own))))
+    weights = done.doubts.scales.mean
     assert (weights[BAD] < 0.1).all()
     assert (np.delete(weights, BAD) > 0.5).all()
-    assert learned.upper_bound == np.inf
-    np.testing.assert_allclose(learned.predictor.noise, learned.values["noise"] * learned.doubts.noise_factor)
+    assert done.upper_bound == np.inf
+    np.testing.assert_allclose(done.predictor.noise, done.values["noise"] * done.doubts.noise_factor)
 
 
 def test_what_is_fixed_stays():
-    task = task_of(max_iter=5)
-    task = replace(task, table=task.table.with_fixed("noise"))
-    learned = fit_doubting(task, _best)
-    np.testing.assert_array_equal(learned.predictor.noise, task.table.values_at_start()["noise"])
+    model = wrong_at_three(max_iter=5)
+    model = replace(model, table=model.table.with_fixed("noise"))
+    done = finished(*fit_doubting(model, lambda own: (own, search(own))))
+    np.testing.assert_array_equal(done.predictor.noise, model.table.values_at_start()["noise"])
 
 
 def test_the_variance_of_clean_rows_is_theirs():

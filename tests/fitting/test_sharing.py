@@ -2,23 +2,14 @@ import numpy as np
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct
 
-from skevgp.data.source import LocalSource
-from skevgp.fitting import sharing
-from skevgp.fitting.inducing import Placement
-from skevgp.fitting.outputs import fit_outputs
+from skevgp.data.rows import LocalSource
 from skevgp.fitting.sharing import found_groups, with_groups
 from skevgp.model.objectives import BoundObjective
-from skevgp.solvers.lbfgs import lbfgs
+from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import NotPositiveDefiniteError
 from skevgp.utils.monitor import Monitor
 
-from .cases import N, data_of, request
-
-
-def fitted(monitor=None, previous=None, **changes):
-    """As an estimator does it."""
-    rng, monitor = np.random.RandomState(0), Monitor() if monitor is None else monitor
-    return fit_outputs(with_groups(request(**changes), rng, monitor, previous), rng, monitor, previous)
+from .cases import N, data_of, fitted, problem_of
 
 
 def waves(frequencies, noise=0.01, n=400, seed=0):
@@ -38,7 +29,7 @@ AUTO = {"sharing": "auto", "n_inducing": 40, "kernel": RBF(1.0)}
 
 
 def found(n_threads=1, rng=0, **changes):
-    asked = request(**{**AUTO, "n_threads": n_threads} | changes)
+    asked = problem_of(**{**AUTO, "n_threads": n_threads} | changes)
     return found_groups(asked, np.random.RandomState(rng), Monitor())
 
 
@@ -49,11 +40,6 @@ def test_outputs_of_like_smoothness_are_joined(seed):
     scaled = data_of(data["Y"] * [1.0, 1e-3, 1e4, 1.0], data["X"])
     assert found(**data) == found(**scaled) == [[0, 2], [1, 3]]
     assert found(**waves([0.5, 0.5, 0.5], seed=seed)) == [[0, 1, 2]]
-
-
-def test_the_groups_do_not_depend_on_threads():
-    data = waves([0.5, 3.0, 0.5, 1.5])
-    assert found(1, **data) == found(3, **data)
 
 
 def test_constant_outputs_and_noise_have_groups_of_their_own():
@@ -85,7 +71,7 @@ def test_a_single_output_is_not_looked_at():
         raise AssertionError("nobody needs the rows")
 
     data = waves([0.5])
-    asked = request(**data, source=LocalSource(load, N), sharing="auto", max_iter=5)
+    asked = problem_of(**data, source=LocalSource(load, N), sharing="auto", max_iter=5)
     assert found_groups(asked, np.random.RandomState(0), Monitor()) == [[0]]
 
 
@@ -100,21 +86,9 @@ def test_a_fit_with_found_groups_is_the_fit_with_these_given():
     assert auto.lower_bound == given.lower_bound
 
 
-def test_groups_are_found_whatever_number_of_points_the_fit_begins_with():
-    """The few that it begins with do not tell one kernel from another."""
-    data, given = waves([0.5, 3.0, 0.5]), Placement("k-means", 40)
-    growing = Placement("k-means", 3, max_inducing=40)
-    asked = [
-        with_groups(request(placement=own, sharing="auto", **data), np.random.RandomState(0), Monitor())
-        for own in (given, growing)
-    ]
-    assert asked[0].sharing == asked[1].sharing == [[0, 2], [1]]
-    assert asked[1].placement is growing
-
-
 def test_only_groups_that_were_asked_for_are_looked_for():
     for one in ("all", "kernel", "none", [[1], [0]]):
-        asked = request(sharing=one)
+        asked = problem_of(sharing=one)
         assert with_groups(asked, np.random.RandomState(0), Monitor()) is asked
 
 
@@ -131,11 +105,13 @@ def test_groups_that_were_found_are_kept_and_others_are_not():
 def test_ctrl_c_while_groups_are_looked_for_reaches_the_user(monkeypatch):
     """There is no fit yet to keep; and nobody is told of these fits."""
 
+    minimise = LBFGS.minimise
+
     def interrupted(*arguments):
         arguments[-1].stop()
-        return lbfgs(*arguments)
+        return minimise(*arguments)
 
-    monkeypatch.setattr(sharing, "lbfgs", interrupted)
+    monkeypatch.setattr(LBFGS, "minimise", interrupted)
     told = []
     with pytest.raises(KeyboardInterrupt):
         fitted(Monitor(lambda *what: told.append(what)), sharing="auto", **waves([0.5, 3.0]))
@@ -150,7 +126,7 @@ def test_bounds_that_cannot_be_computed_do_not_end_the_fit(monkeypatch, raises):
                 raise NotPositiveDefiniteError
             return np.nan, np.full_like(flat, np.nan)
 
-    monkeypatch.setattr("skevgp.fitting.sparse.BoundObjective", Broken)
+    monkeypatch.setattr("skevgp.fitting.model.BoundObjective", Broken)
     assert found(**waves([0.5, 3.0])) == [[0, 1]]
 
 

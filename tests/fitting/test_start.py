@@ -1,17 +1,15 @@
 import numpy as np
 import pytest
 
-from skevgp.data.source import Moments
-from skevgp.data.threads import BlockMap
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import alike_neighbours, parameter_of, starting_table
+from skevgp.fitting.search import Rules
+from skevgp.fitting.start import alike_neighbours, parameter_of
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.model import SparseModel
 from skevgp.model.parameters import ParameterTable
 
-from ..oracle import identity_rows
-from .cases import COEF_MEAN, COEF_SCALE, NO_FEATURES, H, N, X, Y, source_of, units_of
+from ..oracle import identity_rows, table_of
+from .cases import NO_FEATURES, H, N, X, Y, source_of, units_of
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-9])
@@ -29,21 +27,20 @@ def test_noise_is_seldom_alike():
         assert not alike_neighbours(identity_rows(rng.randn(n, 3), rng.randn(n, 100))).any()
 
 
-def test_a_start_without_opinion_takes_the_default():
-    parameter = parameter_of(Start(), "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
-    assert (parameter.start, parameter.lower, parameter.upper) == ([2.0], [1.0], [3.0])
-
-
-def test_a_start_in_the_users_units_is_divided_by_the_unit():
-    start = Start(np.array([20.0]), np.array([[5.0, 50.0]]))
-    parameter = parameter_of(start, "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
-    assert (parameter.start, parameter.lower, parameter.upper) == ([2.0], [0.5], [5.0])
-
-
-def test_a_start_outside_the_default_bounds_is_put_inside():
-    parameter = parameter_of(Start(np.array([100.0])), "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0)
-    table = ParameterTable([parameter])
-    np.testing.assert_allclose(table.values(table.start())["x"], [3.0])
+@pytest.mark.parametrize(
+    ("start", "first", "lower", "upper", "widest"),
+    [
+        (Start(), 2.0, 1.0, 3.0, 9.0),
+        (Start(np.array([20.0]), np.array([[5.0, 50.0]])), 2.0, 0.5, 5.0, None),
+        (Start(np.array([100.0])), 3.0, 1.0, 3.0, 9.0),
+    ],
+    ids=["no opinion", "in the user's units", "outside of the limits"],
+)
+def test_a_start_is_the_users_within_limits(start, first, lower, upper, widest):
+    own = parameter_of(start, "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0, 9.0)
+    assert (own.lower, own.upper, own.widest) == ([lower], [upper], widest)
+    table = ParameterTable([own])
+    np.testing.assert_allclose(table.values(table.start())["x"], [first])
 
 
 def test_starts_and_limits_follow_the_data_and_the_rules():
@@ -54,7 +51,7 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     rules = Rules(1e-4, 1e-10, lengthscale=0.5, **limits)
     scatter, points = np.array([1.0, 0.01]), np.zeros((1, 3, 2))
     starts = Starts(Start(), Start(), Start())
-    table = starting_table(Moments.of(X), points, np.ones(2), starts, scatter, rules, 2)
+    table = table_of(X, points, starts, scatter, 2, rules)
     first, (sigma, root) = table.values(table.start()), (X.std(axis=0), np.sqrt(2.0))
     np.testing.assert_allclose(first["hyperparameters"], 0.5 * root * sigma)
     np.testing.assert_allclose(first["signal"], 1.0)
@@ -64,12 +61,6 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
     np.testing.assert_allclose([lower["signal"], upper["signal"]], [[1e-3] * 2, [1e3] * 2])
     np.testing.assert_allclose([lower["noise"], upper["noise"]], [1e-10 * scatter, [50.0] * 2])
     np.testing.assert_allclose(table["signal"].widest, 1e5)
-
-
-def test_bounds_of_the_users_are_the_widest():
-    bounds = np.array([[0.5, 5.0]])
-    parameter = parameter_of(Start(bounds=bounds), "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 1.0, 9.0)
-    assert (parameter.lower, parameter.upper, parameter.widest) == ([0.5], [5.0], None)
 
 
 # --- there and back between the user's units and the internal ones ---------------------------------------------------
@@ -87,13 +78,7 @@ def test_targets_come_back(target_mean, features):
     assert internal.features is raw.features
     back = units.target_mean + raw.features @ units.prior.offset.T + internal.targets * units.target_unit
     np.testing.assert_allclose(back, Y, rtol=1e-12)
-
-
-def test_residuals_are_of_order_one_whatever_the_units():
-    for factor in (1.0, 1e-9, 1e9):
-        scaled = {"H": NO_FEATURES, "Y": factor * Y}
-        residuals = units_of(**scaled).to_internal(source_of(**scaled).take(np.arange(N))).targets
-        np.testing.assert_allclose(np.mean(residuals**2, axis=0), 1.0, rtol=1e-9)
+    np.testing.assert_array_equal(units.rows(source_of(H=features)).some(np.arange(N)).targets, internal.targets)
 
 
 def test_the_features_leave_as_little_as_they_can_at_the_reference():
@@ -102,35 +87,6 @@ def test_the_features_leave_as_little_as_they_can_at_the_reference():
     left = np.sqrt(np.mean((Y - H @ fitted) ** 2, axis=0))
     np.testing.assert_allclose(units_of().target_unit, left, rtol=1e-2)
     assert (units_of().target_unit < units_of(H=NO_FEATURES).target_unit).all()
-
-
-def test_the_prior_is_that_of_the_user():
-    prior = units_of().prior
-    np.testing.assert_array_equal(prior.mean, COEF_MEAN)
-    np.testing.assert_array_equal(prior.scale, COEF_SCALE)
-
-
-def test_the_internal_prior_is_that_of_weights_in_units_of_their_target():
-    units = units_of()
-    internal, unit = units.internal_prior(), units.target_unit[:, np.newaxis]
-    np.testing.assert_allclose(internal.mean * unit, COEF_MEAN)
-    np.testing.assert_allclose(internal.scale * unit, COEF_SCALE)
-    np.testing.assert_allclose(internal.offset * unit, units.prior.offset)
-
-
-def test_rows_are_in_internal_units():
-    units, threads = units_of(), BlockMap()
-    rows = units.rows(source_of(), threads)
-    assert rows.threads is threads
-    np.testing.assert_array_equal(rows.some(np.array([4, 2])).targets, units.to_internal(ROWS).targets[[4, 2]])
-    np.testing.assert_allclose(rows.scatter(), units.to_internal(ROWS).targets.var(axis=0), rtol=1e-12)
-
-
-def test_a_density_per_row_goes_to_the_users_units_by_the_logarithm_of_the_unit():
-    """log N(y | μ, s²) = log N(y / u | μ / u, (s / u)²) - log u."""
-    units = units_of()
-    assert units.log_unit(slice(0, 2)) == pytest.approx(np.log(units.target_unit).sum())
-    assert units.log_unit(slice(1, 2)) == pytest.approx(np.log(units.target_unit[1]))
 
 
 def test_predictions_are_of_y():

@@ -13,6 +13,7 @@ from sklearn.gaussian_process.kernels import WhiteKernel
 
 from skevgp import EVGPRegressor
 from skevgp.kernels import FunctionKernel
+from skevgp.solvers import LBFGS
 
 from .cases import smooth
 
@@ -26,7 +27,7 @@ def fitted(kernel, **arguments):
 
 
 def test_a_function_is_a_kernel():
-    model, same = fitted(smooth, tol=1.0), fitted(FunctionKernel(smooth), tol=1.0)
+    model, same = fitted(smooth, solver=LBFGS(tol=1.0)), fitted(FunctionKernel(smooth), solver=LBFGS(tol=1.0))
     assert model.kernel_ == same.kernel_
     assert isinstance(model.kernel_.k2, FunctionKernel)
     np.testing.assert_array_equal(model.predict(X_NEW), same.predict(X_NEW))
@@ -85,11 +86,11 @@ def test_other_defaults_than_floats_are_no_hyperparameters():
 
     kernel = FunctionKernel(power)
     assert [h.name for h in kernel.hyperparameters] == ["bias"]
-    assert fitted(kernel, tol=1.0).kernel_.k2.function is power
+    assert fitted(kernel, solver=LBFGS(tol=1.0)).kernel_.k2.function is power
 
 
 def test_a_function_without_hyperparameters():
-    model = fitted(lambda X, Z: anp.exp(-anp.sum((X[:, None] - Z[None]) ** 2, axis=2)), tol=1.0)
+    model = fitted(lambda X, Z: anp.exp(-anp.sum((X[:, None] - Z[None]) ** 2, axis=2)), solver=LBFGS(tol=1.0))
     assert repr(model.kernel_.k2) == "FunctionKernel(<lambda>)"
     assert model.n_parameters_ == 2 + 8 * 2 + 8 + 8 * 9 // 2
 

@@ -19,15 +19,15 @@ from sklearn.gaussian_process.kernels import (
 
 from skevgp import EVGPRegressor
 from skevgp.data.blocks import Batch
-from skevgp.data.source import Moments
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import checked_variance, starting_table
+from skevgp.fitting.start import checked_variance
 from skevgp.kernels import FunctionKernel
 from skevgp.kernels.parse import Start, Starts, parse_kernel
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective, ElboObjective
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 
-from ..oracle import central_differences, problem, relative_error
+from ..oracle import central_differences, problem, relative_error, table_of
 from .cases import KERNELS, REGISTERED, Z, parsed, polynomial, smooth
 
 
@@ -40,8 +40,8 @@ def model_with(kernel, shared=True, **sizes):
     points = table["inducing_points"].start
     starts = Starts(spec.starts.hyperparameters, Start(np.array([0.7])), Start(np.array([0.2])))
     variance = checked_variance(covariance, spec.starts.hyperparameters.value, points[0])
-    inputs, ones, size = Moments.of(rows.inputs), np.ones(2), covariance.n_hyperparameters
-    table = starting_table(inputs, points, ones, starts, ones, Rules(1e-2), size, variance)
+    size = covariance.n_hyperparameters
+    table = table_of(rows.inputs, points, starts, np.ones(2), size, mean_variance=variance)
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
 
 
@@ -145,7 +145,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
     kernel = TREES[name]
     noise = None if "WhiteKernel" in str(kernel) else 0.02
     offset = np.array([2.0, -1.0])
-    model = EVGPRegressor(kernel=kernel, noise_variance=noise, n_inducing=20, max_iter=0, sharing=sharing)
+    model = EVGPRegressor(kernel=kernel, noise=Gaussian(variance=noise), n_inducing=20, max_iter=0, sharing=sharing)
     model.fit(X + offset, Y)
     mean, std = model.predict(X_NEW + offset, return_std=True, include_noise=False)
     _, cov = model.predict(X_NEW + offset, return_cov=True, include_noise=False)
@@ -167,7 +167,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
 @pytest.mark.parametrize("name", TREES)
 def test_a_fit_gains_and_comes_back_as_the_same_tree(name):
     kernel = TREES[name]
-    start, end = (fitted(kernel, max_iter=n, tol=1.0) for n in (0, None))
+    start, end = (fitted(kernel, max_iter=n, solver=LBFGS(tol=1.0)) for n in (0, None))
     assert end.lower_bound_ > start.lower_bound_
     assert np.isfinite(end.predict(X_NEW, return_std=True)).all()
     tree = parse_kernel(kernel, 2).tree
@@ -201,7 +201,7 @@ def test_samples_follow_the_covariance(name):
 def test_partial_fit_and_pickles_keep_other_kernels(name):
     kernel, y = TREES[name], Y[:, 0]
     noise = None if "WhiteKernel" in str(kernel) else 0.02
-    arguments = {"kernel": kernel, "noise_variance": noise, "n_inducing": 12, "max_iter": 0}
+    arguments = {"kernel": kernel, "noise": Gaussian(variance=noise), "n_inducing": 12, "max_iter": 0}
     # Distinct rows, no more than inducing points: those are the points; the units of y are those of the first rows.
     model = EVGPRegressor(**arguments).fit(X[:12] + 1.0, y[:12])
     model.partial_fit(X[12:] + 1.0, y[12:])
@@ -230,7 +230,7 @@ def test_single_hyperparameters_can_be_fixed():
     kernel = 2.0 * (
         RBF([0.5, 1.0], "fixed") + ConstantKernel(0.5) * RationalQuadratic(1.5, 0.7, "fixed", (0.1, 5.0))
     ) + WhiteKernel(0.1)
-    model = fitted(kernel, tol=1.0)
+    model = fitted(kernel, solver=LBFGS(tol=1.0))
     rbf, scaled = model.kernel_.k2.k1, model.kernel_.k2.k2
     assert rbf == RBF([0.5, 1.0], "fixed")
     assert scaled.k2.length_scale == 1.5
@@ -245,7 +245,9 @@ def test_single_hyperparameters_can_be_fixed():
 
 def test_a_warm_start_takes_over_hyperparameters_of_the_same_kernel_only():
     y = Y[:, 0]
-    model = EVGPRegressor(kernel=RBF([1.0, 1.0]), n_inducing=8, random_state=0, tol=1.0, warm_start=True).fit(X, y)
+    model = EVGPRegressor(
+        kernel=RBF([1.0, 1.0]), n_inducing=8, random_state=0, solver=LBFGS(tol=1.0), warm_start=True
+    ).fit(X, y)
     learned = model.kernel_.k2.length_scale
     model.set_params(max_iter=0).fit(X, y)
     np.testing.assert_allclose(model.kernel_.k2.length_scale, learned)

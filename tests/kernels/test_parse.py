@@ -25,6 +25,8 @@ from skevgp.kernels.covariances import Product, Sum
 from skevgp.kernels.dot_product import DotProduct as DotProductCovariance
 from skevgp.kernels.parse import BUILDERS, parse_kernel
 from skevgp.kernels.stationary import SquaredExponential
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 
 X = np.random.RandomState(0).randn(20, 2)
 
@@ -198,13 +200,13 @@ def test_the_users_kernel_is_left_alone():
 
 def test_the_fitted_kernel_is_a_valid_start_again():
     model = fitted(None)
-    again = fitted(model.kernel_, noise_variance=model.noise_variance_, max_iter=0)
+    again = fitted(model.kernel_, noise=Gaussian(variance=model.noise_variance_), max_iter=0)
     np.testing.assert_allclose(again.kernel_.theta, model.kernel_.theta, rtol=1e-9)
 
 
 def test_outputs_have_their_own_signal_variance_and_share_the_shape():
     Y = np.column_stack([np.sin(X[:, 0]), 100.0 * np.cos(X[:, 0])])
-    model = EVGPRegressor(n_inducing=8, random_state=0, tol=1.0).fit(X, Y)
+    model = EVGPRegressor(n_inducing=8, random_state=0, solver=LBFGS(tol=1.0)).fit(X, Y)
     first, second = model.kernel_
     np.testing.assert_array_equal(first.k2.length_scale, second.k2.length_scale)
     assert second.k1.constant_value > 100.0 * first.k1.constant_value
@@ -212,7 +214,7 @@ def test_outputs_have_their_own_signal_variance_and_share_the_shape():
 
 def test_noise_from_two_sides_is_an_error():
     with pytest.raises(ValueError, match="noise_variance=0.1 or from the WhiteKernel"):
-        fitted(RBF(1.0) + WhiteKernel(0.1), noise_variance=0.1)
+        fitted(RBF(1.0) + WhiteKernel(0.1), noise=Gaussian(variance=0.1))
 
 
 # --- bounds ------------------------------------------------------------------------------------------------------
@@ -289,5 +291,7 @@ def test_outputs_that_share_a_kernel_are_warned_of_its_bound_once():
     Y = np.sin(np.column_stack([X[:, 0], X[:, 1]]))
     kernel = RBF(0.1, (0.05, 0.1))
     for sharing in ("all", "none"):
-        model = EVGPRegressor(kernel=kernel, sharing=sharing, noise_variance=0.1, inducing_init=X, random_state=0)
+        model = EVGPRegressor(
+            kernel=kernel, sharing=sharing, noise=Gaussian(variance=0.1), inducing_init=X, random_state=0
+        )
         assert sum("length_scale" in message for message in warnings_of(model, X, Y)) == 1

@@ -34,6 +34,7 @@ from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDyn
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.io import load, save
 from skevgp.kernels import FunctionKernel
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 from tests.long.torture import run
 
@@ -90,14 +91,14 @@ def fits(rng, folder):
     for options in (
         {},
         {"sharing": "none", "n_jobs": 2},
-        {"posterior": "diagonal", "sharing": "kernel"},
+        {"solver": LBFGS(posterior="diagonal"), "sharing": "kernel"},
         {"noise": "student-t"},
-        {"n_inducing": "auto", "max_inducing": 25},
+        {"n_inducing": "auto", "solver": LBFGS(max_inducing=25)},
         {"solver": Adam(batch_size=50)},
-        {"solver": "adam", "posterior": "diagonal"},
+        {"solver": Adam(posterior="diagonal")},
         {"solver": LBFGS(n_restarts=1), "kernel": ConstantKernel() * Matern([1.0, 1.0, 1.0], nu=2.5)},
         {"kernel": FunctionKernel(quadratic), "max_iter": 2},
-        {"input_noise": 0.01},
+        {"noise": Gaussian(inputs=0.01)},
     ):
         options = {"n_inducing": 15, "max_iter": 8, "random_state": rng.randint(1000), **options}
         model = EVGPRegressor(InertiaForceGravity("pendulum"), **options).fit(X, Y, groups=groups)
@@ -124,9 +125,9 @@ def others(rng, folder):
 def partial_fits(rng, folder):
     """A model that goes on, with and without forgetting."""
     for forgetting_factor in (1.0, 0.9):
-        model = EVGPRegressor(n_inducing=15, max_iter=5, forgetting_factor=forgetting_factor, random_state=0)
+        model = EVGPRegressor(n_inducing=15, max_iter=5, random_state=0)
         for _ in range(10):
-            model.partial_fit(*data(rng, 50))
+            model.partial_fit(*data(rng, 50), forgetting_factor=forgetting_factor)
             model.predict(data(rng, 5)[0], return_std=True)
         if not np.isfinite(model.lower_bound_):
             raise AssertionError("the bound is not finite")

@@ -4,10 +4,10 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd import grad
+from sklearn.gaussian_process.kernels import ConstantKernel, DotProduct
 
-from skevgp.data.source import Moments
-from skevgp.fitting.rules import Rules
-from skevgp.fitting.start import starting_table
+from skevgp import EVGPRegressor
+from skevgp.fitting.search import Rules
 from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import (
@@ -22,9 +22,12 @@ from skevgp.model.bounds import (
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective
 from skevgp.model.predictor import CoefficientPrior
+from skevgp.noise import Gaussian
+from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
-from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, whitened
+from ..accuracy import at_the_fit
+from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, table_of, whitened
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)
@@ -71,15 +74,8 @@ def test_gradient_agrees_with_finite_differences(family, shared):
 def test_gradient_with_one_lengthscale_for_all_columns():
     model, rows, table = problem()
     model = SparseModel(SquaredExponential(2, isotropic=True), model.prior, "full", model.groups)
-    table = starting_table(
-        Moments.of(rows.inputs),
-        table["inducing_points"].start,
-        np.ones(2),
-        Starts(Start(), Start(), Start()),
-        np.ones(2),
-        Rules(0.1),
-        1,
-    )
+    starts, points = Starts(Start(), Start(), Start()), table["inducing_points"].start
+    table = table_of(rows.inputs, points, starts, np.ones(2), 1, Rules(0.1))
     loss = plain_loss(model, rows, table)
     value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
     assert relative_error(gradient, grad(loss)(table.start())) < 1e-9
@@ -290,6 +286,21 @@ def test_with_points_at_all_rows_both_bounds_are_the_log_likelihood(p, copies):
     lower, upper = bounds_of(model, rows, values)
     exact = dense_bounds(*dense_arguments(values), rows, model.prior)[1]
     np.testing.assert_allclose((lower, upper), exact, rtol=1e-8)
+
+
+def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
+    """Three points on a line, of a linear kernel: K is singular, and a diagonal q's bound has the logarithm of what a
+    jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
+    x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
+    kernel = ConstantKernel(1.0, "fixed") * DotProduct(1.0)
+    model = EVGPRegressor(
+        kernel=kernel, inducing_init=x[6:], solver=LBFGS(posterior="diagonal"), noise=Gaussian(variance=0.1), max_iter=0
+    )
+    one, blocks = at_the_fit(model.fit(x, np.random.RandomState(0).randn(9)))
+    objective, start = BoundObjective(one.sparse, one.table, blocks), one.table.start()
+    step = 0.01 * np.eye(len(start))[0]
+    slope = 9 * (objective(start + step)[0] - objective(start - step)[0]) / 0.02
+    assert 9 * objective(start)[1][0] == pytest.approx(slope, abs=0.1)
 
 
 def test_a_jitter_is_known_from_the_factor():

@@ -7,7 +7,7 @@ import autograd.numpy as anp
 import numpy as np
 import pytest
 
-from skevgp.data.source import RawRows
+from skevgp.data.rows import RawRows
 from skevgp.kernels.constant import Constant
 from skevgp.kernels.covariances import Sum
 from skevgp.kernels.dot_product import DotProduct

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.blocks import Batch, LocalBlocks
-from skevgp.data.internal import MakeBlock
-from skevgp.data.source import LocalSource, RawRows
+from skevgp.data.rows import MakeBlock, RawRows
 from skevgp.model.bounds import bounds_alone, bounds_at_optimum, upper_bound
 from skevgp.model.exact import ExactModel
 from skevgp.model.model import SparseModel
@@ -31,8 +30,8 @@ def weighted(rows, counts=None, variance=None):
 
 
 def blocks_of(raw, kernel, size=17):
-    source, make = LocalSource.holding(raw), MakeBlock((kernel,), lambda rows: rows)
-    return LocalBlocks(lambda rows: make(source.load(rows)), len(raw.inputs), 6, size=size)
+    make = MakeBlock((kernel,), lambda rows: rows)
+    return LocalBlocks(lambda rows: make(raw[rows]), len(raw.inputs), 6, size=size)
 
 
 def drawn(n, seed=3):

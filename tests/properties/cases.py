@@ -14,9 +14,10 @@ from sklearn.gaussian_process import kernels as sk
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, MinMaxScaler, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.features import InertiaForceGravity
 from skevgp.kernels import Cosine
+from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 
@@ -181,14 +182,15 @@ def fixed_models(draw, X, n_outputs, *, exact=None, smooth=False, known_maps=Fal
     d, given = X.shape[1], draw(maps(n_outputs, known_maps) if given_maps is None else given_maps)
     kernel = draw(kernels(d, smooth)) + sk.WhiteKernel(draw(NOISES), "fixed")
     parameters = {**given, "kernel": kernel, "max_iter": 0, "random_state": 0}
-    parameters["coef_mean"] = draw(st.sampled_from([0.0, 0.5]))
-    parameters["coef_scale"] = draw(st.sampled_from([1.0, 0.1, 3.0, 0.0]))
-    share = parameters["share_coef"] = given["feature_map"] is not None and n_outputs > 1 and draw(st.booleans())
+    mean, scale = draw(st.sampled_from([0.0, 0.5])), draw(st.sampled_from([1.0, 0.1, 3.0, 0.0]))
+    share = given["feature_map"] is not None and n_outputs > 1 and draw(st.booleans())
+    parameters["coef_prior"] = CoefPrior(mean, scale, shared=share)
     parameters["normalize_y"] = draw(st.booleans())
     if draw(st.integers(0, 3)) == 3 if exact is None else exact:
         return EGPRegressor(**parameters)
     parameters["sharing"] = draw(sharings(n_outputs, has_rows_of_outputs(given)))
-    parameters["posterior"] = "full" if share else draw(st.sampled_from(["full", "diagonal"]))
+    posterior = "full" if share else draw(st.sampled_from(["full", "diagonal"]))
+    parameters["solver"] = LBFGS(posterior=posterior)
     parameters["inducing_init"] = draw(points(X))
     parameters["n_inducing"] = 6
     return EVGPRegressor(**parameters)
@@ -232,7 +234,8 @@ def learned_cases(draw, most_outputs=3, known_maps=False, given_maps=None):
         return Case(EGPRegressor(**parameters, max_iter=4), X, Y, X_new)
     own = has_rows_of_outputs(given)
     parameters |= {"sharing": draw(sharings(o, own)), "n_inducing": draw(st.sampled_from([1, 5, 40]))}
-    parameters["posterior"] = draw(st.sampled_from(["full", "diagonal"]))
+    posterior = draw(st.sampled_from(["full", "diagonal"]))
+    parameters["solver"] = LBFGS(posterior=posterior)
     parameters["inducing_init"] = draw(st.sampled_from(["auto", "k-means", "greedy"]))
     kind = draw(st.sampled_from(["lbfgs", "student-t", "input noise", "adam", "natural", "restarts"]))
     if own and kind in ("adam", "natural"):
@@ -240,13 +243,13 @@ def learned_cases(draw, most_outputs=3, known_maps=False, given_maps=None):
     if kind == "student-t":
         parameters["noise"] = "student-t"
     elif kind == "input noise":
-        parameters["input_noise"] = 0.1
+        parameters["noise"] = Gaussian(inputs=0.1)
     elif kind == "adam":
-        parameters["solver"] = Adam(batch_size=10)
+        parameters["solver"] = Adam(batch_size=10, posterior=posterior)
     elif kind == "natural":
-        parameters |= {"solver": Adam(batch_size=10, natural_gradient=True), "posterior": "full"}
+        parameters["solver"] = Adam(batch_size=10, natural_gradient=True)
     elif kind == "restarts":
-        parameters["solver"] = LBFGS(n_restarts=1)
+        parameters["solver"] = LBFGS(n_restarts=1, posterior=posterior)
     return Case(EVGPRegressor(**parameters, max_iter=4), X, Y, X_new)
 
 

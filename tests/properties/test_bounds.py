@@ -10,7 +10,7 @@ from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.solvers import Adam
+from skevgp.solvers import LBFGS, Adam
 
 from .cases import STATELESS, data, fewer, fixed_cases, fixed_models, tables
 
@@ -19,7 +19,7 @@ pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceW
 
 def exact_of(model):
     """The exact model of the same kernel, noise and prior."""
-    names = ("feature_map", "kernel", "kernel_map", "coef_mean", "coef_scale", "share_coef", "normalize_y")
+    names = ("feature_map", "kernel", "kernel_map", "coef_prior", "normalize_y")
     return EGPRegressor(**{name: getattr(model, name) for name in names}, max_iter=0)
 
 
@@ -37,8 +37,10 @@ def test_bounds_are_ordered(case):
     model = case.fitted()
     likelihood = exact_of(case.model).fit(case.X, case.Y).log_marginal_likelihood_value_
     assert_in_order(model.lower_bound_, likelihood, model.upper_bound_)
-    if not case.model.share_coef:
-        diagonal, full = (case.with_model(posterior=own).fitted().lower_bound_ for own in ("diagonal", "full"))
+    if not case.model.coef_prior.shared:
+        diagonal, full = (
+            case.with_model(solver=LBFGS(posterior=own)).fitted().lower_bound_ for own in ("diagonal", "full")
+        )
         assert_in_order(diagonal, full, likelihood)
 
 
@@ -46,7 +48,9 @@ def test_bounds_are_ordered(case):
 def test_more_points_bring_the_bounds_together(case, draws):
     points = draws.draw(tables(7, case.X.shape[1]))
     m = draws.draw(st.integers(1, 6))
-    few, many = (case.with_model(posterior="full", inducing_init=own).fitted() for own in (points[:m], points))
+    few, many = (
+        case.with_model(solver=LBFGS(posterior="full"), inducing_init=own).fitted() for own in (points[:m], points)
+    )
     assert_in_order(few.lower_bound_, many.lower_bound_, many.upper_bound_, few.upper_bound_)
 
 
@@ -54,38 +58,15 @@ def test_more_points_bring_the_bounds_together(case, draws):
 @given(fixed_cases(exact=False, most_outputs=1), st.integers(0, 10), st.booleans())
 def test_the_bound_of_any_q_is_below_that_of_the_best(case, n_steps, natural):
     """Adam's q, after a few steps, and q at its optimum for the same points, kernel and noise."""
-    posterior = "full" if natural else case.model.posterior
-    adam = Adam(batch_size=len(case.X), natural_gradient=natural)
-    any_q = case.with_model(solver=adam, max_iter=n_steps, noise_cv=None, posterior=posterior).fitted()
+    posterior = "full" if natural else case.model.solver.posterior
+    adam = Adam(batch_size=len(case.X), natural_gradient=natural, posterior=posterior)
+    any_q = case.with_model(solver=adam, max_iter=n_steps, noise_cv=None).fitted()
     kernel = any_q.kernel_ + sk.WhiteKernel(any_q.noise_variance_, "fixed")
     best = case.with_model(kernel=kernel, inducing_init=any_q.inducing_points_)
-    bounds = [best.with_model(posterior=own).fitted().lower_bound_ for own in (posterior, "full")]
+    bounds = [best.with_model(solver=LBFGS(posterior=own)).fitted().lower_bound_ for own in (posterior, "full")]
     assert_in_order(
         any_q.lower_bound_, *bounds, exact_of(best.model).fit(case.X, case.Y).log_marginal_likelihood_value_
     )
-
-
-@given(fixed_cases(exact=False), st.data())
-def test_the_bound_of_other_kernels(case, draws):
-    """At the fitted one it is that of the fit; elsewhere its gradient is its slope, and the likelihood is above it."""
-    if case.model.share_coef:
-        case = case.with_model(share_coef=False)
-    model, exact = case.fitted(), exact_of(case.model).fit(case.X, case.Y)
-    kernels = model.kernel_ if isinstance(model.kernel_, list) else [model.kernel_]
-    theta = np.array([kernel.theta for kernel in kernels])
-    theta = theta if isinstance(model.kernel_, list) else theta[0]
-    assert model.lower_bound(theta) == pytest.approx(model.lower_bound_, rel=1e-7, abs=1e-6)
-    step = draws.draw(st.lists(st.sampled_from([0.0, 0.5, -0.5]), min_size=theta.size, max_size=theta.size))
-    theta = theta + np.reshape(step, theta.shape)
-    value, gradient = model.lower_bound(theta, eval_gradient=True)
-    assert_in_order(value, exact.log_marginal_likelihood(theta))
-    if case.model.posterior == "diagonal":
-        # Of points that need a jitter, rounding is too much of this bound for short steps (tests/test_theta.py).
-        return
-    ways = 1e-5 * np.eye(theta.size).reshape(-1, *theta.shape)
-    slopes = [(model.lower_bound(theta + way) - model.lower_bound(theta - way)) / 2e-5 for way in ways]
-    # Rounding of such points again, 1e-10 of the bound, over a way of 1e-5.
-    np.testing.assert_allclose(np.ravel(gradient), slopes, rtol=1e-3, atol=1e-3 + 1e-5 * abs(value))
 
 
 @given(data(fewest_rows=2), st.data())

@@ -8,7 +8,8 @@ from sklearn.base import clone
 from sklearn.gaussian_process import kernels as sk
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
+from skevgp.solvers import LBFGS
 
 from .cases import (
     LENGTHS,
@@ -41,7 +42,7 @@ def value_of(model):
 
 def assert_same_value(one, other, shift=0.0):
     """Not of a diagonal q: where points need a jitter, its bound has the logarithm of what rounding makes of that."""
-    if getattr(one, "posterior", "full") == "full":
+    if not hasattr(one, "solver") or one.solver.posterior == "full":
         assert value_of(one) == pytest.approx(value_of(other) + shift, rel=1e-6, abs=1e-5)
 
 
@@ -136,8 +137,10 @@ def test_with_a_vague_intercept_so_it_is(rows, noise, constant):
     X, Y, X_new = rows
     kernel = 1.0 * sk.RBF(1.0) + sk.WhiteKernel(noise, "fixed")
     intercept = FunctionTransformer(_ones)
-    exact = EGPRegressor(intercept, kernel, coef_scale=np.inf, max_iter=0)
-    sparse = EVGPRegressor(intercept, kernel, coef_mean=0.0, coef_scale=1e7, n_inducing=5, max_iter=0, random_state=0)
+    exact = EGPRegressor(intercept, kernel, coef_prior=CoefPrior(scale=np.inf), max_iter=0)
+    sparse = EVGPRegressor(
+        intercept, kernel, coef_prior=CoefPrior(mean=0.0, scale=1e7), n_inducing=5, max_iter=0, random_state=0
+    )
     for model in (exact, sparse):
         one, other = clone(model).fit(X, Y), clone(model).fit(X, Y + constant)
         mean, std = one.predict(X_new, return_std=True)
@@ -154,12 +157,11 @@ def _ones(X):
 @given(fixed_cases(), st.sampled_from([2.0, -1.0, 1e3, -1e-3]))
 def test_the_unit_of_y_is_that_of_predictions(case, unit):
     one, given = case.fitted(), case.model
-    signal, noise = given.kernel.k1, given.kernel.k2.noise_level
+    signal, noise, shared = given.kernel.k1, given.kernel.k2.noise_level, given.coef_prior.shared
     scaled = case.with_model(
         kernel=sk.ConstantKernel(signal.k1.constant_value * unit**2, "fixed") * signal.k2
         + sk.WhiteKernel(noise * unit**2, "fixed"),
-        coef_mean=given.coef_mean * unit,
-        coef_scale=given.coef_scale * abs(unit),
+        coef_prior=CoefPrior(given.coef_prior.mean * unit, given.coef_prior.scale * abs(unit), shared=shared),
     )
     other, size = scaled.fitted(Y=case.Y * unit), size_of(one, case)
     for include_noise in (True, False):
@@ -178,7 +180,7 @@ def test_the_binary_point_of_y_changes_no_digit_of_what_is_learned(case, shift):
     (Zeros have no unit: they count as being of size 1.)
     """
     assume(case.Y.any(axis=0).all())
-    case = case.with_model(kernel=None, **({"input_noise": None} if isinstance(case.model, EVGPRegressor) else {}))
+    case = case.with_model(kernel=None)
     one, other = case.fitted(), case.fitted(Y=case.Y * 2.0**shift)
     for found, expected in zip(
         other.predict(case.X_new, return_std=True), one.predict(case.X_new, return_std=True), strict=True
@@ -206,14 +208,15 @@ def plain_cases(draw):
         parameters = {
             "feature_map": FunctionTransformer(),
             "kernel": kernel + sk.WhiteKernel(noise, "fixed"),
-            "coef_mean": np.tile((0.5 / unit)[order], (o, 1)),
-            "coef_scale": np.tile((scales / np.abs(unit))[order], (o, 1)),
+            "coef_prior": CoefPrior(
+                mean=np.tile((0.5 / unit)[order], (o, 1)), scale=np.tile((scales / np.abs(unit))[order], (o, 1))
+            ),
             "max_iter": 0,
         }
         if is_exact:
             return EGPRegressor(**parameters)
         places = (points * unit)[:, order]
-        return EVGPRegressor(**parameters, inducing_init=places, posterior=posterior, sharing="all")
+        return EVGPRegressor(**parameters, inducing_init=places, solver=LBFGS(posterior=posterior), sharing="all")
 
     return model, X, Y, X_new
 
@@ -238,7 +241,9 @@ def test_the_order_of_inducing_points_does_not_matter(case, draws):
     """(Nor to a diagonal q, but for copies of points: there a jitter decides.)"""
     points = draws.draw(tables(6, case.X.shape[1]))
     order = draws.draw(st.permutations(range(6)))
-    one, other = (case.with_model(posterior="full", inducing_init=own).fitted() for own in (points, points[order]))
+    one, other = (
+        case.with_model(solver=LBFGS(posterior="full"), inducing_init=own).fitted() for own in (points, points[order])
+    )
     assert_same_predictions(one, other, case.X_new, size_of(one, case), 1e-5)
 
 

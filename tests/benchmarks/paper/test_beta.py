@@ -9,10 +9,11 @@ from sklearn.exceptions import ConvergenceWarning
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.solvers import Adam
 
 from ..conftest import read
 
-PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+PAPER = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 
 
 @pytest.fixture

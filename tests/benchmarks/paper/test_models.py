@@ -6,8 +6,9 @@ import numpy as np
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor
 from skevgp.features import AngleEncoder, InertiaForce
+from skevgp.solvers import Adam
 
-PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+PAPER = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 
 
 def test_sizes_are_those_that_give_the_papers_numbers_of_parameters():

@@ -11,17 +11,18 @@ from sklearn.utils import Bunch
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
-from skevgp.estimators.bnn_training import Training
+from skevgp.estimators import bnn
 from skevgp.features import InertiaForceGravity
-from skevgp.fitting import advice
+from skevgp.fitting import messages
 from skevgp.metrics import prediction_error, std_norm
+from skevgp.noise import Gaussian
 from skevgp.solvers import Adam
-from skevgp.solvers.minimum import Minimum
+from skevgp.solvers.base import Minimum
 
 from ..conftest import read
 
 COLUMNS = "system,model,setting,seed,error_mean,error_median,error_p99,std_norm,cr1,cr2,cr3,nlpd,within_0.1,"
-PAPER = {"solver": "adam", "posterior": "diagonal", "sharing": "kernel", "noise_cv": None}
+PAPER = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "noise_cv": None}
 
 
 @pytest.fixture
@@ -320,15 +321,13 @@ def test_the_picture_of_noise_has_a_panel_for_each_setting_of_one_scale(drawn, t
 def messages_of_early_ends():
     """In the library's own words."""
     ended, going = (Minimum(np.zeros(1), 0.0, [0.0], converged) for converged in (True, False))
-    yield advice.how_it_ended(going, n_iter=9, max_iter=9, tol=0.01)
-    yield advice.how_it_ended(going, n_iter=9, max_iter=100, tol=None)
-    yield advice.interrupted(9)
-    yield advice.interrupted(9, max_time=1.0)
+    yield messages.lbfgs_ended(going, n_iter=9, max_iter=9, tol=0.01)
+    yield messages.lbfgs_ended(going, n_iter=9, max_iter=100, tol=None)
+    yield messages.interrupted(9)
+    yield messages.interrupted(9, max_time=1.0)
     yield Adam()._how_it_ended(going, False)
     yield Adam()._how_it_ended(ended, True)
-    for minimum, interrupted, still_falling in ((going, False, False), (ended, True, False), (ended, False, True)):
-        training = Training(np.zeros(1), minimum, np.zeros(1), np.zeros(0), still_falling)
-        yield training.how_it_ended(9, 0.1, interrupted)
+    yield from (bnn._INTERRUPTED, bnn._NOT_FINITE, bnn._STILL_FELL)
 
 
 @pytest.mark.parametrize("message", [*messages_of_early_ends()])
@@ -348,7 +347,10 @@ def test_warnings_tell_how_a_fit_ended():
     assert how_it_ended([str(short[0].message)], 2) == {"converged": False, "unlearned": 0}
     with pytest.warns(ConvergenceWarning) as blind:
         EVGPRegressor(
-            kernel=ConstantKernel(1e-6, "fixed") * RBF(1e3, "fixed"), noise_variance=1.0, n_inducing=3, noise_cv=None
+            kernel=ConstantKernel(1e-6, "fixed") * RBF(1e3, "fixed"),
+            noise=Gaussian(variance=1.0),
+            n_inducing=3,
+            noise_cv=None,
         ).fit(X, y)
     found = how_it_ended([str(warning.message) for warning in blind], 2)
     assert found["unlearned"] == 2

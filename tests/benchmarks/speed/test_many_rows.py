@@ -22,7 +22,13 @@ def test_without_a_reference_there_is_no_page():
     assert many_rows.paragraphs([row]) == []
 
 
-def test_the_reference_begins_on_all_rows():
+def test_the_reference_begins_on_all_rows(tmp_path):
+    from internals import watched
     from speed import many_rows
 
-    assert many_rows.OnAllRows.rules.samples(10**6, 100, 9) == ()
+    sizes = {}
+    for fit in ("default", "reference"):
+        with watched(lambda model, start, ended, fit=fit: sizes.setdefault(fit, start.n_rows)):
+            many_rows.run(many_rows.Cell(10_000, fit, 3, tmp_path))
+    assert sizes["reference"] is None
+    assert sizes["default"] < 10_000

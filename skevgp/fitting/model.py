@@ -1,0 +1,465 @@
+"""The models of a problem: which outputs are fitted together, and each model as a search needs it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from itertools import chain, pairwise, starmap
+from operator import index
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from ..data.blocks import Blocks
+from ..data.rows import Rows, of_outputs
+from ..data.threads import BlockMap
+from ..model.bounds import bounds_alone
+from ..model.exact import ExactModel, LikelihoodObjective
+from ..model.model import SparseModel
+from ..model.objectives import BoundObjective, ElboObjective
+from ..model.parameters import ParameterTable, Values
+from ..solvers.base import Minimum
+from ..solvers.lbfgs import Tolerance
+from ..utils.linalg import NotPositiveDefiniteError
+from ..utils.monitor import Monitor
+from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
+from .messages import adam_ended, lbfgs_ended, learned_too_little
+from .problem import Problem, Sharing
+from .search import FeaturesAlone, Fit, Rules, Start, drawn
+from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
+from .units import may_hide_noise, noise_of_most_evidence
+
+if TYPE_CHECKING:
+    from .fit import Fitted
+
+# By what factor inducing points become more.
+_GROWTH = 1.5
+# Of a priori sums of squares: noise variances below are rounding errors beside them.
+_ROUNDING = 1e-13
+# An iteration that gains less, in nats in all, does not matter. Nor does one that gains less than this share of what
+# the fit has gained over features and noise alone.
+LEAST_TOL, ENOUGH = 0.01, 1.5e-5
+# Relative size of the rounding errors in a bound on all rows.
+_BOUND_ROUNDING = 1e-8
+# Length of the natural gradients' steps for q: the first, and the least.
+_NATURAL_RATES = 0.3, 0.02
+
+
+class Part(NamedTuple):
+    """Outputs that are fitted together.
+
+    ``groups`` are slices of ``outputs``, one for each set of inducing points; rows are ``split`` by them if they share
+    weights or have inputs of their own; ``separate`` groups have kernels of their own.
+    """
+
+    outputs: list[int]
+    groups: tuple[slice, ...]
+    split: bool = False
+    separate: bool = False
+
+
+def parts_of(problem: Problem) -> list[Part]:
+    """The independent models: one, if outputs share their weights."""
+    sharing, shared, per_output = problem.sharing, problem.units.prior.shared, problem.per_output
+    partition = partition_of(sharing, problem.n_outputs)
+    everything = sorted(chain(*partition))
+    if isinstance(sharing, str) and sharing == "kernel":
+        return [Part(everything, tuple(slice(o, o + 1) for o in everything), split=shared or per_output)]
+    if per_output and max(map(len, partition)) > 1:
+        raise ValueError(
+            f"sharing={sharing!r} joins outputs by their inducing points, but kernel_map or feature_map returns a row "
+            "for each output: use 'none', or 'kernel' for outputs with the same kernel."
+        )
+    if not shared or len(partition) == 1:
+        return [Part(own, (slice(0, len(own)),)) for own in partition]
+    ends = np.cumsum([0, *map(len, partition)]).tolist()
+    return [Part(list(chain(*partition)), tuple(starmap(slice, pairwise(ends))), split=True, separate=True)]
+
+
+def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:
+    """The outputs of each independent model, both in ascending order."""
+    everything = list(range(n_outputs))
+    if isinstance(sharing, str):
+        return [[o] for o in everything] if sharing == "none" else [everything]
+    try:
+        groups = sorted(sorted(index(o) for o in group) for group in sharing)
+    except TypeError:
+        groups = []
+    if not all(groups) or sorted(chain(*groups)) != everything:
+        raise ValueError(
+            f"sharing={sharing!r} must be 'all', 'kernel', 'none', 'auto' or a partition of the outputs, such as "
+            f"{[everything[:1], everything[1:]] if n_outputs > 1 else [everything]}: each of range({n_outputs}) in one "
+            "group."
+        )
+    return groups
+
+
+def models_of(
+    problem: Problem,
+    rng: np.random.RandomState,
+    monitor: Monitor,
+    threads: BlockMap,
+    previous: Fitted | None = None,
+) -> list[Model]:
+    """The models to be fitted, each with its rows and where it starts; arguments as of `fit_model`."""
+    units, placement, parts = problem.units, problem.placement, parts_of(problem)
+    rows = units.rows(problem.source, threads)
+
+    # The kernel starts alike in all models. Outputs may have inputs, and so kernels' centres and points, of their own.
+    kernels = centred_kernels(problem.spec.covariance, rows.inputs)
+    sample, points = rows.sample(placement.sample_size, rng), []
+    for output, kernel in enumerate(kernels):
+        inputs = sample.of([output]).inputs
+        alone = starting_table(problem, rows.outputs([output]), np.empty((1, 0, inputs.shape[1]))).values_at_start()
+        points.append(placement.points(inputs, kernel, np.log(alone["hyperparameters"]), rng))
+    first = problem.spec.starts.hyperparameters.value
+    variance = 1.0 if first is None else checked_variance(kernels[0], first, points[0])
+
+    # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
+    seed = rng.randint(np.iinfo(np.int32).max)
+    goes_on = previous is not None and previous.outputs == [part.outputs for part in parts]
+    models = []
+    for i, part in enumerate(parts):
+        heads = [part.outputs[group.start] for group in part.groups]
+        own_kernels = tuple(kernels[o % len(kernels)] for o in heads)
+        warm: Values | None = None
+        if goes_on and previous is not None:
+            warm = previous.values_in(units, rows, own_kernels[0], i)
+            if isinstance(placement.method, np.ndarray):
+                warm.pop("inducing_points", None)
+        sets, found = [points[o % len(points)] for o in heads], None if warm is None else warm.get("inducing_points")
+        most = placement.max_inducing
+        # Where the number of points is to be found, those of the fit before go on.
+        placed = (
+            found is not None
+            and most is not None
+            and len(found) == len(sets)
+            and found.shape[1] <= min(most, len(rows))
+        )
+        start = found if placed else np.array([own[: min(map(len, sets))] for own in sets])
+        assert start is not None
+        # Where they are all rows the bound is the likelihood: no other places are better.
+        stay = (
+            problem.family == "full"
+            and len(sample.targets) >= len(rows)
+            and all(are_all_rows(own, sample.of([o]).inputs) for own, o in zip(start, heads, strict=True))
+        )
+        own_rows = rows.outputs(part.outputs, 1.0 / min(problem.n_threads, len(parts)))
+        n_kernels, exact = (
+            len(start) if part.separate else None,
+            stay and not part.separate and not problem.noise.heavy_tails,
+        )
+        table = starting_table(problem, own_rows, start, variance, n_kernels, exact)
+        if stay:
+            table = table.with_fixed("inducing_points")
+        columns = range(part.outputs[0], part.outputs[-1] + 1)
+        shown = part.outputs[0] if len(part.outputs) == 1 else part.outputs
+        models.append(
+            Model(
+                problem,
+                SparseModel(
+                    own_kernels[0],
+                    units.internal_prior().outputs(part.outputs),
+                    problem.family,
+                    part.groups,
+                    problem.rules.jitter,
+                    stay,
+                    own_kernels if part.split else None,
+                ),
+                own_rows.noisier(problem.row_variance),
+                table,
+                seed,
+                monitor.seen_as(
+                    shift=rows.total * units.log_unit(part.outputs),
+                    outputs=columns if len(columns) == len(part.outputs) else tuple(part.outputs),
+                    about="" if len(parts) == 1 else f"y[:, {shown}]",
+                ),
+                problem.max_iter,
+                problem.tol,
+                None if warm is None else table.started_at(warm).values_at_start(),
+                placed,
+            )
+        )
+    return models
+
+
+@dataclass(frozen=True)
+class Model:
+    """Some outputs that are fitted together: parameters -> bound and gradient, and the way from a start.
+
+    ``table`` are the parameters with first values and limits. ``warm`` are first values from another fit, whose
+    inducing points the table has if they are ``placed``. ``seed`` is the one source of chance.
+    """
+
+    problem: Problem
+    sparse: SparseModel
+    rows: Rows
+    table: ParameterTable
+    seed: int
+    monitor: Monitor
+    max_iter: int
+    tol: float | None
+    warm: Values | None = None
+    placed: bool = False
+
+    @cached_property
+    def rng(self) -> np.random.RandomState:
+        """The one source of chance."""
+        return np.random.RandomState(self.seed)
+
+    # --- the rows -----------------------------------------------------------------------------------------------------
+
+    @property
+    def n_inducing(self) -> int:
+        """Inducing points of each set."""
+        return self.table["inducing_points"].start.shape[1]
+
+    @property
+    def scatter(self) -> np.ndarray:
+        """Noise variances (o,) that would explain all of the residuals."""
+        return self.rows.scatter()
+
+    @property
+    def mean_precision(self) -> float:
+        """Of the rows, where a row with the noise variance itself has 1."""
+        return self.rows.mean_precision
+
+    @property
+    def interpolates(self) -> bool:
+        """Whether there are as many inducing points as rows; points that stay are all rows, some perhaps the same."""
+        return self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
+
+    @cached_property
+    def samples(self) -> tuple[int, ...]:
+        """Sizes of the samples that the fit begins with."""
+        (o, p), (g, _, d) = self.sparse.prior.scale.shape, self.table["inducing_points"].start.shape
+        width = d + p + o if self.sparse.kernels is None else g * (d + p) + o
+        return () if self.interpolates else self.rules.samples(len(self.rows), self.n_inducing + p, width)
+
+    @cached_property
+    def _sample(self) -> Rows:
+        return self.rows.sampled(self.samples[-1], self.rng)
+
+    @cached_property
+    def blocks(self) -> Blocks:
+        """All rows."""
+        return self.sparse.blocks(self.rows, self.n_inducing)
+
+    @cached_property
+    def exact(self) -> ExactModel | None:
+        """The exact model of the rows, where the inducing points are all of them; None where they are not."""
+        sparse, separate = self.sparse, self.table["hyperparameters"].start.ndim == 2
+        if not sparse.complete or separate or self.problem.noise.heavy_tails or self.rules.lowest_noise_exact is None:
+            return None
+        rows, kernels = self.rows.some(np.arange(len(self.rows))), None
+        if sparse.kernels is not None:
+            sets = [sparse.set_of(o, self.table["inducing_points"]) for o in range(len(sparse.prior.scale))]
+            kernels = tuple(sparse.kernels[group] for group in sets)
+        return ExactModel(sparse.kernel, sparse.prior, np.zeros(sparse.prior.scale.shape, dtype=bool), rows, kernels)
+
+    def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
+        """Minus the bound per row, and its gradient: of a sample of so many rows, or of all."""
+        if n_rows is not None:
+            # Smaller samples are parts of larger ones.
+            blocks = self.sparse.blocks(self._sample.part(0, n_rows, 1.0), self.n_inducing)
+            return BoundObjective(self.sparse, table, blocks)
+        if self.exact is not None:
+            return LikelihoodObjective(self.exact, table)
+        return BoundObjective(self.sparse, table, self.blocks)
+
+    # --- the features without a Gaussian process ----------------------------------------------------------------------
+
+    @cached_property
+    def bound_alone(self) -> float:
+        """The bound of the features without a Gaussian process, all that they leave over being noise."""
+        none = np.zeros(len(self.sparse.prior.scale))
+        return float(bounds_alone(self.blocks.linear, self.sparse.prior, self._left_over(none), none).sum())
+
+    @cached_property
+    def alone(self) -> FeaturesAlone:
+        """The bound of the features with as little Gaussian process as the parameters allow."""
+        values, signal, rows = self.table.values_at_start(), self.table["signal"], self.rows
+        points, (kernel, hyperparameters) = values["inducing_points"][0], self.sparse.kernel_of(values, 0)
+        variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
+        little = np.where(signal.free, signal.value_limits()[:, 0], values["signal"])
+        trace = little * variance * rows.total * rows.mean_precision
+        hidden = may_hide_noise(self.sparse.prior, self.blocks.linear.length)
+        bound, noise = self._best_alone(trace, hidden)
+        # The trace of a signal that stays depends on where the kernel ends.
+        is_open = hidden and not signal.free.all()
+        most = self._best_alone(np.zeros(len(trace)), hidden)[0] if is_open else -np.inf
+        return FeaturesAlone(bound, noise, most, hidden)
+
+    def _left_over(self, trace: np.ndarray) -> np.ndarray:
+        """The noise variances (o,) that the features leave over, which may be nothing, and a trace of f's prior."""
+        sums = self.blocks.linear
+        squares = [float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(trace))]
+        return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE * self.rows.mean_precision)
+
+    def _best_alone(self, trace: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
+        """The bound with q(f) at its prior, which has such a trace, and the noise variances (o,) with the highest."""
+        prior, sums = self.sparse.prior, self.blocks.linear
+        least = highest = self._left_over(trace)
+        if self.max_iter > 0 and hidden:
+            lowest, highest = self.table["noise"].value_limits().T
+            # Directions that the rows do not see have a precision of 1, beside which their features are large.
+            sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1)).HH) for o, scale in enumerate(prior.scale)]
+            unseen = [np.sort(own)[: max(len(own) - sums.length, 0)].sum() for own in sizes]
+            least = np.maximum(lowest, _ROUNDING * np.array(unseen))
+        return noise_of_most_evidence(
+            lambda noise: bounds_alone(sums, prior, noise, trace), least, highest, prior.shared
+        )
+
+    # --- starts -------------------------------------------------------------------------------------------------------
+
+    @property
+    def rules(self) -> Rules:
+        """The numbers that the search goes by."""
+        return self.problem.rules
+
+    @property
+    def n_restarts(self) -> int:
+        """Further fits from other starts."""
+        return self.problem.solver.n_restarts
+
+    @property
+    def place(self) -> Callable[[Values], Values] | None:
+        """Values -> the same values with inducing points placed again under their kernel; None leaves them."""
+        anew = self.problem.placement.anew
+        return None if anew is None else partial(self._placed, placement=anew)
+
+    def restart(self) -> Values:
+        """First values drawn at random."""
+        return self._placed(drawn(self.table, self.rules, self.rng), self.problem.placement)
+
+    def _placed(self, values: Values, placement: Placement) -> Values:
+        """The same values with inducing points placed under their kernel, alike for groups with the same."""
+        sample = self.rows.sample(placement.sample_size, self.rng)
+        sets = []
+        for group, outputs in enumerate(self.sparse.groups if self.sparse.kernels is not None else (slice(None),)):
+            kernel, hyperparameters = self.sparse.kernel_of(values, group)
+            inputs = of_outputs(sample.inputs, outputs)
+            sets.append(placement.points(inputs, kernel, np.log(hyperparameters), self.rng))
+        m = min(map(len, sets))
+        points = np.array([own[:m] for own in sets])
+        return values | {"inducing_points": np.repeat(points, len(self.sparse.groups) // len(points), axis=0)}
+
+    def placed_under(self, values: Values) -> Values:
+        """Values of a kernel, with as many inducing points as the model has, placed greedily; all rows if they stay."""
+        if not self.table["inducing_points"].free.any():
+            return values | {"inducing_points": self.table["inducing_points"].start}
+        return self._placed(values, Placement("greedy", self.n_inducing))
+
+    def with_more(self, values: Values) -> Model | None:
+        """The model with half as many points again, those of a fit among them; None if there can be no more."""
+        most = self.problem.placement.max_inducing
+        if most is None or self.n_inducing >= most:
+            return None
+        wanted = min(int(np.ceil(_GROWTH * self.n_inducing)), most)
+        sample, sets, everything = self.rows.sample(greedy_sample_size(wanted), self.rng), [], True
+        for group, (outputs, points) in enumerate(zip(self.sparse.groups, values["inducing_points"], strict=True)):
+            inputs = of_outputs(sample.inputs, outputs)
+            distinct, (kernel, hyperparameters) = distinct_rows(inputs), self.sparse.kernel_of(values, group)
+            if len(inputs) == len(self.rows) and len(distinct) <= wanted:
+                sets.append(distinct)
+            else:
+                everything = False
+                sets.append(with_more(points, wanted, inputs, kernel, np.log(hyperparameters)))
+        n_inducing = min(map(len, sets))
+        if n_inducing <= self.n_inducing:
+            return None
+        table = self.table.with_start("inducing_points", np.array([own[:n_inducing] for own in sets]))
+        if everything and self.sparse.family == "full":
+            # The bound is then the likelihood: no other places are better.
+            table = table.with_fixed("inducing_points")
+            return replace(self, table=table, sparse=replace(self.sparse, complete=True))
+        return replace(self, table=table)
+
+    # --- the way from a start -----------------------------------------------------------------------------------------
+
+    def minimise(self, start: Start) -> Fit:
+        """Run the solver from a start."""
+        table = self.table.started_at(start.values)
+        return (
+            self._by_mini_batches(table, start) if self.problem.solver.stochastic else self._by_all_rows(table, start)
+        )
+
+    def _by_all_rows(self, table: ParameterTable, start: Start) -> Fit:
+        solver: Any = self.problem.solver
+        spent, n_rows = len(start.loss_curve), self.rows.total
+        about = "all rows" if start.n_rows is None else f"{start.n_rows:,} of {len(self.rows):,} rows"
+        if self.problem.placement.max_inducing is not None:
+            about = f"{self.n_inducing} points, {about}"
+        tolerance = Tolerance(LEAST_TOL / n_rows, ENOUGH, -self.bound_alone / n_rows)
+        if self.tol is not None and start.n_rows is None:
+            tolerance = Tolerance(self.tol / n_rows)
+        curvature = None
+        if not start.cold:
+            # From the curvature on the smallest sample, or on all rows.
+            curvature = self.objective(table, self.samples[0] if self.samples else None), table.alike()
+        minimum = solver.minimise(
+            self.objective(table, start.n_rows),
+            table.start(),
+            table.limits(),
+            start.until - spent,
+            tolerance,
+            self.monitor.seen_as(spent, n_rows, about=about),
+            curvature,
+        )
+        return Fit(
+            table.values(minimum.x),
+            -n_rows * minimum.loss,
+            start.loss_curve + [n_rows * loss for loss in minimum.loss_curve],
+            minimum.converged,
+            lbfgs_ended(minimum, spent + minimum.n_iter, self.max_iter, self.tol),
+            n_rows=start.n_rows,
+        )
+
+    def _by_mini_batches(self, table: ParameterTable, start: Start) -> Fit:
+        solver: Any = self.problem.solver
+        n_rows, tol = self.rows.total, LEAST_TOL if self.tol is None else self.tol
+        elbo = ElboObjective(self.sparse, table, self.blocks, _NATURAL_RATES if solver.natural_gradient else None)
+        first = elbo.table.start()
+        minimum: Minimum = solver.minimise(
+            elbo.minibatch(self.rows.batches(self.sparse.kernel, solver.batch_size, self.rng)),
+            first,
+            elbo.table.limits(),
+            start.until,
+            tol / n_rows,
+            self.monitor.seen_as(factor=n_rows),
+            elbo.pace,
+        )
+        # A mini-batch's loss does not tell which point is best: the bound on all rows does.
+        x, (bound, predictor) = first, elbo.solution(first)
+        at_start, reached = bound, bound if minimum.n_iter == 0 else -np.inf
+        for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
+            try:
+                solution = elbo.solution(other)
+            except NotPositiveDefiniteError:
+                continue
+            reached = max(reached, solution[0])
+            if solution[0] >= bound:
+                x, (bound, predictor) = other, solution
+        values = elbo.table.values(x)
+        fell = not reached >= at_start - max(tol, _BOUND_ROUNDING * abs(at_start))
+        return Fit(
+            {name: values[name] for name in start.values},
+            bound,
+            [n_rows * loss for loss in minimum.loss_curve],
+            minimum.converged,
+            adam_ended(minimum, fell, solver.learning_rate, solver.batch_size),
+            predictor,
+        )
+
+    def learned_too_little(self, values: Values) -> str:
+        """What `messages` say of it, of each group with columns of its own; empty if all is well."""
+        if self.rows.inputs.mean.ndim == 1:
+            kernel, hyperparameters = self.sparse.kernel_of(values, 0)
+            return learned_too_little(kernel, values | {"hyperparameters": hyperparameters}, self.table, self.rows)
+        told = []
+        for group, outputs in enumerate(self.sparse.groups):
+            kernel, hyperparameters = self.sparse.kernel_of(values, group)
+            own = {"hyperparameters": hyperparameters, "noise": values["noise"][outputs]}
+            told.append(learned_too_little(kernel, own, self.table, self.rows.within(outputs)))
+        return max(told)

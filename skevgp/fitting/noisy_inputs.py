@@ -1,0 +1,75 @@
+"""Fits whose rows are as noisy as their inputs make them: fits and slopes take turns."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from ..control.posterior import Posterior
+from ..data.dataset import Dataset
+from ..noise.gaussian import own_variance, relative_noise, row_weights
+from ..utils.monitor import Monitor
+from .fit import Fitted
+
+# Fits and slopes take turns until no output's σ² moves by more than this share, or so often.
+_SETTLED, _TURNS = 0.05, 5
+# The least share of a row's variance that σ² is taken for when the rows' noise is compared: a σ² of next to nothing, as
+# of values of a function without noise, would make it any multiple of that.
+_LEAST_SHARE = 1e-3
+# Rows whose slopes are found at once.
+_ROWS_AT_ONCE = 256
+
+
+def fit_to_noisy_inputs(
+    fitted: Fitted,
+    data: Dataset,
+    posterior_of: Callable[[Fitted], Posterior],
+    numbers: np.ndarray,
+    covariance: np.ndarray,
+    refit: Callable[[np.ndarray, Fitted], Fitted],
+    monitor: Monitor,
+    base: np.ndarray | None = None,
+) -> Fitted:
+    """Repeat a fit, first made as if inputs were exact, until the noise variances settle.
+
+    ``numbers`` is X as an array, ``covariance`` (D, D) that of its noise. ``refit`` takes noise variances (n, o) of the
+    rows in units of σ², and the fit to go on from. y is what was added to the columns ``base`` of X, if these are
+    given.
+    """
+    before, weights = None, row_weights(data.chosen, data.source.n_rows)
+    for _ in range(_TURNS):
+        by_inputs, squares = look_at_slopes(posterior_of(fitted), data, numbers, covariance, base)
+        each = zip(squares.T, by_inputs.T, strict=True)
+        own = np.array([own_variance(*of_output, *weights) for of_output in each])
+        if before is not None and (np.abs(np.log(own / before)) < _SETTLED).all():
+            break
+        before = own
+        least = _LEAST_SHARE * np.average(by_inputs, axis=0, weights=weights[0])
+        fitted = refit(relative_noise(by_inputs, np.maximum(own, least), data.chosen), fitted)
+        if monitor.stopped or monitor.out_of_time:
+            break
+    return fitted
+
+
+def look_at_slopes(
+    posterior: Posterior, data: Dataset, numbers: np.ndarray, covariance: np.ndarray, base: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """∂g Σ ∂gᵀ and E(y - g)² of each row that counts and each output, (n, o) each, in the order of the source."""
+    fast, chosen = posterior.compile(include_noise=False), data.chosen
+    positions = np.arange(len(numbers)) if chosen.positions is None else chosen.positions
+    variances, squares = [], []
+    for first in range(0, len(positions), _ROWS_AT_ONCE):
+        own = positions[first : first + _ROWS_AT_ONCE]
+        some = np.asarray(numbers[own], dtype=np.float64)
+        # A map that goes wrong only now is named; what is compiled checks nothing.
+        posterior.maps.rows(data.given, numbers, own)
+        slopes: Any = fast.value_and_jacobian(some)[1].reshape(len(some), -1, some.shape[1])
+        if base is not None:
+            # Where y is what was added to columns of X, their noise is in y too.
+            slopes[:, np.arange(len(base)), base] += 1.0
+        variances.append(np.einsum("noi,ij,noj->no", slopes, covariance, slopes, optimize=True))
+        mean, std = (part.reshape(len(some), -1) for part in fast.predict(some, return_std=True))
+        squares.append((data.y[own].reshape(mean.shape) - mean) ** 2 + std**2)
+    return np.concatenate(variances), np.concatenate(squares)

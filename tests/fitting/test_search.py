@@ -1,0 +1,363 @@
+"""The decisions of a search, one by one: which start comes next, given how the fits before it ended."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from skevgp.fitting.search import (
+    MINI_BATCH_RULES,
+    RULES,
+    FeaturesAlone,
+    Fit,
+    Rules,
+    Search,
+    better,
+    drawn,
+    rules_of,
+    search,
+)
+from skevgp.model.parameters import Parameter, ParameterTable
+from skevgp.solvers import LBFGS, Adam
+from skevgp.utils.monitor import Monitor
+
+OWN = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
+PLACES = np.arange(4.0).reshape(1, 2, 2)
+NOISE = np.array([3.0, 7.0])
+
+
+def table(noise_fixed=False, kernel_fixed=False, widest_signal=None):
+    return ParameterTable(
+        [
+            Parameter("hyperparameters", np.array([2.0, 3.0]), "log", 1e-3, 1e3, fixed=kernel_fixed),
+            Parameter("signal", np.ones(2), "log", 1e-3, 1e3, widest=widest_signal),
+            Parameter("noise", np.full(2, 1e-4), "log", 1e-10, 1e2, fixed=noise_fixed),
+            Parameter("inducing_points", PLACES),
+        ]
+    )
+
+
+def model(**changes):
+    """All that a search asks of a model but the fits."""
+    own = {
+        "rules": OWN,
+        "table": table(),
+        "max_iter": 1000,
+        "n_restarts": 0,
+        "restart": table().values_at_start,
+        "scatter": np.ones(2),
+        "mean_precision": 1.0,
+        "alone": FeaturesAlone(),
+        "interpolates": False,
+        "samples": (),
+        "place": None,
+        "warm": None,
+        "placed": False,
+        "monitor": Monitor(),
+    }
+    return SimpleNamespace(**own | changes)
+
+
+def place(values):
+    return values | {"inducing_points": values["inducing_points"] + 10.0}
+
+
+def drive(model, *results, stop_after=None):
+    """The starts that a search takes when fits end with these (bound, options), and the best; Ctrl-C after so many."""
+    made, results = [], list(results)
+
+    def minimise(start):
+        made.append(start)
+        if len(made) == stop_after:
+            model.monitor.stop()
+        bound, options = results.pop(0)
+        values = start.values | {"noise": np.full(2, options.get("noise", 1e-4))}
+        if "signal" in options:
+            values["signal"] = np.array(options["signal"])
+        curve = [0.0] * options.get("n_iter", start.until)
+        return Fit(values, bound, curve, options.get("converged", True), n_rows=start.n_rows)
+
+    model.minimise = minimise
+    best = search(model)
+    assert not results
+    return made, best
+
+
+GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}
+
+
+# --- other starts -----------------------------------------------------------------------------------------------------
+
+
+def test_a_good_fit_is_left_alone():
+    made, best = drive(model(), (5.0, GOOD))
+    assert [start.until for start in made] == [1000]
+    np.testing.assert_allclose(made[0].values["hyperparameters"], [2.0, 3.0])
+    assert best.bound == 5.0
+
+
+def test_a_collapsed_fit_starts_again_elsewhere_until_one_learns():
+    made, best = drive(model(), (5.0, COLLAPSED), (4.0, COLLAPSED), (9.0, GOOD))
+    np.testing.assert_allclose([start.values["hyperparameters"] for start in made], [[2.0, 3.0], [1.0, 1.5], [4.0, 6]])
+    np.testing.assert_allclose([start.values["noise"] for start in made], [[1e-4] * 2, [1e-4] * 2, [1e-2] * 2])
+    assert best.bound == 9.0
+    # When nothing learns the best bound is kept.
+    assert drive(model(), (5.0, COLLAPSED), (7.0, COLLAPSED), (6.0, COLLAPSED))[1].bound == 7.0
+
+
+def test_one_output_that_collapsed_is_enough():
+    own = Search(model())
+    assert own.collapsed(Fit({"noise": np.array([1e-4, 0.95])}, 5.0))
+    assert not own.collapsed(Fit({"noise": np.array([1e-4, 0.85])}, 5.0))
+
+
+@pytest.mark.parametrize(
+    "changes", [{"table": table(noise_fixed=True)}, {"max_iter": 0}], ids=["fixed", "no iterations"]
+)
+def test_other_starts_need_a_noise_that_moves(changes):
+    assert len(drive(model(**changes), (5.0, COLLAPSED))[0]) == 1
+
+
+def test_where_the_kernel_may_interpolate_a_high_noise_is_tried_too_but_not_twice():
+    made, best = drive(model(interpolates=True), (5.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    assert best.bound == 6.0
+    # And points, as many as rows, stay.
+    assert len(drive(model(interpolates=True, place=place), (5.0, GOOD), (4.0, GOOD))[0]) == 2
+    again = replace(OWN, other_starts=((1.0, OWN.much_noise), (2.0, 100.0)))
+    made, _ = drive(model(interpolates=True, rules=again), (5.0, COLLAPSED), (6.0, COLLAPSED), (4.0, COLLAPSED))
+    assert len({float(start.values["noise"][0]) for start in made}) == len(made) == 3
+
+
+def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
+    """One of two outputs is enough; a limit of the user's has none beyond."""
+    at_limit, inside = {"signal": [1.0, 1e3], "n_iter": 50}, {"signal": [1.0, 900.0], "n_iter": 50}
+    wide = table(widest_signal=1e5)
+    made, best = drive(model(table=wide), (5.0, at_limit), (9.0, {"n_iter": 80}))
+    assert best.bound == 9.0
+    assert (made[1].after.bound, made[1].until) == (5.0, 1000)
+    np.testing.assert_array_equal(made[1].values["signal"], [1.0, 1e3])
+    for own in (model(table=wide, max_iter=50), model()):
+        assert len(drive(own, (5.0, at_limit))[0]) == 1
+    assert len(drive(model(table=wide), (5.0, inside))[0]) == 1
+    # Nor does one that began beyond the first limit.
+    warm = wide.values_at_start() | {"signal": np.array([2e3, 1.0])}
+    assert len(drive(model(table=wide, warm=warm), (5.0, {"signal": [3e3, 1.0], "n_iter": 50}))[0]) == 1
+
+
+# --- fits below the features alone ------------------------------------------------------------------------------------
+
+
+def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
+    below = {"alone": FeaturesAlone(6.0)}
+    assert len(drive(model(**below), (5.0, GOOD), (8.0, GOOD))[0]) == 2
+    assert len(drive(model(**below), (5.0, UNFINISHED))[0]) == 1
+
+
+def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
+    alone, below = FeaturesAlone(6.0, NOISE), [(5.0, GOOD), (4.0, GOOD), (3.0, GOOD)]
+    made, best = drive(model(alone=alone), *below, (6.5, GOOD))
+    np.testing.assert_array_equal(made[3].values["noise"], NOISE)
+    np.testing.assert_array_equal(made[3].values["hyperparameters"], made[0].values["hyperparameters"])
+    assert (made[3].values["signal"] < 1e-3 * NOISE).all()
+    assert best.bound == 6.5
+    # So little signal is little for the rows whose noise is the least, too.
+    made, _ = drive(model(alone=alone, mean_precision=1e4), *below, (6.5, GOOD))
+    assert (made[3].values["signal"] < 1e-7 * NOISE).all()
+    assert len(drive(model(alone=alone, rules=replace(OWN, last_start=False)), *below)[0]) == 3
+    made, _ = drive(model(alone=alone, table=table(noise_fixed=True)), (5.0, GOOD), (6.5, GOOD))
+    assert (made[1].values["signal"] < 1e-3 * NOISE).all()
+    # What is not below them has nothing to gain there.
+    assert len(drive(model(alone=alone), (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
+
+
+def test_what_has_not_ended_may_still_rise_unless_the_noise_is_hidden():
+    seen, hidden = FeaturesAlone(6.0, NOISE), FeaturesAlone(6.0, NOISE, hidden=True)
+    assert len(drive(model(alone=seen), (5.0, UNFINISHED))[0]) == 1
+    assert len(drive(model(alone=hidden), (5.0, UNFINISHED), (6.5, GOOD))[0]) == 2
+    # Where the kernel ends elsewhere it may be more, but not more than so much.
+    unknown = replace(hidden, most=8.0)
+    assert len(drive(model(alone=unknown), (7.0, GOOD), (6.5, GOOD))[0]) == 2
+    assert len(drive(model(alone=unknown), (8.0, GOOD))[0]) == 1
+    assert len(drive(model(alone=hidden), (7.0, GOOD))[0]) == 1
+
+
+# --- inducing points that are placed again ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("bounds", "kept"), [((5.0, 7.0, 6.0, 9.0), 10.0), ((5.0, 1.0, 6.0, 9.0), 0.0)])
+def test_points_are_placed_again_and_the_better_of_both_fits_goes_on(bounds, kept):
+    made, best = drive(model(place=place), *((bound, UNFINISHED) for bound in bounds[:3]), (bounds[3], GOOD))
+    assert [start.until for start in made] == [100, 200, 200, 1000]
+    for start, shift in zip(made, (0.0, 10.0, 0.0, kept), strict=True):
+        np.testing.assert_array_equal(start.values["inducing_points"], PLACES + shift)
+    assert made[1].after is made[2].after
+    assert (made[1].after.bound, made[3].after.bound, best.bound) == (5.0, max(bounds[1:3]), 9.0)
+
+
+def test_a_first_stage_that_has_ended_is_not_prolonged_and_stages_end_with_max_iter():
+    made, best = drive(model(place=place), (5.0, GOOD), (4.0, GOOD))
+    assert [start.until for start in made] == [100, 200]
+    assert best.bound == 5.0
+    made, _ = drive(model(place=place, max_iter=110), *((bound, UNFINISHED) for bound in (5.0, 7.0, 6.0)))
+    assert [start.until for start in made] == [100, 110, 110]
+
+
+@pytest.mark.parametrize(
+    "changes", [{"max_iter": 100}, {"table": table(kernel_fixed=True)}, {"rules": replace(OWN, stage=None)}, {}]
+)
+def test_points_stay_where_there_is_no_second_stage(changes):
+    own = model(place=None if changes == {} else place, **changes)
+    assert len(drive(own, (5.0, UNFINISHED))[0]) == 1
+
+
+# --- restarts and fits from before ------------------------------------------------------------------------------------
+
+
+def test_restarts_are_drawn_and_the_best_of_all_is_kept():
+    first = table().values_at_start()
+    drawn_values = iter([first | {"noise": np.full(2, 0.1)}, first | {"noise": np.full(2, 0.2)}])
+    own = model(n_restarts=2, restart=lambda: next(drawn_values))
+    made, best = drive(own, (5.0, GOOD), (8.0, GOOD), (6.0, GOOD))
+    np.testing.assert_allclose([start.values["noise"] for start in made], [[1e-4] * 2, [0.1] * 2, [0.2] * 2])
+    assert best.bound == 8.0
+
+
+def test_a_restart_has_stages_of_its_own_and_the_last_start_comes_once_after_all():
+    made, best = drive(model(n_restarts=1, place=place), *((bound, GOOD) for bound in (5.0, 4.0, 3.0, 3.5)))
+    assert [start.until for start in made] == [100, 200, 100, 200]
+    # It goes on from the restart's first stage, though the fit before it was better.
+    assert (made[3].after.bound, best.bound) == (3.0, 5.0)
+    below = [(bound, GOOD) for bound in (5.0, 4.0, 3.0)]
+    made, best = drive(model(alone=FeaturesAlone(6.0, NOISE), n_restarts=2), *below, *below, *below, (6.5, GOOD))
+    assert [bool((start.values["noise"] == NOISE).all()) for start in made] == [False] * 9 + [True]
+    assert best.bound == 6.5
+
+
+@pytest.mark.parametrize(("moved", "placed"), [(1.0, False), (0.0, True), (0.0, False)])
+def test_points_that_another_fit_has_moved_are_not_placed_again(moved, placed):
+    """Those that the table has from it count as moved."""
+    warm = {"inducing_points": PLACES + moved, "noise": np.full(2, 0.3)}
+    stays = bool(moved) or placed
+    results = [(5.0, UNFINISHED)] if stays else [(5.0, GOOD), (4.0, GOOD)]
+    made, _ = drive(model(warm=warm, placed=placed, place=place), *results)
+    assert (made[0].until == 1000) == stays
+    np.testing.assert_array_equal(made[0].values["inducing_points"], PLACES + moved)
+    np.testing.assert_allclose(made[0].values["noise"], 0.3)
+
+
+def test_a_warm_start_that_leads_nowhere_is_left_for_a_cold_one():
+    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
+    made, best = drive(model(warm=warm, rules=replace(OWN, other_starts=())), (5.0, COLLAPSED), (4.0, GOOD))
+    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
+    assert best.bound == 5.0
+
+
+def test_of_equal_fits_the_later_is_kept_and_any_is_better_than_none():
+    first, second = Fit({}, 1.0), Fit({}, 1.0)
+    assert better(first, second) is second
+    assert better(None, Fit({}, -np.inf)).bound == -np.inf
+    assert better(first, Fit({}, -np.inf)) is first
+
+
+def test_drawn_values_stay_within_limits_and_leave_what_is_fixed():
+    own, rng = table(kernel_fixed=True), np.random.RandomState(0)
+    values = [drawn(own, OWN, rng) for _ in range(50)]
+    noise = np.array([value["noise"] for value in values])
+    assert noise.min() >= 1e-4 / 30.0 * (1 - 1e-9)
+    assert noise.max() <= 1e-4 * 30.0 * (1 + 1e-9)
+    assert noise.max() / noise.min() > 30.0
+    np.testing.assert_allclose([value["hyperparameters"] for value in values], [[2.0, 3.0]] * 50)
+
+
+# --- interruption -----------------------------------------------------------------------------------------------------
+
+
+def test_ctrl_c_ends_the_search_with_the_best_so_far():
+    made, best = drive(model(n_restarts=9), (4.0, GOOD), (3.0, GOOD), stop_after=2)
+    assert (len(made), best.bound) == (2, 4.0)
+    made, best = drive(model(samples=(1000,)), (1.0, GOOD), (2.0, GOOD), stop_after=2)
+    assert (best.n_rows, best.bound) == (1000, 2.0)
+
+
+def test_ctrl_c_while_points_are_placed_keeps_the_fit():
+    def interrupted(values):
+        raise KeyboardInterrupt
+
+    own = model(place=interrupted)
+    assert drive(own, (4.0, GOOD))[1].bound == 4.0
+    assert own.monitor.stopped
+
+
+def test_ctrl_c_before_any_fit_is_an_interrupt():
+    def interrupted(start):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        search(SimpleNamespace(**vars(model()) | {"minimise": interrupted}))
+
+
+# --- samples of the rows ----------------------------------------------------------------------------------------------
+
+
+def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
+    each = [(5.0, UNFINISHED), (4.0, UNFINISHED), (6.0, GOOD), (4.5, GOOD), (3.0, UNFINISHED), (2.0, GOOD)]
+    made, best = drive(model(samples=(1000, 4000), place=place), *each)
+    # Two noises, points placed again and the old ones; then the better on more rows, and on all.
+    assert [start.n_rows for start in made] == [1000, 1000, 1000, 1000, 4000, None]
+    assert [start.until for start in made] == [100, 100, 200, 200, 1000, 1000]
+    np.testing.assert_allclose(made[1].values["noise"], 0.1)
+    assert [start.cold for start in made] == [True] + 5 * [False]
+    for later in made[4:]:
+        np.testing.assert_allclose(later.values["inducing_points"], PLACES + 10.0)
+        assert later.after is None
+    # A fit to more rows is the better one, whatever the bounds of samples.
+    assert (best.bound, best.n_rows) == (2.0, None)
+
+
+def test_what_collapsed_on_a_sample_starts_again_on_more_rows():
+    own = model(rules=replace(OWN, other_starts=()), samples=(1000, 4000))
+    made, best = drive(own, *[(5.0, COLLAPSED)] * 4, (2.0, GOOD))
+    assert [start.n_rows for start in made] == [1000, 1000, 4000, 4000, None]
+    for cold in made[::2]:
+        np.testing.assert_allclose(cold.values["hyperparameters"], [2.0, 3.0])
+        np.testing.assert_allclose(cold.values["noise"], 1e-4)
+        assert cold.cold
+    assert best.bound == 2.0
+
+
+def test_what_collapses_on_all_rows_only_starts_again_there():
+    own = model(rules=replace(OWN, other_starts=(), much_noise=None), samples=(1000,))
+    made, best = drive(own, (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
+    assert [start.n_rows for start in made] == [1000, None, None]
+    np.testing.assert_allclose(made[2].values["noise"], 1e-4)
+    assert best.bound == 3.0
+
+
+def test_few_iterations_are_the_most_on_a_sample_too_and_none_need_no_sample():
+    made, _ = drive(model(samples=(1000,), max_iter=7), *((bound, UNFINISHED) for bound in (5.0, 4.0, 2.0)))
+    assert [start.until for start in made] == [7, 7, 7]
+    made, _ = drive(model(samples=(1000,), max_iter=0), (5.0, GOOD))
+    assert [start.n_rows for start in made] == [None]
+
+
+@pytest.mark.parametrize(
+    ("n_rows", "n_inducing", "width", "sizes"),
+    [
+        (1999, 10, 9, ()),
+        (2000, 10, 9, (1000,)),
+        (36_000, 256, 9, (5120,)),
+        (36_000, 100, 9, (2000, 8000)),
+        (10**7, 10, 9, (1000, 4000, 16_000, 64_000)),
+        (10**7, 10, 100, (1000, 4000, 16_000)),
+    ],
+)
+def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, width, sizes):
+    assert replace(OWN, sample=(1000, 20)).samples(n_rows, n_inducing, width) == sizes
+    assert OWN.samples(n_rows, n_inducing, width) == ()
+
+
+def test_the_rules_are_those_of_a_solver_that_sees_all_rows_or_of_one_that_does_not():
+    assert rules_of(LBFGS()) is RULES
+    assert rules_of(Adam()) is MINI_BATCH_RULES
