@@ -70,7 +70,7 @@ MODELS = {
     "diagonal": sparse(POLYNOMIAL, solver=LBFGS(posterior="diagonal")),
     "student-t": sparse(POLYNOMIAL, noise="student-t"),
     "all rows": sparse(n_inducing=80, kernel=sk.RBF(0.5)),
-    "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1)),
+    "sums": sparse(kernel=2.0 * sk.Matern(1.0, nu=1.5) + sk.DotProduct(0.5) + sk.WhiteKernel(0.1), noise="gaussian"),
     "exact": exact(),
     "exact, features": exact(POLYNOMIAL, normalize_y=True),
     "exact, shared weights": exact(Rows(), coef_prior=CoefPrior(shared=True)),
