@@ -30,7 +30,15 @@ from ..noise.gaussian import input_covariance, relative_noise
 from ..solvers import LBFGS, Adam, as_solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
-from ..utils.validation import check_integer, check_magnitude, check_real, is_dask, is_frame, unchanged_if_it_fails
+from ..utils.validation import (
+    check_integer,
+    check_magnitude,
+    check_real,
+    is_dask,
+    is_frame,
+    unchanged_if_it_fails,
+    words_of,
+)
 from .base import GaussianProcess, refuse_moved
 
 
@@ -320,13 +328,14 @@ class EVGPRegressor(GaussianProcess):
             problem = self._problem(data, solver, noise)
             previous = getattr(self, "_fitted", None) if self.warm_start else None
             rng = check_random_state(self.random_state)
+            numbers = None if noise.inputs is None else self._numbers(data)
             fitted = fit_model(problem, rng, monitor, previous)
-            if noise.inputs is not None:
+            if numbers is not None and noise.inputs is not None:
 
                 def refit(variance: np.ndarray, before: Fitted) -> Fitted:
                     return fit_model(replace(problem, row_variance=variance), rng, monitor, before)
 
-                numbers, covariance = self._numbers(data), input_covariance(noise.inputs, data.maps.n_columns)
+                covariance = input_covariance(noise.inputs, data.maps.n_columns)
                 posterior_of = self._posterior_of(data, problem)
                 fitted = fit_to_noisy_inputs(
                     fitted, data, posterior_of, numbers, covariance, refit, monitor, self._columns_changed
@@ -470,6 +479,8 @@ class EVGPRegressor(GaussianProcess):
             self.kernel_map_ = data.maps.kernel_map
             return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
         except ValueError as error:
+            if words_of(data.given):
+                raise
             raise ValueError(
                 "inputs of Gaussian noise needs an X of numbers, none of them missing: others have no slopes."
             ) from error
