@@ -140,9 +140,10 @@ class Posterior:
         """Predict y, and how that changes with the columns of X.
 
         Derivatives go through kernel, kernel map and feature map. They are exact for this package's transformers and
-        kernels, for scikit-learn's scalers, PolynomialFeatures and PCA, pipelines and unions of these, and for any map
-        with a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features); of other maps they are
-        central differences, good to about ten digits where the map is smooth on the scale of the rows of `fit`.
+        kernels, for scikit-learn's scalers, PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD, for pipelines
+        and unions of these, and for any map with a method ``jacobian(X)`` that returns (n_samples, n_features_out,
+        n_features). Of other maps they are central differences, good to about ten digits where the map is smooth on the
+        scale of the rows of `fit`.
 
         Parameters
         ----------
