@@ -9,11 +9,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..data.rows import of_outputs
-from ..maps.derivatives import MappedRows, chained, mapped
-from ..maps.elementary import DirectMap
+from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted
+from .derivatives import MappedRows, chained, mapped
 
 _NONE = np.empty((0, 0))
 # What two points may differ by that are the same but for rounding, as a share of the largest.
@@ -30,7 +30,7 @@ class CompiledPredictor:
     ----------
     predictor : Predictor
         Frozen, in the user's units.
-    feature_map, kernel_map : DirectMap or None
+    feature_map, kernel_map : Map or None
         Of plain arrays.
     include_noise : bool, default=True
         Whether standard deviations are of y, with the learned noise, or of the noise-free g(x).
@@ -68,8 +68,8 @@ class CompiledPredictor:
     def __init__(
         self,
         predictor: Predictor,
-        feature_map: DirectMap | None,
-        kernel_map: DirectMap | None,
+        feature_map: Map | None,
+        kernel_map: Map | None,
         include_noise: bool = True,
         base: np.ndarray | None = None,
     ):

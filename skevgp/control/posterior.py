@@ -18,16 +18,15 @@ from numpy.typing import ArrayLike
 from sklearn.utils import check_random_state
 
 from ..data.maps import Maps
-from ..maps.derivatives import gradient_covariance, mapped
-from ..maps.maps import direct_maps
+from ..maps import as_map, as_maps
 from ..model.predictor import Predictor
 from ..utils.shapes import like_y
 from ..utils.validation import check_fitted, check_integer
 from .c_code import write_c
-from .casadi import FittedModel, with_base
+from .casadi import Exported, with_base
 from .compiled import CompiledPredictor
-from .functions import FunctionSamples
-from .paths import Functions
+from .derivatives import gradient_covariance, mapped
+from .functions import Functions, FunctionSamples
 
 # Of the derivatives of all rows at once.
 _NUMBERS = 2**20
@@ -141,9 +140,10 @@ class Posterior:
         """Predict y, and how that changes with the columns of X.
 
         Derivatives go through kernel, kernel map and feature map. They are exact for this package's transformers and
-        kernels, for scikit-learn's scalers, PolynomialFeatures and PCA, pipelines and unions of these, and for any map
-        with a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features); of other maps they are
-        central differences, good to about ten digits where the map is smooth on the scale of the rows of `fit`.
+        kernels, for scikit-learn's scalers, PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD, for pipelines
+        and unions of these, and for any map with a method ``jacobian(X)`` that returns (n_samples, n_features_out,
+        n_features). Of other maps they are central differences, good to about ten digits where the map is smooth on the
+        scale of the rows of `fit`.
 
         Parameters
         ----------
@@ -242,12 +242,12 @@ class Posterior:
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        fast, direct = self.compile(), direct_maps(self.maps)
+        fast, maps = self.compile(), as_maps(self.maps)
         parts, covariances = [], []
         for rows in self._few(X):
             parts.append(fast.value_and_jacobian(rows)[1])
             if return_std or return_cov:
-                covariances.append(gradient_covariance(self.predictor, mapped(rows, *direct)))
+                covariances.append(gradient_covariance(self.predictor, mapped(rows, *maps)))
         gradient = np.concatenate(parts)
         if not covariances:
             return gradient
@@ -295,7 +295,7 @@ class Posterior:
         >>> slope.round(2)
         array([1.])
         """
-        return CompiledPredictor(self.predictor, *direct_maps(self.maps), include_noise, self.base)
+        return CompiledPredictor(self.predictor, *as_maps(self.maps), include_noise, self.base)
 
     def sample_functions(
         self, n: int = 1, random_state: int | np.random.RandomState | None = 0, *, n_waves: int = 3000
@@ -350,7 +350,7 @@ class Posterior:
 
     def functions(self) -> Functions:
         """The posterior as functions to be drawn, and followed along the paths that they make."""
-        return Functions(self.predictor, *direct_maps(self.maps), self.base)
+        return Functions(self.predictor, *as_maps(self.maps), self.base)
 
     def to_casadi(self, name: str = "evgp", *, include_noise: bool = True, parametric: bool = False) -> Any:
         """Write mean and variance as a CasADi function, which differentiates them exactly.
@@ -479,8 +479,10 @@ class Posterior:
         function = self.to_casadi(name, include_noise=include_noise)
         return write_c(function, path, jacobian, self.maps.columns, include_noise)
 
-    def _for_casadi(self) -> FittedModel:
-        return FittedModel(self.predictor, self.maps.feature_map, self.maps.kernel_map, self.maps.n_columns)
+    def _for_casadi(self) -> Exported:
+        maps = self.maps
+        features, inputs = (None if each is None else as_map(each) for each in (maps.feature_map, maps.kernel_map))
+        return Exported(self.predictor, features, inputs, maps.n_columns)
 
 
 # The methods that take rows, and the estimator's method that validates these.

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from sklearn.utils import Bunch, check_random_state
 
 from ..exceptions import ignored
-from ..maps.elementary import as_fitted, package_of
+from ..utils.frames import as_fitted, package_of
 from ..utils.validation import LARGEST, as_floats, check_fitted, check_integer
 
 # (states (n, n_states), step) -> inputs (n, n_inputs).

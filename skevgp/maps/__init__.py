@@ -1,1 +1,6 @@
-"""A transformer as a function of one row: its value, its Jacobian, its CasADi expression."""
+"""A fitted transformer as a function of rows: value, Jacobian and CasADi expression, in one adapter for each."""
+
+from . import physics, sklearn  # noqa: F401  whose adapters register themselves
+from .base import ADAPTERS, Identity, Map, NoExpressionError, adapts, as_map, as_maps
+
+__all__ = ["ADAPTERS", "Identity", "Map", "NoExpressionError", "adapts", "as_map", "as_maps"]

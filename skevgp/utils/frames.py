@@ -1,14 +1,18 @@
-"""Data frames as arrays and back, for states and files that cannot hold them."""
+"""Data frames as arrays and back: for states and files, and for what was fitted to frames and gets arrays."""
 
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.util import find_spec
+from sys import modules
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from .validation import is_frame
 
+# What they call the names of columns in a constructor that takes an array.
+_NAMED = (("pandas", "columns"), ("polars", "schema"))
 _PACKAGES = {"pandas": "DataFrame", "polars": "DataFrame", "pyarrow": "table"}
 
 
@@ -59,3 +63,23 @@ class FrameColumns(NamedTuple):
                 f"The model was fitted to a data frame of {self.package}: pip install {self.package} (here: {error})."
             ) from error
         return getattr(module, _PACKAGES[self.package])(dict(zip(self.names, self.columns, strict=True)))
+
+
+def package_of(values: Any) -> str:
+    """Where the class of some values is from."""
+    return type(values).__module__.partition(".")[0]
+
+
+def as_fitted(estimator: Any, X: np.ndarray, package: str) -> Any:
+    """Rows as an estimator takes them: as a data frame if it was fitted to one.
+
+    It is of the package, if that is one of data frames, else of one that is in use, or installed; rows are as they are
+    if there is none.
+    """
+    names = getattr(estimator, "feature_names_in_", None)
+    if names is None:
+        return X
+    for name, keyword in sorted(_NAMED, key=lambda frame: (frame[0] != package, frame[0] not in modules)):
+        if name in modules or find_spec(name) is not None:
+            return import_module(name).DataFrame(X, **{keyword: list(names)})
+    return X

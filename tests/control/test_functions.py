@@ -1,18 +1,20 @@
-"""Functions drawn from the posterior have its mean, and its covariance to what waves can do."""
+"""Functions drawn from the posterior have its mean and covariance: exactly along a path, else to what waves can do."""
 
 import pickle
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process.kernels import RBF, Matern, RationalQuadratic
+from sklearn.gaussian_process.kernels import RBF, DotProduct, Matern, RationalQuadratic
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
 from skevgp.kernels import FunctionKernel
+from skevgp.solvers import LBFGS
 
-from .cases import N_OUTPUTS, QUICK, D
+from .cases import N_OUTPUTS, QUICK, D, own_features, quick
 from .test_derivatives import close, differences
 
-N = 1500
+N, N_PATHS = 1500, 20_000
 
 
 def test_they_have_the_posteriors_mean_and_covariance(model, data):
@@ -53,7 +55,7 @@ def test_many_rows_are_evaluated_piece_by_piece(data, monkeypatch):
     X, Y, X_new = data
     functions = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y).sample_functions(2, n_waves=50)
     expected = functions(X_new)
-    monkeypatch.setattr("skevgp.control.functions._NUMBERS", 600)
+    monkeypatch.setattr("skevgp.control.functions._NUMBERS_OF_WAVES", 600)
     np.testing.assert_allclose(functions(X_new), expected, rtol=1e-10, atol=1e-12)
 
 
@@ -132,3 +134,52 @@ def test_they_are_counted_by_integers(data):
             functions[wrong]
     with pytest.raises(IndexError, match="There are 2 functions; got the index 2"):
         functions[2]
+
+
+# --- along a path ----------------------------------------------------------------------------------------------------
+
+FOLLOWED = {
+    "plain": EVGPRegressor(n_inducing=8),
+    "features": EVGPRegressor(PolynomialFeatures(1), sharing=[[0, 1], [2]], n_inducing=8, normalize_y=True),
+    "diagonal": EVGPRegressor(
+        PolynomialFeatures(1), solver=LBFGS(posterior="diagonal"), sharing="kernel", n_inducing=8
+    ),
+    "shared weights": EVGPRegressor(FunctionTransformer(own_features), coef_prior=CoefPrior(shared=True), n_inducing=8),
+    "not stationary": EVGPRegressor(kernel=RBF(1.5) * DotProduct(1.0) + Matern(1.3, nu=0.5), n_inducing=8),
+    "exact": EGPRegressor(PolynomialFeatures(1)),
+}
+
+
+@pytest.fixture(scope="module", params=FOLLOWED)
+def followed(request):
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (60, 2))
+    Y = np.column_stack([np.sin(2.0 * X[:, 0]) + X[:, 1], X[:, 0] * X[:, 1], np.cos(X.sum(axis=1))])
+    return quick(FOLLOWED[request.param]).fit(X, Y + 0.1 * rng.randn(*Y.shape))
+
+
+def test_along_a_given_path_they_have_the_posteriors_joint_covariance(followed):
+    path = np.array([[0.0, 0.0], [0.4, -0.3], [3.0, 2.5], [0.0, 0.0], [0.4, -0.3 + 1e-9], [2.8, 2.9]])
+    step = followed._posterior.functions().draw(N_PATHS, len(path), np.random.RandomState(1))
+    values = np.stack([step(np.repeat(row[np.newaxis], N_PATHS, axis=0)) for row in path], axis=1)
+    mean, joint = followed.predict(path, return_cov="joint", include_noise=False)
+    size = np.sqrt(np.diag(joint))
+    errors = (values - mean).reshape(N_PATHS, -1)
+    assert np.abs(errors.mean(axis=0) / size).max() < 5.0 / np.sqrt(N_PATHS)
+    covariance = errors.T @ errors / N_PATHS
+    assert np.abs((covariance - joint) / np.outer(size, size)).max() < 6.0 / np.sqrt(N_PATHS)
+    # A function is one: back at a row it has the value that it had.
+    assert np.abs(values[:, 3] - values[:, 0]).max() < 1e-5 * size.max()
+    assert np.abs(values[:, 4] - values[:, 1]).max() < 1e-2 * size.max()
+
+
+def test_rows_that_the_points_know_leave_nothing_to_draw():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-2.0, 2.0, (30, 1))
+    model = EVGPRegressor(inducing_init=X, max_iter=0).fit(X, np.sin(X[:, 0]))
+    step = model._posterior.functions().draw(50, 30, rng)
+    for row in X:
+        values = step(np.repeat(row[np.newaxis], 50, axis=0))
+        assert np.isfinite(values).all()
+        mean, std = model.predict(row[np.newaxis], return_std=True, include_noise=False)
+        assert (np.abs(values - mean) < 6.0 * std + 1e-6).all()

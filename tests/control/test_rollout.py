@@ -224,7 +224,7 @@ def test_one_particle_is_a_trajectory(sparse, inputs):
 
 def test_particles_that_do_not_fit_into_memory_at_once_follow_each_other(sparse, inputs, monkeypatch):
     expected = rollout(sparse, Z0, inputs, n_samples=3000, random_state=0)
-    monkeypatch.setattr("skevgp.control.paths._NUMBERS", 500_000)
+    monkeypatch.setattr("skevgp.control.functions._NUMBERS_OF_PATHS", 500_000)
     found = rollout(sparse, Z0, inputs, n_samples=3000, random_state=0)
     slack = 6.0 * expected.std.max() / np.sqrt(3000.0)
     np.testing.assert_allclose(found.mean, expected.mean, atol=slack)

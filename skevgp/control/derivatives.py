@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data.rows import of_outputs
+from ..maps import Map
 from ..model.predictor import Predictor, PredictorGroup
-from .elementary import DirectMap
 
 
 class MappedRows(NamedTuple):
@@ -42,7 +42,7 @@ def _of_group(slopes: np.ndarray, group: PredictorGroup) -> np.ndarray:
     return of_outputs(slopes.reshape(n, o, k * columns), group.outputs).reshape(n, k, columns)
 
 
-def mapped(X: np.ndarray, feature_map: DirectMap | None, kernel_map: DirectMap | None) -> MappedRows:
+def mapped(X: np.ndarray, feature_map: Map | None, kernel_map: Map | None) -> MappedRows:
     """Rows X (n, D) through the maps, of which either may be None."""
     n, columns = X.shape
     features, feature_slopes = np.empty((n, 0)), np.empty((n, 0, columns))

@@ -1,7 +1,4 @@
-"""Forward and inverse dynamics in CasADi, from the numbers of a Pinocchio model (whose wheel has no CasADi part).
-
-Spatial vectors are Pinocchio's, linear part first, in the frame of their joint (Featherstone 2008, chapters 5 and 7).
-"""
+"""Adapters of our own transformers, and rigid-body dynamics in CasADi, which Pinocchio's wheel does not have."""
 
 from __future__ import annotations
 
@@ -10,8 +7,139 @@ from typing import Any
 
 import numpy as np
 
+from ..features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
+from ..features.gravity import SineGravity
+from ..features.robot_map import RobotTransformer
 from ..robots.loading import joint_axes
 from ..utils.casadi import casadi
+from .base import Map, adapts, as_map, unchanged
+from .sklearn import chosen
+
+
+@adapts(RobotTransformer)
+class Unvalidated(Map):
+    """One of our transformers, without its validation. Subclasses of it know its expression too."""
+
+    by_example = False
+
+    @classmethod
+    def of(cls, transformer: RobotTransformer, example: Any) -> Map:
+        return cls(transformer)
+
+    @classmethod
+    def covers(cls, transformer: Any) -> bool:
+        # A subclass of ours may add features: it then has a Jacobian of its own. It must not change what they return.
+        return cls is Unvalidated and unchanged(transformer, "_jacobian", "transform", "jacobian")
+
+    def value(self, X: np.ndarray) -> np.ndarray:
+        return self.transformer._values(X)
+
+    def jacobian(self, X: np.ndarray) -> np.ndarray:
+        return self.transformer._slopes(X)
+
+
+@adapts(AngleEncoder)
+class Angles(Unvalidated):
+    """Angles by their sines and cosines."""
+
+    def casadi(self, x: Any) -> Any:
+        ca, encoder = casadi(), self.transformer
+        if not len(encoder._angles):
+            return x
+        angles = chosen(x, encoder._angles)
+        row, n = ca.vertcat(x, ca.sin(angles), ca.cos(angles)), x.numel()
+        source = encoder._source.copy()
+        source[encoder._sines] = n + np.arange(len(encoder._angles))
+        source[encoder._cosines] = n + len(encoder._angles) + np.arange(len(encoder._angles))
+        return row[source.tolist()]
+
+
+class _OfRobot(Unvalidated):
+    """Features of [q, q̇, u], which are multiplied by the time step where a row ends with it: see `RobotMap`."""
+
+    def casadi(self, x: Any) -> Any:
+        features = self.transformer
+        if not features._timed:
+            return self.features(x)
+        return casadi().vertcat(x[: features._n_kept(features._layout)], x[-1] * self.features(x[:-1]))
+
+    def features(self, x: Any) -> Any:
+        """The expression of the features of x = [q, q̇, u]."""
+        raise NotImplementedError
+
+
+@adapts(InertiaForce)
+class Newton(_OfRobot):
+    """The row itself."""
+
+    def features(self, x: Any) -> Any:
+        return x
+
+
+@adapts(InertiaForceGravity)
+class NewtonGravity(_OfRobot):
+    """The row, and gravity."""
+
+    def features(self, x: Any) -> Any:
+        gravity = self.transformer._gravity
+        of_gravity = _sines(gravity, x) if type(gravity) is SineGravity else as_map(gravity).casadi(x)
+        return casadi().vertcat(x, of_gravity)
+
+
+def _sines(gravity: SineGravity, x: Any) -> Any:
+    ca, angles = casadi(), gravity._summed
+    if (angles.sum(axis=1) == 1.0).all():
+        return ca.sin(chosen(x, angles.argmax(axis=1)))
+    return ca.sin(ca.mtimes(ca.DM(angles), x))
+
+
+@adapts(LinkGravity)
+class GravityOfLinks(_OfRobot):
+    """Gravity, passed on from each link to the next as `LinkGravity` does it."""
+
+    def features(self, x: Any) -> Any:
+        if self.transformer.robot is None:
+            return x
+        ca, links = casadi(), self.transformer._links
+        weights: list[Any] = []
+        for i, parent in enumerate(links._parents):
+            turns = links._turns[i].any()
+            rotation = ca.DM(links._fixed[i, 0] + (0.0 if turns else links._cosine[i, 0]))
+            if turns:
+                rotation = rotation + ca.cos(x[i]) * ca.DM(links._cosine[i, 0])
+                rotation = rotation + ca.sin(x[i]) * ca.DM(links._sine[i, 0])
+            before = weights[parent] if parent >= 0 else ca.DM(links._weight.reshape(1, 3))
+            weights.append(ca.mtimes(before, rotation))
+        return chosen(ca.horzcat(*weights).T, self.transformer._columns) * ca.DM(self.transformer._signs)
+
+
+@adapts(NominalDynamics)
+class Nominal(_OfRobot):
+    """Accelerations and torques of a rigid-body model."""
+
+    def features(self, x: Any) -> Any:
+        """As a function of scalars, inside: a tenth of the time that matrices of 6 x 6 would take."""
+        if self.transformer.robot is None:
+            return x
+        ca, layout = casadi(), self.transformer._layout
+        n, body = layout.n_joints, SymbolicRigidBody(self.transformer._body.model)
+        row = ca.MX.sym("x", x.numel())
+        q, v = row[:n], row[n : 2 * n]
+        force = ca.MX.zeros(n, 1)
+        force[list(layout.driven)] = row[2 * n :]
+        terms = {
+            "acceleration": lambda: body.accelerations_under(q, v, force),
+            "gravity": lambda: body.gravity(q),
+            "bias": lambda: body.forces(q, v, None),
+            "input": lambda: body.accelerations(q, None, force, gravity=False),
+        }
+        found = ca.vertcat(*(terms[term]() for term in self.transformer._terms))
+        return ca.Function("nominal_dynamics", [row], [found]).expand()(x)
+
+
+# --- rigid-body dynamics ---------------------------------------------------------------------------------------------
+# From the numbers of a Pinocchio model. Spatial vectors are Pinocchio's, linear part first, in the frame of their joint
+# (Featherstone 2008, chapters 5 and 7).
 
 _KNOWN = ("JointModelR", "JointModelP")
 

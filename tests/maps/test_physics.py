@@ -4,7 +4,7 @@ import pinocchio as pin
 import pytest
 
 from skevgp.datasets import load_robot
-from skevgp.maps.symbolic_rigid_body import SymbolicRigidBody
+from skevgp.maps.physics import SymbolicRigidBody
 from skevgp.robots import RigidBody
 
 ROBOTS = ["pendulum", "cartpole", "acrobot", "iiwa14", "panda", "ur5"]
