@@ -304,7 +304,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
-        blocks = self._functions(self._validated(X), self._weights)
+        blocks = self._blocks_of_outputs(self._validated(X), self._weights)
         scale, offset = self._scaling.y_scale, self._scaling.y_mean
         noise = self._noise if include_noise else np.zeros_like(self._noise)
         if return_cov:
@@ -348,7 +348,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         check_integer(n_samples, "n_samples", minimum=1)
         rng = np.random.default_rng(check_random_state(random_state).randint(2**31))
         weights = self._network.draw(self._theta, n_samples, rng)
-        samples = np.concatenate(list(self._functions(X, weights)), axis=1)
+        samples = np.concatenate(list(self._blocks_of_outputs(X, weights)), axis=1)
         if include_noise:
             samples = samples + np.sqrt(self._noise) * rng.standard_normal(samples.shape)
         samples = np.moveaxis(samples * self._scaling.y_scale + self._scaling.y_mean, 0, 2)
@@ -444,7 +444,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             check_magnitude(X, "X")
         return X
 
-    def _functions(self, X: np.ndarray, weights: list[np.ndarray]) -> Iterator[np.ndarray]:
+    def _blocks_of_outputs(self, X: np.ndarray, weights: list[np.ndarray]) -> Iterator[np.ndarray]:
         """Standardised outputs (n_draws, rows, o) without noise, for one block of rows after the other."""
         size = max(1, _NUMBERS_AT_ONCE // (len(weights[0]) * max(drawn.shape[2] for drawn in weights)))
         for first in range(0, len(X), size):
@@ -560,7 +560,6 @@ class VariationalNetwork:
         self.sizes, self.slope, self.prior_log_stds = tuple(sizes), negative_slope, np.log(prior_scales)
         matrices, vectors = list(pairwise(self.sizes)), [(size,) for size in self.sizes[1:]]
         self.n_hidden = sum(self.sizes[1:-1])
-        self.n_weights = sum(fan_in * fan_out for fan_in, fan_out in matrices)
         self.n_parameters = 0
         self._parts: list[tuple[slice, tuple[int, ...]]] = []
         for shape in [*matrices, *matrices, *vectors, vectors[-1]]:

@@ -95,7 +95,7 @@ def test_the_loss_is_what_brute_force_over_weights_gives(network):
     prior = np.repeat(np.exp(network.prior_log_stds), [layer.mean.size for layer in network.split(theta)[0]])
     weights = network.draw(theta, n_draws, rng)
     flat = np.concatenate([w.reshape(n_draws, -1) for w in weights], axis=1)
-    n = network.n_weights
+    n = flat.shape[1]
     divergence = norm.logpdf(flat, theta[:n], np.exp(theta[n : 2 * n])) - norm.logpdf(flat, 0.0, prior)
     likelihood = norm.logpdf(Y, network.functions(theta, weights, X), np.exp(0.5 * log_noise))
     brute = divergence.sum(axis=1) / N_ROWS - likelihood.sum(axis=2).mean(axis=1)
