@@ -70,6 +70,7 @@ def state():
 @pytest.fixture(autouse=True)
 def _as_it_was():
     """The test changes nothing; values are other than usual, so that one that is set back to a default is seen too."""
+    pyplot.close("all")
     with np.errstate(invalid="print"), np.printoptions(precision=5):
         np.random.seed(7)  # noqa: NPY002
         random.seed(7)
