@@ -87,9 +87,12 @@ def check_agreement(
     if not (np.isfinite(integral).all() and np.isfinite(np.ptp(position, axis=0)).all()):
         return  # numbers that overflow are told where they are filtered
     floor = max(2.0 * slowest if what == "velocity" else 0.0, _SLOWEST[what])
-    causes = {}
+    causes, steps = {}, [_resolution(column) for column in rate.T]
+    rounding = min((step for step in steps if step > 0.0), default=0.0)
     for joint, name in enumerate(names):
-        windows = _moving(time, position[:, joint], rate[:, joint], pieces, floor)
+        # A joint so slow that the driver rounds it to 0 throughout shows what it rounds to in other joints only.
+        slow = max(floor, 0.0 if steps[joint] > 0.0 else 2.0 * rounding)
+        windows = _moving(time, position[:, joint], rate[:, joint], integral[:, joint], pieces, slow)
         cause = None if windows is None else _cause(windows, joint, time, rate, integral, pieces, names, what)
         if cause is None and wrapped is not None:
             cause = _differenced(time, position[:, joint], rate[:, joint], wrapped[:, joint])
@@ -105,25 +108,47 @@ def check_agreement(
 
 
 def _moving(
-    time: np.ndarray, position: np.ndarray, rate: np.ndarray, pieces: Sequence[slice], floor: float
+    time: np.ndarray,
+    position: np.ndarray,
+    rate: np.ndarray,
+    integral: np.ndarray,
+    pieces: Sequence[slice],
+    floor: float,
 ) -> _Windows | None:
-    """The shortest windows in which enough motion is well above the noise; None if there are none."""
+    """The shortest windows in which enough motion is well above the noise; None if there are none.
+
+    In half of them or more the integral moves too, if longer ones can have that: differences of a coarse position are 0
+    in most rows.
+    """
     step = float(np.median(np.diff(time)))
     noise = _noise(time, position, pieces)
-    length = _SHORTEST
+    length, found = _SHORTEST, None
     while True:
-        first = np.concatenate([np.arange(rows.start, rows.stop - length, length) for rows in pieces])
-        last = first + length
+        ends = [_windows(time[rows], rows.start, length) for rows in pieces]
+        first, last = (np.concatenate(each) for each in zip(*ends, strict=True))
         change = position[last] - position[first]
         speed = np.abs(change) / (time[last] - time[first])
         # A velocity in coarse units is 0 in slow motion.
         coarse = min(2.0 * _resolution(rate), 0.5 * np.quantile(speed, 0.9)) if len(speed) else 0.0
         moves = (np.abs(change) > _NOISES * noise) & (speed > max(floor, coarse))
         if moves.sum() >= _FEWEST:
-            return _Windows(first[moves], last[moves], change[moves])
+            found = _Windows(first[moves], last[moves], change[moves])
+            if np.median(np.abs(found.of(integral))) > 0.0 or not rate.any():
+                return found
         length *= 2
         if length * step > _LONGEST:
-            return None
+            return found
+
+
+def _windows(time: np.ndarray, start: int, length: int) -> tuple[np.ndarray, np.ndarray]:
+    """First and last rows of windows of so many steps, and of nearly as many mean ones: stamps may come in bursts."""
+    first = np.arange(0, max(0, len(time) - length), length)
+    if not len(first):
+        return first, first
+    least = time[first] + (length - 0.5) * (time[-1] - time[0]) / (len(time) - 1)
+    last = np.maximum(first + length, np.searchsorted(time, least))
+    inside = last < len(time)
+    return start + first[inside], start + last[inside]
 
 
 def _resolution(values: np.ndarray) -> float:

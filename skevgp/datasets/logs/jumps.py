@@ -162,7 +162,11 @@ def find_jumps(
     wrapped = np.zeros((len(steps), len(columns)), dtype=bool)
     for joint, column in enumerate(columns):
         period = periods[joint]
-        turns = np.zeros(len(steps)) if period is None else column.turns(period, _how(asked[joint], kinds[joint]))
+        turns = (
+            np.zeros(len(steps))
+            if period is None
+            else column.turns(period, _how(asked[joint], kinds[joint], column, period))
+        )
         wrapped[:, joint] = turns != 0.0
         wraps.append(int(wrapped[:, joint].sum()))
         if wraps[-1]:
@@ -188,15 +192,21 @@ def find_jumps(
     )
 
 
-def _how(asked: Wish, kind: Kind) -> str:
-    return "forced" if asked is not False and asked != "auto" else "turns" if kind == "turns" else "any"
+def _how(asked: Wish, kind: Kind, column: _Steps, period: float) -> str:
+    """How much evidence is needed: little for a period that the user gives, or says that there is one.
+
+    Positions beyond one period may be in another unit, and then each of their steps looks like so many periods.
+    """
+    if asked is True:
+        return "forced" if np.ptp(column.position) <= (1.0 + _LOOSE) * period else "turns"
+    return "forced" if isinstance(asked, float) else "turns" if kind == "turns" else "any"
 
 
 def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[Kind]) -> list[float | None]:
     """By which period each joint may be unwrapped: all joints of a log have the same unit."""
     wanted = [one is True or (one == "auto" and kind != "bounded") for one, kind in zip(asked, kinds, strict=True)]
     degrees = any(
-        wish and column.turns(DEGREES, _how(one, kind)).any()
+        wish and column.turns(DEGREES, _how(one, kind, column, DEGREES)).any()
         for wish, column, one, kind in zip(wanted, columns, asked, kinds, strict=True)
     )
     common = DEGREES if degrees else RADIANS

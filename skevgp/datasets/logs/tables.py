@@ -212,9 +212,12 @@ def _layout(text: Any, columns: Mapping[str, list[int | str]], decimal: str) -> 
 
 def _delimiter(line: str, decimal: str) -> str | None:
     """What separates cells; None are spaces."""
+    bare = re.sub(r'"[^"]*"', "", line).rstrip("\t; \r\n")
     for other in ("\t", ";"):
-        # A comma then stands before decimals, or in a name.
-        if other in line:
+        cells = [cell.strip() for cell in bare.split(other)]
+        # A comma then stands before decimals, or in a name. One at the end of a cell separates it from the next.
+        apart = len(cells) > 1 and not any(cell.endswith(",") for cell in cells)
+        if apart and (all(_is_number(cell) for cell in cells) or len(cells) > bare.count(",")):
             return other
     return "," if "," in line and (decimal == "." or '"' in line) else None
 

@@ -68,3 +68,34 @@ def test_nan_velocities_are_ignored_when_derived(load):
 def test_invalid_velocity_raises(load):
     with pytest.raises(ValueError, match='velocity must be "recorded" or "derive"; got \'none\''):
         load(Q, DQ, velocity="none")
+
+
+def test_a_joint_that_creeps_may_have_a_velocity_that_is_rounded_to_0(load):
+    q = np.column_stack([40.0 * np.sin(T), 10.0 + 0.3 * np.minimum(T, 5.0)])
+    dq = np.round(np.column_stack([40.0 * np.cos(T), np.where(T < 5.0, 0.3, 0.0)]))
+    assert load(q, dq).data.shape[1] == 6
+
+
+def test_differences_of_a_coarse_encoder_agree_though_most_rows_are_0(load):
+    fine = np.arange(0.0, 20.0, 0.001)
+    count = 2.0 * np.pi / 2048.0
+    q = np.round(np.column_stack([np.sin(0.3 * fine), np.cos(0.2 * fine)]) / count) * count
+    dq = np.diff(q, axis=0, append=q[-1:]) / 0.001
+    assert np.mean(dq[::10] == 0.0) > 0.5
+    load(q[::10], dq[::10])
+    with pytest.raises(ValueError, match="contradicts the position"):
+        load(q[::10], -dq[::10])
+
+
+def test_stamps_may_come_in_bursts(tmp_path):
+    """Ten rows within two milliseconds, then none for 98: what a host stamps that reads a buffer."""
+    stamps = np.floor(T / 0.1) * 0.1 + np.arange(len(T)) % 10 * 2e-4
+    file = tmp_path / "log.csv"
+    for factor in (1.0, 3.0):
+        np.savetxt(file, np.column_stack([stamps, np.sin(T), factor * np.cos(T), T]), delimiter=",", fmt="%.9g")
+        columns = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+        if factor == 1.0:
+            load_log(file, columns=columns, max_gap=0.5)
+        else:
+            with pytest.raises(ValueError, match="contradicts the position"):
+                load_log(file, columns=columns, max_gap=0.5)

@@ -114,3 +114,13 @@ def test_smooth_motion_with_noise_and_resolution_is_no_jump(seed, step, unit):
     found = find_jumps(t, position, float(np.median(np.diff(t))), np.inf, ["auto"], ["any"])
     assert found.cuts == []
     assert found.wraps == [0]
+
+
+@pytest.mark.parametrize("q", [170.0 * np.sin(T[::10]), 500.0 * np.sin(T[::10])], ids=["degrees", "millimetres"])
+def test_what_never_wraps_stays_although_the_user_expects_wraps(load, q):
+    """Steps of several degrees are not turns of 2π; `wrap=True` says that the angle would wrap, not in which unit."""
+    t = T[::10]
+    expected = load(q, t=t, wrap=False, dt=0.1, cutoff=2.0)
+    found = load(q, t=t, wrap=True, dt=0.1, cutoff=2.0)
+    assert found.recordings[0].wrapped == {"q1": 0}
+    assert_array_equal(found.data, expected.data)

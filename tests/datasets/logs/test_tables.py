@@ -249,3 +249,20 @@ def test_broken_compression_is_told_with_the_name(tmp_path, spoil):
     file.write_bytes(spoil(gzip.compress(b"0,1,2\n" * 1000)))
     with pytest.raises(ValueError, match="bad.csv.gz: it is no text, or its compression is broken"):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
+@pytest.mark.parametrize(
+    "row",
+    ["{},\t{},\t{},\t{}", "{},{},{},{}\t"],
+    ids=["comma and tab", "trailing tab"],
+)
+def test_commas_separate_whatever_follows_them(tmp_path, row):
+    file, t = tmp_path / "log.csv", np.arange(0.0, 5.0, 0.01)
+    table = np.column_stack([t, np.sin(t), np.cos(t), t])
+    text = "\n".join(row.format(*(f"{value:.9f}" for value in values)) for values in table)
+    columns = {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+    file.write_text("\n".join(",".join(f"{value:.9f}" for value in values) for values in table))
+    expected = load_log(file, columns=columns).data
+    for header in ("", row.format("time", "q", "dq", "tau") + "\n", '"time","q [rad; link]","dq\t","tau"\n'):
+        file.write_text(header + text)
+        assert_array_equal(load_log(file, columns=columns).data, expected)
