@@ -20,6 +20,7 @@ _AGREES = (2.0 / 3.0, 1.5)  # slopes that are no contradiction
 _ERRORS = 6.0  # standard errors that a slope is away from 1, at least
 _FITS = 0.3  # median deviation over median change: less is a cause that explains the signal
 _LATE, _LATEST = 0.03, 0.5  # s: delays that matter, and those that are looked for
+_ALIKE = 0.05  # deviations that differ by less are no reason to prefer one delay to another
 _UNITS = {
     "velocity": {
         -1.0: "of opposite sign",
@@ -195,23 +196,25 @@ def _cause(
 ) -> str | None:
     """What a contradicting signal seems to be; None if it agrees."""
     change, other = windows.change, windows.of(integral[:, joint])
+    # The median of what it deviates does not show it where the joint mostly moves one way.
+    if unsigned := _unsigned(change, other):
+        return unsigned
     fastest = np.abs(change / (time[windows.last] - time[windows.first])).max()
     slope, error = _slope(change, other)
     plain = _deviation(change, other)
     if _AGREES[0] <= slope <= _AGREES[1] or abs(slope - 1.0) <= _ERRORS * error:
         if plain <= 0.2:
             return None
-        return _unsigned(change, other) or _late(windows, joint, time, integral, pieces, 0.5 * plain)
+        return _late(windows, joint, time, integral, pieces, 0.5 * plain)
     if np.ptp(rate[:, joint]) == 0.0:
         return (
             f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may "
             "never fill it"
         )
     if slope != 0.0 and _deviation(change, other, slope) <= _FITS:
-        return _unsigned(change, other) or _scale(slope, what)
+        return _scale(slope, what)
     return (
         _other_column(windows, joint, integral, names)
-        or _unsigned(change, other)
         or _late(windows, joint, time, integral, pieces, _FITS)
         or f"it does not follow the motion (slope {slope:.2g} instead of 1)"
     )
@@ -268,7 +271,10 @@ def _late(
             continue
         other = np.interp(last[inside], time, column) - np.interp(first[inside], time, column)
         found.append(_deviation(windows.change[inside], other))
-    best = int(np.argmin(found))
+    # Periodic motion fits at whole periods, too: the shortest of the delays that fit about as well as the best.
+    padded = np.pad(found, 1, constant_values=np.inf)
+    lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (padded[1:-1] <= min(found) + _ALIKE)
+    best = min(np.flatnonzero(lowest).tolist(), key=lambda index: abs(delays[index]))
     delay = float(delays[best])
     if found[best] >= enough or abs(delay) < max(_LATE, 2.0 * step):
         return None

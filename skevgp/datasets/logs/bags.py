@@ -63,7 +63,7 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
             rows = [(*row[:column], (), *row[column + 1 :]) for row in rows]
     names = _joints([row[0] for row in rows], joints)
     mine = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
-    refused = {at: told for at, index in enumerate(mine) if (told := _twice(rows[index][0]))}
+    refused = {at: told for at, index in enumerate(mine) if (told := _twice(rows[index][0], names))}
     problems: dict[int, str] = {}
     position, velocity, acceleration, effort = (
         _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed, problems)
@@ -80,9 +80,9 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
     return Recording(signals, names, float(times[0] * _NANO), problems, refused)
 
 
-def _twice(names: list[str]) -> str:
-    """What is said of a message that has a joint twice; empty if all is well."""
-    twice = next((name for place, name in enumerate(names) if name in names[:place]), None)
+def _twice(names: list[str], wanted: list[str]) -> str:
+    """What is said of a message that has one of the wanted joints twice; empty if all is well."""
+    twice = next((name for place, name in enumerate(names) if name in names[:place] and name in wanted), None)
     return "" if twice is None else f"names the joint {twice!r} twice, so that its values are not known"
 
 
@@ -134,6 +134,8 @@ def _topic(topics: dict[str, str], topic: str | None) -> str:
 def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
     """Whose signals are taken: all messages that have all of them count, those of other robots or hands do not."""
     if joints is None:
+        # A driver's first messages may name no joint.
+        sets = [names for names in sets if names] or sets
         differing = {tuple(sorted(names)) for names in sets}
         if len(differing) > 1:
             raise ValueError(f"messages are of different joints, say by joints which you mean: {sorted(differing)}.")

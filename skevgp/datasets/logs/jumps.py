@@ -34,7 +34,8 @@ _COUNTS = 50.0  # ... and so many times the resolution of the positions
 _SMOOTH = 0.125  # of a period: 95 % of steps are predicted better than that where an angle is sampled well
 _STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is no jump
 _SPIKE = 3  # rows that are away and come back, at most
-_MOST = 0.02  # of all steps: a joint with more lone steps is one that moves in steps
+_MOST = 0.02  # of the steps in which it moves: a joint with more lone steps is one that moves in steps
+_BINS = 16  # of the positions' range: an angle that several turns lead away from and back was in more than half of them
 _UNLIMITED = 1e10  # limits beyond it are none
 
 Kind = str  # "any", "turns" (revolute without limits) or "bounded" (prismatic, or with limits)
@@ -273,6 +274,8 @@ class _Steps:
         if not jumps.any():
             return none
         loose = jumps & (error <= np.minimum(_LOOSE * period + spread, _SMOOTH * period))
+        if self._goes_to_and_fro(turns[loose]):
+            loose &= np.abs(turns) == 1.0
         if self._starts_again(period, turns, loose) and np.quantile(error[known], 0.95) <= _SMOOTH * period:
             return np.where(loose, turns, 0.0)
         # A turn that was lost, at any place: only where it stands among slow steps.
@@ -284,6 +287,14 @@ class _Steps:
         fast = np.abs(self.d) > _FASTER * fastest * self.lasting
         tight = loose & (error <= (_LOOSE if how == "turns" else _TIGHT) * period + spread)
         return np.where(tight & alone & fast, turns, 0.0)
+
+    def _goes_to_and_fro(self, turns: np.ndarray) -> bool:
+        """Whether jumps of several turns lead there and back, and little is between, as of a joint with two states."""
+        several = turns[np.abs(turns) > 1.0]
+        if not ((several > 0.0).any() and (several < 0.0).any()):
+            return False
+        visited = np.histogram(self.position, _BINS)[0] > 0
+        return bool(visited.mean() <= 0.5)
 
     def _starts_again(self, period: float, turns: np.ndarray, jumps: np.ndarray) -> bool:
         """Whether all positions lie within what one jump spans, and come near its ends."""
@@ -324,7 +335,7 @@ class _Steps:
             else:
                 groups.append([index])
         away = sum(abs(error[group].sum()) > 0.5 * np.abs(error[group]).max() for group in groups)
-        if away > max(4, _MOST * len(self.d)):
+        if away > max(4, _MOST * np.count_nonzero(self.d)):
             return []
         return [(group[0], group[-1] + 1) for group in groups]
 

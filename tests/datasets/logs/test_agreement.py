@@ -99,3 +99,18 @@ def test_stamps_may_come_in_bursts(tmp_path):
         else:
             with pytest.raises(ValueError, match="contradicts the position"):
                 load_log(file, columns=columns, max_gap=0.5)
+
+
+@pytest.mark.parametrize("seconds", [0.04, 0.1, 0.2, -0.1])
+def test_the_delay_of_periodic_motion_is_the_shortest(load, seconds):
+    q = np.column_stack([np.sin(4.0 * np.pi * T), np.cos(4.0 * np.pi * T)])
+    dq = 4.0 * np.pi * np.column_stack([np.cos(4.0 * np.pi * (T - seconds)), -np.sin(4.0 * np.pi * (T - seconds))])
+    with pytest.raises(ValueError, match=f"{abs(seconds):.2g} s {'late' if seconds > 0.0 else 'early'}"):
+        load(q, dq)
+
+
+def test_a_speed_without_sign_is_found_where_the_joint_mostly_moves_one_way(load):
+    q = np.column_stack([0.8 * T + np.sin(T) + 0.5 * np.sin(2.3 * T), np.sin(T)])
+    dq = np.column_stack([np.abs(0.8 + np.cos(T) + 1.15 * np.cos(2.3 * T)), np.cos(T)])
+    with pytest.raises(ValueError, match="Joint 'q1': it is a speed without sign"):
+        load(q, dq)

@@ -309,3 +309,18 @@ def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
     every = write(tmp_path / "every", spoilt_states(range(len(T)), name=["a", "a"]))
     with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
         load_log(every)
+
+
+def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
+    fields = {"position": [0.0, 0.0, 1.0], "velocity": [0.0, 0.0, 0.0], "effort": [0.0, 0.0, 2.0]}
+    file = write(tmp_path / "hand", spoilt_states(range(len(T)), name=["finger", "finger", "a"], **fields))
+    raw = load_log(file, joints=["a"], rest_velocity=0.0).recordings[0].raw
+    assert_allclose(raw.position, 1.0)
+    with pytest.raises(ValueError, match="names the joint 'finger' twice"):
+        load_log(file, joints=["finger"])
+
+
+def test_first_messages_without_names_are_left_out(tmp_path):
+    empty: dict = {"position": [], "velocity": [], "effort": []}
+    file = write(tmp_path / "bag", spoilt_states([0, 1, 2], name=[], **empty))
+    assert_allclose(load_log(file).recordings[0].raw.position, motion(T[3:])[0], rtol=1e-15)

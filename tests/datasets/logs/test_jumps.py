@@ -124,3 +124,19 @@ def test_what_never_wraps_stays_although_the_user_expects_wraps(load, q):
     found = load(q, t=t, wrap=True, dt=0.1, cutoff=2.0)
     assert found.recordings[0].wrapped == {"q1": 0}
     assert_array_equal(found.data, expected.data)
+
+
+def test_a_gripper_in_millimetres_goes_to_and_fro_and_turns_nowhere(load):
+    """44 mm are seven times 2π."""
+    t = T[::10]
+    q = np.where(t % 5.0 > 2.5, 44.0, 0.0) + 0.05 * np.random.RandomState(0).randn(len(t))
+    log = load(q, t=t, dt=0.1, cutoff=2.0)
+    assert log.recordings[0].wrapped == {"q1": 0}
+
+
+def test_a_joint_whose_samples_are_held_does_not_cut_the_record(load):
+    """A gripper at 10 Hz in a table at 100 Hz that moves at times: each of its steps stands alone."""
+    moved = np.interp(T % 4.0, [0.0, 2.0, 2.5, 4.0], [0.0, 0.0, 0.8, 0.8]) * np.where(T % 8.0 < 4.0, 1.0, -1.0)
+    held = moved[np.arange(len(T)) // 10 * 10]
+    log = load(held)
+    assert [cut for cut in log.recordings[0].cuts if cut[2] == "jump"] == []
