@@ -308,7 +308,8 @@ def _lift_efforts(model: Any, joints: list[str]) -> None:
     """Infinite limits of effort, as of a joint without <limit>; a joint of several velocities is refused later."""
     lower, upper = np.array(model.lowerEffortLimit), np.array(model.upperEffortLimit)
     for name in joints:
-        velocity = model.joints[model.getJointId(name)].idx_v
+        # The first name is Pinocchio's own, "universe", which a joint of the file may have too.
+        velocity = model.joints[list(model.names).index(name, 1)].idx_v
         lower[velocity], upper[velocity] = -np.inf, np.inf
     if joints:
         model.lowerEffortLimit, model.upperEffortLimit = lower, upper

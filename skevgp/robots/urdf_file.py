@@ -31,6 +31,8 @@ _SHORTEST_AXIS = 1e-9
 _MOST_ELEMENTS, _DEEPEST = 1_000_000, 100
 # Pinocchio goes from joint to joint by recursion, and makes matrices of as many rows and columns as joints move.
 _LONGEST_CHAIN, _MOST_JOINTS = 500, 300
+# Elements that simulators and controllers read, whatever is in them.
+_OF_OTHERS = ("gazebo", "transmission")
 
 
 class Element:
@@ -211,7 +213,7 @@ def _check_expanded(root: Element) -> None:
     """Refuse a xacro file, which is a program that writes a URDF file."""
     found = [root]
     for element in found:
-        found += element.children
+        found += [child for child in element.children if child.tag not in _OF_OTHERS]
         if element.tag.startswith("xacro:"):
             raise ValueError(
                 f"it has the element <{element.tag}> of xacro, which is not run here; expand the file first, by the "

@@ -246,3 +246,16 @@ def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     assert model.inertias[1].mass == 1.5
     with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
         load(text.format(joint("b", "c")))
+
+
+def test_a_joint_may_have_the_name_of_pinocchios_root(load):
+    text = robot("abc", joint("a", "b", name="universe"), joint("b", "c"))
+    model, _ = warned(load, text.replace('"1" velocity', '"-5" velocity', 1))
+    assert_array_equal(effort_limits(model), [[-np.inf, -1.0], [np.inf, 1.0]])
+
+
+@pytest.mark.parametrize("of", ["gazebo", "transmission"])
+def test_what_simulators_and_controllers_read_may_be_in_xacro(load, of):
+    plain = robot("ab", joint("a", "b"))
+    text = plain.replace("</robot>", f'<{of}><xacro:thing xmlns:xacro="http://x"/></{of}></robot>')
+    assert load(text) == load(plain)
