@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..data.rows import Columns, of_outputs, times_weights
-from ..utils.linalg import covariance_root, diagonal_of, times_lower
+from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance, times_lower
 from .statistics import Kernel, Whitening
 
 # Of the deviations of all outputs at once.
@@ -277,10 +277,7 @@ class Predictor:
         mean, own, common = self._own_covariances(inputs, features, noise)
         covariance = np.empty((len(mean), *mean.shape))
         for output, (matrix, shared) in enumerate(zip(own, common, strict=True)):
-            root = covariance_root(matrix)
-            found = root @ root.T
-            diagonal_of(found)[...] = diagonal_of(matrix)
-            covariance[:, :, output] = found + shared.T @ shared
+            covariance[:, :, output] = nearest_covariance(matrix) + shared.T @ shared
         return mean, covariance
 
     def sample(

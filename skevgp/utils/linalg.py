@@ -110,14 +110,29 @@ def covariance_root(covariance: np.ndarray) -> np.ndarray:
     -------
     root : ndarray of shape (n, n)
     """
-    factor, info = lapack.dpotrf(covariance.T, lower=0, clean=1)
-    if info == 0 and isfinite(factor.trace()):
-        return factor.T
+    factor = _cholesky_root(covariance)
+    if factor is not None:
+        return factor
     values, vectors = eigh(covariance, check_finite=False)
     root = vectors * np.sqrt(np.maximum(values, 0.0))
     sizes = np.einsum("ij,ij->i", root, root)
     shrink = np.divide(diagonal_of(covariance), sizes, out=np.zeros(len(sizes)), where=sizes > 0.0)
     return root * np.sqrt(shrink)[:, np.newaxis]
+
+
+def nearest_covariance(covariance: np.ndarray) -> np.ndarray:
+    """The matrix itself if it has a Cholesky factor, else F Fᵀ of `covariance_root`, with the same diagonal."""
+    if _cholesky_root(covariance) is not None:
+        return 0.5 * (covariance + covariance.T)
+    root = covariance_root(covariance)
+    found: np.ndarray = root @ root.T
+    diagonal_of(found)[...] = diagonal_of(covariance)
+    return found
+
+
+def _cholesky_root(covariance: np.ndarray) -> np.ndarray | None:
+    factor, info = lapack.dpotrf(covariance.T, lower=0, clean=1)
+    return factor.T if info == 0 and isfinite(factor.trace()) else None
 
 
 def diagonal_of(matrix: np.ndarray) -> np.ndarray:
