@@ -45,10 +45,11 @@ MEMORY = """
 import resource
 import numpy as np
 from skevgp import EVGPRegressor
+from skevgp.solvers import LBFGS
 
 X = np.random.RandomState(0).uniform(size=(6000, 2))
 y = np.sin(9.0 * X[:, 0])
-model = EVGPRegressor(n_inducing=20, max_iter=2, tol=1e9, random_state=0).fit(X, y)
+model = EVGPRegressor(n_inducing=20, max_iter=2, solver=LBFGS(tol=1e9), random_state=0).fit(X, y)
 before, known = model.predict(X[:50]), dict(vars(model))
 size = int(open("/proc/self/statm").read().split()[0]) * resource.getpagesize()
 resource.setrlimit(resource.RLIMIT_AS, (size + 2**26, size + 2**26))

@@ -134,9 +134,9 @@ def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     """Same kernel: Adam has to find q, whose optimum L-BFGS has in closed form; then all of it."""
     fixed = ConstantKernel(2.0, "fixed") * RBF([1.0, 1.0], "fixed") + WhiteKernel(0.01, "fixed")
     x, y = X[:60], Y[:60, 0]
-    arguments = {"n_inducing": 6, "solver": LBFGS(posterior=posterior), "feature_map": PolynomialFeatures(1)}
-    lbfgs = model(kernel=fixed, solver=LBFGS(tol=1e-8), **arguments).fit(x, y)
-    adam = model(kernel=fixed, solver=Adam(batch_size=60), max_iter=2000, **arguments).fit(x, y)
+    arguments = {"n_inducing": 6, "feature_map": PolynomialFeatures(1), "kernel": fixed}
+    lbfgs = model(solver=LBFGS(tol=1e-8, posterior=posterior), **arguments).fit(x, y)
+    adam = model(solver=Adam(batch_size=60, posterior=posterior), max_iter=2000, **arguments).fit(x, y)
     assert adam.lower_bound_ == pytest.approx(lbfgs.lower_bound_, rel=1e-4)
     np.testing.assert_allclose(adam.predict(X_NEW), lbfgs.predict(X_NEW), atol=0.01)
     np.testing.assert_allclose(
@@ -480,7 +480,7 @@ def test_warm_start_with_other_shapes_starts_anew():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("solver", ["lbfgs", "adam"])
+@pytest.mark.parametrize("solver", [LBFGS(tol=1e6), Adam(tol=1e6)], ids=["lbfgs", "adam"])
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 16)

@@ -273,7 +273,7 @@ def test_noise_that_is_noise_is_not_a_failure():
 def test_targets_far_from_their_prior_mean_are_told(sharing):
     with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
         model(sharing=sharing).fit(X, Y + [0.0, 1e6])
-    with pytest.warns(ConvergenceWarning, match="raise coef_scale"):
+    with pytest.warns(ConvergenceWarning, match="raise the scale of coef_prior"):
         model(feature_map=PolynomialFeatures(1), solver=LBFGS(tol=1.0), sharing=sharing).fit(X, Y + 1e6)
     with warnings.catch_warnings():
         warnings.simplefilter("error")

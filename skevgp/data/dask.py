@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from typing import Any
 
@@ -341,6 +341,7 @@ def _predicted(X: np.ndarray, model: Any, return_std: bool, include_noise: bool,
     if len(X) == 0:
         return np.empty((0, width))
     model = copy(model)
-    model.feature_map_, model.kernel_map_ = deepcopy((model.feature_map_, model.kernel_map_))
+    posterior = model._posterior
+    model._posterior = replace(posterior, maps=deepcopy(posterior.maps))
     found = model.predict(X, return_std=return_std, include_noise=include_noise)
     return np.hstack([part.reshape(len(X), -1) for part in (found if return_std else (found,))])

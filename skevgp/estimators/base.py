@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, Self
+from functools import wraps
+from inspect import signature
+from typing import Any, Literal, ParamSpec, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -27,6 +29,7 @@ from ..utils.state import StatefulEstimator
 from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
 from .summary import ModelSummary, html_of, of_gaussian_process
 
+P = ParamSpec("P")
 # Attributes that there are only if there are weights.
 _OF_WEIGHTS = ("coef_", "coef_std_", "coef_cov_", "coef_names_", "coef_prior_mean_", "coef_prior_scale_")
 # Attributes that are found when somebody asks.
@@ -47,13 +50,19 @@ _MOVED = {
 }
 
 
-def refuse_moved(estimator: Any, given: dict[str, Any]) -> None:
-    """Refuse arguments that an estimator does not have, and say where those of version 0.1 are now."""
-    for name in given:
-        kind = type(estimator).__name__
-        if name in _MOVED:
-            raise TypeError(f"{kind} has no argument {name!r} since version 0.2: use {_MOVED[name]}.")
-        raise TypeError(f"{kind}.__init__() got an unexpected keyword argument {name!r}")
+def names_moved_arguments(init: Callable[P, None]) -> Callable[P, None]:
+    """An ``__init__`` that says of arguments of version 0.1 where they are now."""
+    known = signature(init).parameters
+
+    @wraps(init)
+    def checked(*args: P.args, **kwargs: P.kwargs) -> None:
+        for name in kwargs:
+            if name in _MOVED and name not in known:
+                kind = type(args[0]).__name__
+                raise TypeError(f"{kind} has no argument {name!r} since version 0.2: use {_MOVED[name]}.")
+        init(*args, **kwargs)
+
+    return checked
 
 
 class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):

@@ -26,7 +26,7 @@ from ..noise import Gaussian, as_noise
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import check_fitted, is_dask, unchanged_if_it_fails
-from .base import GaussianProcess, refuse_moved
+from .base import GaussianProcess, names_moved_arguments
 
 # Of so many, an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
@@ -91,8 +91,6 @@ class EGPRegressor(GaussianProcess):
         Draws the restarts.
     verbose : int, default=0
         Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
-    **moved : dict
-        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------
@@ -151,7 +149,7 @@ class EGPRegressor(GaussianProcess):
     Before a fit predictions are of the prior, where y counts as of size one (maps are fitted to the rows that are asked
     for: with scalers among them, rows are relative to each other):
 
-    >>> prior = EGPRegressor(PolynomialFeatures(1), coef_scale=[0.0, 2.0])
+    >>> prior = EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=[0.0, 2.0]))
     >>> mean, std = prior.predict([[0.0], [3.0]], return_std=True)
     >>> std.round(2)
     array([1.  , 6.08])
@@ -177,6 +175,7 @@ class EGPRegressor(GaussianProcess):
 
     _fitted: ExactFit
 
+    @names_moved_arguments
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
@@ -195,9 +194,7 @@ class EGPRegressor(GaussianProcess):
         n_targets: int | None = None,
         random_state: int | np.random.RandomState | None = None,
         verbose: int = 0,
-        **moved: Any,
     ):
-        refuse_moved(self, moved)
         self.feature_map = feature_map
         self.kernel = kernel
         self.kernel_map = kernel_map

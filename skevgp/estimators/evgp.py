@@ -39,7 +39,7 @@ from ..utils.validation import (
     unchanged_if_it_fails,
     words_of,
 )
-from .base import GaussianProcess, refuse_moved
+from .base import GaussianProcess, names_moved_arguments
 
 
 class EVGPRegressor(GaussianProcess):
@@ -108,8 +108,6 @@ class EVGPRegressor(GaussianProcess):
         Verbosity. 0 prints nothing. 1 shows the rows that are fitted, the iteration, the bound and the seconds so far:
         in one live line if tqdm is installed and the output is a terminal or a notebook, else in a line every ten
         seconds. 2 prints a line at each iteration.
-    **moved : dict
-        Arguments of version 0.1, which a TypeError says where to find now.
 
     Attributes
     ----------
@@ -222,6 +220,7 @@ class EVGPRegressor(GaussianProcess):
 
     _fitted: Fitted
 
+    @names_moved_arguments
     def __init__(
         self,
         feature_map: TransformerMixin | None = None,
@@ -241,9 +240,7 @@ class EVGPRegressor(GaussianProcess):
         n_jobs: int | None = None,
         random_state: int | np.random.RandomState | None = None,
         verbose: int = 0,
-        **moved: Any,
     ):
-        refuse_moved(self, moved)
         self.feature_map = feature_map
         self.kernel = kernel
         self.kernel_map = kernel_map
