@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 _SHORTEST, _LONGEST = 4, 0.5  # of windows: steps, and s
+_MOST = 5000  # windows that are compared: of more, some
 _FEWEST = 12  # windows in which the joint moves, or nothing is said
 _NOISES = 10.0  # a window's change of position, in standard deviations of its noise
 _SLOWEST = {"velocity": 0.02, "acceleration": 0.2}  # per s, or per s²: drivers round what is slower to 0
@@ -138,8 +139,15 @@ def _usual(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> f
     for column in position.T:
         _, speed, _ = _windows(time, column, pieces, _SHORTEST)
         if speed.any():
-            reached.append(np.quantile(speed, 0.95))
+            reached.append(np.quantile(_some(speed), 0.95))
     return float(np.median(reached)) if reached else 0.0
+
+
+def _some(values: np.ndarray) -> np.ndarray:
+    """At most as many as are needed, in their order; at random, as stamps may repeat a pattern."""
+    if len(values) <= _MOST:
+        return values
+    return values[np.sort(np.random.default_rng(0).choice(len(values), _MOST, replace=False))]
 
 
 def _moving(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], slow: float) -> _Windows | None:
@@ -150,7 +158,7 @@ def _moving(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], slo
         windows, speed, usual = _windows(time, position, pieces, length)
         moves = (np.abs(windows.change) > _NOISES * noise) & (speed > slow)
         if moves.sum() >= _FEWEST:
-            return windows.at(moves)
+            return windows.at(_some(np.flatnonzero(moves)))
         length *= 2
         if 2.0 * usual > _LONGEST or not len(speed):
             return None
