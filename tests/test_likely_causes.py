@@ -12,6 +12,7 @@ from skevgp.datasets import load_robot
 from skevgp.exceptions import RobotModelWarning
 from skevgp.features import NominalDynamics, RigidBodyRegressor
 from skevgp.identification.likely_causes import likely_causes
+from skevgp.robots import RigidBody
 
 from .test_inverse_dynamics import Arm, with_masses
 
@@ -179,3 +180,12 @@ def test_of_an_unphysical_robot_a_fit_warns_once():
     with pytest.warns(RobotModelWarning, match="'q2' has 1 kg and moments") as caught:
         InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
     assert len(caught) == 1
+
+
+@pytest.mark.parametrize("robot", ["cartpole", "ur5"])
+def test_torques_without_gravity_are_no_sign_of_degrees(robot):
+    """A driver that compensates gravity leaves it out: positions at 0 explain the rest as well as radians do."""
+    arm = Arm(robot, noise=NOISE)
+    q, v, a = np.split(arm.X, 3, axis=1)
+    gravity = RigidBody(arm.model).forces(q, 0.0 * v, 0.0 * a)
+    assert not any("degrees" in cause for cause in causes_of(arm.nominal, arm.X, arm.y - gravity))

@@ -16,7 +16,7 @@ from scipy.optimize import linear_sum_assignment
 from ..robots import RigidBody
 from ..robots.loading import joint_axes
 
-_ROWS, _ROWS_OF_SEARCH = 400, 200
+_ROWS, _ROWS_OF_SEARCH = 400, 100
 # Robots of many joints use fewer rows. With more joints than the last number, only limits of positions are compared.
 _TORQUES, _LEAST_ROWS, _MOST_JOINTS = 4000, 100, 40
 # A cause is named if the residual's share of the variance falls to this share of itself, and by at least the second.
@@ -70,8 +70,10 @@ def likely_causes(
     some = np.unique(np.linspace(0, len(X) - 1, n_rows).astype(int))
     trial = _Trial(feature_map, prior, X[some], y[some])
     before, tried = trial.left(trial.X, trial.y), _degrees(trial, degrees)
+    # Radians taken for degrees are next to nothing, which explains torques better where a term is not in them at all.
+    without = min((before, *(one.without for one in tried)))
     best = min(tried, key=lambda one: one.left, default=None)
-    if best is not None and _much_less(best.left, before):
+    if best is not None and _much_less(best.left, without):
         rest = {joint: text for joint, text in said.items() if "q" not in best.blocks or joint not in best.joints}
         return [best.said(trial.names), *_of_limits(rest, degrees), *_order(trial, best.X)]
     # With columns in another order too, radians alone explain torques no better.
@@ -178,12 +180,16 @@ def _listed(said: dict[int, str], joints: list[int]) -> str:
 
 
 class _Degrees(NamedTuple):
-    """Signals in degrees: their blocks and joints, the rows with these in radians, and what is left of torques then."""
+    """Signals in degrees: their blocks and joints, and the rows with these in radians.
+
+    ``left`` is what is left of the torques then, ``without`` what is left with these signals at 0.
+    """
 
     blocks: tuple[str, ...]
     joints: list[int]
     X: np.ndarray
     left: float
+    without: float
 
     def said(self, names: list[str]) -> str:
         what = " and ".join(", ".join(_BLOCKS[block] for block in self.blocks).rsplit(", ", 1))
@@ -195,10 +201,11 @@ def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
     n, turning, found = len(trial.names), np.flatnonzero(trial.turns).tolist(), []
     for joints in [turning] * bool(turning) + [suspects] * (bool(suspects) and suspects != turning):
         for blocks in _UNITS:
-            X = trial.X.copy()
-            for block in blocks:
-                X[:, [n * "qva".index(block) + joint for joint in joints]] *= np.pi / 180.0
-            found.append(_Degrees(blocks, joints, X, trial.left(X, trial.y)))
+            columns = [n * "qva".index(block) + joint for block in blocks for joint in joints]
+            X, none = trial.X.copy(), trial.X.copy()
+            X[:, columns] *= np.pi / 180.0
+            none[:, columns] = 0.0
+            found.append(_Degrees(blocks, joints, X, trial.left(X, trial.y), trial.left(none, trial.y)))
     return found
 
 
