@@ -20,6 +20,7 @@ _AGREES = (2.0 / 3.0, 1.5)  # slopes that are no contradiction
 _ERRORS = 6.0  # standard errors that a slope is away from 1, at least
 _FITS = 0.3  # median deviation over median change: less is a cause that explains the signal
 _LATE, _LATEST = 0.03, 0.5  # s: delays that matter, and those that are looked for
+_CHANCE = 1.5  # three standard deviations of the share of windows, were each as likely as not
 _ALIKE = 0.05  # deviations that differ by less are no reason to prefer one delay to another
 _UNITS = {
     "velocity": {
@@ -262,21 +263,29 @@ def _late(
     starts = np.concatenate([np.full(rows.stop - rows.start, time[rows.start]) for rows in pieces])
     step = float(np.median(np.diff(time)))
     delays = np.linspace(-_LATEST, _LATEST, 101)
-    found = []
-    for delay in delays:
+
+    def moved(delay: float) -> tuple[np.ndarray, np.ndarray]:
         first, last = time[windows.first] + delay, time[windows.last] + delay
         inside = (first >= starts[windows.first]) & (last <= ends[windows.first])
-        if inside.sum() < _FEWEST:
-            found.append(np.inf)
-            continue
-        other = np.interp(last[inside], time, column) - np.interp(first[inside], time, column)
-        found.append(_deviation(windows.change[inside], other))
+        return inside, np.interp(last[inside], time, column) - np.interp(first[inside], time, column)
+
+    found = []
+    for delay in delays:
+        inside, other = moved(delay)
+        enough_windows = len(other) >= _FEWEST
+        found.append(_deviation(windows.change[inside], other) if enough_windows else np.inf)
     # Periodic motion fits at whole periods, too: the shortest of the delays that fit about as well as the best.
     padded = np.pad(found, 1, constant_values=np.inf)
     lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (padded[1:-1] <= min(found) + _ALIKE)
     best = min(np.flatnonzero(lowest).tolist(), key=lambda index: abs(delays[index]))
     delay = float(delays[best])
     if found[best] >= enough or abs(delay) < max(_LATE, 2.0 * step):
+        return None
+    # Of so many delays one fits by chance: it has to fit better than none in clearly more than half of the windows.
+    inside, other = moved(delay)
+    now = windows.of(column)[inside]
+    better = np.abs(windows.change[inside] - other) < np.abs(windows.change[inside] - now)
+    if better.mean() < 0.5 + _CHANCE / np.sqrt(len(better)):
         return None
     return f"it is {abs(delay):.2g} s {'late' if delay > 0.0 else 'early'}"
 

@@ -114,3 +114,13 @@ def test_a_speed_without_sign_is_found_where_the_joint_mostly_moves_one_way(load
     dq = np.column_stack([np.abs(0.8 + np.cos(T) + 1.15 * np.cos(2.3 * T)), np.cos(T)])
     with pytest.raises(ValueError, match="Joint 'q1': it is a speed without sign"):
         load(q, dq)
+
+
+def test_a_noisy_velocity_of_few_rows_is_not_late(tmp_path):
+    t = np.arange(0.0, 10.0, 0.1)
+    q, dq = np.sin(1.3 * t) + 0.4 * np.sin(3.1 * t), 1.3 * np.cos(1.3 * t) + 1.24 * np.cos(3.1 * t)
+    file, columns = tmp_path / "log.csv", {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+    for seed in range(30):
+        noisy = dq + dq.std() * np.random.RandomState(seed).randn(len(t))
+        np.savetxt(file, np.column_stack([t, q, noisy, q]), delimiter=",")
+        load_log(file, columns=columns, dt=0.1, cutoff=2.0)
