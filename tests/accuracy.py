@@ -8,11 +8,11 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
-from skevgp.data.dataset import Dataset
 from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
 from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
 from skevgp.solvers import LBFGS
 
+from .oracle import at_the_fit
 from .precise import PreciseModel, cholesky, condition, solved, squared_exponential
 
 COEF_MEAN, COEF_SCALE = 0.5, 2.0
@@ -112,13 +112,6 @@ def jitter_of(model):
 
 def in_order(gradient, names=("hyperparameters", "signal", "noise", "inducing_points")):
     return np.concatenate([np.ravel(gradient[name]) for name in names])
-
-
-def at_the_fit(model, X, y):
-    """Model, blocks of all rows, and parameters."""
-    (fitted,) = model._fitted.models
-    rows = model._fitted.units.rows(Dataset.further(model, model._posterior.maps, X, y).source)
-    return fitted, fitted.sparse.blocks(rows, fitted.values["inducing_points"].shape[1])
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ import autograd.numpy as anp
 import numpy as np
 
 from skevgp.data.blocks import LocalBlocks
+from skevgp.data.dataset import Dataset
 from skevgp.data.rows import LocalSource, MakeBlock, Moments, RawRows, Rows
 from skevgp.fitting.search import Rules
 from skevgp.fitting.start import starting_table
@@ -14,6 +15,13 @@ from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import LOG_2PI
 from skevgp.model.model import SparseModel
 from skevgp.model.predictor import CoefficientPrior
+
+
+def at_the_fit(model, X, y):
+    """Model, blocks of all rows, and parameters."""
+    (fitted,) = model._fitted.models
+    rows = model._fitted.units.rows(Dataset.further(model, model._posterior.maps, X, y).source)
+    return fitted, fitted.sparse.blocks(rows, fitted.values["inducing_points"].shape[1])
 
 
 def central_differences(function, x, step=1e-6):

@@ -209,3 +209,12 @@ def test_of_an_unphysical_robot_a_fit_warns_once():
     with pytest.warns(RobotModelWarning, match="'q2' has 1 kg and moments") as caught:
         InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
     assert len(caught) == 1
+
+
+@pytest.mark.parametrize("robot", ["cartpole", "ur5"])
+def test_torques_without_gravity_are_no_sign_of_degrees(robot):
+    """A driver that compensates gravity leaves it out: positions at 0 explain the rest as well as radians do."""
+    arm = Arm(robot, noise=NOISE)
+    q, v, a = np.split(arm.X, 3, axis=1)
+    gravity = RigidBody(arm.model).forces(q, 0.0 * v, 0.0 * a)
+    assert not any("degrees" in cause for cause in causes_of(arm.nominal, arm.X, arm.y - gravity))

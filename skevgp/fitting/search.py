@@ -1,7 +1,7 @@
 """The search over starts: from where a model is fitted, one start after the other, and which of the fits is kept.
 
 A fit may end where the noise explains everything, or with inducing points where nothing happens: one start is not
-enough. ARCHITECTURE.md has a table of the rules, what each prevents, and the test that fails without it.
+enough. docs/guide/inside.md has a table of the rules, what each prevents, and the test that fails without it.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ LOWEST_NOISE_EXACT = 1e-12
 
 @dataclass(frozen=True)
 class Rules:
-    """The numbers that a search goes by; ARCHITECTURE.md says what each prevents."""
+    """The numbers that a search goes by; docs/guide/inside.md says what each prevents."""
 
     # Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
     # keeps L-BFGS out of the optimum where the noise explains everything.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..utils.optional import require
+from ..utils.state import stored_as
 from .loading import joint_axes
 
 _ALONG = ("JointModelRevoluteUnaligned", "JointModelPrismaticUnaligned", "JointModelRevoluteUnboundedUnaligned")
@@ -193,3 +194,6 @@ def _body(pin: Any, values: np.ndarray) -> Any:
     body = pin.Inertia.Zero()  # its constructor refuses a moment that rounding made negative
     body.mass, body.lever, body.inertia = float(values[0]), values[1:4], values[4:].reshape(3, 3)
     return body
+
+
+stored_as(RobotNumbers, RobotNumbers.of, RobotNumbers.model)

@@ -5,6 +5,7 @@ Data frames and Pinocchio's models, which skops cannot hold, are arrays there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import PurePath
 from typing import Any
 
@@ -12,10 +13,18 @@ from sklearn.base import BaseEstimator
 
 from .._version import __version__
 from ..exceptions import InconsistentVersionWarning, warn_user
-from ..robots.numbers import RobotNumbers
 from .frames import FrameColumns
 
 _KEY = "_skevgp_version"
+# Classes of plain data, each with what makes it of an object (None of others) and what makes the object of it.
+_STORED: dict[type, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
+    FrameColumns: (FrameColumns.of, FrameColumns.frame)
+}
+
+
+def stored_as(kind: type, of: Callable[[Any], Any], back: Callable[[Any], Any]) -> None:
+    """Let states hold plain data of a class ``kind`` in place of the objects that ``of`` knows."""
+    _STORED[kind] = of, back
 
 
 class StatefulEstimator(BaseEstimator):
@@ -47,11 +56,9 @@ def _as_data(value: Any) -> Any:
     if isinstance(value, PurePath):
         # Paths of another system cannot be made here.
         return str(value)
-    data = FrameColumns.of(value)
-    return RobotNumbers.of(value) or value if data is None else data
+    found = (of(value) for of, _ in _STORED.values())
+    return next((data for data in found if data is not None), value)
 
 
 def _from_data(value: Any) -> Any:
-    if isinstance(value, FrameColumns):
-        return value.frame()
-    return value.model() if isinstance(value, RobotNumbers) else value
+    return _STORED[type(value)][1](value) if type(value) in _STORED else value

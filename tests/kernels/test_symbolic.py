@@ -1,4 +1,3 @@
-import casadi as ca
 import numpy as np
 import pytest
 from sklearn.gaussian_process import kernels as sk
@@ -6,6 +5,8 @@ from sklearn.gaussian_process import kernels as sk
 from skevgp.kernels import FunctionKernel
 
 from .cases import KERNELS, X, Z, parsed
+
+ca = pytest.importorskip("casadi")
 
 WITHOUT = {"matern 0.3", "matern 1", "matern 0.8", "matern 1.9, ard", "matern 7.3", "matern 60"}
 

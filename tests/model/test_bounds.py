@@ -26,8 +26,16 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
-from ..accuracy import at_the_fit
-from ..oracle import central_differences, collapsed_bound, dense_bounds, problem, relative_error, table_of, whitened
+from ..oracle import (
+    at_the_fit,
+    central_differences,
+    collapsed_bound,
+    dense_bounds,
+    problem,
+    relative_error,
+    table_of,
+    whitened,
+)
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)

@@ -165,3 +165,13 @@ def test_an_accelerometer_that_measures_gravity_too_is_no_contradiction(tmp_path
     np.savetxt(file, np.column_stack([T, np.sin(T), np.cos(T), 0.5 - np.sin(T), T]), delimiter=",")
     log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "acceleration": 3, "effort": 4})
     assert np.abs(log.data[:, 2] - 0.5 + log.data[:, 0]).max() < 0.01
+
+
+def test_a_noisy_velocity_of_few_rows_is_not_late(tmp_path):
+    t = np.arange(0.0, 10.0, 0.1)
+    q, dq = np.sin(1.3 * t) + 0.4 * np.sin(3.1 * t), 1.3 * np.cos(1.3 * t) + 1.24 * np.cos(3.1 * t)
+    file, columns = tmp_path / "log.csv", {"time": 0, "position": 1, "velocity": 2, "effort": 3}
+    for seed in range(30):
+        noisy = dq + dq.std() * np.random.RandomState(seed).randn(len(t))
+        np.savetxt(file, np.column_stack([t, q, noisy, q]), delimiter=",")
+        load_log(file, columns=columns, dt=0.1, cutoff=2.0)
