@@ -1,6 +1,7 @@
 """What `InverseDynamics` says of columns in another order or in degrees, and nothing of these where all is right."""
 
 import warnings
+from time import perf_counter
 
 import numpy as np
 import pandas as pd
@@ -91,6 +92,34 @@ def test_degrees_of_one_joint_are_named():
     causes = causes_of(arm.nominal, in_degrees(arm.X, "qva", [1]), arm.y)
     assert len(causes) == 1
     assert "positions, velocities and accelerations of ['shoulder_lift_joint'] look like degrees" in causes[0]
+
+
+@pytest.mark.parametrize("robot", ["cartpole", "so100", "kinova", "ur10"])
+@pytest.mark.parametrize("seed", range(2))
+def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robot, seed):
+    """Without gravity, in amperes, or with signs of their own, torques are explained best without some signals."""
+    arm, rng = Arm(robot, noise=0.0), np.random.default_rng(seed)
+    q, v, a = np.split(arm.X, 3, axis=1)
+    forces = RigidBody(arm.nominal).forces
+    wrong = {
+        "compensated": forces(q, v, a) - forces(q, 0.0 * v, 0.0 * a),
+        "currents": arm.y * rng.uniform(0.01, 0.2, arm.nominal.nv),
+        "signs": arm.y * rng.choice([-1.0, 1.0], arm.nominal.nv),
+    }
+    causes = {name: causes_of(arm.nominal, arm.X, y) for name, y in wrong.items()}
+    assert not any("degrees" in cause for several in causes.values() for cause in several)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("robot", ["panda", "solo12", "g1_29dof_rev_1_0"])
+def test_the_search_for_causes_is_short(robot):
+    """About a second; the limit is for busy machines."""
+    arm = Arm(robot, noise=NOISE)
+    y = arm.y + 3.0 * arm.y.std(axis=0) * np.random.default_rng(0).normal(size=arm.y.shape)
+    feature_map = RigidBodyRegressor(arm.nominal).fit(arm.X)
+    prior, began = feature_map.coef_prior(y.shape[1]), perf_counter()
+    likely_causes(feature_map, arm.X, y, prior, is_far=True)
+    assert perf_counter() - began < 8.0
 
 
 def test_degrees_in_another_order_are_named_both():

@@ -13,10 +13,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from ..data.threads import single_threaded_libraries
 from ..robots import RigidBody
 from ..robots.loading import joint_axes
 
-_ROWS, _ROWS_OF_SEARCH = 400, 100
+_ROWS, _ROWS_OF_SEARCH = 400, 200
 # Robots of many joints use fewer rows. With more joints than the last number, only limits of positions are compared.
 _TORQUES, _LEAST_ROWS, _MOST_JOINTS = 4000, 100, 40
 # A cause is named if the residual's share of the variance falls to this share of itself, and by at least the second.
@@ -27,10 +28,12 @@ _WIDER, _LEAST_NOISE = 10.0, 1e-4
 _LEAST_SHARE = 1e-3
 # Up to the first number of joints, all orders are tried. Up to the second, a search exchanges or moves joints step by
 # step. With more joints, the orders by name and backwards are tried.
-_MOST_ALL, _MOST_SEARCHED, _MOST_TRIALS = 6, 12, 2000
+_MOST_ALL, _MOST_SEARCHED, _MOST_TRIALS = 6, 12, 1000
 # Positions are beyond limits if they exceed them by this share of the range. They look like degrees if they are larger
 # than a turn, and than the larger limit times the second number.
 _BEYOND, _DEGREES = 0.1, 3.0
+# Positions, velocities and accelerations of robots in radians are mostly below it: what is so small is not in degrees.
+_RADIANS = 2.0 * np.pi
 _MOST_NAMED, _MOST_SAID = 8, 3
 _UNITS = (("q",), ("q", "v", "a"), ("q", "v"), ("q", "a"), ("v", "a"), ("v",), ("a",))
 _BLOCKS = {"q": "positions", "v": "velocities", "a": "accelerations"}
@@ -40,6 +43,7 @@ _A_TURN = 0.05
 _LARGEST_LIMIT = 1e6
 
 
+@single_threaded_libraries()  # matrices are small: with more threads these wait for each other
 def likely_causes(
     feature_map: Any, X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray], *, is_far: bool
 ) -> list[str]:
@@ -70,10 +74,9 @@ def likely_causes(
     some = np.unique(np.linspace(0, len(X) - 1, n_rows).astype(int))
     trial = _Trial(feature_map, prior, X[some], y[some])
     before, tried = trial.left(trial.X, trial.y), _degrees(trial, degrees)
-    # Radians taken for degrees are next to nothing, which explains torques better where a term is not in them at all.
-    without = min((before, *(one.without for one in tried)))
     best = min(tried, key=lambda one: one.left, default=None)
-    if best is not None and _much_less(best.left, without):
+    # A scale so small nearly removes signals: degrees are named if that would not explain torques as well.
+    if best is not None and _much_less(best.left, before) and _much_less(best.left, trial.left_without(best)):
         rest = {joint: text for joint, text in said.items() if "q" not in best.blocks or joint not in best.joints}
         return [best.said(trial.names), *_of_limits(rest, degrees), *_order(trial, best.X)]
     # With columns in another order too, radians alone explain torques no better.
@@ -109,13 +112,19 @@ class _Trial:
         noise = 0.01 * np.where(moves, variance, 1.0)
         for _ in range(2):
             weight = moves / noise
-            information = np.einsum("nop,noq->pq", H * weight[:, np.newaxis], H, optimize=True)
+            information = (H * weight[:, np.newaxis]).reshape(-1, len(root)).T @ H.reshape(-1, len(root))
             precision = root.T @ information @ root + np.eye(len(root))
             right = root.T @ np.einsum("nop,no->p", H, target * weight)
             missed = target - H @ (root @ np.linalg.lstsq(precision, right, rcond=None)[0])
             share = np.mean(missed**2, axis=0)[moves] / variance[moves]
             noise[moves] = np.maximum(share, _LEAST_NOISE) * variance[moves]
         return float(np.mean(np.minimum(share, 1.0)))
+
+    def left_without(self, one: _Degrees) -> float:
+        """The share that is left with signals set to 0."""
+        X = self.X.copy()
+        X[:, one.columns] = 0.0
+        return self.left(X, self.y)
 
     def costs(self, X: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Logarithms of the shares that the model's torque of each joint, with friction there, leaves of columns of y.
@@ -180,16 +189,13 @@ def _listed(said: dict[int, str], joints: list[int]) -> str:
 
 
 class _Degrees(NamedTuple):
-    """Signals in degrees: their blocks and joints, and the rows with these in radians.
-
-    ``left`` is what is left of the torques then, ``without`` what is left with these signals at 0.
-    """
+    """Signals in degrees: where they are, the rows with these in radians, and what is left of torques then."""
 
     blocks: tuple[str, ...]
     joints: list[int]
+    columns: list[int]
     X: np.ndarray
     left: float
-    without: float
 
     def said(self, names: list[str]) -> str:
         what = " and ".join(", ".join(_BLOCKS[block] for block in self.blocks).rsplit(", ", 1))
@@ -201,11 +207,11 @@ def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
     n, turning, found = len(trial.names), np.flatnonzero(trial.turns).tolist(), []
     for joints in [turning] * bool(turning) + [suspects] * (bool(suspects) and suspects != turning):
         for blocks in _UNITS:
-            columns = [n * "qva".index(block) + joint for block in blocks for joint in joints]
-            X, none = trial.X.copy(), trial.X.copy()
-            X[:, columns] *= np.pi / 180.0
-            none[:, columns] = 0.0
-            found.append(_Degrees(blocks, joints, X, trial.left(X, trial.y), trial.left(none, trial.y)))
+            places = [[n * "qva".index(block) + joint for joint in joints] for block in blocks]
+            if all(np.abs(trial.X[:, columns]).max() > _RADIANS for columns in places):
+                columns, X = [column for block in places for column in block], trial.X.copy()
+                X[:, columns] *= np.pi / 180.0
+                found.append(_Degrees(blocks, joints, columns, X, trial.left(X, trial.y)))
     return found
 
 

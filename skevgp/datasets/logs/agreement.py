@@ -2,7 +2,8 @@
 
 The integral of the velocity is compared with the change of position, in windows so long that the change is far above
 the noise and the resolution of the position. The slope of one over the other is 1 if they agree, however noisy the
-velocity is, and it has a standard error: a velocity is refused only where its slope is clearly another one.
+velocity is, and it has a standard error: a velocity is refused only where its slope is clearly another one, in all
+windows, or in those of one direction or half of the record.
 """
 
 from __future__ import annotations
@@ -13,15 +14,19 @@ from dataclasses import dataclass
 import numpy as np
 
 _SHORTEST, _LONGEST = 4, 0.5  # of windows: steps, and s
+_MOST = 5000  # windows that are compared: of more, some
 _FEWEST = 12  # windows in which the joint moves, or nothing is said
 _NOISES = 10.0  # a window's change of position, in standard deviations of its noise
 _SLOWEST = {"velocity": 0.02, "acceleration": 0.2}  # per s, or per s²: drivers round what is slower to 0
-_AGREES = (2.0 / 3.0, 1.5)  # slopes that are no contradiction
+_SLOW = 0.02  # ... and what is slower than this part of what joints reach
+_AGREES = 1.5  # slopes up to that, and down to its inverse, are no contradiction
+_AGREES_IN_PART = 2.0  # ... in one direction, or in half of the record
 _ERRORS = 6.0  # standard errors that a slope is away from 1, at least
 _FITS = 0.3  # median deviation over median change: less is a cause that explains the signal
+_PART = 0.25  # of all motion, in one direction or half of the record: less says nothing
 _LATE, _LATEST = 0.03, 0.5  # s: delays that matter, and those that are looked for
-_CHANCE = 1.5  # three standard deviations of the share of windows, were each as likely as not
-_ALIKE = 0.05  # deviations that differ by less are no reason to prefer one delay to another
+_BETTER = 4.0  # standard errors by which more than half of the windows must have less of a deviation then
+_ALIAS = 0.1  # deviations that differ by less say nothing of which delay it is
 _UNITS = {
     "velocity": {
         -1.0: "of opposite sign",
@@ -47,6 +52,9 @@ class _Windows:
 
     def of(self, integral: np.ndarray) -> np.ndarray:
         return integral[self.last] - integral[self.first]
+
+    def at(self, some: np.ndarray) -> _Windows:
+        return _Windows(self.first[some], self.last[some], self.change[some])
 
 
 def check_agreement(
@@ -88,13 +96,14 @@ def check_agreement(
     integral[1:] = np.cumsum((rate[1:] + rate[:-1]) / 2.0 * np.diff(time)[:, np.newaxis], axis=0)
     if not (np.isfinite(integral).all() and np.isfinite(np.ptp(position, axis=0)).all()):
         return  # numbers that overflow are told where they are filtered
-    floor = max(2.0 * slowest if what == "velocity" else 0.0, _SLOWEST[what])
-    causes, steps = {}, [_resolution(column) for column in rate.T]
-    rounding = min((step for step in steps if step > 0.0), default=0.0)
+    floor = max(2.0 * slowest if what == "velocity" else 0.0, _SLOWEST[what], _SLOW * _usual(time, position, pieces))
+    resolutions = [_resolution(column) for column in rate.T]
+    finest = min([one for one in resolutions if one > 0.0], default=0.0)
+    causes = {}
     for joint, name in enumerate(names):
-        # A joint so slow that the driver rounds it to 0 throughout shows what it rounds to in other joints only.
-        slow = max(floor, 0.0 if steps[joint] > 0.0 else 2.0 * rounding)
-        windows = _moving(time, position[:, joint], rate[:, joint], integral[:, joint], pieces, slow)
+        # Drivers round velocities. A column of zeros is rounded as the others are.
+        slow = max(floor, 2.0 * (resolutions[joint] or finest))
+        windows = _moving(time, position[:, joint], pieces, slow)
         cause = None if windows is None else _cause(windows, joint, time, rate, integral, pieces, names, what)
         if cause is None and wrapped is not None:
             cause = _differenced(time, position[:, joint], rate[:, joint], wrapped[:, joint])
@@ -109,48 +118,50 @@ def check_agreement(
         )
 
 
-def _moving(
-    time: np.ndarray,
-    position: np.ndarray,
-    rate: np.ndarray,
-    integral: np.ndarray,
-    pieces: Sequence[slice],
-    floor: float,
-) -> _Windows | None:
-    """The shortest windows in which enough motion is well above the noise; None if there are none.
+def _windows(
+    time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], length: int
+) -> tuple[_Windows, np.ndarray, float]:
+    """All windows of so many steps, their speeds, and how long the usual one is.
 
-    In half of them or more the integral moves too, if longer ones can have that: differences of a coarse position are 0
-    in most rows.
+    Stamps that come in bursts make short windows of time, not fast joints.
     """
-    step = float(np.median(np.diff(time)))
+    first = np.concatenate([np.arange(rows.start, rows.stop - length, length) for rows in pieces])
+    last = first + length
+    lasting = time[last] - time[first]
+    usual = float(np.mean(lasting)) if len(first) else 0.0
+    change = position[last] - position[first]
+    return _Windows(first, last, change), np.abs(change) / np.maximum(lasting, usual), usual
+
+
+def _usual(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> float:
+    """Of the speeds that joints reach, the median over those that move."""
+    reached = []
+    for column in position.T:
+        _, speed, _ = _windows(time, column, pieces, _SHORTEST)
+        if speed.any():
+            reached.append(np.quantile(_some(speed), 0.95))
+    return float(np.median(reached)) if reached else 0.0
+
+
+def _some(values: np.ndarray) -> np.ndarray:
+    """At most as many as are needed, in their order; at random, as stamps may repeat a pattern."""
+    if len(values) <= _MOST:
+        return values
+    return values[np.sort(np.random.default_rng(0).choice(len(values), _MOST, replace=False))]
+
+
+def _moving(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], slow: float) -> _Windows | None:
+    """The shortest windows in which enough motion is well above the noise; None if there are none."""
     noise = _noise(time, position, pieces)
-    length, found = _SHORTEST, None
+    length = _SHORTEST
     while True:
-        ends = [_windows(time[rows], rows.start, length) for rows in pieces]
-        first, last = (np.concatenate(each) for each in zip(*ends, strict=True))
-        change = position[last] - position[first]
-        speed = np.abs(change) / (time[last] - time[first])
-        # A velocity in coarse units is 0 in slow motion.
-        coarse = min(2.0 * _resolution(rate), 0.5 * np.quantile(speed, 0.9)) if len(speed) else 0.0
-        moves = (np.abs(change) > _NOISES * noise) & (speed > max(floor, coarse))
+        windows, speed, usual = _windows(time, position, pieces, length)
+        moves = (np.abs(windows.change) > _NOISES * noise) & (speed > slow)
         if moves.sum() >= _FEWEST:
-            found = _Windows(first[moves], last[moves], change[moves])
-            if np.median(np.abs(found.of(integral))) > 0.0 or not rate.any():
-                return found
+            return windows.at(_some(np.flatnonzero(moves)))
         length *= 2
-        if length * step > _LONGEST:
-            return found
-
-
-def _windows(time: np.ndarray, start: int, length: int) -> tuple[np.ndarray, np.ndarray]:
-    """First and last rows of windows of so many steps, and of nearly as many mean ones: stamps may come in bursts."""
-    first = np.arange(0, max(0, len(time) - length), length)
-    if not len(first):
-        return first, first
-    least = time[first] + (length - 0.5) * (time[-1] - time[0]) / (len(time) - 1)
-    last = np.maximum(first + length, np.searchsorted(time, least))
-    inside = last < len(time)
-    return start + first[inside], start + last[inside]
+        if 2.0 * usual > _LONGEST or not len(speed):
+            return None
 
 
 def _resolution(values: np.ndarray) -> float:
@@ -176,8 +187,49 @@ def _slope(change: np.ndarray, other: np.ndarray) -> tuple[float, float]:
     order = np.argsort(ratio)
     middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
     slope = float(ratio[order][min(middle, len(ratio) - 1)])
-    scale = 1.4826 * np.median(np.abs(other - slope * change))
+    # Of the mean deviation, not the median one: most windows of a velocity in spikes hold none.
+    scale = 1.2533 * np.mean(np.abs(other - slope * change))
     return slope, float(1.2533 * scale / np.sqrt((change**2).sum()))
+
+
+def _mean_slope(change: np.ndarray, other: np.ndarray) -> tuple[float, float]:
+    """The same by least squares.
+
+    They see the mean where few rows hold all of a velocity: it was differenced at a higher rate, or stamps of time come
+    in bursts.
+    """
+    slope = float(change @ other / (change @ change))
+    return slope, float(np.sqrt(np.mean((other - slope * change) ** 2) / (change @ change)))
+
+
+def _agrees(change: np.ndarray, other: np.ndarray, factor: float) -> bool:
+    """Whether one of the slopes is near 1, or both are uncertain."""
+    slopes = [_slope(change, other), _mean_slope(change, other)]
+    return any(1.0 / factor <= slope <= factor for slope, _ in slopes) or all(
+        abs(slope - 1.0) <= _ERRORS * error for slope, error in slopes
+    )
+
+
+def _contradicting(change: np.ndarray, other: np.ndarray, what: str) -> tuple[str, np.ndarray] | None:
+    """The windows whose slope is another one, and where these are; None if there are none."""
+    everything, rises = np.arange(len(change)), change > 0.0
+    if not _agrees(change, other, _AGREES):
+        return "", everything
+    parts = {
+        " in the first half": everything[: len(change) // 2],
+        " in the second half": everything[len(change) // 2 :],
+    }
+    if what == "velocity":  # accelerometers measure gravity, too
+        parts |= {" where the position rises": everything[rises], " where the position falls": everything[~rises]}
+    least = _PART * np.abs(change).sum()
+    for where, some in parts.items():
+        if (
+            len(some) >= _FEWEST
+            and np.abs(change[some]).sum() >= least
+            and not _agrees(change[some], other[some], _AGREES_IN_PART)
+        ):
+            return where, some
+    return None
 
 
 def _deviation(change: np.ndarray, other: np.ndarray, slope: float = 1.0) -> float:
@@ -197,27 +249,29 @@ def _cause(
 ) -> str | None:
     """What a contradicting signal seems to be; None if it agrees."""
     change, other = windows.change, windows.of(integral[:, joint])
-    # The median of what it deviates does not show it where the joint mostly moves one way.
-    if unsigned := _unsigned(change, other):
-        return unsigned
-    fastest = np.abs(change / (time[windows.last] - time[windows.first])).max()
-    slope, error = _slope(change, other)
-    plain = _deviation(change, other)
-    if _AGREES[0] <= slope <= _AGREES[1] or abs(slope - 1.0) <= _ERRORS * error:
+    if cause := _unsigned(change, other):
+        return cause
+    plain, found = _deviation(change, other), _contradicting(change, other, what)
+    lasting = time[windows.last] - time[windows.first]
+    if found is None:
         if plain <= 0.2:
             return None
-        return _late(windows, joint, time, integral, pieces, 0.5 * plain)
+        offset = _offset(change, other, lasting, 0.5 * plain) if what == "velocity" else None
+        return offset or _late(windows, joint, time, integral, pieces, 0.5 * plain)
     if np.ptp(rate[:, joint]) == 0.0:
         return (
-            f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as {fastest:.3g}; the driver may "
-            "never fill it"
+            f"it is {rate[0, joint] + 0.0:g} in all rows, and the motion is as fast as "
+            f"{np.abs(change / lasting).max():.3g}; the driver may never fill it"
         )
-    if slope != 0.0 and _deviation(change, other, slope) <= _FITS:
+    where, some = found
+    slope, _ = _slope(change[some], other[some])
+    if not where and slope != 0.0 and _deviation(change, other, slope) <= _FITS:
         return _scale(slope, what)
     return (
         _other_column(windows, joint, integral, names)
+        or _offset(change, other, lasting, 0.5 * plain)
         or _late(windows, joint, time, integral, pieces, _FITS)
-        or f"it does not follow the motion (slope {slope:.2g} instead of 1)"
+        or f"it does not follow the motion{where} (slope {slope + 0.0:.2g} instead of 1)"
     )
 
 
@@ -244,48 +298,61 @@ def _other_column(windows: _Windows, joint: int, integral: np.ndarray, names: Se
 
 
 def _unsigned(change: np.ndarray, other: np.ndarray) -> str | None:
-    back = np.abs(change[change < 0.0]).sum() / np.abs(change).sum()
-    if (
-        not 0.1 <= back <= 0.9
-        or (other * np.sign(other.sum()) < 0.0).any()
-        or _deviation(np.abs(change), other) > _FITS
-    ):
+    falls, other = change < 0.0, other if other.sum() >= 0.0 else -other
+    back = np.abs(change[falls]).sum() / np.abs(change).sum()
+    if not 0.1 <= back <= 0.9 or (other < 0.0).any():
+        return None
+    # The median of all does not show how it deviates where the joint mostly moves one way.
+    if any(_deviation(np.abs(change[some]), other[some]) > _FITS for some in (falls, ~falls)):
         return None
     return "it is a speed without sign"
+
+
+def _offset(change: np.ndarray, other: np.ndarray, lasting: np.ndarray, enough: float) -> str | None:
+    """A constant without which the deviation falls below ``enough``."""
+    apart = (other - change) / lasting
+    offset = float(np.median(apart))
+    error = 1.2533**2 * np.mean(np.abs(apart - offset)) / np.sqrt(len(apart))
+    if abs(offset) <= _ERRORS * error or _deviation(change, other - offset * lasting) >= enough:
+        return None
+    return f"it is {abs(offset):.2g} too {'high' if offset > 0.0 else 'low'} in all rows"
 
 
 def _late(
     windows: _Windows, joint: int, time: np.ndarray, integral: np.ndarray, pieces: Sequence[slice], enough: float
 ) -> str | None:
-    """A delay with which the deviation falls below ``enough``."""
+    """A delay with which the deviation falls below ``enough``, in most windows."""
     column = integral[:, joint]
     ends = np.concatenate([np.full(rows.stop - rows.start, time[rows.stop - 1]) for rows in pieces])
     starts = np.concatenate([np.full(rows.stop - rows.start, time[rows.start]) for rows in pieces])
+    # The same windows for all delays.
+    windows = windows.at(
+        (time[windows.first] - _LATEST >= starts[windows.first]) & (time[windows.last] + _LATEST <= ends[windows.first])
+    )
+    if len(windows.change) < _FEWEST:
+        return None
     step = float(np.median(np.diff(time)))
     delays = np.linspace(-_LATEST, _LATEST, 101)
-
-    def moved(delay: float) -> tuple[np.ndarray, np.ndarray]:
-        first, last = time[windows.first] + delay, time[windows.last] + delay
-        inside = (first >= starts[windows.first]) & (last <= ends[windows.first])
-        return inside, np.interp(last[inside], time, column) - np.interp(first[inside], time, column)
-
-    found = []
-    for delay in delays:
-        inside, other = moved(delay)
-        enough_windows = len(other) >= _FEWEST
-        found.append(_deviation(windows.change[inside], other) if enough_windows else np.inf)
-    # Periodic motion fits at whole periods, too: the shortest of the delays that fit about as well as the best.
-    padded = np.pad(found, 1, constant_values=np.inf)
-    lowest = (padded[1:-1] <= padded[:-2]) & (padded[1:-1] <= padded[2:]) & (padded[1:-1] <= min(found) + _ALIKE)
-    best = min(np.flatnonzero(lowest).tolist(), key=lambda index: abs(delays[index]))
+    missed = np.abs(
+        [
+            np.interp(time[windows.last] + delay, time, column)
+            - np.interp(time[windows.first] + delay, time, column)
+            - windows.change
+            for delay in delays
+        ]
+    )  # (n_delays, n_windows)
+    found = np.median(missed, axis=1) / np.median(np.abs(windows.change))
+    # Of a periodic motion several delays explain as much: the shortest.
+    lowest = (found <= np.r_[np.inf, found[:-1]]) & (found <= np.r_[found[1:], np.inf])
+    lowest &= found <= found.min() + _ALIAS
+    best = min(np.flatnonzero(lowest).tolist(), key=lambda one: abs(delays[one]))
     delay = float(delays[best])
-    if found[best] >= enough or abs(delay) < max(_LATE, 2.0 * step):
-        return None
-    # Of so many delays one fits by chance: it has to fit better than none in clearly more than half of the windows.
-    inside, other = moved(delay)
-    now = windows.of(column)[inside]
-    better = np.abs(windows.change[inside] - other) < np.abs(windows.change[inside] - now)
-    if better.mean() < 0.5 + _CHANCE / np.sqrt(len(better)):
+    better = np.mean(missed[best] < missed[len(delays) // 2])
+    if (
+        found[best] >= enough
+        or abs(delay) < max(_LATE, 2.0 * step)
+        or better <= 0.5 + 0.5 * _BETTER / np.sqrt(len(windows.change))
+    ):
         return None
     return f"it is {abs(delay):.2g} s {'late' if delay > 0.0 else 'early'}"
 

@@ -62,8 +62,16 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
         if field in ignored:
             rows = [(*row[:column], (), *row[column + 1 :]) for row in rows]
     names = _joints([row[0] for row in rows], joints)
-    mine = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
-    refused = {at: told for at, index in enumerate(mine) if (told := _twice(rows[index][0], names))}
+    whole = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
+    told = [_twice(row[0], names) for row in rows]
+    mine = sorted({*whole, *(index for index, why in enumerate(told) if why)})
+    passed = [
+        index
+        for index in (*range(mine[0]), *range(mine[-1] + 1, len(rows)))
+        if not rows[index][0] or set(names) & set(rows[index][0])
+    ]
+    other = "" if joints is not None else "; say by joints which you mean, if you do not need it"
+    refused = {at: told[index] + other for at, index in enumerate(mine) if told[index]}
     problems: dict[int, str] = {}
     position, velocity, acceleration, effort = (
         _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed, problems)
@@ -77,7 +85,7 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
     # The difference first: nanoseconds since 1970 have more digits than a float.
     time = (times - times[0]) * _NANO
     signals = Signals(time, position, velocity, acceleration, effort)
-    return Recording(signals, names, float(times[0] * _NANO), problems, refused)
+    return Recording(signals, names, float(times[0] * _NANO), problems, refused, len(passed))
 
 
 def _twice(names: list[str], wanted: list[str]) -> str:
@@ -134,12 +142,17 @@ def _topic(topics: dict[str, str], topic: str | None) -> str:
 def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
     """Whose signals are taken: all messages that have all of them count, those of other robots or hands do not."""
     if joints is None:
-        # A driver's first messages may name no joint.
-        sets = [names for names in sets if names] or sets
-        differing = {tuple(sorted(names)) for names in sets}
-        if len(differing) > 1:
+        # A driver's first and last messages may name few joints, or none.
+        most = max(sets, key=lambda names: len(set(names)))
+        whole = [index for index, names in enumerate(sets) if set(names) == set(most)]
+        differing = {
+            tuple(sorted(names))
+            for index, names in enumerate(sets)
+            if not set(names) <= set(most) or (whole[0] < index < whole[-1] and names and not _twice(names, most))
+        } | {tuple(sorted(most))}
+        if len({frozenset(names) for names in differing}) > 1:
             raise ValueError(f"messages are of different joints, say by joints which you mean: {sorted(differing)}.")
-        return list(sets[0])
+        return list(dict.fromkeys(most))
     if not any(set(joints) <= set(names) for names in sets):
         known = sorted({name for names in sets for name in names})
         raise ValueError(f"no message has all of joints={list(joints)}; they have {known}.")
@@ -156,7 +169,7 @@ def _signal(
         return None
     found = np.full((len(rows), len(joints)), np.nan)
     for row, (names, values) in enumerate(rows):
-        if len(values) == len(names):
+        if len(values) == len(names) and set(joints) <= set(names):
             found[row] = [values[names.index(joint)] for joint in joints]
         else:
             problems.setdefault(row, f"the message has {len(values)} values of {title} for {len(names)} names")

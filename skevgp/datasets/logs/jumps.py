@@ -33,6 +33,7 @@ _LONELY = 8.0  # ... and so many times what its neighbours deviate in its direct
 _COUNTS = 50.0  # ... and so many times the resolution of the positions
 _SMOOTH = 0.125  # of a period: 95 % of steps are predicted better than that where an angle is sampled well
 _STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is no jump
+_RANGE = 0.9  # of the positions: where it is more than a turn they may be in degrees or mm, and steps are larger
 _SPIKE = 3  # rows that are away and come back, at most
 _MOST = 0.02  # of the steps in which it moves: a joint with more lone steps is one that moves in steps
 _BINS = 16  # of the positions' range: an angle that several turns lead away from and back was in more than half of them
@@ -280,7 +281,7 @@ class _Steps:
             return np.where(loose, turns, 0.0)
         # A turn that was lost, at any place: only where it stands among slow steps.
         alone = self._share(turns == 0.0) >= 0.5
-        others = whole & ~loose
+        others = whole & ~(loose & alone)
         for before, after in self.lone(self.resolution):
             others[before:after] = False
         fastest = (np.abs(self.d) / self.lasting)[others].max(initial=0.0)
@@ -316,7 +317,10 @@ class _Steps:
         error = self.d - middle * self.steps
         size = np.abs(error)
         limit = np.maximum(_LONELY * deviation * self.lasting, _COUNTS * resolution)
-        lone = self.whole & np.isfinite(size) & (size > limit) & (4.0 * size > _STRONGEST * self.lasting**2)
+        lone = self.whole & np.isfinite(size) & (size > limit)
+        if lone.any():
+            low, high = np.quantile(self.position, [0.5 - _RANGE / 2.0, 0.5 + _RANGE / 2.0])
+            lone &= 4.0 * size > _STRONGEST * max(1.0, (high - low) / RADIANS) * self.lasting**2
         speed = np.abs(self.d) / self.lasting
         while lone.any():
             rest = speed[self.whole & ~lone].max(initial=0.0)

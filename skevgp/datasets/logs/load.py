@@ -377,7 +377,7 @@ def _recording(
     factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
     if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
         raise ValueError(f"gains must be a finite number, or one for each of the {n_joints} joints; got {gains!r}.")
-    raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap)
+    raw, step, gap = in_order(replace(kept, torque=kept.torque * factor), how.max_gap, read.joint_names)
     with np.errstate(all="ignore"):
         found = find_jumps(raw.time, raw.position, step, gap, wrap, kinds)
         raw = replace(raw, position=found.position)
@@ -390,7 +390,7 @@ def _recording(
         filename=str(file),
         start=read.start,
         n_repeated=len(kept.time) - len(raw.time),
-        n_incomplete=n_incomplete,
+        n_incomplete=n_incomplete + read.n_passed,
         raw=Bunch(**vars(raw)),
         processed=Bunch(**vars(done.signals), why=done.why),
         cuts=done.cuts,

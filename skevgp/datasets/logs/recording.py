@@ -45,6 +45,7 @@ class Recording:
     # Of rows by number: what they lack, where a NaN does not say enough, and what no ``keep`` but theirs makes good.
     problems: Mapping[int, str] = field(default_factory=dict)
     refused: Mapping[int, str] = field(default_factory=dict)
+    n_passed: int = 0  # messages at the beginning and end that do not name all joints
 
 
 def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
@@ -73,12 +74,13 @@ def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
         if row in read.refused:
             raise ValueError(f"row {row} {read.refused[row]}.")
     kept = read.signals.at(rows)
+    fine = np.array([int(row) not in read.problems for row in rows])
     lacks: list[tuple[str, np.ndarray]] = []  # of each signal (n, n_joints)
     for name, signal in vars(kept).items():
         if signal is not None:
             lack = np.isnan(signal.reshape(len(rows), -1))
-            if name in ("velocity", "acceleration") and int(rows[0]) not in read.problems:
-                lack &= ~lack.all(axis=0)
+            if name in ("velocity", "acceleration") and fine.any():
+                lack[fine] &= ~lack[fine].all(axis=0)
             lacks.append((name, lack))
     incomplete = np.any([lack.any(axis=1) for _, lack in lacks], axis=0)
     whole = np.flatnonzero(~incomplete)

@@ -62,7 +62,7 @@ class Processed:
     cuts: list[Cut]  # first and last second, and why
 
 
-def in_order(raw: Signals, max_gap: float | None) -> tuple[Signals, float, float]:
+def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple[Signals, float, float]:
     """Rows by their times, one for each, with the median step and what is taken for a gap.
 
     Rows that come late by less than a gap are put where they belong (messages overtake each other); a clock that goes
@@ -70,11 +70,15 @@ def in_order(raw: Signals, max_gap: float | None) -> tuple[Signals, float, float
     """
     for name, signal in vars(raw).items():
         if signal is not None and not np.isfinite(signal).all():
-            spoilt = ~np.isfinite(signal.reshape(len(signal), -1)).all(axis=1)
+            spoilt = ~np.isfinite(signal.reshape(len(signal), -1))
             hint = f' Pass {name}="derive" to ignore it.' if name in ("velocity", "acceleration") else ""
-            if spoilt.all():
-                raise ValueError(f"the {name} is not finite in any row kept: the driver may never fill it.{hint}")
-            raise ValueError(f"the {name} of row {np.flatnonzero(spoilt)[0]} of those kept is not finite.{hint}")
+            never = spoilt.all(axis=0)
+            if never.any():
+                joint = "" if never.all() else f" of joint {names[int(np.argmax(never))]!r}"
+                why = "the driver may never fill it"
+                raise ValueError(f"the {name}{joint} is not finite in any row kept: {why}.{hint}")
+            row = np.flatnonzero(spoilt.any(axis=1))[0]
+            raise ValueError(f"the {name} of row {row} of those kept is not finite.{hint}")
     order = np.argsort(raw.time, kind="stable")
     steps = np.diff(raw.time[order])
     if not (steps > 0.0).any():

@@ -194,6 +194,14 @@ class _Layout:
 def _layout(text: Any, columns: Mapping[str, list[int | str]], decimal: str) -> tuple[_Layout, Iterator[str]]:
     """How a table is written, and its rows."""
     comments, first, lines = _beginning(text)
+    while (second := next(lines, None)) is not None:
+        delimiter = _delimiter(second, decimal)
+        cells = _cells(first, delimiter)
+        if len(cells) >= len(_cells(second, delimiter)) or all(_is_number(cell) for cell in cells):
+            lines = chain([second], lines)
+            break
+        comments.append(first)  # a title
+        first = second
     delimiter = _delimiter(first, decimal)
     cells = _cells(first, delimiter)
     numeric = all(_is_number(cell) for cell in cells)

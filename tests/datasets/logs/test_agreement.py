@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from skevgp.datasets import load_log
+from skevgp.datasets.logs.agreement import check_agreement
 
 T = np.arange(0.0, 20.0, 0.01)
 Q = np.column_stack([np.sin(T) + 0.3 * np.sin(2.7 * T), np.cos(1.4 * T) - 0.2 * np.sin(3.1 * T)])
@@ -37,6 +38,9 @@ def late(seconds):
         (DQ[:, ::-1], "Joint 'q1': the column of 'q2' fits it"),
         (np.abs(DQ), "speed without sign"),
         (late(0.2), "0.2 s late"),
+        (DQ + [0.5, 0.0], "Joint 'q1': it is 0.5 too high in all rows"),
+        (np.where(T[:, np.newaxis] < 9.0, 0.0, DQ), "does not follow the motion in the first half .slope 0 instead"),
+        (np.where(DQ < 0.0, 0.0, DQ), "does not follow the motion where the position falls"),
     ],
 )
 def test_a_contradiction_names_joint_and_cause(load, dq, cause):
@@ -114,6 +118,53 @@ def test_a_speed_without_sign_is_found_where_the_joint_mostly_moves_one_way(load
     dq = np.column_stack([np.abs(0.8 + np.cos(T) + 1.15 * np.cos(2.3 * T)), np.cos(T)])
     with pytest.raises(ValueError, match="Joint 'q1': it is a speed without sign"):
         load(q, dq)
+
+
+@pytest.mark.parametrize("rate", [10, 20])
+@pytest.mark.parametrize("seed", range(20))
+def test_noise_in_logs_of_few_rows_is_no_delay(seed, rate):
+    rng = np.random.default_rng(seed)
+    t = np.arange(0.0, rng.uniform(3.0, 12.0), 1.0 / rate)
+    speed, phase = rng.uniform(0.3, 4.0), rng.uniform(0.0, 6.0)
+    dq = speed * np.cos(speed * t + phase) + speed * rng.standard_normal(len(t))
+    check_agreement(t, np.sin(speed * t + phase)[:, None], dq[:, None], [slice(0, len(t))], ["q1"])
+
+
+@pytest.mark.parametrize("counts", [2048, 3600, 4096])
+@pytest.mark.parametrize("rows", [10, 20], ids=["100 Hz", "50 Hz"])
+@pytest.mark.parametrize("speed", [0.1, 0.3, 1.0])
+def test_differences_of_any_coarse_encoder_agree(counts, rows, speed):
+    fine = np.arange(0.0, 30.0, 0.001)
+    count = 2.0 * np.pi / counts
+    q = np.round(np.sin(speed * fine) / count) * count
+    dq = np.diff(q, prepend=q[0]) / 0.001
+    some = slice(None, None, rows)
+    check_agreement(
+        fine[some], q[some, np.newaxis], dq[some, np.newaxis], [slice(0, len(fine) // rows)], ["q1"], slowest=0.01
+    )
+
+
+@pytest.mark.parametrize("frequency", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("burst", [5, 10, 20])
+def test_stamps_in_bursts_are_no_delay(burst, frequency):
+    phase = 2.0 * np.pi * frequency * T
+    stamps = np.arange(len(T)) // burst * burst * 0.01 + np.arange(len(T)) % burst * 2e-4
+    dq = 2.0 * np.pi * frequency * np.cos(phase)
+    check_agreement(stamps, np.sin(phase)[:, None], dq[:, None], [slice(0, len(T))], ["q1"])
+
+
+def test_a_velocity_that_is_0_below_a_threshold_agrees_where_the_joint_creeps(load):
+    """Drivers have a threshold in units of the motor, so that it may be any number."""
+    q = np.column_stack([40.0 * np.sin(T), 10.0 + 0.3 * T])
+    dq = np.column_stack([40.0 * np.cos(T), np.full(len(T), 0.3)])
+    load(q, np.where(np.abs(dq) < 0.5, 0.0, dq))
+
+
+def test_an_accelerometer_that_measures_gravity_too_is_no_contradiction(tmp_path):
+    file = tmp_path / "log.csv"
+    np.savetxt(file, np.column_stack([T, np.sin(T), np.cos(T), 0.5 - np.sin(T), T]), delimiter=",")
+    log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "acceleration": 3, "effort": 4})
+    assert np.abs(log.data[:, 2] - 0.5 + log.data[:, 0]).max() < 0.01
 
 
 def test_a_noisy_velocity_of_few_rows_is_not_late(tmp_path):

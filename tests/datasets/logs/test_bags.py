@@ -304,11 +304,15 @@ def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_
 
 def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
     file = write(tmp_path / "one", spoilt_states([4], name=["a", "a"]))
-    with pytest.raises(ValueError, match="messages are of different joints"):
+    with pytest.raises(ValueError, match="row 4 names the joint 'a' twice, so that its values are not known; say by"):
         load_log(file)
+    assert load_log(file, keep=slice(5, None)).joint_names == ["a", "b"]
     every = write(tmp_path / "every", spoilt_states(range(len(T)), name=["a", "a"]))
     with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
         load_log(every)
+    first = write(tmp_path / "first", spoilt_states([0, 1], name=["a", "a"]))
+    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
+        load_log(first)
 
 
 def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
@@ -320,7 +324,28 @@ def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
         load_log(file, joints=["finger"])
 
 
-def test_first_messages_without_names_are_left_out(tmp_path):
-    empty: dict = {"position": [], "velocity": [], "effort": []}
-    file = write(tmp_path / "bag", spoilt_states([0, 1, 2], name=[], **empty))
-    assert_allclose(load_log(file).recordings[0].raw.position, motion(T[3:])[0], rtol=1e-15)
+@pytest.mark.parametrize("joints", [None, ["a", "b"]], ids=["all joints", "chosen joints"])
+@pytest.mark.parametrize("names", [[], ["a"]], ids=["no name", "one name"])
+def test_messages_at_the_ends_that_name_few_joints_are_left_out_and_counted(tmp_path, names, joints):
+    values = [1.0] * len(names)
+    fields = {"name": names, "position": values, "velocity": values, "effort": values}
+    file = write(tmp_path / "bag", spoilt_states([0, 1, 2, len(T) - 1], **fields))
+    recording = load_log(file, joints=joints).recordings[0]
+    assert recording.n_incomplete == 4
+    assert_allclose(recording.raw.position, motion(T[3:-1])[0], rtol=1e-15)
+
+
+def test_a_message_that_names_few_joints_between_others_is_an_error(tmp_path):
+    fields = {"name": ["a"], "position": [1.0], "velocity": [1.0], "effort": [1.0]}
+    with pytest.raises(ValueError, match=r"messages are of different joints, .*: \[\('a',\), \('a', 'b'\)\]"):
+        load_log(write(tmp_path / "bag", spoilt_states([7], **fields)))
+
+
+@pytest.mark.parametrize("first", [range(0), range(3)], ids=["in all messages", "after messages without velocity"])
+def test_a_velocity_that_one_joint_never_has_is_told_with_its_name(tmp_path, first):
+    topics = spoilt_states(first, velocity=[])
+    for row, (_, message) in enumerate(topics["/joint_states"][1]):
+        if row not in first:
+            message.velocity = np.array([message.velocity[0], np.nan])
+    with pytest.raises(ValueError, match="the velocity of joint 'b' is not finite in any row kept: the driver may nev"):
+        load_log(write(tmp_path / "bag", topics))

@@ -140,3 +140,20 @@ def test_a_joint_whose_samples_are_held_does_not_cut_the_record(load):
     held = moved[np.arange(len(T)) // 10 * 10]
     log = load(held)
     assert [cut for cut in log.recordings[0].cuts if cut[2] == "jump"] == []
+
+
+def test_a_wheel_that_starts_and_stops_fast_turns_as_recorded(load):
+    """At 10 Hz its steps are nearly a turn."""
+    t = T[::10]
+    q = 60.0 * np.clip(t - 5.0, 0.0, 8.0)
+    log = load(q, t=t, dt=0.1, cutoff=2.0)
+    assert log.recordings[0].wrapped == {"q1": 0}
+    assert_array_equal(log.recordings[0].raw.position[:, 0], q)
+
+
+@pytest.mark.parametrize("unit", [1.0, 180.0 / np.pi, 1000.0], ids=["rad", "degrees", "mm"])
+def test_a_short_fast_move_is_no_jump_in_any_unit(load, unit):
+    """An impact: 0.01 rad between two rows, which a strong motor could do."""
+    q = 1.4 * np.cos(0.15 * T) + 0.01 * (T > 10.0)
+    log = load(unit * q)
+    assert [cut for cut in log.recordings[0].cuts if cut[2] == "jump"] == []

@@ -123,6 +123,8 @@ def test_nothing_leaks_across_a_gap(load):
     log = load(np.vstack([first, second]))
     other = second.copy()
     other[:, 1:] += 100.0
+    other[:, 4:6] = second[:, 4:6] + 20.0
+    other[:, 1:3] += 20.0 * second[:, :1]
     assert_array_equal(np.unique(log.pieces), [0, 1])
     assert not log.groups.any()
     (gap,) = [cut for cut in log.recordings[0].cuts if cut[2] == "gap"]

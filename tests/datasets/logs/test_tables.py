@@ -266,3 +266,11 @@ def test_commas_separate_whatever_follows_them(tmp_path, row):
     for header in ("", row.format("time", "q", "dq", "tau") + "\n", '"time","q [rad; link]","dq\t","tau"\n'):
         file.write_text(header + text)
         assert_array_equal(load_log(file, columns=columns).data, expected)
+
+
+@pytest.mark.parametrize("title", ["Recorded by robot 7 on Monday", "Robot 7, Monday", "sep=,"])
+def test_a_title_before_the_table_is_passed_over(tmp_path, expected, title):
+    body = write_table(tmp_path / "body.csv", TABLE).read_text()
+    file = tmp_path / "log.csv"
+    file.write_text(f"{title}\n{body}")
+    assert_equal(load_log(file, columns=BY_NAME), expected)
