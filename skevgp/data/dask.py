@@ -13,7 +13,7 @@ from sklearn.utils import check_array
 
 from ..utils.optional import require
 from ..utils.validation import as_floats, check_magnitude, is_dask
-from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks, sums_of
+from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks
 from .maps import EXAMPLE_ROWS, MappedRows, RowShapes, fit_map, fresh_map, spread
 from .rows import LocalSource, RawRows, made
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
@@ -218,7 +218,7 @@ class DaskBlocks:
 
     @cached_property
     def linear(self) -> LinearSums:
-        return self.sum(sums_of)
+        return self.sum(LinearSums.of_block)
 
     def sum(self, function: Callable[[Any], Any]) -> Any:
         return _sum_over(self._partitions, function)

@@ -293,8 +293,7 @@ class Model:
 
     def _left_over(self, trace: np.ndarray) -> np.ndarray:
         """The noise variances (o,) that the features leave over, which may be nothing, and a trace of f's prior."""
-        sums = self.blocks.linear
-        squares = [float(sums.of(slice(o, o + 1)).RR[0]) for o in range(len(trace))]
+        squares = self.blocks.linear.RR
         return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE * self.rows.mean_precision)
 
     def _best_alone(self, trace: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
@@ -304,7 +303,7 @@ class Model:
         if self.max_iter > 0 and hidden:
             lowest, highest = self.table["noise"].value_limits().T
             # Directions that the rows do not see have a precision of 1, beside which their features are large.
-            sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1)).HH) for o, scale in enumerate(prior.scale)]
+            sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1))[0]) for o, scale in enumerate(prior.scale)]
             unseen = [np.sort(own)[: max(len(own) - sums.length, 0)].sum() for own in sizes]
             least = np.maximum(lowest, _ROUNDING * np.array(unseen))
         return noise_of_most_evidence(

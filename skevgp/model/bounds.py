@@ -392,9 +392,8 @@ def bounds_alone(sums: LinearSums, prior: CoefficientPrior, noise: np.ndarray, t
     VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
     for index, (variance, left) in enumerate(zip(noise, trace, strict=True)):
         output = slice(index, index + 1)
-        own = sums.of(output)
-        products = VV, VH, VR, own.HH, own.HR, own.RR
-        statistics = SufficientStatistics(own.n_rows, *products, float(left), own.log_variance, own.surplus)
+        products = VV, VH, VR, *sums.of(output)
+        statistics = SufficientStatistics(sums.n_rows, *products, float(left), sums.log_variance, sums.surplus)
         whitening = Whitening(None, VV, VV)
         groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), prior.outputs(output)))
     return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full")])

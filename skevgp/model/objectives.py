@@ -141,8 +141,7 @@ class ElboObjective:
         else:
             self.family = FullFamily(optima) if model.family == "full" else DiagonalFamily(optima, factors)
         # A step of w should move the prediction as much as a step of v does.
-        of_features = blocks.linear.of(slice(0, len(model.prior.scale)))
-        reach = model.prior.scale * np.sqrt(np.diagonal(of_features.HH) / self.n_rows)
+        reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH[0]) / self.n_rows)
         m = start["inducing_points"].shape[1]
         unit = np.hstack([np.ones((len(reach), m)), 1.0 / np.where(reach > 0.0, reach, 1.0)])
         self.table = ParameterTable([*table.parameters, *self.family.parameters(unit)])

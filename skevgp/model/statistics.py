@@ -180,7 +180,7 @@ class SufficientStatistics:
     unexplained : float
         The sum over rows of k(x, x) - |v|², each clipped at 0.
     log_variance, surplus : float
-        As of `LinearStatistics`.
+        As of `LinearSums`.
     """
 
     n_rows: float
@@ -336,20 +336,21 @@ def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientS
     -------
     statistics : SufficientStatistics
     """
-    linear = blocks.linear.of(outputs)
+    sums = blocks.linear
+    HH, HR, RR = sums.of(outputs)
     VV, VL, unexplained = blocks.sum(_FirstPass(whitening, outputs))
-    p = len(linear.HH)
+    p = len(HH)
     return SufficientStatistics(
-        linear.n_rows,
+        sums.n_rows,
         VV,
         VL[:, :p],
         VL[:, p:],
-        linear.HH,
-        linear.HR,
-        linear.RR,
+        HH,
+        HR,
+        RR,
         float(unexplained),
-        linear.log_variance,
-        linear.surplus,
+        sums.log_variance,
+        sums.surplus,
     )
 
 

@@ -8,7 +8,7 @@ import sys
 import numpy as np
 import pytest
 
-from skevgp.data.blocks import CACHE_BYTES, KEEP_BYTES, Batch, Block, LinearStatistics, LocalBlocks, block_rows
+from skevgp.data.blocks import CACHE_BYTES, KEEP_BYTES, Batch, Block, LinearSums, LocalBlocks, block_rows
 from skevgp.data.threads import BlockMap
 
 RNG = np.random.RandomState(0)
@@ -49,15 +49,15 @@ def test_the_linear_part_of_all_outputs_is_no_copy(outputs):
 
 
 def test_the_sums_that_depend_on_no_parameter():
-    sums = LinearStatistics.of_block(block())
+    sums = LinearSums.of_block(block())
     assert sums.n_rows == 50
-    for found, expected in [(sums.HH, H.T @ H), (sums.HR, H.T @ R), (sums.RR, np.sum(R**2, axis=0))]:
+    for found, expected in [(sums.HH[0], H.T @ H), (sums.HR, H.T @ R), (sums.RR, np.sum(R**2, axis=0))]:
         np.testing.assert_allclose(found, expected, rtol=1e-12)
 
 
 def test_they_add():
-    total = LinearStatistics.of_block(block())
-    sums = LinearStatistics.of_block(block(slice(20))) + LinearStatistics.of_block(block(slice(20, 50)))
+    total = LinearSums.of_block(block())
+    sums = LinearSums.of_block(block(slice(20))) + LinearSums.of_block(block(slice(20, 50)))
     for name, expected in vars(total).items():
         np.testing.assert_allclose(getattr(sums, name), expected, rtol=1e-12)
 
@@ -66,7 +66,7 @@ def test_a_batch_stands_for_itself():
     batch = Batch(block())
     assert batch.sum(lambda own: own) is batch.block
     assert batch.block.may_keep
-    np.testing.assert_array_equal(batch.linear.HH, LinearStatistics.of_block(block()).HH)
+    np.testing.assert_array_equal(batch.linear.HH, LinearSums.of_block(block()).HH)
 
 
 @pytest.mark.parametrize("n_inducing", [0, 1, 10, 100, 1000, 10**6])
@@ -87,7 +87,7 @@ def test_blocks_cover_all_rows_once(n_inducing):
 
 @pytest.mark.parametrize("size", [1, 7, 49, 50, 1000])
 def test_sums_are_over_all_rows(size):
-    found, expected = blocks(size=size).linear, LinearStatistics.of_block(block())
+    found, expected = blocks(size=size).linear, LinearSums.of_block(block())
     for name, value in vars(expected).items():
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-12)
 
@@ -103,7 +103,7 @@ def test_blocks_that_memory_allows_are_made_once():
     made = []
     own = blocks(made)
     for _ in range(3):
-        own.sum(LinearStatistics.of_block)
+        own.sum(LinearSums.of_block)
     assert sorted(made) == [(first, min(first + 7, 50)) for first in range(0, 50, 7)]
     assert own[0] is own[0]
 
@@ -112,9 +112,9 @@ def test_others_are_made_again_at_each_pass():
     made = []
     # Room for three blocks of 7 rows, whose numbers count twice: as prepared and as linear.
     own = blocks(made, share=3.5 * (2 * 8 * 7 * 5) / CACHE_BYTES)
-    whole = own.sum(LinearStatistics.of_block)
+    whole = own.sum(LinearSums.of_block)
     assert len(made) == 8
-    again = own.sum(LinearStatistics.of_block)
+    again = own.sum(LinearSums.of_block)
     assert made[8:] == [(21, 28), (28, 35), (35, 42), (42, 49), (49, 50)]
     np.testing.assert_array_equal(again.HH, whole.HH)
 

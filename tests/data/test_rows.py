@@ -76,7 +76,7 @@ def test_blocks_are_made_of_the_loaded_rows(source):
     for own, expected in [(source, H), (source.part(3, 90), H[3:90])]:
         sums = own.blocks(make, 10, BlockMap(), 1.0).linear
         assert sums.n_rows == len(expected)
-        np.testing.assert_allclose(sums.HH, expected.T @ expected, rtol=1e-12)
+        np.testing.assert_allclose(sums.HH[0], expected.T @ expected, rtol=1e-12)
 
 
 class Loads:
@@ -142,7 +142,7 @@ def test_some_outputs():
 def test_a_part_is_of_consecutive_rows_and_has_a_share_of_the_share():
     part = rows(share=0.5).part(20, 30, 0.1)
     assert (len(part), part.share) == (10, 0.05)
-    np.testing.assert_allclose(part.blocks(Identity(), 6).linear.HH, H[20:30].T @ H[20:30], rtol=1e-12)
+    np.testing.assert_allclose(part.blocks(Identity(), 6).linear.HH[0], H[20:30].T @ H[20:30], rtol=1e-12)
 
 
 def test_a_sample_is_all_rows_or_some_in_their_order():

@@ -14,9 +14,9 @@ from skevgp.fitting.calibration import (
     PREDICTED_ROWS,
     CrossValidation,
     LeftOut,
-    Limits,
-    Search,
     Seen,
+    Variance,
+    VarianceSearch,
     calibrated,
     folds_in_order,
     folds_of_groups,
@@ -24,6 +24,7 @@ from skevgp.fitting.calibration import (
     prior_of,
     random_folds,
     sums_of_others,
+    variances,
 )
 from skevgp.model.predictor import CoefficientPrior
 from skevgp.model.statistics import collect
@@ -357,7 +358,11 @@ def search_of(output, model, rows, table, values):
     groups = left_out(model, values, rows, [fold.rows for fold in folds])
     where = [(group, index) for group in groups for index in range(len(group[0].group.noise))]
     group, index = where[output]
-    return Search(output, index, group, [None] * 4, values, Limits.of(table, 1e4), 1e-6)
+    s_low, s_high = table["signal"].value_limits().T
+    low, high = table["noise"].value_limits().T
+    signals = variances(table["signal"], values["signal"], 1e-4 * s_low, 1e4 * s_high)
+    noises = variances(table["noise"], values["noise"], np.maximum(low, 1e-6), high)
+    return VarianceSearch(index, group, [None] * 4, signals[output], noises[output])
 
 
 def assert_best(search, signals=(0.5, 0.8, 1.0, 1.25, 2.0), noises=(0.5, 0.8, 1.0, 1.25, 2.0), slack=1e-4):
@@ -368,7 +373,7 @@ def assert_best(search, signals=(0.5, 0.8, 1.0, 1.25, 2.0), noises=(0.5, 0.8, 1.
         return search._losses(signal / noise, np.array([noise]))[0]
 
     for s2 in signal * np.array(signals):
-        for n2 in np.maximum(noise * np.array(noises), search.lowest):
+        for n2 in np.maximum(noise * np.array(noises), search.noise.low):
             assert loss(s2, n2) > loss(signal, noise) - slack
     return signal, noise
 
@@ -393,7 +398,7 @@ def test_what_is_fixed_is_left_and_the_other_is_best_for_it(which):
 def test_at_a_limit_of_the_signal_the_noise_is_best():
     search = search_of(0, *small())
     highest = 0.3 * search.best()[0]
-    search = replace(search, limits=replace(search.limits, signal=np.array([[1e-9, highest]] * 2)))
+    search = replace(search, signal=Variance(search.signal.at_bound, 1e-9, highest))
     assert assert_best(search, signals=(1.0,), slack=1e-3)[0] == pytest.approx(highest)
 
 
@@ -403,7 +408,8 @@ def test_the_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest,
     model, rows, table, values = small()
     table = table.with_fixed("signal") if fixed else table
     values = values if first is None else values | {"noise": np.full(2, first)}
-    search = replace(search_of(0, model, rows, table, values), lowest=lowest)
+    search = search_of(0, model, rows, table, values)
+    search = replace(search, noise=search.noise._replace(low=lowest))
     assert assert_best(search, signals=(1.0,), slack=1e-3)[1] >= lowest
 
 

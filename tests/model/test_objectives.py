@@ -63,7 +63,7 @@ def traced_loss(elbo, family, block, linear):
             log_dets.append(log_det)
         VV, VH, VR, unexplained = (anp.stack(part) for part in zip(*parts, strict=True))
         statistics = SufficientStatistics(
-            linear.n_rows, VV, VH, VR, linear.HH, linear.HR, linear.RR, unexplained, 0.0, 0.0
+            linear.n_rows, VV, VH, VR, linear.HH[0], linear.HR, linear.RR, unexplained, 0.0, 0.0
         ).scaled(n_rows / linear.n_rows)
         assert VV.shape == (o, m, m)
         return (
