@@ -1,4 +1,4 @@
-"""Fit the exact model: where it starts, from where else it is tried, what the user should know."""
+"""`fit_exact`: maximise the likelihood of the exact model, and return the result as `ExactFit`."""
 
 from __future__ import annotations
 
@@ -28,37 +28,36 @@ from .units import Units, check_independent, may_hide_noise, noise_of_most_evide
 if TYPE_CHECKING:
     from .model import Model
 
-# (θ -> minus the log marginal likelihood, first θ, bounds=) -> the best θ and its value, as scikit-learn's GPR asks.
+# Takes θ -> minus the log marginal likelihood, the first θ and bounds=. Returns the best θ and its value, as for GPR.
 Optimizer = Callable[..., tuple[np.ndarray, float]]
-# On so many rows it is seen whether a user's kernel works.
+# A user's kernel is checked on so many rows.
 _CHECKED_ROWS = 500
-# Of a second opinion on the kernel of a sparse model.
+# Number of rows of the exact model that checks the kernel of a sparse model.
 _SAMPLE = 1000
-# A signal that is as good as none, as a share of one that the user fixes.
+# A negligible signal, as a share of one that the user fixes.
 _NO_SIGNAL = 1e-12
 
 
 @dataclass(frozen=True)
 class ExactTask:
-    """An exact model of some rows, as a search needs it.
-
-    ``scatter`` is the variance (o,) of what the features leave over. ``rng`` draws the restarts. With ``optimizer``,
-    the user's takes the place of L-BFGS, and is asked in the units of ``units``.
-    """
+    """An exact model of some rows, with all that `search` needs."""
 
     model: ExactModel
     table: ParameterTable
+    # (o,): variance of the residuals.
     scatter: np.ndarray
     rules: Rules
     max_iter: int
     tol: float
+    # For restarts.
     rng: np.random.RandomState
     monitor: Monitor
     n_restarts: int = 0
+    # The user's optimizer instead of L-BFGS. It works in the units of ``units``.
     optimizer: Optimizer | None = None
     units: Units | None = None
 
-    # Of sparse models only: samples of the rows, inducing points, and the fit before.
+    # Only sparse models have samples, inducing points, and an earlier fit.
     interpolates: ClassVar[bool] = True
     samples: ClassVar[tuple[int, ...]] = ()
     warm: ClassVar[None] = None
@@ -67,25 +66,25 @@ class ExactTask:
 
     @property
     def mean_precision(self) -> float:
-        """Of the rows, where a row with the noise variance itself has 1."""
+        """Mean precision of the rows, in units of 1/σ²."""
         precision = self.model.rows.precision
         return 1.0 if precision is None else float(precision.sum() / self.model.rows.total)
 
     @cached_property
     def alone(self) -> FeaturesAlone:
-        """The likelihood of the features with as little Gaussian process as the parameters allow."""
+        """The likelihood of the features with as little Gaussian process as the limits allow."""
         if self.optimizer is not None or self.max_iter == 0:
             return FeaturesAlone()
         signal, hidden = self.table["signal"], may_hide_noise(self.model.prior, len(self.model.rows.inputs))
         bound, noise = self._best_with(np.where(signal.free, signal.value_limits()[:, 0], signal.start), hidden)
         most = -np.inf
         if hidden and not signal.free.all():
-            # What a signal that stays costs depends on where the kernel ends.
+            # The cost of a fixed signal depends on the end of the kernel.
             most, _ = self._best_with(_NO_SIGNAL * signal.start, hidden)
         return FeaturesAlone(bound, noise, most, hidden)
 
     def _best_with(self, signal: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
-        """The likelihood with such a signal (o,), and the noise variances (o,), perhaps hidden, with the highest."""
+        """The highest likelihood for a signal (o,), and its noise variances (o,), searched over all decades if ``hidden``."""
         rows, values = self.model.rows, self.table.values_at_start()
         least, highest = self.table["noise"].value_limits().T
         if not hidden:
@@ -97,7 +96,7 @@ class ExactTask:
         return noise_of_most_evidence(evidence, least, highest, self.model.prior.shared)
 
     def restart(self) -> Values:
-        """First values drawn at random."""
+        """Random first values."""
         return drawn(self.table, self.rules, self.rng)
 
     def minimise(self, start: Start) -> Fit:
@@ -124,7 +123,7 @@ class ExactTask:
         loss: Callable[[np.ndarray], tuple[float, np.ndarray]],
         monitor: Monitor,
     ) -> Fit:
-        """The user's optimizer on minus the log marginal likelihood, in logarithms of the user's units."""
+        """Run the user's optimizer on minus the log marginal likelihood, in logarithms of the user's units."""
         n, (lower, upper) = self.model.rows.total, table.limits()
         assert self.units is not None
         log_variance, shift = 2.0 * np.log(self.units.target_unit), log_units_of_contrasts(self.units, self.model).sum()
@@ -169,26 +168,24 @@ class ExactTask:
 
 @dataclass(frozen=True)
 class Unhindered:
-    """What a kernel would be without inducing points: the exact model of some rows, fitted."""
+    """The fitted exact model of some rows: the kernel without the limits of inducing points."""
 
     model: ExactModel
     fit: Fit
     n_parameters: int
 
     def missed_by(self, values: Values) -> float:
-        """How much less likely the rows are under other values, in nats per row and output.
-
-        Less half a nat for each parameter: that much a fit gains by chance.
-        """
+        """Loss of log likelihood of the rows at other values, in nats per row and output."""
+        # A fit gains about half a nat per parameter by chance.
         likelihood = float(self.model.log_likelihoods(values).sum())
         nats = self.model.rows.total * self.model.rows.targets.shape[1]
         return (self.fit.bound - 0.5 * self.n_parameters - likelihood) / nats
 
 
 def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered | None:
-    """Fit the exact model of a sample of a model's rows, ``tol`` in nats per row and output.
+    """Fit the exact model of a sample of a model's rows. ``tol`` is in nats per row and output.
 
-    None if the kernel is fixed, or groups have kernels of their own.
+    Returns None if the kernel is fixed, or groups have their own kernels.
     """
     if model.max_iter == 0 or not model.table["hyperparameters"].free.any() or model.sparse.kernels is not None:
         return None
@@ -202,49 +199,31 @@ def exact_model_of_sample(model: Model, max_iter: int, tol: float) -> Unhindered
 
 @dataclass(frozen=True)
 class ExactFit:
-    """The exact model of some outputs, fitted.
-
-    Attributes
-    ----------
-    units : Units
-    model : ExactModel
-    table : ParameterTable
-        Where it started, and its limits.
-    fit : Fit
-        In internal units.
-    messages : tuple of str
-        What the user should know of how it ended.
-    """
+    """The fitted exact model of all outputs."""
 
     units: Units
     model: ExactModel
+    # The limits and the start of the parameters.
     table: ParameterTable
+    # In internal units.
     fit: Fit
+    # For the user.
     messages: tuple[str, ...]
 
     def predictor(self) -> Predictor:
-        """Of all outputs, in the user's units."""
+        """The predictor of all outputs, in the user's units."""
         return self.units.predictor([self.model.predictor(self.fit.values)], [list(range(len(self.units.target_unit)))])
 
     @property
     def log_marginal_likelihood(self) -> float:
-        """In nats, summed over outputs."""
+        """Log marginal likelihood, in nats, summed over outputs."""
         return self.fit.bound - self._shift
 
     def log_likelihood_at(self, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
-        """Of an output under another kernel and noise, and its gradient in the logarithms of these.
+        """Log likelihood of an output at other numbers, and its gradient in their logarithms.
 
-        Parameters
-        ----------
-        output : int
-        numbers : ndarray of shape (n_hyper + 2,)
-            Hyperparameters of k̃, s² and σ², in the user's units.
-
-        Returns
-        -------
-        value : float
-            In nats, in the user's units.
-        gradient : ndarray of shape (n_hyper + 2,)
+        ``numbers`` (n_hyper + 2,) are the hyperparameters of k̃, s² and σ², in the user's units. So is the value, in
+        nats.
         """
         own, model = slice(output, output + 1), self.model
         kernel = model.kernel if model.kernels is None else model.kernels[output]
@@ -283,7 +262,7 @@ def fit_exact(
     tol: float,
     optimizer: Optimizer | None = None,
 ) -> ExactFit:
-    """Maximise the log marginal likelihood of all rows."""
+    """Maximise the log marginal likelihood of all rows of a problem."""
     units, rows, vague = problem.units, problem.units.rows(problem.source), problem.vague
     n, first, variance = len(rows), problem.spec.starts.hyperparameters.value, 1.0
     everything = rows.some(np.arange(n))
@@ -294,7 +273,7 @@ def fit_exact(
         variance = checked_variance(kernel, first, everything.of(slice(0, 1)).inputs[some])
     table = starting_table(problem, rows, np.empty((1, 0, everything.inputs.shape[-1])), variance, exact=True)
     if optimizer is not None:
-        # It is the user's when to go where.
+        # The user's optimizer gets the widest limits at once.
         table = table.widened(("signal", "noise"))
     model = ExactModel(kernel, units.internal_prior(), vague, everything, kernels if others else None)
     task = ExactTask(
@@ -315,7 +294,7 @@ def fit_exact(
     if changed:
         best = replace(best, values=values, bound=float(model.log_likelihoods(values).sum()))
 
-    # What the user should know of it.
+    # Messages for the user.
     proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
     messages = [best.message, far_from_prior(proper, rows)]
     if problem.max_iter > 0:
@@ -334,40 +313,28 @@ def fit_exact(
 
 
 def log_units_of_contrasts(units: Units, model: ExactModel) -> np.ndarray:
-    """From internal units to the user's, for each output's loss (o,) of all rows: each contrast has a unit."""
+    """The difference of each output's loss (o,) of all rows between the user's and internal units."""
+    # A vague weight uses up one row: the likelihood is that of n - n_vague contrasts, each with a unit.
     n_vague = model.vague.sum(axis=1)
     if model.prior.shared:
         n_vague[1:] = 0
     return (model.rows.total - n_vague) * np.log(units.target_unit)
 
 
-# (output, numbers) -> a value, and its gradient in the logarithms of these.
+# Maps (output, numbers) to a value, and its gradient in the logarithms of the numbers.
 OfKernel = Callable[[int, np.ndarray], tuple[float, np.ndarray]]
 
 
 def value_at(
     theta: ArrayLike, eval_gradient: bool, order: np.ndarray, fitted: Sequence[np.ndarray], of_kernel: OfKernel
 ) -> Any:
-    """The sum over outputs of what each has at its theta and, if asked for, its gradient, of the shape of theta.
+    """The sum over outputs of a function of kernels at theta and, optionally, its gradient, of the shape of theta.
 
-    It is -inf, as in scikit-learn's GaussianProcessRegressor, for a kernel whose matrix cannot be factorised.
-
-    Parameters
-    ----------
-    theta : array-like of shape (n_theta,) or, for several outputs, (o, n_theta)
-    eval_gradient : bool
-    order : ndarray of shape (n_theta,)
-        Where in the numbers each entry of theta is: `KernelSpec.order`.
-    fitted : sequence of ndarray
-        Of each output the numbers (k̃'s hyperparameters, s², perhaps σ²), in the user's units: what theta does not have
-        stays as it is there.
-    of_kernel : callable
-        In the user's units.
-
-    Raises
-    ------
-    ValueError
-        If theta has another shape or is out of range.
+    ``theta`` is (n_theta,) or, for several outputs, (o, n_theta). ``order`` (n_theta,) is the position of each entry in
+    the numbers (`KernelSpec.order`). ``fitted`` has these numbers of each output (k̃'s hyperparameters, s², perhaps σ²)
+    in the user's units: numbers that are not in theta stay. The value is -inf, as in scikit-learn's
+    GaussianProcessRegressor, if the kernel matrix cannot be factorised. Raises a ValueError if theta has another shape
+    or is out of range.
     """
     n_outputs, thetas = len(fitted), as_floats(theta, "theta")
     shape = (len(order),) if n_outputs == 1 else (n_outputs, len(order))

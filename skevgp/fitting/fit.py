@@ -1,4 +1,4 @@
-"""Fit the models of a problem, and keep what came of it. `fit_model` is the whole of it, from top to bottom."""
+"""`fit_model`: place inducing points, maximise the bound of each model, and return the result as `Fitted`."""
 
 from __future__ import annotations
 
@@ -25,22 +25,22 @@ from .sharing import with_groups
 from .start import with_signal_of_constants
 from .units import Units
 
-# Inducing points become more until that raises the bound by less than so many nats per row and output.
+# Inducing points are added until this raises the bound by less than so many nats per row and output.
 _GAIN = 0.01
-# Points limit the kernel if it makes the rows of a sample less likely than their own kernel does, by so many nats per
-# row and output.
+# There are too few points if the kernel gives a sample a lower log likelihood than the kernel of an exact model does,
+# by more than this, in nats per row and output.
 _MISSED = 0.02
-# On the way, no more iterations than this, and none that gain less than this, in nats per row and output.
+# Largest number of iterations between, and the tolerance, in nats per row and output.
 _ITERATIONS, _COARSE = 60, 2e-4
-# Signal over noise variance above which rows on top of each other are points of their own, for the same reason.
+# For a higher ratio of signal to noise variance, the exact predictor is used for duplicate rows too.
 _HIGH_RATIO = 1e9
 
 
 def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None) -> Fitted:
-    """Place inducing points and maximise the bound of each model.
+    """Place inducing points and maximise the bound of each model of a problem.
 
-    ``rng`` places inducing points, draws mini-batches and restarts. The monitor is told of each iteration's loss, in
-    the user's units. The fit starts where ``previous`` ended, as far as shapes agree.
+    ``rng`` places inducing points, and draws mini-batches and restarts. ``monitor`` receives the loss of each iteration
+    in the user's units. The fit starts from the parameters of ``previous``, as far as shapes agree.
     """
     problem = with_groups(problem, rng, monitor, previous)
     parts = parts_of(problem)
@@ -49,7 +49,7 @@ def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, pr
     threads = BlockMap(problem.n_threads if len(parts) == 1 else 1)
     try:
         models = models_of(problem, rng, monitor, threads, previous)
-        # Of the time that is left each has a share when its turn comes.
+        # Each model has a share of the time that is left when it starts.
         turns = [(model, 1.0 / -(-(len(models) - i) // at_once)) for i, model in enumerate(models)]
         fitted = side_by_side(_fit_one, turns, at_once, monitor)
     finally:
@@ -62,8 +62,9 @@ def fit_model(problem: Problem, rng: np.random.RandomState, monitor: Monitor, pr
 
 
 def _fit_one(turn: tuple[Model, float]) -> FittedModel:
+    """Fit one model, given the share of the remaining time that it has."""
     model, share = turn
-    # A copy, with which the blocks of rows are forgotten.
+    # The copy owns the blocks of rows, so that they are freed after the fit.
     model = replace(model, monitor=model.monitor.with_time(share))
     if not model.problem.noise.heavy_tails:
         return finished(*_best(model))
@@ -72,21 +73,22 @@ def _fit_one(turn: tuple[Model, float]) -> FittedModel:
 
 
 def _best(model: Model) -> tuple[Model, Fit]:
-    """The best fit, and the model that it is of, whose number of inducing points may have been found."""
+    """The best fit and its model. The model is another one if the number of inducing points was to be found."""
     return (model, search(model)) if model.problem.placement.max_inducing is None else grown(model)
 
 
 def grown(model: Model) -> tuple[Model, Fit]:
-    """A fit whose number of inducing points has been found, and the model that it is of.
+    """The best fit, and its model with the number of inducing points that it needs.
 
-    Half as many points again are added, the rows that are least known from those before, and the fit goes on for a few
-    iterations; until that raises the bound by less than `_GAIN`. The fit before then goes on to its end. Only there
-    `max_iter` counts: after too few iterations on the way, points would be credited with what further ones gain.
-
-    With few points the noise may explain so much that half as many again show nothing of what there is to learn. Hence
-    a second opinion, the kernel of the exact model of a sample: while it makes the sample likelier than the fit's by
-    `_MISSED`, growth does not end, and it is tried at each step.
+    Half as many points again are added, the rows that are predicted worst so far, and the fit continues for a few
+    iterations. This ends when it raises the bound by less than `_GAIN`. Then the last fit but one continues to its end.
     """
+    # Only the last fit has `max_iter` iterations. If there were too few between, points would be credited with the gain
+    # of further iterations.
+    #
+    # With few points, the noise may explain so much that half as many again change nothing. The kernel of an exact
+    # model of a sample is a second opinion. While it makes the sample more likely than the kernel of the fit does, by
+    # `_MISSED`, points are added, and it is tried as a start at each step.
     nats = model.rows.total * len(model.scatter)
     iterations, tol = _ITERATIONS if model.max_iter > 0 else 0, model.tol or 0.0
     coarse = replace(model, max_iter=iterations, tol=max(tol, _COARSE * nats))
@@ -97,7 +99,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
             starts, limited = [fit.values | {"inducing_points": more.table["inducing_points"].start}], False
             if unhindered is not None and unhindered.missed_by(fit.values) > _MISSED:
                 starts, limited = [*starts, more.placed_under(unhindered.fit.values)], True
-            # Where they start: nothing is optimised.
+            # The bound at each start, without any iteration.
             start = max((more.minimise(Start(values, 0)) for values in starts), key=lambda tried: tried.bound)
             larger = more.minimise(Start(start.values, coarse.max_iter))
             if larger.bound - fit.bound < _GAIN * nats and not limited:
@@ -110,7 +112,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
 
 
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:
-    """What is kept of a fit; signal and noise are calibrated if the problem says so and Ctrl-C did not."""
+    """Calibrate signal and noise, compute the bounds and make the predictor of a fit."""
     sparse, values, exact, by = model.sparse, fit.values, model.exact, model.problem.noise_cv
     messages, found, dependent = [fit.message, far_from_prior(sparse.prior, model.rows)], None, False
     values, changed = with_signal_of_constants(model.problem, model.rows, model.table, values)
@@ -118,26 +120,26 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     if not model.monitor.stopped and model.max_iter > 0:
         messages.append(model.learned_too_little(values))
         if by is not None:
-            # The algebra of folds is the sparse model's.
+            # Folds use the algebra of the sparse model, with its lowest noise.
             lowest = model.rules.lowest_noise * model.scatter
             noisy = values if exact is None else values | {"noise": np.maximum(values["noise"], lowest)}
             with model.monitor.keeping_the_best():
                 found = calibrated(sparse, noisy, statistics, model.table, model.rows, by, model.seed)
             dependent = found is not None and found.dependent
             if exact is not None and by.groups is None:
-                # What folds correct, that inducing points represent too little, is no matter here.
+                # Folds correct the error of the inducing points. The exact model has none.
                 found = None
     if found is not None:
         values = values | {"signal": found.signal, "noise": found.noise}
         messages.append(signal_gone(found.gone, len(found.noise)))
-    # Else summed row by row, which keeps its digits where the noise is low.
+    # If the bound is not known, errors are summed row by row, which keeps digits where the noise is low.
     known = found is None and not changed and np.isfinite(fit.bound) and fit.n_rows is None
     if exact is None:
         bound = fit.bound if known else sparse.bound(values, statistics, model.blocks)
         upper_bound = sparse.upper_bound(values, statistics, model.blocks)
     else:
         bound = upper_bound = fit.bound if known else float(exact.log_likelihoods(values).sum())
-    # The jitter of k(X_m, X_m) would show in the std.
+    # In the sparse predictor, the jitter of k(X_m, X_m) would show in the std.
     distinct = values["inducing_points"].shape[1] == len(model.rows)
     is_exact = exact is not None and (distinct or bool((values["signal"] > _HIGH_RATIO * values["noise"]).any()))
     if exact is not None and is_exact:
@@ -154,50 +156,50 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
 
 @dataclass(frozen=True)
 class FittedModel:
-    """A fitted sparse model of some outputs, in internal units.
-
-    ``table`` has its limits, and where it started. ``statistics``, one for each set of inducing points, are those at
-    ``values``. ``dependent`` says that rows near each other were found to be alike. ``doubts`` are those of the rows,
-    if the noise has heavy tails. The bounds are known where they are better than from the statistics. The predictor is
-    that of the exact model if it ``is_exact``.
-    """
+    """A fitted sparse model of some outputs, in internal units."""
 
     sparse: SparseModel
+    # The limits and the start of the parameters.
     table: ParameterTable
     values: Values
+    # For each set of inducing points, at ``values``.
     statistics: list[SufficientStatistics]
     predictor: Predictor
     loss_curve: list[float]
     message: str
+    # Whether neighbouring rows are alike.
     dependent: bool = False
+    # Only for noise with heavy tails.
     doubts: RowDoubts | None = None
+    # Only if they are more accurate than from the statistics.
     known_bound: float | None = None
     known_upper_bound: float | None = None
+    # Whether the predictor is that of the exact model.
     is_exact: bool = False
 
     @cached_property
     def bound(self) -> float:
-        """On the log marginal likelihood, in nats, of the residuals in internal units."""
+        """Lower bound on the log marginal likelihood of the residuals, in nats, in internal units."""
         return self.sparse.bound(self.values, self.statistics) if self.known_bound is None else self.known_bound
 
     @cached_property
     def upper_bound(self) -> float:
-        """What it cannot exceed."""
+        """Upper bound on the same."""
         if self.known_upper_bound is not None:
             return self.known_upper_bound
         return self.sparse.upper_bound(self.values, self.statistics)
 
     def updated(self, rows: Rows, weight: float = 1.0) -> FittedModel:
-        """Fold new rows in: same kernel and inducing points, q at its optimum for all rows so far.
+        """The model with new rows: same kernel and inducing points, q at its optimum for all rows so far.
 
         ``weight`` multiplies the log likelihood of the earlier rows.
         """
         if self.doubts is not None:
             return self.doubts.updated(self, rows)
-        # Whatever its points were of the rows before.
+        # Points that were all rows before are not all rows now.
         sparse, values = replace(self.sparse, complete=False), self.values
         if self.is_exact:
-            # From here on the points are some rows of many, with the sparse model's algebra and its lowest noise.
+            # From here on the sparse model is used, with its lowest noise.
             lowest = np.where(self.table["noise"].free, Rules.lowest_noise, 0.0)
             values = values | {"noise": np.maximum(values["noise"], lowest)}
             whitenings = list(sparse.whitenings(values))
@@ -220,20 +222,23 @@ class FittedModel:
 
 @dataclass(frozen=True)
 class Fitted:
-    """The fitted models of all outputs, and the outputs of each; ``found`` says that these were not given."""
+    """The fitted models of all outputs."""
 
     units: Units
+    # Of each model.
     outputs: list[list[int]]
+    # Whether the groups of outputs were found, and not given.
     found: bool
     models: tuple[FittedModel, ...]
+    # For the user.
     messages: tuple[str, ...]
 
     def predictor(self) -> Predictor:
-        """Of all outputs, in the user's units."""
+        """The predictor of all outputs, in the user's units."""
         return self.units.predictor([one.predictor for one in self.models], self.outputs)
 
     def updated(self, source: Source, weight: float = 1.0, row_variance: np.ndarray | None = None) -> Fitted:
-        """Fold new rows into the predictors; ``weight`` multiplies what is known of the others."""
+        """The models with new rows. ``weight`` multiplies the log likelihood of the earlier rows."""
         rows = self.units.rows(source)
         pairs = zip(self.outputs, self.models, strict=True)
         models = (one.updated(rows.outputs(own).noisier(row_variance), weight) for own, one in pairs)
@@ -241,47 +246,47 @@ class Fitted:
 
     @property
     def row_scales(self) -> np.ndarray | None:
-        """E[τ] of each row and model, (n, n_models); None if the noise is Gaussian."""
+        """E[τ] of each row and model, (n, n_models). None for Gaussian noise."""
         each = [one.doubts.scales.mean for one in self.models if one.doubts is not None]
         return np.column_stack(each) if each else None
 
     @property
     def dependent(self) -> bool:
-        """Whether rows near each other were found to be alike."""
+        """Whether neighbouring rows are alike."""
         return any(one.dependent for one in self.models)
 
     @property
     def lower_bound(self) -> float:
-        """In nats, summed over outputs."""
+        """Lower bound on the log marginal likelihood, in nats, summed over outputs."""
         return sum(one.bound for one in self.models) - self._shift
 
     @property
     def upper_bound(self) -> float:
-        """On the log marginal likelihood, in nats, summed over outputs."""
+        """Upper bound on the log marginal likelihood, in nats, summed over outputs."""
         return sum(one.upper_bound for one in self.models) - self._shift
 
     @property
     def n_iter(self) -> int:
-        """Iterations of the longest fit."""
+        """Number of iterations of the longest fit."""
         return max(len(one.loss_curve) for one in self.models)
 
     @property
     def loss_curve(self) -> np.ndarray:
-        """Minus the bound per iteration, (n_iter,); a model that is done keeps its last value."""
+        """Minus the bound per iteration, (n_iter,), summed over models. A model that has ended keeps its last value."""
         if self.n_iter == 0:
             return np.empty(0)
-        # One that had nothing to learn made no iterations.
+        # A model without free parameters has no iterations.
         curves = [one.loss_curve or [-one.bound] for one in self.models]
         return np.sum([np.pad(curve, (0, self.n_iter - len(curve)), "edge") for curve in curves], axis=0) + self._shift
 
     @property
     def _shift(self) -> float:
-        # From internal units to the user's, for a loss of all rows.
+        # Difference of the loss of all rows between the user's and internal units.
         return self.models[0].statistics[0].n_rows * self.units.log_unit(slice(None))
 
     @property
     def n_parameters(self) -> int:
-        """Free parameters of kernels, noise, inducing points and q."""
+        """Number of free parameters of kernels, noise, inducing points and q."""
         total = 0
         for one in self.models:
             n_outputs, p = one.sparse.prior.scale.shape
@@ -295,7 +300,7 @@ class Fitted:
 
     @property
     def sharing(self) -> list[list[int]]:
-        """Outputs by what they are fitted with: of a model, or of a group that is joined to others by weights alone."""
+        """The groups of outputs that share a kernel."""
         found = []
         for outputs, one in zip(self.outputs, self.models, strict=True):
             separate = one.values["hyperparameters"].ndim == 2
@@ -309,7 +314,7 @@ class Fitted:
         )
         limits = one.table[name].value_limits()
         if name == "signal":
-            # Calibrated, it may have left them.
+            # Calibration may have moved it outside.
             (low, high), signal = limits[within], one.values["signal"][within]
             return np.array([[min(low, signal), max(high, signal)]]) * self.units.target_unit[output] ** 2
         if one.table[name].start.ndim == 1:
@@ -317,7 +322,7 @@ class Fitted:
         return limits.reshape(*one.table[name].start.shape, 2)[one.sparse.set_of(within, one.table[name])]
 
     def values_in(self, units: Units, rows: Rows, kernel: Kernel, model: int) -> Values:
-        """A model's values in other internal units, as far as they can serve another fit."""
+        """The values of a model in other internal units, as far as they are useful for another fit."""
         one, own, inputs = self.models[model], self.outputs[model], rows.inputs
         values, points = one.values, one.values["inducing_points"]
         if inputs.mean.ndim == 2 and one.sparse.kernels is None:
@@ -326,7 +331,7 @@ class Fitted:
             return {}
         lowest, highest = (edge.reshape(-1, 1, points.shape[2]) for edge in (inputs.lowest, inputs.highest))
         outside = (points < 2.0 * lowest - highest) | (points > 2.0 * highest - lowest)
-        # A few may have gone far where functions are smooth; of most it means that the rows are others.
+        # For a smooth function a few points may be far outside. If most are, the rows are different ones.
         if outside.any(axis=-1).mean() > 0.5:
             return {}
         ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2

@@ -1,4 +1,4 @@
-"""Where inducing points start."""
+"""Placement of inducing points at the start of a fit, and when more are added."""
 
 from __future__ import annotations
 
@@ -15,39 +15,32 @@ from ..model.statistics import Kernel, Whitening
 from ..utils.validation import as_floats, check_magnitude
 from .start import column_scale
 
-# Points that there are first if their number is to be found.
+# First number of points if the number is to be found.
 _FIRST = 10
-# On a sample of the rows the search costs a fraction of a second and places points as well as on all of them.
+# On a sample the search takes a fraction of a second, and its points are as good as those from all rows.
 MAX_SAMPLE = 10_000
-# The greedy search keeps so many numbers at most, 80 MB.
+# Largest number of floats that the greedy search keeps: 80 MB.
 LARGEST_SEARCH = 10_000_000
-# Below this share of the prior variance, what is left is rounding: it no longer tells which row is the least known.
+# Below this share of the prior variance, variances are rounding errors and do not rank rows.
 _EXHAUSTED = 1e-10
-# After the decimal point, of rows in units of their columns' scatter: those that agree in them are one and the same.
+# Rows are equal if they agree in so many decimal places, in standard deviations of their columns.
 _DIGITS = 10
 
 
 @dataclass(frozen=True)
 class Placement:
-    """How inducing points are chosen.
+    """How inducing points are chosen."""
 
-    Attributes
-    ----------
-    method : {"auto", "k-means", "greedy"} or ndarray of shape (m, d)
-        ``"auto"`` starts as ``"k-means"``; or the points themselves, in the same units as the inputs.
-    n_inducing : int
-        At most so many points; an array brings its own number.
-    max_inducing : int, optional
-        At most so many in the end, if their number is to be found.
-    """
-
+    # The points themselves (m, d), or the name of a method. ``"auto"`` starts as ``"k-means"``.
     method: Literal["auto", "k-means", "greedy"] | np.ndarray
+    # Largest number of points at the start. An array has its own number.
     n_inducing: int
+    # Largest number of points at the end, if their number is to be found.
     max_inducing: int | None = None
 
     @classmethod
     def of(cls, inducing_init: Any, n_inducing: int | str, max_inducing: int | None, n_columns: int) -> Placement:
-        """What the arguments of these names say, for inputs of so many columns; points are checked."""
+        """The placement for the estimator's arguments, for inputs with ``n_columns``. Points are checked."""
         most = max_inducing if isinstance(n_inducing, str) else None
         first = min(_FIRST, max_inducing or _FIRST) if isinstance(n_inducing, str) else n_inducing
         if isinstance(inducing_init, str):
@@ -65,13 +58,13 @@ class Placement:
 
     @property
     def anew(self) -> Placement | None:
-        """How to place them once more, when the kernel has learned something; None if they stay."""
+        """The placement for a second time, when the kernel has learned something. None if the points stay."""
         by_user = isinstance(self.method, np.ndarray)
         return replace(self, method="greedy") if not by_user and self.method == "auto" else None
 
     @property
     def sample_size(self) -> int:
-        """How many rows are enough to choose from."""
+        """Number of rows from which points are chosen."""
         if isinstance(self.method, str) and self.method == "greedy":
             return greedy_sample_size(self.n_inducing)
         return max(MAX_SAMPLE, 10 * self.n_inducing)
@@ -79,22 +72,11 @@ class Placement:
     def points(
         self, inputs: np.ndarray, kernel: Kernel, hyperparameters: np.ndarray, rng: np.random.RandomState
     ) -> np.ndarray:
-        """Choose the points.
+        """Choose inducing points (m, d) from rows (n, d), at most as many as there are distinct rows.
 
-        Parameters
-        ----------
-        inputs : ndarray of shape (n_rows, d)
-            Of all rows, or of ``sample_size`` of them.
-        kernel : Kernel
-        hyperparameters : ndarray of shape (n_hyper,)
-            As the kernel takes them; only ``"greedy"`` asks the kernel.
-        rng : RandomState
-
-        Returns
-        -------
-        inducing_points : ndarray of shape (m, d)
-            With m = min(n_inducing, distinct rows): all distinct rows, in the order of their first appearance, if there
-            are no more than ``n_inducing``. Rows that differ by rounding only are one.
+        If there are no more distinct rows than points, these are returned in the order of their first appearance. Rows
+        that differ by rounding errors count as one. Only ``"greedy"`` uses the kernel and its hyperparameters
+        (n_hyper,).
         """
         if isinstance(self.method, np.ndarray):
             return self.method
@@ -107,12 +89,12 @@ class Placement:
 
 
 def greedy_sample_size(n_inducing: int) -> int:
-    """How many rows are enough for a greedy search of so many points."""
+    """Number of rows for a greedy search of so many points."""
     return max(2 * n_inducing, min(MAX_SAMPLE, LARGEST_SEARCH // n_inducing))
 
 
 def distinct_rows(inputs: np.ndarray) -> np.ndarray:
-    """Rows in the order of their first appearance; those that differ by rounding only are one."""
+    """Distinct rows in the order of their first appearance. Rows that differ by rounding errors count as one."""
     _, first = np.unique(_rounded(inputs, Moments.of(inputs)), axis=0, return_index=True)
     return inputs[np.sort(first)]
 
@@ -120,24 +102,9 @@ def distinct_rows(inputs: np.ndarray) -> np.ndarray:
 def with_more(
     points: np.ndarray, n_inducing: int, inputs: np.ndarray, kernel: Kernel, hyperparameters: np.ndarray
 ) -> np.ndarray:
-    """Inducing points, and after them the rows that are least known from all before.
+    """Inducing points (m, d), followed by the rows that they predict worst, at most ``n_inducing`` in all.
 
-    Parameters
-    ----------
-    points : ndarray of shape (m, d)
-        Those that are there.
-    n_inducing : int
-        How many there are to be.
-    inputs : ndarray of shape (n, d)
-        Rows to choose from; of rows that are equally little known the first is taken.
-    kernel : Kernel
-    hyperparameters : ndarray of shape (n_hyper,)
-        As the kernel takes them.
-
-    Returns
-    -------
-    inducing_points : ndarray of shape (m + k, d)
-        With k = n_inducing - m, or less where fewer rows are distinct from each other and from the points.
+    There are fewer if fewer rows are distinct from each other and from the points. Of equal rows the first is taken.
     """
     moments = Moments.of(inputs)
     _, first = np.unique(_rounded(np.vstack([points, inputs]), moments), axis=0, return_index=True)
@@ -148,7 +115,7 @@ def with_more(
 
 
 def are_all_rows(points: np.ndarray, inputs: np.ndarray) -> bool:
-    """Whether each row (n, d) is among the points (m, d), but for rounding."""
+    """Whether each row (n, d) is one of the points (m, d), up to rounding errors."""
     moments = Moments.of(inputs)
     known, rows = _rounded(points, moments), _rounded(inputs, moments)
     n_known = len(np.unique(known, axis=0))
@@ -156,19 +123,19 @@ def are_all_rows(points: np.ndarray, inputs: np.ndarray) -> bool:
 
 
 def _rounded(inputs: np.ndarray, moments: Moments) -> np.ndarray:
-    """Rows in units of their columns' scatter, to the digits that count."""
+    """Rows in standard deviations of their columns, rounded to the digits that count."""
     return np.round((inputs - moments.mean) / column_scale(moments), _DIGITS)
 
 
 def _cluster_centres(inputs: np.ndarray, n_inducing: int, rng: np.random.RandomState) -> np.ndarray:
-    """k-means, each column scaled to unit standard deviation; fewer points where rows differ by rounding only."""
+    """Centres of k-means with columns of unit standard deviation. There are fewer if rows differ by rounding only."""
     moments = Moments.of(inputs)
     scale = column_scale(moments)
-    # Of rows that differ by rounding only: fewer points are then the right answer. (Other fits may warn meanwhile.)
+    # k-means warns if rows differ by rounding only. Fewer points are then correct.
     with ignored("Number of distinct clusters", ConvergenceWarning):
         clusters = KMeans(n_inducing, n_init=1, max_iter=30, random_state=rng).fit((inputs - moments.mean) / scale)
-    # Kept in k-means++'s order, the first ones far apart: sorted, each would almost follow from the one before, and
-    # Adam's steps in whitened coordinates would be smaller (its error on the pendulum grew by half).
+    # The order of k-means++ is kept: the first ones are far apart. In sorted order, each would almost follow from the
+    # one before, and Adam's steps in whitened coordinates would be smaller (its error on the pendulum grew by half).
     centres = moments.mean + clusters.cluster_centers_ * scale
     _, first = np.unique(centres, axis=0, return_index=True)
     return centres[np.sort(first)]
@@ -181,28 +148,13 @@ def _least_known(
     hyperparameters: np.ndarray,
     given: np.ndarray | None = None,
 ) -> np.ndarray:
-    """One after the other the row whose variance given the rows before, k(x, x) - q(x, x), is the largest.
+    """Choose rows one after another, each with the largest variance given the rows before.
 
-    (Burt, Rasmussen & van der Wilk 2020, "Convergence of sparse variational inference in Gaussian process regression",
-    section 4.2.3: the greedy maximum of the determinant of k(X_m, X_m).) A Cholesky factorisation with pivots, O(n m²).
-    Once every row follows from the chosen ones but for rounding, the row farthest from them is next. Points that are
-    given count as chosen before: the Cholesky factor begins with their rows.
-
-    Parameters
-    ----------
-    inputs : ndarray of shape (n, d)
-        Distinct rows; of rows that are equally little known the first is taken.
-    n_inducing : int
-        m < n.
-    kernel : Kernel
-    hyperparameters : ndarray of shape (n_hyper,)
-    given : ndarray of shape (k, d), optional
-        Points that are none of the rows.
-
-    Returns
-    -------
-    inducing_points : ndarray of shape (m, d)
+    Rows (n, d) are distinct. ``given`` (k, d) are points that count as chosen before. Of equal variances the first row
+    is taken. If all variances are rounding errors, the row farthest from the chosen ones is next.
     """
+    # (Burt, Rasmussen & van der Wilk 2020, section 4.2.3: the greedy maximum of the determinant of k(X_m, X_m).) It is
+    # a Cholesky factorisation with pivots, O(n m²). ``rows`` (k + m, n) is the factor; given points are its first rows.
     prepared = kernel.prepare(inputs)
     variance = np.array(np.broadcast_to(kernel.at(hyperparameters, inputs[:1]).diagonal(prepared), len(inputs)))
     enough = _EXHAUSTED * variance.max()
@@ -227,6 +179,6 @@ def _least_known(
         row = kernel.at(hyperparameters, inputs[[pivot]]).cross(prepared)[0]
         rows[count] = (row - rows[:count, pivot] @ rows[:count]) / np.sqrt(variance[pivot])
         variance = np.maximum(variance - rows[count] ** 2, 0.0)
-        # Exactly: what rounding leaves of it must not be chosen again.
+        # Exactly 0, so that rounding errors do not let the row be chosen again.
         variance[pivot] = 0.0
     return inputs[chosen]

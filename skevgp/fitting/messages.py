@@ -1,4 +1,4 @@
-"""Messages: what the user should know of how a fit went. Each is empty if there is nothing to say."""
+"""Messages to the user about the end of a fit. Each function returns an empty text if there is nothing to say."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from ..model.statistics import Kernel
 from ..solvers.base import Minimum
 from .start import alike_neighbours, neighbours
 
-# When no start got below this share, the user should know.
+# Nothing was learned if the noise explains more than this share.
 _NOTHING_LEARNED = 0.99
-# A kernel is white noise if of so many pairs of neighbours hardly any, this share, have this correlation. (The likeness
-# that counts in `alike_neighbours` is more than that of such a share.)
+# A kernel is white noise if no more than this share of so many pairs of neighbours have at least this correlation.
+# (`alike_neighbours` needs more similar pairs than that.)
 _PAIRS, _WHITE_SHARE, _WHITE = 200, 0.1, 0.01
-# y is far from its prior mean: by so many times its scatter, or by a weight so many prior standard deviations out.
+# y is far from its prior mean by so many times its standard deviation, a weight by so many prior standard deviations.
 _FAR, _FAR_WEIGHT = 1e4, 100.0
 
 DEPENDENT_ROWS = (
@@ -27,18 +27,9 @@ DEPENDENT_ROWS = (
 
 
 def lbfgs_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
-    """Why L-BFGS ended before it converged; nothing if it did.
+    """Why L-BFGS ended before it converged, after ``n_iter`` iterations in all.
 
-    Parameters
-    ----------
-    minimum : Minimum
-    n_iter : int
-        Its iterations and those before.
-    max_iter : int
-    tol : float or None
-        In nats; None if the solver chose it.
-    sparse : bool, default=True
-        Whether there are inducing points.
+    ``tol`` is None if the solver chose it. ``sparse`` says whether there are inducing points.
     """
     if minimum.converged:
         return ""
@@ -56,7 +47,7 @@ def lbfgs_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None,
 
 
 def adam_ended(minimum: Minimum, fell: bool, learning_rate: float, batch_size: int) -> str:
-    """Why Adam's result is not what was hoped for; nothing if it is."""
+    """Why Adam failed. ``fell`` says whether its bound ended below the first one."""
     if not minimum.converged:
         return (
             f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
@@ -72,13 +63,13 @@ def adam_ended(minimum: Minimum, fell: bool, learning_rate: float, batch_size: i
 
 
 def interrupted(n_iter: int, max_time: float | None = None) -> str:
-    """That Ctrl-C ended the fit, or that so many seconds were over."""
+    """That Ctrl-C, or the end of ``max_time``, ended the fit."""
     how = "was interrupted" if max_time is None else f"ended since max_time={max_time:g} seconds were over,"
     return f"The fit {how} after {n_iter} iterations; the best parameters so far are kept."
 
 
 def signal_gone(gone: int, n_outputs: int) -> str:
-    """That of so many outputs fitted together nothing holds for groups that were left out."""
+    """That nothing of ``gone`` outputs holds for held-out groups."""
     if not gone:
         return ""
     return (
@@ -89,8 +80,8 @@ def signal_gone(gone: int, n_outputs: int) -> str:
 
 
 def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
-    """Whether y, or a weight, is so far from its prior mean that the fit suffers."""
-    # Of residuals at the rounding error of y, neither is of size one.
+    """That y, or a weight, is too far from its prior mean."""
+    # Residuals that are rounding errors of y are not of size one.
     far = rows.residuals.mean[rows.columns] ** 2
     if (rows.scatter() / rows.mean_precision < _FAR**-2 * np.minimum(far, 1.0)).any():
         return (
@@ -106,7 +97,7 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
 
 
 def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, rows: Rows, sparse: bool = True) -> str:
-    """Whether noise explains what the Gaussian process could have learned: the model's, or the kernel as noise."""
+    """That the noise, or a white kernel, explains what the Gaussian process could have learned."""
     told = ""
     if table["noise"].free.any():
         told = nothing_learned(values["noise"], rows, sparse)
@@ -116,10 +107,10 @@ def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, ro
 
 
 def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
-    """Whether noise variances (o,) explain everything of targets whose neighbouring rows are alike."""
+    """That noise variances (o,) explain all of targets whose neighbouring rows are alike."""
     nothing = noise > _NOTHING_LEARNED * rows.scatter()
     if nothing.any():
-        # Where residuals look like noise, noise is the answer.
+        # If residuals look like noise, noise is the right answer.
         nothing &= alike_neighbours(rows)
     if not nothing.any():
         return ""
@@ -139,7 +130,7 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
 
 
 def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str:
-    """Whether the kernel itself, k̃, is white noise though neighbouring rows are alike."""
+    """That the kernel k̃ itself became white noise, though neighbouring rows are alike."""
     if len(rows) < 2:
         return ""
     each, other = neighbours(rows, _PAIRS)

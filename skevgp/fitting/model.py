@@ -1,4 +1,4 @@
-"""The models of a problem: which outputs are fitted together, and each model as a search needs it."""
+"""The independent models of a problem: which outputs each has, its rows, its starts, and one run of the solver."""
 
 from __future__ import annotations
 
@@ -33,34 +33,32 @@ from .units import may_hide_noise, noise_of_most_evidence
 if TYPE_CHECKING:
     from .fit import Fitted
 
-# By what factor inducing points become more.
+# Factor by which the number of inducing points grows.
 _GROWTH = 1.5
-# Of a priori sums of squares: noise variances below are rounding errors beside them.
+# Noise variances below this share of the prior sum of squares are lost in rounding.
 _ROUNDING = 1e-13
-# An iteration that gains less, in nats in all, does not matter. Nor does one that gains less than this share of what
-# the fit has gained over features and noise alone.
+# The tolerance of L-BFGS, in nats: this, or this share of the gain over features and noise alone if that is more.
 LEAST_TOL, ENOUGH = 0.01, 1.5e-5
 # Relative size of the rounding errors in a bound on all rows.
 _BOUND_ROUNDING = 1e-8
-# Length of the natural gradients' steps for q: the first, and the least.
+# Length of the natural gradient steps of q: the first, and the smallest.
 _NATURAL_RATES = 0.3, 0.02
 
 
 class Part(NamedTuple):
-    """Outputs that are fitted together.
-
-    ``groups`` are slices of ``outputs``, one for each set of inducing points; rows are ``split`` by them if they share
-    weights or have inputs of their own; ``separate`` groups have kernels of their own.
-    """
+    """Outputs that are fitted together."""
 
     outputs: list[int]
+    # Slices of ``outputs``, one for each set of inducing points.
     groups: tuple[slice, ...]
+    # Whether rows are split by groups, because groups share weights or have their own inputs.
     split: bool = False
+    # Whether groups have their own kernels.
     separate: bool = False
 
 
 def parts_of(problem: Problem) -> list[Part]:
-    """The independent models: one, if outputs share their weights."""
+    """The outputs of each independent model. There is one model if outputs share their weights."""
     sharing, shared, per_output = problem.sharing, problem.units.prior.shared, problem.per_output
     partition = partition_of(sharing, problem.n_outputs)
     everything = sorted(chain(*partition))
@@ -78,7 +76,7 @@ def parts_of(problem: Problem) -> list[Part]:
 
 
 def partition_of(sharing: Sharing, n_outputs: int) -> list[list[int]]:
-    """The outputs of each independent model, both in ascending order."""
+    """The outputs of each independent model according to ``sharing``, in ascending order."""
     everything = list(range(n_outputs))
     if isinstance(sharing, str):
         return [[o] for o in everything] if sharing == "none" else [everything]
@@ -102,11 +100,11 @@ def models_of(
     threads: BlockMap,
     previous: Fitted | None = None,
 ) -> list[Model]:
-    """The models to be fitted, each with its rows and where it starts; arguments as of `fit_model`."""
+    """The models of a problem, each with its rows and its start. Arguments are those of `fit_model`."""
     units, placement, parts = problem.units, problem.placement, parts_of(problem)
     rows = units.rows(problem.source, threads)
 
-    # The kernel starts alike in all models. Outputs may have inputs, and so kernels' centres and points, of their own.
+    # All models start with the same kernel. If outputs have their own inputs, kernels have own centres and points.
     kernels = centred_kernels(problem.spec.covariance, rows.inputs)
     sample, points = rows.sample(placement.sample_size, rng), []
     for output, kernel in enumerate(kernels):
@@ -116,7 +114,7 @@ def models_of(
     first = problem.spec.starts.hyperparameters.value
     variance = 1.0 if first is None else checked_variance(kernels[0], first, points[0])
 
-    # The same for all, so that outputs that share nothing are fitted as they would be alone but for rounding.
+    # All models have the same seed: outputs that share nothing are then fitted as if each was alone.
     seed = rng.randint(np.iinfo(np.int32).max)
     goes_on = previous is not None and previous.outputs == [part.outputs for part in parts]
     models = []
@@ -130,7 +128,7 @@ def models_of(
                 warm.pop("inducing_points", None)
         sets, found = [points[o % len(points)] for o in heads], None if warm is None else warm.get("inducing_points")
         most = placement.max_inducing
-        # Where the number of points is to be found, those of the fit before go on.
+        # If the number of points is to be found, it starts from the points of the fit before.
         placed = (
             found is not None
             and most is not None
@@ -139,7 +137,7 @@ def models_of(
         )
         start = found if placed else np.array([own[: min(map(len, sets))] for own in sets])
         assert start is not None
-        # Where they are all rows the bound is the likelihood: no other places are better.
+        # If all rows are points, the bound is the likelihood, and no other points are better.
         stay = (
             problem.family == "full"
             and len(sample.targets) >= len(rows)
@@ -186,33 +184,32 @@ def models_of(
 
 @dataclass(frozen=True)
 class Model:
-    """Some outputs that are fitted together: parameters -> bound and gradient, and the way from a start.
-
-    ``table`` are the parameters with first values and limits. ``warm`` are first values from another fit, whose
-    inducing points the table has if they are ``placed``. ``seed`` is the one source of chance.
-    """
+    """Some outputs that are fitted together: rows, parameters, starts, and one run of the solver."""
 
     problem: Problem
     sparse: SparseModel
     rows: Rows
+    # The parameters with first values and limits.
     table: ParameterTable
     seed: int
     monitor: Monitor
     max_iter: int
+    # In nats. None: relative to the gain over features and noise alone.
     tol: float | None
+    # First values from another fit, and whether the table has its inducing points.
     warm: Values | None = None
     placed: bool = False
 
     @cached_property
     def rng(self) -> np.random.RandomState:
-        """The one source of chance."""
+        """The only source of randomness of the fit."""
         return np.random.RandomState(self.seed)
 
     # --- the rows -----------------------------------------------------------------------------------------------------
 
     @property
     def n_inducing(self) -> int:
-        """Inducing points of each set."""
+        """Number of inducing points of each set."""
         return self.table["inducing_points"].start.shape[1]
 
     @property
@@ -222,12 +219,12 @@ class Model:
 
     @property
     def mean_precision(self) -> float:
-        """Of the rows, where a row with the noise variance itself has 1."""
+        """Mean precision of the rows, in units of 1/σ²."""
         return self.rows.mean_precision
 
     @property
     def interpolates(self) -> bool:
-        """Whether there are as many inducing points as rows; points that stay are all rows, some perhaps the same."""
+        """Whether there are as many inducing points as rows. Fixed points are all rows, without duplicates."""
         return self.n_inducing >= len(self.rows) or not self.table["inducing_points"].free.any()
 
     @cached_property
@@ -243,12 +240,12 @@ class Model:
 
     @cached_property
     def blocks(self) -> Blocks:
-        """All rows."""
+        """All rows as blocks."""
         return self.sparse.blocks(self.rows, self.n_inducing)
 
     @cached_property
     def exact(self) -> ExactModel | None:
-        """The exact model of the rows, where the inducing points are all of them; None where they are not."""
+        """The exact model of the rows if all rows are inducing points, else None."""
         sparse, separate = self.sparse, self.table["hyperparameters"].start.ndim == 2
         if not sparse.complete or separate or self.problem.noise.heavy_tails or self.rules.lowest_noise_exact is None:
             return None
@@ -259,9 +256,9 @@ class Model:
         return ExactModel(sparse.kernel, sparse.prior, np.zeros(sparse.prior.scale.shape, dtype=bool), rows, kernels)
 
     def objective(self, table: ParameterTable, n_rows: int | None = None) -> BoundObjective | LikelihoodObjective:
-        """Minus the bound per row, and its gradient: of a sample of so many rows, or of all."""
+        """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all."""
         if n_rows is not None:
-            # Smaller samples are parts of larger ones.
+            # A smaller sample is the first part of the larger one.
             blocks = self.sparse.blocks(self._sample.part(0, n_rows, 1.0), self.n_inducing)
             return BoundObjective(self.sparse, table, blocks)
         if self.exact is not None:
@@ -272,13 +269,13 @@ class Model:
 
     @cached_property
     def bound_alone(self) -> float:
-        """The bound of the features without a Gaussian process, all that they leave over being noise."""
+        """The bound of the features without a Gaussian process, where noise explains all residuals."""
         none = np.zeros(len(self.sparse.prior.scale))
         return float(bounds_alone(self.blocks.linear, self.sparse.prior, self._left_over(none), none).sum())
 
     @cached_property
     def alone(self) -> FeaturesAlone:
-        """The bound of the features with as little Gaussian process as the parameters allow."""
+        """The bound of the features with as little Gaussian process as the limits allow."""
         values, signal, rows = self.table.values_at_start(), self.table["signal"], self.rows
         points, (kernel, hyperparameters) = values["inducing_points"][0], self.sparse.kernel_of(values, 0)
         variance = np.mean(kernel.at(np.log(hyperparameters), points).diagonal(kernel.prepare(points)))
@@ -286,23 +283,23 @@ class Model:
         trace = little * variance * rows.total * rows.mean_precision
         hidden = may_hide_noise(self.sparse.prior, self.blocks.linear.length)
         bound, noise = self._best_alone(trace, hidden)
-        # The trace of a signal that stays depends on where the kernel ends.
+        # The trace of a fixed signal depends on the end of the kernel.
         is_open = hidden and not signal.free.all()
         most = self._best_alone(np.zeros(len(trace)), hidden)[0] if is_open else -np.inf
         return FeaturesAlone(bound, noise, most, hidden)
 
     def _left_over(self, trace: np.ndarray) -> np.ndarray:
-        """The noise variances (o,) that the features leave over, which may be nothing, and a trace of f's prior."""
+        """Noise variances (o,) equal to the mean squared residuals of the features, plus a trace of f's prior."""
         squares = self.blocks.linear.RR
         return np.maximum((squares + trace) / self.rows.total, LOWEST_NOISE * self.rows.mean_precision)
 
     def _best_alone(self, trace: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
-        """The bound with q(f) at its prior, which has such a trace, and the noise variances (o,) with the highest."""
+        """The highest bound with q(f) at its prior, which has a given trace, and the noise variances (o,) for it."""
         prior, sums = self.sparse.prior, self.blocks.linear
         least = highest = self._left_over(trace)
         if self.max_iter > 0 and hidden:
             lowest, highest = self.table["noise"].value_limits().T
-            # Directions that the rows do not see have a precision of 1, beside which their features are large.
+            # Directions without data have a precision of 1, which is lost in rounding next to large features.
             sizes = [scale**2 * np.diagonal(sums.of(slice(o, o + 1))[0]) for o, scale in enumerate(prior.scale)]
             unseen = [np.sort(own)[: max(len(own) - sums.length, 0)].sum() for own in sizes]
             least = np.maximum(lowest, _ROUNDING * np.array(unseen))
@@ -314,26 +311,26 @@ class Model:
 
     @property
     def rules(self) -> Rules:
-        """The numbers that the search goes by."""
+        """The rules of the search."""
         return self.problem.rules
 
     @property
     def n_restarts(self) -> int:
-        """Further fits from other starts."""
+        """Number of further fits from random starts."""
         return self.problem.solver.n_restarts
 
     @property
     def place(self) -> Callable[[Values], Values] | None:
-        """Values -> the same values with inducing points placed again under their kernel; None leaves them."""
+        """The function that places inducing points again under the kernel of its argument. None if they stay."""
         anew = self.problem.placement.anew
         return None if anew is None else partial(self._placed, placement=anew)
 
     def restart(self) -> Values:
-        """First values drawn at random."""
+        """Random first values."""
         return self._placed(drawn(self.table, self.rules, self.rng), self.problem.placement)
 
     def _placed(self, values: Values, placement: Placement) -> Values:
-        """The same values with inducing points placed under their kernel, alike for groups with the same."""
+        """The same values with inducing points placed under their kernel, equal for groups with the same kernel."""
         sample = self.rows.sample(placement.sample_size, self.rng)
         sets = []
         for group, outputs in enumerate(self.sparse.groups if self.sparse.kernels is not None else (slice(None),)):
@@ -345,13 +342,13 @@ class Model:
         return values | {"inducing_points": np.repeat(points, len(self.sparse.groups) // len(points), axis=0)}
 
     def placed_under(self, values: Values) -> Values:
-        """Values of a kernel, with as many inducing points as the model has, placed greedily; all rows if they stay."""
+        """Values of a kernel with the model's number of inducing points, placed greedily."""
         if not self.table["inducing_points"].free.any():
             return values | {"inducing_points": self.table["inducing_points"].start}
         return self._placed(values, Placement("greedy", self.n_inducing))
 
     def with_more(self, values: Values) -> Model | None:
-        """The model with half as many points again, those of a fit among them; None if there can be no more."""
+        """The model with half as many points again, including those of a fit. None if there cannot be more."""
         most = self.problem.placement.max_inducing
         if most is None or self.n_inducing >= most:
             return None
@@ -370,7 +367,7 @@ class Model:
             return None
         table = self.table.with_start("inducing_points", np.array([own[:n_inducing] for own in sets]))
         if everything and self.sparse.family == "full":
-            # The bound is then the likelihood: no other places are better.
+            # The bound is then the likelihood, and no other points are better.
             table = table.with_fixed("inducing_points")
             return replace(self, table=table, sparse=replace(self.sparse, complete=True))
         return replace(self, table=table)
@@ -385,6 +382,7 @@ class Model:
         )
 
     def _by_all_rows(self, table: ParameterTable, start: Start) -> Fit:
+        """Run a solver that sees all rows."""
         solver: Any = self.problem.solver
         spent, n_rows = len(start.loss_curve), self.rows.total
         about = "all rows" if start.n_rows is None else f"{start.n_rows:,} of {len(self.rows):,} rows"
@@ -395,7 +393,7 @@ class Model:
             tolerance = Tolerance(self.tol / n_rows)
         curvature = None
         if not start.cold:
-            # From the curvature on the smallest sample, or on all rows.
+            # The curvature on the smallest sample, or on all rows.
             curvature = self.objective(table, self.samples[0] if self.samples else None), table.alike()
         minimum = solver.minimise(
             self.objective(table, start.n_rows),
@@ -416,6 +414,7 @@ class Model:
         )
 
     def _by_mini_batches(self, table: ParameterTable, start: Start) -> Fit:
+        """Run a solver that sees mini-batches."""
         solver: Any = self.problem.solver
         n_rows, tol = self.rows.total, LEAST_TOL if self.tol is None else self.tol
         elbo = ElboObjective(self.sparse, table, self.blocks, _NATURAL_RATES if solver.natural_gradient else None)
@@ -429,7 +428,7 @@ class Model:
             self.monitor.seen_as(factor=n_rows),
             elbo.pace,
         )
-        # A mini-batch's loss does not tell which point is best: the bound on all rows does.
+        # The loss of a mini-batch is too noisy to choose the best point. The bound on all rows is not.
         x, (bound, predictor) = first, elbo.solution(first)
         at_start, reached = bound, bound if minimum.n_iter == 0 else -np.inf
         for other in (*minimum.others, minimum.x) if minimum.n_iter > 0 else ():
@@ -452,7 +451,7 @@ class Model:
         )
 
     def learned_too_little(self, values: Values) -> str:
-        """What `messages` say of it, of each group with columns of its own; empty if all is well."""
+        """The message of `messages.learned_too_little`, for each group with its own columns. Empty if all is well."""
         if self.rows.inputs.mean.ndim == 1:
             kernel, hyperparameters = self.sparse.kernel_of(values, 0)
             return learned_too_little(kernel, values | {"hyperparameters": hyperparameters}, self.table, self.rows)

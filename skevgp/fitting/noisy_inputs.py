@@ -1,4 +1,4 @@
-"""Fits whose rows are as noisy as their inputs make them: fits and slopes take turns."""
+"""Fits with noise in the inputs: fits, and estimates of the slopes of the function, alternate."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from ..noise.gaussian import own_variance, relative_noise, row_weights
 from ..utils.monitor import Monitor
 from .fit import Fitted
 
-# Fits and slopes take turns until no output's σ² moves by more than this share, or so often.
+# Fits and slopes alternate until no output's σ² changes by more than this share, or so many times.
 _SETTLED, _TURNS = 0.05, 5
-# The least share of a row's variance that σ² is taken for when the rows' noise is compared: a σ² of next to nothing, as
-# of values of a function without noise, would make it any multiple of that.
+# Relative noise variances are computed with a σ² of at least this share of the mean variance from the inputs. For a
+# function without noise, σ² is almost 0, and they would be almost infinite.
 _LEAST_SHARE = 1e-3
-# Rows whose slopes are found at once.
+# Number of rows whose slopes are computed at once.
 _ROWS_AT_ONCE = 256
 
 
@@ -32,11 +32,10 @@ def fit_to_noisy_inputs(
     monitor: Monitor,
     base: np.ndarray | None = None,
 ) -> Fitted:
-    """Repeat a fit, first made as if inputs were exact, until the noise variances settle.
+    """Repeat a fit, which first had exact inputs, until the noise variances converge.
 
-    ``numbers`` is X as an array, ``covariance`` (D, D) that of its noise. ``refit`` takes noise variances (n, o) of the
-    rows in units of σ², and the fit to go on from. y is what was added to the columns ``base`` of X, if these are
-    given.
+    ``numbers`` is X as an array, and ``covariance`` (D, D) is that of its noise. ``refit`` takes noise variances (n, o)
+    of the rows in units of σ², and the fit to continue. If ``base`` is given, y was a difference to these columns of X.
     """
     before, weights = None, row_weights(data.chosen, data.source.n_rows)
     for _ in range(_TURNS):
@@ -56,18 +55,18 @@ def fit_to_noisy_inputs(
 def look_at_slopes(
     posterior: Posterior, data: Dataset, numbers: np.ndarray, covariance: np.ndarray, base: np.ndarray | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∂g Σ ∂gᵀ and E(y - g)² of each row that counts and each output, (n, o) each, in the order of the source."""
+    """∂g Σ ∂gᵀ and E(y - g)² of each row that counts and each output, both (n, o), in the order of the source."""
     fast, chosen = posterior.compile(include_noise=False), data.chosen
     positions = np.arange(len(numbers)) if chosen.positions is None else chosen.positions
     variances, squares = [], []
     for first in range(0, len(positions), _ROWS_AT_ONCE):
         own = positions[first : first + _ROWS_AT_ONCE]
         some = np.asarray(numbers[own], dtype=np.float64)
-        # A map that goes wrong only now is named; what is compiled checks nothing.
+        # The maps are checked here, because the compiled posterior checks nothing.
         posterior.maps.rows(data.given, numbers, own)
         slopes: Any = fast.value_and_jacobian(some)[1].reshape(len(some), -1, some.shape[1])
         if base is not None:
-            # Where y is what was added to columns of X, their noise is in y too.
+            # If y is a difference to columns of X, the noise of these is in y too.
             slopes[:, np.arange(len(base)), base] += 1.0
         variances.append(np.einsum("noi,ij,noj->no", slopes, covariance, slopes, optimize=True))
         mean, std = (part.reshape(len(some), -1) for part in fast.predict(some, return_std=True))

@@ -1,4 +1,4 @@
-"""Fits whose noise has heavy tails: those of the rest, and the doubts of each row, take turns."""
+"""Fits with Student-t noise: fits of the model, and estimates of the noise of each row, alternate."""
 
 from __future__ import annotations
 
@@ -18,55 +18,49 @@ from .search import Fit, Start, better, search
 if TYPE_CHECKING:
     from .fit import FittedModel
 
-# The first look at the rows: a fit of so many iterations to so many of them, or so many per inducing point.
+# The first scales come from a fit of so many iterations to so many rows, or so many per inducing point.
 _LOOK_ITERATIONS, _LOOK_ROWS, _LOOK_ROWS_PER_POINT = 30, 2000, 10
 # The median of the square of a standard normal number.
 _MEDIAN_SQUARE = 0.4549
-# If more rows than this share seem to be outliers, none of them is taken for one to begin with.
+# If more than this share of the rows seem to be outliers, the first scales are all 1.
 _FEW = 0.3
-# The share of the iterations before doubts are looked at anew, and then so many from one look to the next.
+# Share of the iterations before scales are estimated again, and then the number of iterations between estimates.
 _BEFORE, _BETWEEN = 2.0 / 3.0, 50
-# Doubts and q take turns until no E[τ] moves by more than this, or so often.
+# Scales and q alternate until no E[τ] changes by more than this, or so many times.
 _SETTLED, _TURNS = 0.05, 5
-# It ends when the rest gains less from one look to the next than so many times what ends L-BFGS.
+# The fit ends when the gain between two estimates is less than so many times the tolerance of L-BFGS.
 _PATIENCE = 3.0
-# Rows farther off than so many standard deviations of the others do not count for the noise of y.
+# Rows with larger errors than so many standard deviations of the others do not count for the noise of y.
 _FAR = 6.0
-# Rows that are predicted at once.
+# Number of rows that are predicted at once.
 _ROWS_AT_ONCE = 4096
 
 
 @dataclass(frozen=True)
 class RowDoubts:
-    """How much each row is doubted.
+    """The noise scale of each row."""
 
-    Attributes
-    ----------
-    scales : RowScales
-        q(τ) of each row.
-    noise_factor : ndarray of shape (o,)
-        The noise variance of rows that are no outliers, in units of σ².
-    """
-
+    # q(τ) of each row.
     scales: RowScales
+    # (o,): the noise variance of rows that are not outliers, in units of σ².
     noise_factor: np.ndarray
 
     def weigh(self, rows: Rows) -> Rows:
-        """Rows as the rest of the model sees them."""
+        """The rows weighted by their noise scales."""
         source = rows.source
         if not isinstance(source, LocalSource):
             raise TypeError("Rows of Dask arrays cannot be doubted.")
         return replace(rows, source=source.weighed(self.scales.mean, self.scales.log_variance))
 
     def told(self, fitted: FittedModel) -> FittedModel:
-        """What is said of the noise is that of rows that are no outliers; no upper bound is known."""
+        """A fitted model with the noise variance of rows that are not outliers. No upper bound is known."""
         predictor = replace(fitted.predictor, noise=fitted.values["noise"] * self.noise_factor)
         return replace(fitted, known_upper_bound=np.inf, predictor=predictor)
 
     def updated(self, fitted: FittedModel, rows: Rows) -> FittedModel:
-        """Fold new rows in, which are doubted first for what is predicted of them, and then by turns with q.
+        """A fitted model with new rows, whose noise scales and q alternate. The scales of earlier rows stay.
 
-        What was doubted of the rows before stays.
+        The first scales come from the predictions before the update.
         """
         noise, plain = fitted.values["noise"], replace(fitted, doubts=None)
         look = look_at(rows, of_residuals(fitted.predictor))
@@ -81,15 +75,15 @@ class RowDoubts:
         return doubts.told(replace(plain.updated(doubts.weigh(rows)), doubts=doubts))
 
     def differ_from(self, before: RowDoubts) -> bool:
-        """Whether some row is doubted more, or less, than before."""
+        """Whether the scale of some row has changed."""
         return bool(np.abs(self.scales.mean - before.scales.mean).max() >= _SETTLED)
 
 
 def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, RowDoubts]:
-    """Fit a model whose noise has heavy tails by coordinate ascent: no turn lowers the bound."""
+    """Fit a model with Student-t noise by coordinate ascent. No step lowers the bound."""
     rows, doubts = model.rows, _first_doubts(model)
     first = model.max_iter - int((1.0 - _BEFORE) * model.max_iter)
-    # Where no row stands out, the fit is that with Gaussian noise.
+    # Without outliers, the first fit is that with Gaussian noise.
     seen = doubts.weigh(rows) if (doubts.scales.outlier > 0.5).any() else rows
     weighed, fit = run(replace(model, rows=seen, max_iter=first))
     weighed = replace(weighed, max_iter=model.max_iter)
@@ -109,7 +103,7 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
 
 
 def _first_doubts(model: Model) -> RowDoubts:
-    """From a short fit to some rows, by whose errors' median all are judged."""
+    """Noise scales from a short fit to some rows. The median of its errors gives the variance."""
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
     some = rows.sampled(size, model.rng) if size < len(rows) else rows
     short = replace(model, rows=some, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
@@ -122,22 +116,10 @@ def _first_doubts(model: Model) -> RowDoubts:
 
 
 def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model, Fit, RowDoubts]:
-    """Kernel, noise and inducing points stay; doubts and q move until they hardly do.
+    """Alternate noise scales and q until they converge, with kernel, noise and inducing points fixed.
 
-    Parameters
-    ----------
-    model : Model
-        With rows that are doubted.
-    fit : Fit
-    rows : Rows
-        As they are.
-    doubts : RowDoubts
-        Of the model's rows.
-
-    Returns
-    -------
-    model, fit, doubts
-        The model with its rows doubted anew, the fit with the bound that it then has, and the doubts.
+    ``rows`` are the unweighted rows. Returns the model with rows weighted by the new scales, the fit with its bound,
+    and the scales.
     """
     noise = fit.values["noise"]
     for _ in range(_TURNS):
@@ -147,39 +129,33 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break
-    # Where nothing is optimised.
+    # No iteration: only the bound is computed.
     return model, replace(fit, bound=model.minimise(Start(fit.values, 0)).bound), doubts
 
 
 def _tolerance(model: Model, fit: Fit) -> float:
-    """In nats: an iteration that gains less is not worth it."""
+    """Smallest gain of an iteration, in nats."""
     return max(LEAST_TOL, ENOUGH * (fit.bound - model.bound_alone)) if model.tol is None else model.tol
 
 
 def predictor_at(model: Model, values: Values) -> Predictor:
-    """With q at its optimum; of residuals."""
+    """The predictor of residuals with q at its optimum."""
     return of_residuals(model.sparse.at_optimum(values, model.sparse.statistics(values, model.blocks)))
 
 
 def of_residuals(predictor: Predictor) -> Predictor:
-    """The same without the reference that residuals are taken from."""
+    """The same predictor for residuals."""
     return replace(predictor, offset=np.zeros_like(predictor.offset))
 
 
 @dataclass(frozen=True)
 class Look:
-    """Rows and what is predicted of them.
+    """Rows and their predictions."""
 
-    Attributes
-    ----------
-    errors, latent : ndarray of shape (n, o)
-        What the mean leaves over, and the variance of the noise-free prediction.
-    variance, counts : ndarray of shape (n,)
-        v and w.
-    """
-
+    # (n, o): errors of the mean, and variances of the noise-free prediction.
     errors: np.ndarray
     latent: np.ndarray
+    # (n,): v and w.
     variance: np.ndarray
     counts: np.ndarray
 
@@ -190,15 +166,15 @@ class Look:
 
     @property
     def typical(self) -> np.ndarray:
-        """A variance (o,) that no few rows can move: by the median."""
+        """A robust variance (o,), from the median."""
         return np.maximum(np.median(self.squares, axis=0) / _MEDIAN_SQUARE, np.finfo(float).tiny)
 
     def distances(self, noise: np.ndarray) -> np.ndarray:
-        """The d (n,) of rows under noise variances (o,)."""
+        """The squared Mahalanobis distance (n,) of rows, for noise variances (o,)."""
         return (self.squares / noise).sum(axis=1)
 
     def clean_variance(self) -> np.ndarray:
-        """Mean squared errors (o,) of the rows that are no outliers."""
+        """Mean squared errors (o,) of the rows that are not outliers."""
         variance, kept, squares = self.typical, np.zeros(len(self.errors), dtype=bool), self.squares
         while True:
             now = (squares <= _FAR**2 * variance).all(axis=1) | kept
@@ -209,7 +185,7 @@ class Look:
 
 
 def look_at(rows: Rows, predictor: Predictor) -> Look:
-    """What a predictor of residuals says of each row; a pass over them."""
+    """Predict each row by a predictor of residuals, in one pass."""
 
     def of(first: int) -> tuple[np.ndarray, ...]:
         some = rows.some(np.arange(first, min(first + _ROWS_AT_ONCE, len(rows))))

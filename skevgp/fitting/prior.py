@@ -16,9 +16,9 @@ from ..utils.sklearn import safe_indexing
 from ..utils.state import StatefulEstimator
 from ..utils.validation import as_floats, check_magnitude
 
-# Of a weight whose map has no opinion: the feature could explain ten times the target's standard deviation.
+# Without a prior from the map, a feature may explain this many times the target's standard deviation.
 _WIDE = 10.0
-# Of correlations.
+# Rounding errors of correlations.
 _ROUNDING = 1e-8
 
 
@@ -86,10 +86,7 @@ def as_coef_prior(coef_prior: Any) -> CoefPrior:
 
 
 class Resolved(NamedTuple):
-    """Mean and standard deviations (k, p), and C (k, p, p) with Σ = C Cᵀ, or None if weights are independent.
-
-    k is the number of outputs, or 1 if they share their weights.
-    """
+    """Mean and standard deviations (k, p), and C (k, p, p) with Σ = C Cᵀ. k is 1 if outputs share their weights."""
 
     mean: np.ndarray
     scale: np.ndarray
@@ -99,17 +96,13 @@ class Resolved(NamedTuple):
 def resolved(
     prior: CoefPrior, feature_map: Any, X: Any, wide: np.ndarray, n_outputs: int, allow_vague: bool = False
 ) -> Resolved:
-    """Prior mean and covariance of the weights of a fitted feature map.
+    """The prior of the weights of a fitted feature map, checked.
 
-    The map's method ``coef_prior(n_outputs)`` returns the mean and either the standard deviations or the covariance
-    (k, p, p), or one (p, p) for all; unions concatenate those of their parts. A part without the method, and entries of
-    a scale that are NaN, get mean 0 and the scale ``wide`` (k, p). Of X only the first row is used, to learn the widths
-    of the parts of a union.
-
-    Raises
-    ------
-    ValueError
-        If a shape does not fit, a value is not finite, a scale is negative, or a covariance is none.
+    The map's method ``coef_prior(n_outputs)`` returns the mean, and the standard deviations or the covariance: (k, p,
+    p), or one (p, p) for all. A union joins the priors of its parts. A part without the method, and entries of a scale
+    that are NaN, get mean 0 and the scale ``wide`` (k, p). Only the first row of X is used, to find the widths of the
+    parts. ``allow_vague`` allows infinite scales. Raises a ValueError if a shape does not fit, a value is not finite, a
+    scale is negative, or a covariance is not positive semi-definite.
     """
     shape, shared = wide.shape, n_outputs > len(wide)
     for name in ("mean", "scale", "cov"):
@@ -152,7 +145,7 @@ def _independent(shape: tuple[int, int]) -> np.ndarray:
 
 
 def _of_covariance(covariance: ArrayLike, name: str, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray]:
-    """Standard deviations (k, p) and correlation (k, p, p) of a covariance, checked."""
+    """Standard deviations (k, p) and correlations (k, p, p) of a covariance, checked."""
     k, p = shape
     values = as_floats(covariance, name)
     if values.shape not in ((p, p), (k, p, p)):
@@ -200,12 +193,12 @@ def _as_table(value: ArrayLike | str, name: str, shape: tuple[int, int], shared:
 
 
 def _shapes(shape: tuple[int, int]) -> list[tuple[int, ...]]:
-    """What may stand for (k, p): of one output, or one row for all, that row alone."""
+    """The shapes that are accepted for (k, p): for one output, a row alone too."""
     return [shape, shape[1:]] if shape[0] == 1 else [shape]
 
 
 def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
-    """The same for errors."""
+    """The same for error messages."""
     if shared:
         return f"the shape (n_features_out,) = {shape[1:]}, since the outputs share their weights"
     alone = f", or {shape[1:]} for the one output" if shape[0] == 1 else ""
@@ -215,20 +208,11 @@ def _shapes_text(shape: tuple[int, int], shared: bool) -> str:
 def wide_scale(
     feature_size: np.ndarray, target_std: np.ndarray, target_largest: np.ndarray, shared: bool = False
 ) -> np.ndarray:
-    """10 * std(y) / rms(h), the scale of weights of which nothing is known.
+    """10 * std(y) / rms(h), the scale of weights without prior knowledge: (o, p), or (1, p) if they are shared.
 
-    Parameters
-    ----------
-    feature_size : ndarray of shape (p,) or (o, p)
-        Root mean square of each feature.
-    target_std, target_largest : ndarray of shape (o,)
-        Standard deviation of each target, and its largest absolute value, which serves where it does not vary.
-    shared : bool, default=False
-        Whether outputs share their weights: the widest of each.
-
-    Returns
-    -------
-    scale : ndarray of shape (o, p), or (1, p) if they are shared
+    ``feature_size`` (p,) or (o, p) is the rms of each feature. ``target_largest`` (o,) is the largest absolute value of
+    each target, which is used if its standard deviation is 0. For shared weights the widest scale of all outputs
+    counts.
     """
     size = np.where(target_std > 0.0, target_std, target_largest)
     size = _WIDE * np.where(size > 0.0, size, 1.0)[:, np.newaxis]
@@ -243,7 +227,7 @@ def wide_scale(
 def _map_prior(
     feature_map: Any, first: Any, n_outputs: int, shape: tuple[int, int]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and scale (k, width) of a map's weights, and their correlation; NaN in the scale where it has no opinion."""
+    """Mean and scale (k, width) of a map's weights, and their correlation. NaN in the scale if the map has none."""
     if hasattr(feature_map, "coef_prior"):
         return _own_prior(feature_map, n_outputs, shape)
     mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
@@ -261,7 +245,7 @@ def _map_prior(
 
 
 def says_shared(feature_map: Any) -> bool:
-    """Whether a fitted feature map says that all outputs have the same weights; a union if all of its parts do."""
+    """Whether a fitted feature map says that all outputs have the same weights. All parts of a union must say so."""
     if hasattr(feature_map, "share_coef"):
         return bool(feature_map.share_coef)
     if isinstance(feature_map, Pipeline):
@@ -276,7 +260,7 @@ def says_shared(feature_map: Any) -> bool:
 
 
 def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What a map's ``coef_prior`` says, checked."""
+    """The result of a map's ``coef_prior``, checked."""
     (k, p), prior, allowed = shape, feature_map.coef_prior(n_outputs), _shapes(shape)
     called = f"coef_prior of {feature_map!r}"
     parts = [as_floats(part, f"What {called} returns") for part in prior] if isinstance(prior, (tuple, list)) else []
@@ -294,9 +278,9 @@ def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tupl
 
 
 def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarray, float]]:
-    """The parts of a union: map, what it sees of the first row, its columns in the result, their weight.
+    """The parts of a union: map, its input for the first row, its columns in the result, and its weight.
 
-    Parts of weight 0 are left out: their features are 0 and say nothing of a weight.
+    Parts of weight 0 are left out: their features are 0.
     """
     if isinstance(feature_map, FeatureUnion):
         start = 0
@@ -322,16 +306,7 @@ def _weight(union: Any, name: str) -> float:
 
 
 def coef_names(feature_map: Any, columns: np.ndarray | None, n_features: int, letter: str = "h") -> np.ndarray:
-    """What a fitted map calls its features; "h0", "h1", ... if it does not say.
-
-    Parameters
-    ----------
-    feature_map : transformer
-    columns : ndarray of str, or None
-        Names of the columns of X.
-    n_features : int
-    letter : str, default="h"
-    """
+    """Names of the features of a fitted map. "h0", "h1", ... (with ``letter``) if it has none."""
     try:
         names = np.asarray([str(name) for name in feature_map.get_feature_names_out(columns)], dtype=object)
     except (AttributeError, TypeError, ValueError):

@@ -1,4 +1,4 @@
-"""A problem: what is asked of a fit. The estimators make it, and the fit reads it."""
+"""`Problem`: the description of a fit. An estimator makes it, and `fit_model` reads it."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ from .prior import CoefPrior, resolved, says_shared, wide_scale
 from .search import Rules, rules_of
 from .units import Units
 
-# For an infinite prior scale: so many times what could explain y alone.
+# An infinite prior scale becomes this many times the scale with which a feature could explain y alone.
 _VAGUE = 1e3
-# Of the largest feature: one that is smaller tells nothing next to it.
+# A feature that is smaller than this share of the largest one counts as 0.
 _NEGLIGIBLE = 1e-80
-# What features may add, in units of what they leave: its square, by the least noise variance, has to be finite.
+# Largest prior standard deviation of the features' contribution, in units of the residuals. Its square over the lowest
+# noise variance must be finite.
 _LARGEST_SPREAD = 1e130
 
 Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
@@ -35,59 +36,37 @@ Sharing = Literal["all", "kernel", "none", "auto"] | Sequence[Sequence[int]]
 
 @dataclass(frozen=True)
 class Problem:
-    """What is asked of a fit: the rows, the model, and how its parameters are found.
+    """A fit to be made: the rows, the model, and how its parameters are found."""
 
-    Attributes
-    ----------
-    source : Source
-        The rows through both maps, in the user's units.
-    units : Units
-        The internal units, and the prior of the weights.
-    spec : KernelSpec
-        What the user says of kernel and noise.
-    vague : ndarray of shape (o, p)
-        Weights with an infinite prior scale; in ``units.prior`` theirs is very wide.
-    shapes : tuple of tuple of int
-        Of a row's kernel inputs and of its features.
-    groups : ndarray of shape (n,), optional
-        The group of each row of the source.
-    placement : Placement, optional
-        Of the inducing points; None for the exact model.
-    solver : LBFGS or Adam
-    max_iter : int
-    tol : float, optional
-        In nats; None leaves it to the fit.
-    sharing : {"all", "kernel", "none", "auto"} or sequence of sequence of int
-    found : bool
-        Whether the groups of outputs were found and not given.
-    family : {"full", "diagonal"}
-        Of q.
-    noise_cv : CrossValidation, optional
-        By which signal and noise are calibrated.
-    noise : Gaussian or StudentT
-        Model of the noise.
-    row_variance : ndarray of shape (n, o), optional
-        Noise variances of the rows in units of σ², on top of what the source knows. Outputs of a model share the mean.
-    n_threads : int
-        For independent models, or else for blocks of rows.
-    """
-
+    # The rows through both maps, in the user's units.
     source: Source
+    # Shift and scale of the targets, and the prior of the weights.
     units: Units
+    # The user's choices for kernel and noise.
     spec: KernelSpec
+    # (o, p): weights with an infinite prior scale. In ``units.prior`` their scale is very wide.
     vague: np.ndarray
+    # Shapes of a row's kernel inputs and of its features.
     shapes: RowShapes
+    # (n,): the group of each row of the source.
     groups: np.ndarray | None = None
+    # How inducing points are placed. The exact model does not use it.
     placement: Placement = field(default_factory=lambda: Placement("auto", 0))
     solver: LBFGS | Adam = field(default_factory=LBFGS)
     max_iter: int = 0
+    # In nats. None: the fit chooses it.
     tol: float | None = None
     sharing: Sharing = "all"
+    # Whether ``sharing`` was found by the fit, and not given.
     found: bool = False
     family: PosteriorFamily = "full"
+    # The folds by which signal and noise are calibrated.
     noise_cv: CrossValidation | None = None
     noise: Gaussian | StudentT = field(default_factory=Gaussian)
+    # (n, o): noise variances of the rows in units of σ², on top of those in the source. The outputs of a model share
+    # their mean.
     row_variance: np.ndarray | None = None
+    # For independent models, or else for blocks of rows.
     n_threads: int = 1
 
     @classmethod
@@ -101,9 +80,9 @@ class Problem:
         normalize_y: bool,
         allow_vague: bool = False,
     ) -> Problem:
-        """Look at the rows: the kernel's start, the prior of the weights, and the internal units.
+        """Find the kernel's start, the prior of the weights and the internal units from the rows.
 
-        ``allow_vague`` allows weights of which nothing is known before.
+        ``allow_vague`` allows infinite prior scales.
         """
         inputs, features, targets = data.source.sum(moments_of_rows)
         check_not_vanishing(targets.largest, "y")
@@ -148,21 +127,21 @@ class Problem:
 
     @property
     def n_columns(self) -> int:
-        """Width of the kernel's inputs."""
+        """Number of columns of the kernel's inputs."""
         return self.shapes[0][-1]
 
     @property
     def per_output(self) -> bool:
-        """Whether outputs have inputs or features of their own."""
+        """Whether each output has its own inputs or features."""
         return max(map(len, self.shapes)) > 1
 
     @property
     def rules(self) -> Rules:
-        """The numbers that the search goes by."""
+        """The rules of the search."""
         return rules_of(self.solver)
 
     def check(self) -> None:
-        """Refuse what the solver or the diagonal q cannot fit, such as weights that are shared or correlated."""
+        """Raise a ValueError if the solver or the diagonal posterior cannot fit this problem."""
         solver, prior, is_adam = self.solver, self.units.prior, isinstance(self.solver, Adam)
         if is_adam and self.per_output and isinstance(self.sharing, str) and self.sharing == "kernel":
             raise ValueError(
@@ -181,19 +160,19 @@ class Problem:
 def _prior(
     asked: CoefPrior, data: Dataset, features: Moments, targets: Moments, allow_vague: bool
 ) -> tuple[CoefficientPrior, np.ndarray]:
-    """The weights' prior, in the user's units, and which of them (o, p) are vague."""
+    """The prior of the weights in the user's units, and which of them (o, p) are vague."""
     o, shared, feature_map = len(targets.mean), asked.shared, data.maps.feature_map
     if isinstance(shared, str):
         shared = says_shared(feature_map)
     elif shared and feature_map is None:
         raise ValueError("shared=True of CoefPrior needs a feature_map: without one there are no weights to share.")
     shared = bool(shared) and o > 1 and feature_map is not None
-    # Bumps far from all rows, say, are as good as 0.
+    # A bump far from all rows, for example, counts as 0.
     size = np.where(features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0), features.rms, 0.0)
     wide = wide_scale(size, np.sqrt(targets.variance), targets.largest, shared)
     mean, scale, root = resolved(asked, feature_map, data.given, wide, o, allow_vague)
     vague = np.isinf(scale)
-    # For an infinite prior scale, one so wide that it does not matter.
+    # An infinite scale becomes one so wide that its value does not matter.
     scale = np.where(vague, _VAGUE * wide_scale(size, targets.largest, targets.largest, shared), scale)
     if shared:
         mean, scale, vague = (np.repeat(values, o, axis=0) for values in (mean, scale, vague))

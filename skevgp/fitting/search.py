@@ -1,6 +1,6 @@
-"""The search over starts: from where a model is fitted, one start after the other, and which of the fits is kept.
+"""The search over starts: where each fit of a model starts, and which fit is kept.
 
-A fit may end where the noise explains everything, or with inducing points where nothing happens: one start is not
+A fit may end where the noise explains everything, or with inducing points where nothing happens. One start is not
 enough. docs/guide/inside.md has a table of the rules, what each prevents, and the test that fails without it.
 """
 
@@ -21,69 +21,67 @@ if TYPE_CHECKING:
     from .exact import ExactTask
     from .model import Model
 
-# Nats: by less than this, a white kernel and noise are below each other by rounding.
+# In nats. With a smaller difference, rounding decides whether a white kernel or noise has the higher bound.
 _WORTH = 0.01
-# Of a mean row's noise: so little signal costs next to nothing, and the gradient still tells whether it should grow.
+# Share of the mean noise variance. A signal this small costs almost nothing, and its gradient shows if it should grow.
 _LITTLE = 1e-4
-# Numbers: samples are held in memory.
+# Largest number of floats of a sample. Samples are held in memory.
 LARGEST_SAMPLE = 2_000_000
-# Of the exact model, where rounding does not matter before the noise is so low: a smooth function is met to 1e-6.
+# Lower limit of the noise in the exact model. Above it, rounding does not matter. A smooth function is met to 1e-6.
 LOWEST_NOISE_EXACT = 1e-12
 
 
 @dataclass(frozen=True)
 class Rules:
-    """The numbers that a search goes by; docs/guide/inside.md says what each prevents."""
+    """The numbers that control a search. docs/guide/inside.md says what each prevents."""
 
-    # Where the noise variance starts if the user does not say, as a share of what the features leave over. A low one
-    # keeps L-BFGS out of the optimum where the noise explains everything.
+    # Default start of the noise variance, as a share of the residuals' variance. A low one keeps L-BFGS out of the
+    # optimum where the noise explains everything.
     first_noise: float
-    # Its lower limit in the same units. Below 1e-10, what rounding leaves of k(x, x) - |v|² in a sparse model
-    # outweighs the noise.
+    # Its lower limit in the same units. Below 1e-10, the rounding errors of k(x, x) - |v|² in a sparse model are larger
+    # than the noise.
     lowest_noise: float = 1e-10
-    # The lower limit where inducing points are all rows, and the exact model's algebra takes the place of the sparse
-    # one's; None keeps the sparse one's.
+    # The lower limit if all rows are inducing points, so that the exact model is used. None: always the sparse model.
     lowest_noise_exact: float | None = None
-    # Its upper limit, in units of the variance that the features leave over; of a fit that starts there or above, the
-    # targets' variance if that is more.
+    # Its upper limit, in units of the residuals' variance. A fit that starts there or above may go up to the targets'
+    # variance.
     highest_noise: float = 1e2
-    # Where lengthscales start, in standard deviations of their column, times √d: rows are then neither all alike nor
-    # all strangers, whatever the number of columns.
+    # Start of the length scales, in standard deviations of their column times √d. Rows are then neither all similar nor
+    # all uncorrelated, for any number of columns.
     lengthscale: float = 0.6
-    # In the same units, the lower one without √d.
+    # Their limits in the same units. The lower one is without √d.
     lengthscale_limits: tuple[float, float] = (1e-2, 1e4)
-    # Of the signal variance, in units of the variance that the features leave over. From a first guess L-BFGS may
-    # step far, and without an upper limit makes long waves of huge height from small ones.
+    # Limits of the signal variance, in units of the residuals' variance. L-BFGS may step far from a first guess.
+    # Without an upper limit it makes long waves of huge height from small ones.
     signal_limits: tuple[float, float] = (1e-8, 1e2)
-    # The upper limit of a fit that starts where another ended at the first limit: polynomials, and sums of functions
-    # of single columns, are to a stationary kernel a long lengthscale and a high signal. None leaves the fit there.
+    # The upper limit for a fit that continues another one from the first limit: for polynomials and for sums of
+    # functions of single columns, a stationary kernel needs a long length scale and a high signal. None: no such fit.
     widest_signal: float | None = 1e4
-    # Of k(X_m, X_m).
+    # Jitter of k(X_m, X_m).
     jitter: Jitter = JITTER
-    # An output counts as not learned when noise comes to explain this share of what the features leave over.
+    # An output is not learned if the noise explains this share of the residuals' variance.
     collapsed: float = 0.9
-    # Where a collapsed fit starts again: factors on the first lengthscales and the first noise variance.
+    # Starts after a collapsed fit: factors on the first length scales and the first noise variance.
     other_starts: tuple[tuple[float, float], ...] = ()
-    # Whether a fit that has ended below the features alone starts at last from the noise that suits these.
+    # Whether a fit that ended below the features alone starts once more, from the noise that is best for these.
     last_start: bool = True
-    # A start from a noise so many times higher comes after the first, where it costs little: on a sample of the rows,
-    # or with as many inducing points as rows. The kernel may then explain every row by itself, and a low noise lead
-    # to that plateau; a high one finds much noise sooner.
+    # The second start has a noise so many times higher, on a sample of the rows or with as many inducing points as
+    # rows, where it costs little. Otherwise a low noise may lead to a plateau where the kernel explains each row by
+    # itself. A high one finds much noise sooner.
     much_noise: float | None = None
-    # Iterations after which inducing points are placed anew, and so many again until it shows whether that was
-    # better; on all rows, or on the smallest sample. None leaves the points.
+    # Inducing points are placed again after so many iterations on all rows or on the smallest sample. After so many
+    # again, the better of both fits is kept. None: the points are placed once.
     stage: int | None = None
-    # Rows, and rows per inducing point and feature: so many are enough to begin with, the larger number counts. None
-    # takes all.
+    # The first sample has so many rows, or so many per inducing point and feature if that is more. None: all rows.
     sample: tuple[int, int] | None = None
-    # A sample is followed by one so many times larger; one of more than half of the rows, or of more numbers than
-    # `LARGEST_SAMPLE`, is left out.
+    # The next sample is so many times larger. Samples of more than half of the rows, or of more floats than
+    # `LARGEST_SAMPLE`, are left out.
     growth: int = 4
-    # A restart multiplies the first values by numbers between 1 / factor and the factor, drawn log-uniformly.
+    # A restart multiplies the first values by random numbers between 1 / factor and the factor, log-uniformly.
     restart_factors: dict[str, float] = field(default_factory=lambda: {"hyperparameters": 3.0, "noise": 30.0})
 
     def samples(self, n_rows: int, n_weights: int, width: int) -> tuple[int, ...]:
-        """Sizes of the samples that a fit begins with; none if there are too few rows of ``width`` numbers."""
+        """Sizes of the samples that a fit begins with. Empty if there are too few rows (of ``width`` numbers)."""
         if self.sample is None:
             return ()
         sizes, size = [], max(self.sample[0], self.sample[1] * n_weights)
@@ -93,8 +91,8 @@ class Rules:
         return tuple(sizes)
 
 
-# For a solver that sees all rows, and for one that sees mini-batches. Adam's steps do not grow with the gradient: the
-# noise starts nearer to the data's scatter, and inducing points stay where they are placed.
+# Rules for a solver that sees all rows, and for one that sees mini-batches. Adam's steps do not grow with the gradient:
+# the noise starts closer to the variance of the data, and inducing points are placed once.
 RULES = Rules(
     first_noise=1e-4,
     lowest_noise_exact=LOWEST_NOISE_EXACT,
@@ -107,27 +105,27 @@ MINI_BATCH_RULES = Rules(first_noise=1e-2, widest_signal=None, last_start=False)
 
 
 def rules_of(solver: Solver) -> Rules:
-    """The rules of a fit by this solver."""
+    """The rules for a solver."""
     return MINI_BATCH_RULES if solver.stochastic else RULES
 
 
 @dataclass(frozen=True)
 class Fit:
-    """Where an optimiser ended.
-
-    ``bound`` is in nats, in internal units; -inf if it could not be computed. ``loss_curve`` is minus the bound per
-    iteration, with that of the fits it went on from first. ``message`` says what the user should know of how it ended.
-    ``predictor`` is there if q is not at its optimum for the values. ``n_rows`` is the size of the sample that was
-    fitted, None for all rows. ``widened`` are the parameters that had their widest limits.
-    """
+    """The end of one run of an optimiser."""
 
     values: Values
+    # In nats, in internal units. -inf if it could not be computed.
     bound: float
+    # Minus the bound per iteration, including the fits that this one continues.
     loss_curve: list[float] = field(default_factory=list)
     converged: bool = True
+    # For the user. Empty if all is well.
     message: str = ""
+    # Only if q is not at its optimum for the values.
     predictor: Predictor | None = None
+    # Size of the sample that was fitted. None: all rows.
     n_rows: int | None = None
+    # Names of the parameters that had their widest limits.
     widened: tuple[str, ...] = ()
 
     @property
@@ -137,62 +135,56 @@ class Fit:
 
     @property
     def rank(self) -> tuple[float, float]:
-        """The better of two fits has the higher rank: one to more rows, or else the higher bound."""
+        """Sort key for the better of two fits: more rows first, then the higher bound."""
         return np.inf if self.n_rows is None else self.n_rows, self.bound
 
 
 def better(best: Fit | None, fit: Fit) -> Fit:
-    """The fit with the higher rank; of equals the later, which may have gone on from the other."""
+    """The fit with the higher rank. Of equal ones the later, which may have continued the other."""
     return fit if best is None or fit.rank >= best.rank else best
 
 
 @dataclass(frozen=True)
 class FeaturesAlone:
-    """The bound of the features without a Gaussian process: a fit that ends below has failed.
-
-    ``noise`` are the noise variances (o,) with which it is reached. ``most`` is what it may be, and no more, where that
-    depends on where a kernel of fixed signal ends. ``hidden`` says that the noise may be far above what the features
-    leave over, from where no fit climbs to it.
-    """
+    """The bound of the features without a Gaussian process. A fit that ends below it has failed."""
 
     bound: float = -np.inf
+    # (o,): the noise variances that reach the bound.
     noise: np.ndarray | None = None
+    # An upper limit of the bound, if it depends on the end of a kernel with a fixed signal.
     most: float = -np.inf
+    # Whether the noise may be far above the residuals, so that no fit climbs to it.
     hidden: bool = False
 
 
 @dataclass(frozen=True)
 class Start:
-    """From where a fit starts, and how far it may go.
-
-    ``until`` is the most iterations, those of ``after`` among them, the fit to the same rows that it goes on from.
-    ``n_rows`` is the size of the sample that is fitted, None for all rows. ``cold`` marks a first guess, where the
-    curvature of the bound says little of that at the end.
-    """
+    """The start of a fit, and its limit of iterations."""
 
     values: Values
+    # Largest number of iterations, including those of ``after``.
     until: int
+    # The fit to the same rows that this one continues.
     after: Fit | None = None
+    # Size of the sample to fit. None: all rows.
     n_rows: int | None = None
+    # Whether the values are a first guess. The curvature of the bound there says little about its end.
     cold: bool = False
 
     @property
     def loss_curve(self) -> list[float]:
-        """Of the iterations before the first of this fit."""
+        """The loss of each iteration before this fit."""
         return [] if self.after is None else self.after.loss_curve
 
 
 class _StoppedError(Exception):
-    """Ctrl-C, or the end of the time: the best fit so far counts."""
+    """Ctrl-C was pressed or the time is over. The best fit so far is the result."""
 
 
 def search(model: Model | ExactTask) -> Fit:
-    """Fit a model from one start after the other; the best fit, after Ctrl-C of those so far.
+    """Fit a model from one start after another and return the best fit. After Ctrl-C, it is the best so far.
 
-    Raises
-    ------
-    KeyboardInterrupt
-        If there is none yet.
+    Raises KeyboardInterrupt if there is none yet.
     """
     found = Search(model)
     with model.monitor.keeping_the_best(patient=True), suppress(_StoppedError):
@@ -203,19 +195,19 @@ def search(model: Model | ExactTask) -> Fit:
 
 
 class Search:
-    """The fits of a model so far, and the best of them."""
+    """The best fit of a model so far, and the rules for the next start."""
 
     def __init__(self, model: Model | ExactTask):
         self.model, self.rules, self.table, self.max_iter = model, model.rules, model.table, model.max_iter
         self.best: Fit | None = None
 
     def run(self) -> None:
-        """Fit from one start after the other; cold ones only if those from another fit lead nowhere."""
+        """Fit from one start after another. If the start from an earlier fit fails, cold starts follow."""
         first, warm = self.table.values_at_start(), self.model.warm
         if warm is None:
             best = self._released(self._climb(first))
         else:
-            # Inducing points that another fit moved have found their places.
+            # Inducing points that another fit moved are in good places.
             moved_before = self.model.placed or not np.array_equal(warm["inducing_points"], first["inducing_points"])
             if moved_before:
                 best = self._released(self._unless_collapsed(first | warm, self.max_iter))
@@ -227,13 +219,14 @@ class Search:
             for _ in range(self.model.n_restarts):
                 best = better(best, self._released(self._climb(self.model.restart())))
         if self._is_doubtful(best):
-            # A fit with little signal, from the noise that suits the features alone.
+            # A fit with little signal, from the noise that is best for the features alone.
             noise = self.model.alone.noise
             assert noise is not None
             little = np.minimum(first["signal"], _LITTLE * noise / self.model.mean_precision)
             self._released(self._fit(Start(first | {"signal": little, "noise": noise}, self.max_iter)))
 
     def _fit(self, start: Start) -> Fit:
+        """Run the solver once and keep the best fit. Raise `_StoppedError` after Ctrl-C."""
         fit = replace(self.model.minimise(start), widened=self.table.held(start.values))
         self.best = better(self.best, fit)
         if self.model.monitor.stopped:
@@ -241,15 +234,15 @@ class Search:
         return fit
 
     def _released(self, best: Fit) -> Fit:
-        """A fit that ended at a limit goes on from there, where the table has a wider one."""
+        """Continue a fit that ended at a limit, if the table has a wider one."""
         if best.n_iter < self.max_iter and set(self.table.held(best.values)) - set(best.widened):
             best = better(best, self._fit(Start(best.values, self.max_iter, best)))
         return best
 
     def _climb(self, values: Values) -> Fit:
-        """A fit to a sample of the rows, then on from there to larger ones, and at last to all.
+        """Fit a sample of the rows, continue on larger samples, and at last on all rows.
 
-        Most of what kernel and noise have to learn is learned from a few rows, where an iteration costs little.
+        Kernel and noise learn most from a few rows, where an iteration costs little.
         """
         stage, samples = self.rules.stage, self.model.samples
         if stage is None or not samples or self.max_iter == 0:
@@ -268,12 +261,10 @@ class Search:
         return better(best, self._stages(values, self.max_iter))
 
     def _stages(self, values: Values, max_iter: int, n_rows: int | None = None) -> Fit:
-        """A fit whose inducing points are placed again under the kernel that the first iterations learned.
-
-        (Burt et al. 2020 do so until it gains nothing; once gained nearly all here.) The first places cannot know which
-        columns matter, and L-BFGS moves points a little, not across the data. A stage later the better of the two, the
-        fit from the new places and that which went on from the old ones, goes on.
-        """
+        """Fit in stages: after the first iterations, inducing points are placed again under the learned kernel."""
+        # (Burt et al. 2020 repeat this until nothing is gained. Once gained almost all here.) The first places cannot
+        # know which columns matter, and L-BFGS moves points a little, not across the data. One stage later, the better
+        # of two fits continues: from the new places, or from the old ones.
         stage, place = self.rules.stage, self.model.place
         if (
             place is None
@@ -292,7 +283,7 @@ class Search:
         return best
 
     def _unless_collapsed(self, values: Values, until: int, n_rows: int | None = None) -> Fit:
-        """A fit from these values; from other starts too where it may have ended in a bad optimum."""
+        """Fit from these values, and from other starts if the fit may have ended in a bad optimum."""
         free, everything = bool(self.table["noise"].free.any()), n_rows is None
         much = self.rules.much_noise if free and (self.model.interpolates or not everything) else None
         best = self._fit(Start(values, until, None, n_rows, cold=True))
@@ -312,18 +303,18 @@ class Search:
         return best
 
     def collapsed(self, fit: Fit) -> bool:
-        """Whether noise came to explain everything, or the kernel explains less than nothing would."""
+        """Whether the noise explains everything, or the kernel makes the bound worse than the features alone."""
         if (fit.values["noise"] > self.rules.collapsed * self.model.scatter).any():
             return True
         return self._below(fit)
 
     def _below(self, fit: Fit, hopeless: bool = False) -> bool:
-        """Whether it ended below the features alone; what has not ended yet may still rise, unless that is hopeless."""
+        """Whether a fit ended below the features alone. One that has not ended may still rise, unless ``hopeless``."""
         ended = hopeless or fit.converged or fit.n_iter < self.max_iter
         return fit.n_rows is None and ended and fit.bound < self.model.alone.bound - _WORTH
 
     def _is_doubtful(self, best: Fit) -> bool:
-        """Whether it ended below the features alone, or maybe did, and a fit could start from there."""
+        """Whether the best fit is, or may be, below the features alone, and another start could help."""
         alone, free = self.model.alone, self.table["noise"].free.any() or self.table["signal"].free.any()
         if alone.noise is None or self.max_iter == 0 or not free or not self.rules.last_start:
             return False
@@ -332,7 +323,7 @@ class Search:
 
 
 def moved(values: Values, length_factor: float, noise_factor: float) -> Values:
-    """The same values with other hyperparameters and another noise."""
+    """The same values with hyperparameters and noise multiplied by factors."""
     return values | {
         "hyperparameters": length_factor * values["hyperparameters"],
         "noise": noise_factor * values["noise"],
@@ -340,7 +331,7 @@ def moved(values: Values, length_factor: float, noise_factor: float) -> Values:
 
 
 def drawn(table: ParameterTable, rules: Rules, rng: np.random.RandomState) -> Values:
-    """The table's first values with kernel and noise elsewhere, within their limits."""
+    """Random first values of kernel and noise within their limits."""
     coordinates = table.coordinates(table.start())
     for name, factor in rules.restart_factors.items():
         reach = np.log(factor)

@@ -1,4 +1,4 @@
-"""Which outputs share a model, where that is to be found."""
+"""The groups of outputs that share a kernel, for ``sharing="auto"``."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from .problem import Problem
 if TYPE_CHECKING:
     from .fit import Fitted
 
-# Of what its own Gaussian process gains an output over features and noise.
+# Largest loss of an output, as a share of the gain of its own Gaussian process over features and noise.
 _LARGEST_LOSS = 0.01
-# At the most, if the time is limited.
+# Largest share of ``max_time``.
 _SHARE_OF_TIME = 0.5
-# In squared internal units: rounding.
+# Variances of residuals below this are rounding errors, in squared internal units.
 _CONSTANT = 1e-12
-# By which groups are found: at most so many rows and points; iterations of the first fit and of others; in nats.
+# Short fits: largest numbers of rows and points, iterations of the first fit and of the others, tolerance in nats.
 _SAMPLE, _POINTS = 1000, 100
 _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
 
@@ -38,26 +38,10 @@ _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
 def with_groups(
     problem: Problem, rng: np.random.RandomState, monitor: Monitor, previous: Fitted | None = None
 ) -> Problem:
-    """With ``sharing="auto"`` the same problem with groups, those that ``previous`` found if there are any.
+    """For ``sharing="auto"``, the same problem with groups: those of ``previous``, or those found by short fits.
 
-    Parameters
-    ----------
-    problem : Problem
-    rng : RandomState
-        Which stays as it is: a fit with these groups given is the same fit.
-    monitor : Monitor
-        Which Ctrl-C stops, and which is told of no iteration.
-    previous : Fitted, default=None
-        A fit to other rows.
-
-    Returns
-    -------
-    problem : Problem
-
-    Raises
-    ------
-    KeyboardInterrupt
-        There is nothing yet to keep.
+    ``rng`` is not changed: a fit with the same groups given is the same fit. Ctrl-C raises KeyboardInterrupt, since
+    there is no fit to keep yet.
     """
     if not (isinstance(problem.sharing, str) and problem.sharing == "auto"):
         return problem
@@ -74,28 +58,17 @@ def with_groups(
 
 
 def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> list[list[int]]:
-    """Which outputs to fit together: those that one kernel serves, each of them nearly as well as one of its own.
+    """A partition of the outputs into groups that one kernel serves almost as well as own kernels do.
 
-    (The sum of their bounds, which a fit maximises, does not show it: outputs with little noise rule it.) What a kernel
-    is worth is seen in short fits to a sample of the rows. The first is of all outputs. Its inducing points then stay,
-    so that what follows is a matter of the kernel and not of luck: from there each output is fitted alone, and all
-    together. If that costs one of them too much (`_LARGEST_LOSS`), each becomes a group, and of all pairs of groups
-    those with the kernels most alike are tried first, and joined if it costs no output too much, until none is left.
-    Outputs that learned nothing from the sample are the last group, or if they are constant in the first one. Constants
-    of which nothing is left over have a group of their own: their kernel is as smooth as may be.
-
-    Parameters
-    ----------
-    problem : Problem
-    rng : RandomState
-    monitor : Monitor
-        Which Ctrl-C stops.
-
-    Returns
-    -------
-    groups : list of list of int
-        A partition of the outputs.
+    Short fits to a sample of the rows decide it. The sum of the bounds, which a fit maximises, does not: outputs with
+    little noise dominate it.
     """
+    # The first short fit is of all outputs. Its inducing points are then fixed, so that the kernel alone makes a
+    # difference. From there each output is fitted alone, and all outputs together. If sharing costs one of them more
+    # than `_LARGEST_LOSS`, each output becomes a group. Pairs of groups with the most similar kernels are tried first.
+    # They are joined if it costs no output too much, until no pair is left. Outputs that learned nothing from the
+    # sample are the last group, or join the first group if they are constant. Constants that the features explain are a
+    # group of their own: their kernel may be as smooth as the limits allow.
     everything = list(range(len(problem.units.target_unit)))
     if len(everything) == 1 or problem.max_iter == 0:
         return [everything]
@@ -104,8 +77,8 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
         return [everything]
     found = side_by_side(fits.alone, everything, problem.n_threads, monitor)
     own = np.array([fits.bound(o, values) for o, values in enumerate(found)])
-    # A kernel of its own has more parameters, too, each worth ½ log n nats (Schwarz 1978): of what gains less, the
-    # sample shows nothing.
+    # An own kernel has more parameters, and each must gain ½ log n nats (Schwarz 1978). If an output gains less, the
+    # sample says nothing about it.
     gain, chance = own - fits.without, 0.5 * fits.n_free * np.log(fits.n_rows)
     bearable = np.maximum(_LARGEST_LOSS * gain, chance)
     learned = [o for o in everything if gain[o] > chance]
@@ -114,7 +87,7 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
         bounds = [fits.bound(o, values) for o, values in zip(outputs, shared, strict=True)]
         return bool((own[outputs] - bounds <= bearable[outputs]).all())
 
-    # Rows that were not drawn may show it, and then the others must not rule its kernel: a group of its own.
+    # Rows outside of the sample may say more. Other outputs must not dominate its kernel then: it has its own group.
     unknown = [o for o in everything if o not in learned]
     variance = problem.units.rows(problem.source).residuals.variance if unknown else np.empty(0)
     still = [o for o in unknown if problem.units.constant is not None and problem.units.constant[o]]
@@ -152,31 +125,22 @@ def found_groups(problem: Problem, rng: np.random.RandomState, monitor: Monitor)
 
 @dataclass(frozen=True)
 class _ShortFits:
-    """Fits to a sample of the rows, all with the inducing points where a first one of all outputs ended.
+    """Fits to a sample of the rows, all with the inducing points of a first fit to all outputs."""
 
-    A fit is told as the values of each of its outputs.
-
-    Attributes
-    ----------
-    problem : Problem
-        Of the sample and the points.
-    together : list of dict
-        Where the first ended.
-    monitor : Monitor
-    """
-
+    # With the sample for its rows, and with the inducing points.
     problem: Problem
+    # The values of each output at the end of the first fit.
     together: list[Values]
     monitor: Monitor
 
     @classmethod
     def of(cls, problem: Problem, rng: np.random.RandomState, monitor: Monitor) -> _ShortFits:
-        """With the first fit."""
+        """Make the first fit."""
         raw = Rows(problem.source, lambda rows: rows).sample(_SAMPLE, rng)
         source = LocalSource.holding(raw)
         most = problem.placement.max_inducing or problem.placement.n_inducing
         placement = Placement("k-means", min(most, _POINTS))
-        # Each output has weights of its own here, if it shares them or not: what is asked is which kernel it wants.
+        # Here outputs do not share their weights: only the kernel matters.
         units = replace(problem.units, prior=replace(problem.units.prior, shared=False))
         problem = replace(problem, source=source, units=units, placement=placement, sharing="all", family="full")
         (model,) = models_of(problem, rng, monitor, BlockMap())
@@ -186,11 +150,12 @@ class _ShortFits:
 
     @property
     def n_rows(self) -> int:
+        """Number of rows of the sample."""
         return self.problem.source.n_rows
 
     @property
     def n_free(self) -> int:
-        """Parameters of k̃ that are not fixed."""
+        """Number of free parameters of k̃."""
         return int(self._each[0].table["hyperparameters"].free.sum())
 
     @property
@@ -199,11 +164,11 @@ class _ShortFits:
         return np.array([model.bound_alone for model in self._each])
 
     def alone(self, output: int) -> Values:
-        """An output, from where the first fit ended."""
+        """The values of an output that continues the first fit alone."""
         return self.further([output], self.together)[0]
 
     def further(self, outputs: list[int], starts: list[Values]) -> list[Values]:
-        """Some outputs, from the values of all: from the mean of their kernels."""
+        """The values of some outputs that continue together, from the mean of their kernels."""
         others = [[o] for o in range(len(starts)) if o not in outputs]
         (model,) = (own for own in self._planned([outputs, *others]) if own.rows.columns == outputs)
         own = [starts[o] for o in outputs]
@@ -212,7 +177,7 @@ class _ShortFits:
         return _short_fit(model, model.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
 
     def bound(self, output: int, values: Values) -> float:
-        """Of an output with its values; very low where it cannot be computed."""
+        """The bound of an output at its values. Very low if it cannot be computed."""
         model = self._each[output]
         try:
             loss, _ = model.objective(model.table)(model.table.started_at(values).start())
@@ -221,22 +186,24 @@ class _ShortFits:
         return -model.rows.total * loss if np.isfinite(loss) else -np.finfo(float).max
 
     def shape(self, values: Values) -> np.ndarray:
-        """k̃ at the points, as a vector of length 1: products are alignments (Cristianini et al. 2001)."""
+        """k̃ at the inducing points as a vector of length 1. Products are alignments (Cristianini et al. 2001)."""
         kernel, (points,) = self._each[0].sparse.kernel, values["inducing_points"]
         K = kernel.at(np.log(values["hyperparameters"]), points).matrix()
         return np.ravel(K) / np.linalg.norm(K)
 
     @cached_property
     def _each(self) -> list[Model]:
+        """A model for each output."""
         return self._planned([[o] for o in range(len(self.together))])
 
     def _planned(self, groups: list[list[int]]) -> list[Model]:
+        """A model for each group."""
         models = models_of(replace(self.problem, sharing=groups), np.random.RandomState(0), self.monitor, BlockMap())
         return [replace(model, table=model.table.with_fixed("inducing_points")) for model in models]
 
 
 def _short_fit(model: Model, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:
-    """The values of each output where so many iterations lead."""
+    """The values of each output after at most ``n_iter`` iterations."""
     tolerance = Tolerance(_SHORT_TOL / model.rows.total)
     minimum = LBFGS().minimise(model.objective(table), table.start(), table.limits(), n_iter, tolerance, monitor)
     values = table.values(minimum.x)

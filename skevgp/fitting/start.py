@@ -1,4 +1,4 @@
-"""Where a fit starts: first values and limits, what is seen of the rows before, and predictions without any rows."""
+"""Starts: first values and limits of the parameters, checks of the rows before a fit, and predictions without a fit."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from .units import SMALLEST_UNIT
 if TYPE_CHECKING:
     from .problem import Problem
 
-# Of squared target units, however little they scatter: about the rounding error of the residuals.
+# Lowest noise variance in squared target units: about the rounding error of the residuals.
 LOWEST_NOISE = 1e-20
 _NEIGHBOUR_SAMPLE = 2000
 
 
 def column_centre(inputs: Moments) -> np.ndarray:
-    """The mean (d,) of each column, or the constant itself: what is left of it is then 0, not rounding errors."""
+    """The mean (d,) of each column. For a constant column, exactly the constant."""
     return np.where(_constant(inputs), inputs.lowest, inputs.mean)
 
 
 def column_scale(inputs: Moments) -> np.ndarray:
-    """The standard deviation (d,) of each column; 1 where the column is constant but for rounding."""
+    """The standard deviation (d,) of each column. 1 for a constant column."""
     scale = np.sqrt(inputs.variance)
     return np.where(_constant(inputs) | (scale <= SMALLEST_UNIT), 1.0, scale)
 
 
 def centred_kernels(covariance: Covariance, inputs: Moments) -> tuple[Covariance, ...]:
-    """The kernel, told around which centre it is used; where outputs have inputs of their own, that of each."""
+    """The kernel with the centre of its inputs. One for each output that has its own inputs."""
     return tuple(covariance.centred(own) for own in np.atleast_2d(column_centre(inputs)))
 
 
@@ -47,25 +47,10 @@ def _constant(inputs: Moments) -> np.ndarray:
 
 
 def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> float:
-    """The mean of k̃(x, x) over the first inducing points; on the way it is seen whether k̃ works there.
+    """The mean of k̃(x, x) over the first inducing points (m, d), at the user's hyperparameters (n_hyper,).
 
-    Parameters
-    ----------
-    kernel : Kernel
-    hyperparameters : ndarray of shape (n_hyper,)
-        First values of the user's.
-    inducing_points : ndarray of shape (m, d)
-
-    Returns
-    -------
-    variance : float
-        Above 0.
-
-    Raises
-    ------
-    ValueError
-        If k̃(X_m, X_m) is not finite, not symmetric, 0, or not positive semi-definite, has another diagonal than
-        k̃(x, x), or cannot be differentiated where x = x'.
+    Raises a ValueError if k̃(X_m, X_m) is not finite, not symmetric, 0 or not positive semi-definite, if its diagonal
+    is not k̃(x, x), or if it has no gradient where x = x'.
     """
     at = kernel.at(np.log(hyperparameters), inducing_points)
     K = at.matrix()
@@ -95,20 +80,10 @@ def checked_variance(kernel: Kernel, hyperparameters: np.ndarray, inducing_point
 
 
 def alike_neighbours(rows: Rows) -> np.ndarray:
-    """Whether neighbouring rows have residuals more alike than noise has: then there is something to learn.
-
-    The mean square difference of residuals between each row and its nearest neighbour is about twice their variance if
-    they are noise (von Neumann 1941, for rows in order); less by four of its standard errors, about 1.6 / √n each, is
-    more than chance.
-
-    Parameters
-    ----------
-    rows : Rows
-
-    Returns
-    -------
-    alike : ndarray of shape (o,)
-    """
+    """Whether neighbouring rows have more similar residuals than noise has, (o,). Then there is something to learn."""
+    # The mean squared difference of residuals between each row and its nearest neighbour is about twice their variance
+    # if they are noise (von Neumann 1941, for ordered rows). Its standard error is about 1.6 / √n of that. Less by four
+    # of these is more than chance.
     if _constant(rows.inputs).all() or len(rows) < 2:
         return np.zeros(len(rows.scatter()), dtype=bool)
     each, other = neighbours(rows)
@@ -117,7 +92,7 @@ def alike_neighbours(rows: Rows) -> np.ndarray:
 
 
 def neighbours(rows: Rows, size: int = _NEIGHBOUR_SAMPLE) -> tuple[RawRows, RawRows]:
-    """Up to ``size`` of a sample of the rows, and the nearest of its others to each, in standard deviations."""
+    """Up to ``size`` rows of a sample, and the nearest other row of the sample to each, in standard deviations."""
     some = rows.some(np.unique(np.linspace(0, len(rows) - 1, _NEIGHBOUR_SAMPLE).astype(int)))
     inputs = (some.inputs - rows.inputs.mean) / column_scale(rows.inputs)
     queried = np.unique(np.linspace(0, len(inputs) - 1, size).astype(int))
@@ -136,9 +111,9 @@ def starting_table(
 ) -> ParameterTable:
     """The parameters of a model of some outputs: hyperparameters of k̃, s², σ² (in squared target units) and X_m.
 
-    ``rows`` are those of the outputs; inducing points are (g, m, d); ``mean_variance`` is the mean of k̃(x, x) where it
-    starts; ``n_kernels`` is the number of kernels where groups of outputs have one each; ``exact`` allows the lower
-    noise of the exact model.
+    ``rows`` are those of the outputs. Inducing points are (g, m, d). ``mean_variance`` is the mean of k̃(x, x) at the
+    start. ``n_kernels`` is the number of kernels if groups of outputs have one each. ``exact`` allows the lower noise
+    of the exact model.
     """
     units, starts, rules = problem.units, problem.spec.starts, problem.rules
     if exact and rules.lowest_noise_exact is not None:
@@ -146,7 +121,7 @@ def starting_table(
     inputs, own, precision, scatter = rows.inputs, rows.columns, rows.mean_precision, rows.scatter()
     target_unit, constant, rounding = units.target_unit[own], units.constant[own], units.rounding[own]
     o, scale = np.ones(len(target_unit)), column_scale(inputs)
-    # Outputs may have columns of their own, and groups of them kernels of their own.
+    # Outputs may have their own columns, and groups of outputs their own kernels.
     typical = np.sqrt(np.mean(scale**2, axis=0)) if scale.ndim == 2 and n_kernels is None else scale
     if problem.spec.covariance.n_hyperparameters <= 1:
         typical = np.sqrt(np.mean(typical**2, axis=-1, keepdims=True))
@@ -168,7 +143,7 @@ def starting_table(
             parameter_of(
                 starts.signal,
                 "signal",
-                # Among others, a constant is not to rule the kernel that they share.
+                # A constant must not dominate the kernel that it shares with other outputs.
                 np.where(np.logical_and(constant, not still), rules.signal_limits[0], 1.0) * signal,
                 rules.signal_limits[0] * signal,
                 rules.signal_limits[1] * signal,
@@ -201,7 +176,7 @@ def with_signal_of_constants(
 ) -> tuple[Values, bool]:
     """Values in which constants among other outputs have the signal that they would have alone, and whether any has.
 
-    The fit gave them next to none, so that they do not rule the kernel that they share.
+    During the fit they have almost no signal, so that they do not dominate the kernel that they share.
     """
     still, start = rows.still(), table["signal"].start
     if problem.spec.starts.signal.value is not None or not still.any() or still.all():
@@ -222,19 +197,9 @@ def parameter_of(
 ) -> Parameter:
     """A row of the table, in internal units.
 
-    Parameters
-    ----------
-    start : Start
-        What the user says, in his units.
-    name : str
-    default, lower, upper : ndarray of the parameter's shape
-        Start and limits, in internal units, where the user says nothing; a start is put inside the limits.
-    unit : ndarray or float
-        The user's values are divided by it.
-    widest : ndarray of the parameter's shape, optional
-        The upper limit once a fit has ended at the other, where the user says nothing.
-    stays : bool, default=False
-        Whether it is fixed, whatever the user says.
+    ``start`` holds the user's value and bounds, in units of ``unit``. Without them, ``default`` is the start, and
+    ``lower`` and ``upper`` are the limits. ``widest`` is the upper limit of a fit that continues another one from
+    ``upper``. ``stays`` fixes the parameter.
     """
     first = default if start.value is None else np.broadcast_to(start.value / unit, default.shape)
     if start.bounds is not None:
@@ -243,16 +208,10 @@ def parameter_of(
 
 
 def prior_predictor(rows: Rows, spec: KernelSpec, prior: CoefficientPrior) -> Predictor:
-    """The prior of y: a predictor without points.
+    """The prior of y as a predictor without inducing points.
 
-    Parameters
-    ----------
-    rows : Rows
-        Where it is used.
-    spec : KernelSpec
-        Of which nothing starts from the data (`KernelSpec.as_given`). Noise of which it says nothing is left out.
-    prior : CoefficientPrior
-        Of the weights, in the user's units.
+    ``spec`` must have all of its starts (`KernelSpec.as_given`). If it has no noise, there is none. ``prior`` is in the
+    user's units.
     """
     o, p = prior.scale.shape
     starts, kernels = spec.starts, centred_kernels(spec.covariance, rows.inputs)

@@ -1,4 +1,4 @@
-"""The internal units: what the features alone explain of y is taken out of it, and what they leave is of size one."""
+"""Internal units: the fit of the features alone is subtracted from y, and the residuals are divided by their size."""
 
 from __future__ import annotations
 
@@ -14,21 +14,18 @@ from ..data.threads import BlockMap
 from ..model.predictor import CoefficientPrior, Predictor
 from ..utils.linalg import diagonal_of, jittered_cholesky, triangular_inverse
 
-# So that the lowest noise variance in the user's units is not rounded to 0.
+# With a smaller unit, the lowest noise variance in the user's units would be rounded to 0.
 SMALLEST_UNIT = 1e-140
-# What residuals have of rounding errors, as a share of the target's largest value.
+# Size of the rounding errors of residuals, as a share of the target's largest value.
 _TARGET_ROUNDING = 1e-14
-# Of a feature's size: where it adds less than this to the others, sums of products leave few of its digits.
+# If a smaller share of a feature is independent of the others, sums of products keep few of its digits.
 _SEEN = 1e-6
-# Where it adds less than this, refinement would not converge.
+# With a smaller share than this, refinement would not converge.
 _ROUNDING = 1e-12
 
 
 def _products(raw: RawRows, basis: np.ndarray | None = None) -> np.ndarray:
-    """HᵀH of rows times the basis (k, p, p), k = 1 or o: (p, p), or (o, p, p) of features for each output.
-
-    Where rows have weights, each product has the factor ω; so it has below.
-    """
+    """HᵀΩH of features times the basis (k, p, p): (p, p), or (o, p, p) if each output has its own features."""
     H = raw.features if raw.features.ndim == 2 else raw.features.transpose(1, 0, 2)
     if basis is not None:
         H = H @ (basis[0] if H.ndim == 2 else basis)
@@ -39,7 +36,7 @@ def _products(raw: RawRows, basis: np.ndarray | None = None) -> np.ndarray:
 
 @dataclass(frozen=True)
 class _LeftOver:
-    """Rows -> Hᵀl (o, p) and lᵀl (o,) of l = y - target_mean - H coefᵀ; if asked for, HᵀH, Σ ω and Σ w too."""
+    """Maps rows to HᵀΩl (o, p) and lᵀΩl (o,), with l = y - target_mean - H coefᵀ. Optionally also HᵀΩH, Σω, Σw."""
 
     target_mean: np.ndarray
     coef: np.ndarray
@@ -58,7 +55,7 @@ class _LeftOver:
 
 @dataclass(frozen=True)
 class _ProductsIn:
-    """Rows -> HᵀH in a basis, alone in a tuple."""
+    """Maps rows to (HᵀΩH in a basis,)."""
 
     basis: np.ndarray
 
@@ -67,13 +64,11 @@ class _ProductsIn:
 
 
 def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
-    """Upper R (k, p, p) with RᵀR = HᵀH, of features (k = 1), or of those for each output (k = o).
-
-    Where features nearly depend on each other, as powers of a column far from 0 do, their sums of products are those of
-    the basis R⁻¹ too: an R of these puts back the digits that the first one lacks (shifted Cholesky QR; Fukaya,
-    Kannan, Nakatsukasa, Yamamoto, Yanagisawa 2020; without their third factor, which makes Q orthogonal to the last
-    digit: Q is not used).
-    """
+    """Upper triangular R (k, p, p) with RᵀR = HᵀΩH. k is the number of outputs if each has its own features, else 1."""
+    # Features may be nearly collinear, as powers of a column far from 0. Then the products are summed again in the
+    # basis R⁻¹. Their own R restores the digits that the first one lacks (shifted Cholesky QR; Fukaya, Kannan,
+    # Nakatsukasa, Yamamoto & Yanagisawa 2020). Their third factor makes Q orthogonal to the last digit. Q is not used
+    # here.
     R, lower, sizes = _triangles_of(HH)
     if all((diagonal_of(L) >= _SEEN).all() for L in lower):
         return R
@@ -83,7 +78,7 @@ def _triangles(source: Source, HH: np.ndarray) -> np.ndarray:
 
 
 def _triangles_of(products: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], np.ndarray]:
-    """Upper factors (k, p, p) of HᵀH, the lower ones of H with columns of size 1, and these columns' sizes (k, p)."""
+    """Upper factors (k, p, p) of HᵀΩH, lower factors for columns of length 1, and the lengths (k, p) of the columns."""
     products = products if products.ndim == 3 else products[np.newaxis]
     sizes = np.sqrt(np.einsum("kii->ki", products))
     by = np.where(sizes > 0.0, sizes, 1.0)
@@ -95,25 +90,12 @@ def _triangles_of(products: np.ndarray) -> tuple[np.ndarray, list[np.ndarray], n
 
 
 def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPrior) -> tuple[np.ndarray, np.ndarray]:
-    """The most probable w of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), for each output or all of them.
+    """The posterior mode w (o, p) of y = target_mean + H (mean + C w) + ε, w ~ N(0, I), and the residuals' rms (o,).
 
-    The noise variance is first negligible, then what that leaves over; two steps of iterative refinement make up for
-    the rounding of sums over targets.
-
-    Parameters
-    ----------
-    source : Source
-        n rows with p features and o targets.
-    target_mean : ndarray of shape (o,)
-    prior : CoefficientPrior
-        Of the weights; a scale of 0 keeps one at its mean.
-
-    Returns
-    -------
-    w : ndarray of shape (o, p)
-    left_over : ndarray of shape (o,)
-        Root mean square of what they leave over, the noisier a row the less it counts.
+    The rms weighs rows by ω.
     """
+    # The noise variance is first negligible, then the mean squared residual of that fit. Two steps of iterative
+    # refinement correct the rounding of sums over targets.
     (o, p), roots = prior.scale.shape, prior.roots()
     w = np.zeros((o, p))
     HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
@@ -122,7 +104,7 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
     if not together:
         return w, np.sqrt(squares / total_precision)
     triangles = _triangles(source, HH) @ roots
-    # Where outputs share their weights, what each leaves over decides how much it counts.
+    # If outputs share their weights, the residuals of each decide how much it counts.
     for share in (1e-12, 1.0, 1.0) if prior.shared else (1e-12, 1.0):
         noise = share * squares / n_rows
         steps = [_Step.of(outputs, noise[outputs], triangles) for outputs in together if noise[outputs].any()]
@@ -135,22 +117,22 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
 
 @dataclass(frozen=True)
 class _Step:
-    """To the most probable w of some outputs, all the same, under fixed noise variances; in units of the least one.
-
-    ``root`` is a B (p, k) with B Bᵀ the inverse of the precision of w, but for directions that rounding hides.
-    ``told`` (p, p), where features nearly depend on each other, takes from Cᵀ Hᵀ l what is rounding: that in directions
-    in which they do not vary, where the prior decides.
-    """
+    """A Newton step of the w that some outputs share, for fixed noise variances, in units of the smallest one."""
 
     outputs: list[int]
+    # The smallest noise variance, and its ratio (k,) to that of each output.
     least: float
     counts: np.ndarray
+    # (p, k): a B with B Bᵀ the inverse of the precision of w, without directions that are lost in rounding.
     root: np.ndarray
+    # (p, p): for nearly collinear features, removes rounding errors from Cᵀ Hᵀ l: its part in directions in which the
+    # features do not vary, where the prior decides.
     told: np.ndarray | None = None
 
     @classmethod
     def of(cls, outputs: list[int], noise: np.ndarray, triangles: np.ndarray) -> _Step:
-        """From the R C (o, p, p) of all outputs: the precision is not formed, which would square its condition."""
+        """Prepare the step from R C (o, p, p) of all outputs and their noise variances."""
+        # The precision itself is not formed: that would square its condition number.
         noise = np.maximum(noise, 1e-16 * noise.max())
         least = float(noise.min())
         counts, p = least / noise, triangles.shape[-1]
@@ -165,7 +147,7 @@ class _Step:
         return cls(outputs, least, counts, root, (vectors * sizes).T @ (vectors / sizes))
 
     def take(self, w: np.ndarray, from_data: np.ndarray) -> None:
-        """From w, with Cᵀ Hᵀ l of what it leaves over."""
+        """Move w (o, p) in place, given Cᵀ Hᵀ l (o, p) of its residuals l."""
         wanted = self.counts @ from_data[self.outputs]
         wanted = wanted if self.told is None else self.told @ wanted
         wanted -= self.least * w[self.outputs[0]]
@@ -173,20 +155,20 @@ class _Step:
 
 
 def _varying(upper: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Singular values (k,) above rounding, and their right vectors (k, p)."""
+    """Singular values (k,) above rounding errors, and their right vectors (k, p)."""
     try:
         _, values, vectors = svd(upper, full_matrices=False)
     except np.linalg.LinAlgError:
-        # The faster method by halves does not always converge.
+        # The faster divide-and-conquer method does not always converge.
         _, values, vectors = svd(upper, full_matrices=False, lapack_driver="gesvd")
     kept = values >= _ROUNDING * values[0]
     return values[kept], vectors[kept]
 
 
 def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:
-    """Whether what the features leave over may be far below the noise.
+    """Whether the residuals of the features may be far below the noise.
 
-    As many features as rows leave nothing over, and weights far from their prior leave over less than its own would.
+    They vanish with as many features as rows. They are also too small if weights are far from their prior.
     """
     return 2 * prior.scale.shape[1] >= n_rows or float((prior.reference**2).sum(axis=1).max(initial=0.0)) > n_rows
 
@@ -194,26 +176,12 @@ def may_hide_noise(prior: CoefficientPrior, n_rows: int) -> bool:
 def noise_of_most_evidence(
     evidence: Callable[[np.ndarray], np.ndarray], least: np.ndarray, highest: np.ndarray, shared: bool
 ) -> tuple[float, np.ndarray]:
-    """Which noise suits features best that leave over less: the evidence may be the greatest with more.
+    """The highest evidence of a linear model, summed over outputs, and the noise variances (o,) that reach it.
 
-    (Rasmussen & Williams 2006, eq. 2.30, for a linear model.) All decades are tried, since it may be flat over most of
-    them, then quarters of decades around the best.
-
-    Parameters
-    ----------
-    evidence : callable
-        Noise variances (o,) -> nats (o,) of each output.
-    least, highest : ndarray of shape (o,)
-        The first and the last that are tried; only the first if that is not the smaller one.
-    shared : bool
-        Whether all outputs are to have the same multiple of the least.
-
-    Returns
-    -------
-    value : float
-        The evidence, summed over outputs.
-    noise : ndarray of shape (o,)
+    ``evidence`` maps noise variances (o,) to nats (o,) (Rasmussen & Williams 2006, eq. 2.30). The search goes from
+    ``least`` to ``highest``, both (o,). If ``shared``, all outputs have the same multiple of ``least``.
     """
+    # The evidence may be flat over most decades: all are tried, then quarters of decades around the best.
     best, value = least.copy(), np.full(len(least), -np.inf)
     reach = np.log10(np.max(highest / least, initial=1.0))
     for exponents in (np.append(np.arange(0.0, reach), reach), np.arange(-0.75, 1.0, 0.25)):
@@ -231,19 +199,9 @@ def noise_of_most_evidence(
 
 
 def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> None:
-    """Refuse features whose vague weights the rows cannot tell apart.
+    """Raise a ValueError if features with an infinite prior scale are collinear on the rows.
 
-    Parameters
-    ----------
-    features : ndarray of shape (n, p) or (n, o, p)
-    vague : ndarray of shape (o, p)
-        Weights with an infinite prior scale.
-    shared : bool
-        Whether outputs share their weights.
-
-    Raises
-    ------
-    ValueError
+    Features are (n, p) or (n, o, p), and ``vague`` (o, p) says which weights have an infinite scale.
     """
     if features.ndim == 3 and not shared:
         for output, own in enumerate(vague):
@@ -262,55 +220,20 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
             )
 
 
-def unit_of(left_over: np.ndarray, targets: Moments, from_features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The unit of each target, and which targets are constant with nothing left over.
-
-    The unit is the size of what is left over, but not below the rounding error of the target. A constant of which
-    nothing is left over says nothing of a size: its unit is 1, as in scikit-learn's scalers.
-
-    Parameters
-    ----------
-    left_over : ndarray of shape (o,)
-        Root mean square.
-    targets : Moments
-    from_features : ndarray of shape (o,)
-        The largest number that a feature adds a priori. It is what rounds where the target is 0.
-
-    Returns
-    -------
-    unit : ndarray of shape (o,)
-        Above 0.
-    constant : ndarray of bool of shape (o,)
-    """
-    rounding = _TARGET_ROUNDING * np.where(targets.largest > 0.0, targets.largest, from_features)
-    constant = (left_over <= rounding) & (np.sqrt(targets.variance) <= rounding)
-    unit = np.maximum(np.where(constant, 1.0, left_over), rounding)
-    return np.maximum(unit, SMALLEST_UNIT), constant
-
-
 @dataclass(frozen=True)
 class Units:
-    """What is subtracted from and divided out of the targets before inference.
+    """The shift and scale of the targets, and the prior of the weights."""
 
-    Attributes
-    ----------
-    target_mean : ndarray of shape (o,)
-        Subtracted from y; part of the model (0 unless y is normalised).
-    target_unit : ndarray of shape (o,)
-        The size of what the features alone leave over.
-    prior : CoefficientPrior
-        In the user's units.
-    target_scatter, rounding : ndarray of shape (o,)
-        The targets' variance, and that of the rounding of their largest value, in squared target units.
-    constant : ndarray of bool of shape (o,)
-        Targets that do not vary and of which nothing is left over (`unit_of`).
-    """
-
+    # (o,): subtracted from y, and part of the model. 0 unless y is normalised.
     target_mean: np.ndarray
+    # (o,): the size of the residuals of the features alone.
     target_unit: np.ndarray
+    # In the user's units.
     prior: CoefficientPrior
+    # (o,): the targets' variance, and the rounding variance of their largest value, in squared target units.
     target_scatter: np.ndarray
     rounding: np.ndarray
+    # (o,): whether a target is constant and the features explain it.
     constant: np.ndarray
 
     @classmethod
@@ -322,17 +245,22 @@ class Units:
         target_mean: np.ndarray,
         prior: CoefficientPrior,
     ) -> Units:
-        """The units of a training set: its rows, moments of its features and targets, and the prior of its weights."""
+        """The units of training rows, given the moments of their features and targets, and the prior of the weights."""
         reference, left_over = features_alone(source, target_mean, prior)
+        # The unit is the size of the residuals, but not below the rounding error of the target. Where the target is 0,
+        # the largest contribution of a feature a priori rounds.
         largest = np.max(np.abs(prior.mean) * features.largest, axis=1, initial=0.0)
-        unit, constant = unit_of(left_over, targets, largest)
+        error = _TARGET_ROUNDING * np.where(targets.largest > 0.0, targets.largest, largest)
+        # A constant that the features explain says nothing about a size: its unit is 1, as in scikit-learn's scalers.
+        constant = (left_over <= error) & (np.sqrt(targets.variance) <= error)
+        unit = np.maximum(np.maximum(np.where(constant, 1.0, left_over), error), SMALLEST_UNIT)
         rounding = (np.finfo(float).eps * targets.largest / unit) ** 2
         return cls(
             target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2, rounding, constant
         )
 
     def to_internal(self, raw: RawRows) -> RawRows:
-        """The same inputs and features, and what the reference leaves of the targets, in its own units."""
+        """The same inputs and features, with the residuals in internal units for targets."""
         left_over = raw.targets - self.target_mean - times_weights(raw.features, self.prior.offset)
         return replace(raw, targets=left_over / self.target_unit)
 
@@ -342,13 +270,13 @@ class Units:
         return Rows(source, self.to_internal, threads=threads, constant=self.constant, rounding=self.rounding)
 
     def internal_prior(self) -> CoefficientPrior:
-        """The prior for residuals in units of ``target_unit``."""
+        """The prior of the weights in internal units."""
         return self.prior.scaled(1.0 / self.target_unit)
 
     def log_unit(self, outputs: Columns) -> float:
-        """What one row of some outputs adds to the loss on the way to the user's units."""
+        """The difference per row between a loss in the user's units and in internal ones."""
         return float(np.log(self.target_unit[outputs]).sum())
 
     def predictor(self, parts: Sequence[Predictor], outputs: Sequence[list[int]]) -> Predictor:
-        """Predictors of some outputs each, in internal units -> one of all in the user's."""
+        """The predictor of all outputs in the user's units, from predictors of some outputs each in internal units."""
         return Predictor.joined(parts, outputs, self.target_unit, self.prior.offset, self.target_mean)
