@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -108,7 +108,7 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
         _lift_efforts(model, urdf.unknown_efforts)
-        plain, warnings = _plain(model, f"The robot {str(robot)!r}")
+        plain, warnings = _plain(model, f"The robot {str(robot)!r}", urdf.possible_links)
         told = urdf.warnings[:_MOST_TOLD]
         if len(urdf.warnings) > _MOST_TOLD:
             told.append(f"({len(urdf.warnings) - _MOST_TOLD} more are like these.)")
@@ -315,7 +315,7 @@ def _lift_efforts(model: Any, joints: list[str]) -> None:
         model.lowerEffortLimit, model.upperEffortLimit = lower, upper
 
 
-def _plain(model: Any, called: str) -> tuple[Any, list[str]]:
+def _plain(model: Any, called: str, possible_links: Container[str] = ()) -> tuple[Any, list[str]]:
     """The model itself, or a copy whose continuous joints have an angle each, and what to warn of.
 
     Raises
@@ -342,7 +342,7 @@ def _plain(model: Any, called: str) -> tuple[Any, list[str]]:
             raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
     _check_numbers(model, called)
     plain = model if model.nq == model.nv else _with_angles(model)
-    return plain, check_bodies(plain, called, _names_of_links(model))
+    return plain, check_bodies(plain, called, _names_of_links(model), possible_links)
 
 
 def _names_of_links(model: Any) -> list[list[str]]:
