@@ -58,8 +58,9 @@ def load_robot(robot: Robot) -> Any:
         If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
         joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
         number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
-        that is not of length 1 or, in a file, has no direction). If moments of inertia are so far below 0 that the
-        mass matrix is not positive definite. The message names the joint or the link, and the number.
+        that is not of length 1 or, in a file, has no direction, negative masses of fixed links as large as what they
+        are fixed to). If moments of inertia are so far below 0 that the mass matrix is not positive definite. The
+        message names the joint or the link, and the number.
     TypeError
         If ``robot`` is none of the above.
 
@@ -67,9 +68,11 @@ def load_robot(robot: Robot) -> Any:
     -----
     RobotModelWarning
         If no body can have the moments of inertia of a link: an eigenvalue is negative or larger than the sum of the
-        other two (triangle inequality), beyond rounding. If a file has numbers that are not used: a negative limit of
-        effort or velocity, limits of position of which the lower is above the upper, or a joint to mimic that the file
-        does not have. If a link of a file has a negative mass, and the body that it is fixed to has not.
+        other two (triangle inequality). There is no warning where the rounding of the file's digits explains this:
+        0.001 stands for 0.0005 to 0.0015. A model in memory has no digits, and 0.5 % count as rounding. If a file has
+        numbers that are not used: a negative limit of effort or velocity, limits of position of which the lower is
+        above the upper, or a joint to mimic that the file does not have. If a link of a file has a negative mass, and
+        the body that it is fixed to has not.
 
     See Also
     --------

@@ -120,6 +120,12 @@ def test_a_violation_below_the_rounding_of_the_digits_is_not_warned_of(tmp_path,
     assert len(caught) == impossible
 
 
+def test_simulation_does_not_warn_of_rounded_digits(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RobotModelWarning)
+        make_dynamics(arm(tmp_path / "arm.urdf", ("0.01", "0.01", "0.03")), 1)
+
+
 def test_the_file_that_mends_a_robot_is_not_warned_of(tmp_path):
     source = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.04))
     good = inertial_parameters(load_robot(arm(tmp_path / "good.urdf", (0.02, 0.02, 0.02))))
