@@ -129,7 +129,7 @@ class ComputedTorqueController:
         kd: ArrayLike = 20.0,
         ki: ArrayLike = 1.0,
     ):
-        self._plant = Plant(robot)
+        self._plant = robot if isinstance(robot, Plant) else Plant(robot)
         layout = self._plant.layout
         n = layout.n_joints
         if layout.n_inputs != n:

@@ -166,7 +166,7 @@ def make_dynamics(
 
     rng = check_random_state(random_state)
     z0, controller = sampling.draw(plant, (n_trajectories, n_steps), dt, duration, rng)
-    trajectories, inputs = simulate(plant.model, z0, controller, dt, n_steps=n_steps, return_inputs=True, n_jobs=n_jobs)
+    trajectories, inputs = simulate(plant, z0, controller, dt, n_steps=n_steps, return_inputs=True, n_jobs=n_jobs)
 
     states = trajectories[:, :-1].reshape(-1, 2 * layout.n_joints)
     target = trajectories[:, 1:].reshape(states.shape)

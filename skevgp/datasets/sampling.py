@@ -70,7 +70,7 @@ class ControlledMoves:
         kd = min(20.0, 0.6 / dt)  # the paper's gains, softer where a long step would make them unstable
         kp = kd**2 / 4.0
         controller = ComputedTorqueController(
-            plant.model, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kp, kd=kd
+            plant, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kp, kd=kd
         )
         # Positions tell less: a motor that is too weak lets its joint fall as far.
         fastest = _LOST * (_TRAVEL * self.width + _LARGEST_SHAKE / kp) / dt

@@ -133,7 +133,8 @@ def simulate(
            [ 0.0967, -0.1009],
            [ 0.0932, -0.1312]])
     """
-    plant = Plant(system)
+    # A plant has been checked: no second warning.
+    plant = system if isinstance(system, Plant) else Plant(system)
     layout = plant.layout
     n, n_inputs = layout.n_joints, layout.n_inputs
     check_real(dt, "dt", minimum=0.0, strict=True)

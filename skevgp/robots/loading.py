@@ -6,7 +6,7 @@ import importlib.metadata
 import os
 import sys
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Container, Mapping
 from difflib import get_close_matches
 from functools import lru_cache
 from pathlib import Path
@@ -58,8 +58,9 @@ def load_robot(robot: Robot) -> Any:
         If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
         joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
         number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
-        that is not of length 1 or, in a file, has no direction). If moments of inertia are so far below 0 that the
-        mass matrix is not positive definite. The message names the joint or the link, and the number.
+        that is not of length 1 or, in a file, has no direction, negative masses of fixed links as large as what they
+        are fixed to). If moments of inertia are so far below 0 that the mass matrix is not positive definite. The
+        message names the joint or the link, and the number.
     TypeError
         If ``robot`` is none of the above.
 
@@ -67,9 +68,11 @@ def load_robot(robot: Robot) -> Any:
     -----
     RobotModelWarning
         If no body can have the moments of inertia of a link: an eigenvalue is negative or larger than the sum of the
-        other two (triangle inequality), beyond rounding. If a file has numbers that are not used: a negative limit of
-        effort or velocity, limits of position of which the lower is above the upper, or a joint to mimic that the file
-        does not have. If a link of a file has a negative mass, and the body that it is fixed to has not.
+        other two (triangle inequality). There is no warning where the rounding of the file's digits explains this:
+        0.001 stands for 0.0005 to 0.0015. A model in memory has no digits, and 0.5 % count as rounding. If a file has
+        numbers that are not used: a negative limit of effort or velocity, limits of position of which the lower is
+        above the upper, or a joint to mimic that the file does not have. If a link of a file has a negative mass, and
+        the body that it is fixed to has not.
 
     See Also
     --------
@@ -108,7 +111,7 @@ def _read(robot: Robot) -> tuple[Any, list[str]]:
         except (ValueError, RuntimeError) as error:
             raise ValueError(f"The file {str(path)!r} is not a URDF that Pinocchio can read: {error}") from error
         _lift_efforts(model, urdf.unknown_efforts)
-        plain, warnings = _plain(model, f"The robot {str(robot)!r}")
+        plain, warnings = _plain(model, f"The robot {str(robot)!r}", urdf.possible_links)
         told = urdf.warnings[:_MOST_TOLD]
         if len(urdf.warnings) > _MOST_TOLD:
             told.append(f"({len(urdf.warnings) - _MOST_TOLD} more are like these.)")
@@ -315,7 +318,7 @@ def _lift_efforts(model: Any, joints: list[str]) -> None:
         model.lowerEffortLimit, model.upperEffortLimit = lower, upper
 
 
-def _plain(model: Any, called: str) -> tuple[Any, list[str]]:
+def _plain(model: Any, called: str, possible_links: Container[str] = ()) -> tuple[Any, list[str]]:
     """The model itself, or a copy whose continuous joints have an angle each, and what to warn of.
 
     Raises
@@ -342,7 +345,7 @@ def _plain(model: Any, called: str) -> tuple[Any, list[str]]:
             raise ValueError(f"{called} has the joint {name!r} with an axis of length {length:g}; it must be 1.")
     _check_numbers(model, called)
     plain = model if model.nq == model.nv else _with_angles(model)
-    return plain, check_bodies(plain, called, _names_of_links(model))
+    return plain, check_bodies(plain, called, _names_of_links(model), possible_links)
 
 
 def _names_of_links(model: Any) -> list[list[str]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import Any
 
 import numpy as np
@@ -23,7 +24,7 @@ _MEND = (
 )
 
 
-def check_bodies(model: Any, called: str, links: list[list[str]]) -> list[str]:
+def check_bodies(model: Any, called: str, links: list[list[str]], possible_links: Container[str] = ()) -> list[str]:
     """What is wrong with the inertias of a model's links.
 
     A body has a mass of 0 or above. Its moments of inertia about the centre of mass are 0 or above, and none is larger
@@ -38,6 +39,9 @@ def check_bodies(model: Any, called: str, links: list[list[str]]) -> list[str]:
         With which messages begin.
     links : list of list of str
         Names of the links that move with each joint, as far as they are known.
+    possible_links : container of str, default=()
+        Names of the links whose digits, before a file rounded them, can have been those of a body. There is no warning
+        of a body that is made of such links.
 
     Returns
     -------
@@ -58,7 +62,9 @@ def check_bodies(model: Any, called: str, links: list[list[str]]) -> list[str]:
     q = _configuration_of_negative_mass(model) if negative.any() else None
     lacking = moments[:, 0] + moments[:, 1] - moments[:, 2]  # below 0 too if a moment is
     without_mass = (masses == 0.0) & (moments != 0.0).any(axis=1)
-    impossible = (lacking < -np.maximum(_ROUNDED * np.abs(moments).max(axis=1), of_sums)) | without_mass
+    rounded = [bool(names) and all(name in possible_links for name in names) for names in links]
+    impossible = (lacking < -np.maximum(_ROUNDED * np.abs(moments).max(axis=1), of_sums)) & ~np.array(rounded)
+    impossible |= without_mass
     wrong = np.flatnonzero(impossible if q is None else impossible | negative).tolist()
     told = [_sentence(model.names[1 + joint], links[joint], masses[joint], moments[joint]) for joint in wrong]
     more = [f"{len(told) - _MOST_NAMED} more links are like it"] if len(told) > _MOST_NAMED else []

@@ -70,7 +70,7 @@ def test_a_model_in_memory_is_checked_too(tmp_path):
     ("moments", "mass", "told"),
     [
         ((-0.001, 0.01, 0.01), 1.0, "1 kg and moments .* of -0.001, 0.01, 0.01 kg"),  # about an axis that stays still
-        ((0.01, 0.01, 0.03), 1.0, "1 kg and moments .* of 0.01, 0.01, 0.03 kg"),
+        ((0.01, 0.01, 0.04), 1.0, "1 kg and moments .* of 0.01, 0.01, 0.04 kg"),
         ((0.01, 0.01, 0.01), 0.0, "0 kg and moments .* of 0.01, 0.01, 0.01 kg"),
     ],
     ids=["negative", "triangle", "massless"],
@@ -84,7 +84,7 @@ def test_what_moves_by_the_laws_of_mechanics_all_the_same_is_warned_of(tmp_path,
 
 
 def test_a_map_warns_once_of_its_robot(tmp_path):
-    path = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.03))
+    path = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.04))
     with pytest.warns(RobotModelWarning) as caught:
         NominalDynamics(path).fit_transform(np.zeros((2, 6)))
     assert len(caught) == 1
@@ -99,8 +99,35 @@ def test_a_point_a_rod_a_disk_and_what_files_round_are_bodies(tmp_path, moments)
     load_robot(arm(tmp_path / "arm.urdf", moments))
 
 
+@pytest.mark.parametrize(
+    ("moments", "impossible"),
+    [
+        (("0.001", "0.001", "0.003"), False),  # such as 0.00149, 0.00149, 0.00251
+        (("0.0010", "0.0010", "0.0030"), True),
+        (("1e-3", "1e-3", "3e-3"), False),
+        (("0", "0", "0.001"), False),
+        (("0.0", "0.0", "0.0010"), True),
+        (("0.0", "0.0", "0.1234"), True),
+        (("0.001", "0.001", "0.004"), True),
+        (("-0.001", "0.010", "0.010"), True),
+        (("0.001000", "0.00100", "0.00201"), False),
+    ],
+)
+def test_a_violation_below_the_rounding_of_the_digits_is_not_warned_of(tmp_path, moments, impossible):
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_robot(arm(tmp_path / "arm.urdf", moments))
+    assert len(caught) == impossible
+
+
+def test_simulation_does_not_warn_of_rounded_digits(tmp_path):
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RobotModelWarning)
+        make_dynamics(arm(tmp_path / "arm.urdf", ("0.01", "0.01", "0.03")), 1)
+
+
 def test_the_file_that_mends_a_robot_is_not_warned_of(tmp_path):
-    source = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.03))
+    source = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.04))
     good = inertial_parameters(load_robot(arm(tmp_path / "good.urdf", (0.02, 0.02, 0.02))))
     with warnings.catch_warnings():
         warnings.simplefilter("error")

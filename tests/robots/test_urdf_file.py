@@ -149,16 +149,10 @@ def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
         load(robot(["base", *map(str, range(301))], *[joint("base", str(i)) for i in range(301)]))
 
 
-@pytest.mark.parametrize("tail", [b"</x>" * 101, b""], ids=["closed", "open"])
-def test_what_is_nested_deeply_is_told(load, tail):
-    with pytest.raises(ValueError, match="or some 100 deep in each other"):
-        load(b'<robot name="r">' + b"<x>" * 101 + tail)
-
-
-def test_what_has_too_many_elements_is_told(load, monkeypatch):
-    monkeypatch.setattr("skevgp.robots.urdf_file._MOST_ELEMENTS", 20)
-    with pytest.raises(ValueError, match="it has more than 20 elements"):
-        load(ARM)
+def test_what_is_nested_deeply_is_told(load):
+    """Writing goes from element to element by recursion."""
+    with pytest.raises(ValueError, match="it has elements more than 100 deep in each other"):
+        load(b'<robot name="r">' + b"<x>" * 101 + b"</x>" * 101 + b"</robot>")
 
 
 @pytest.mark.parametrize(
@@ -246,6 +240,15 @@ def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     assert model.inertias[1].mass == 1.5
     with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
         load(text.format(joint("b", "c")))
+
+
+@pytest.mark.parametrize("masses", [(2, -2), (2, -2, 3), (-0.5, 2), (2, -2.5, 3), (0.3, -0.1, -0.2)])
+def test_negative_masses_that_pinocchio_cannot_add_are_refused(load, masses):
+    """It divides by the sum after each link, and by some 1e-16 in place of a sum of 0."""
+    bodies = "".join(BODY.format(link, mass) for link, mass in zip("bcd", masses, strict=False))
+    welds = "".join(joint("b", link, "fixed") for link, _ in zip("cd", masses[1:], strict=False))
+    with pytest.raises(ValueError, match=r"the link '.' has <mass value=\"-.*first of them, 'b', which is"):
+        load(f'<robot name="r"><link name="a"/>{bodies}{joint("a", "b")}{welds}</robot>')
 
 
 def test_a_joint_may_have_the_name_of_pinocchios_root(load):
