@@ -84,7 +84,7 @@ class ExactTask:
         return FeaturesAlone(bound, noise, most, hidden)
 
     def _best_with(self, signal: np.ndarray, hidden: bool) -> tuple[float, np.ndarray]:
-        """The highest likelihood for a signal (o,), and its noise variances (o,), searched over all decades if ``hidden``."""
+        """The highest likelihood for a signal (o,), and its noise (o,), searched over all decades if ``hidden``."""
         rows, values = self.model.rows, self.table.values_at_start()
         least, highest = self.table["noise"].value_limits().T
         if not hidden:

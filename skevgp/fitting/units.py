@@ -220,6 +220,20 @@ def check_independent(features: np.ndarray, vague: np.ndarray, shared: bool) -> 
             )
 
 
+def unit_of(left_over: np.ndarray, targets: Moments, from_features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The unit (o,) of each target, and whether it is a constant that the features explain, (o,).
+
+    ``left_over`` (o,) is the rms of the residuals. ``from_features`` (o,) is the largest prior mean of a feature's
+    contribution, which gives the size of rounding errors where the target is 0.
+    """
+    # The unit is the size of the residuals, but not below the rounding error of the target.
+    rounding = _TARGET_ROUNDING * np.where(targets.largest > 0.0, targets.largest, from_features)
+    # A constant that the features explain says nothing about a size: its unit is 1, as in scikit-learn's scalers.
+    constant = (left_over <= rounding) & (np.sqrt(targets.variance) <= rounding)
+    unit = np.maximum(np.where(constant, 1.0, left_over), rounding)
+    return np.maximum(unit, SMALLEST_UNIT), constant
+
+
 @dataclass(frozen=True)
 class Units:
     """The shift and scale of the targets, and the prior of the weights."""
@@ -247,13 +261,8 @@ class Units:
     ) -> Units:
         """The units of training rows, given the moments of their features and targets, and the prior of the weights."""
         reference, left_over = features_alone(source, target_mean, prior)
-        # The unit is the size of the residuals, but not below the rounding error of the target. Where the target is 0,
-        # the largest contribution of a feature a priori rounds.
         largest = np.max(np.abs(prior.mean) * features.largest, axis=1, initial=0.0)
-        error = _TARGET_ROUNDING * np.where(targets.largest > 0.0, targets.largest, largest)
-        # A constant that the features explain says nothing about a size: its unit is 1, as in scikit-learn's scalers.
-        constant = (left_over <= error) & (np.sqrt(targets.variance) <= error)
-        unit = np.maximum(np.maximum(np.where(constant, 1.0, left_over), error), SMALLEST_UNIT)
+        unit, constant = unit_of(left_over, targets, largest)
         rounding = (np.finfo(float).eps * targets.largest / unit) ** 2
         return cls(
             target_mean, unit, replace(prior, reference=reference), targets.variance / unit**2, rounding, constant
