@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +12,6 @@ import numpy as np
 
 from ...utils.optional import require
 from .recording import Recording, Signals
-from .unpacking import Allowance, check_files, check_storages
 
 SUFFIXES = (".db3", ".mcap")
 _STATES, _TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
@@ -102,9 +103,9 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
     rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
     typesys = require("rosbags.typesys", "Reading rosbag2 files")
     try:
-        size = check_files(path)
+        path.stat()
+        _check_databases(path)
         with rosbag2.Reader(path) as reader:
-            check_storages(reader, size)
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
             chosen = _topic(topics, topic)
             # The message types that ROS defines, not those that the file does, of which rosbags would make code.
@@ -112,15 +113,25 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
             connections = [connection for connection in reader.connections if connection.topic == chosen]
             found = [
                 (received, store.deserialize_cdr(data, topics[chosen]))
-                for _, received, data in Allowance(size).messages(reader.messages(connections=connections))
+                for _, received, data in reader.messages(connections=connections)
             ]
     except _TopicError:
         raise
-    except Exception as error:  # of broken files rosbags raises whatever comes, also MemoryError
-        raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {error}).") from error
+    except Exception as error:  # rosbags raises any type for a broken file; MemoryError for a wrong size in it
+        why = str(error) or "a size in it may be wrong"
+        raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {why}).") from error
     if not found:
         raise ValueError(f"the topic {chosen!r} has no messages.")
     return topics[chosen], np.array([received for received, _ in found], dtype=np.int64), [m for _, m in found]
+
+
+def _check_databases(path: Path) -> None:
+    """Refuse damaged SQLite files, of which SQLite itself may read wrong rows in silence."""
+    for file in path.glob("*.db3") if path.is_dir() else [path] * (path.suffix.lower() == ".db3"):
+        with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+            (state,) = database.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise ValueError(f"SQLite finds it damaged: {state}")
 
 
 class _TopicError(ValueError):

@@ -17,7 +17,6 @@ import numpy as np
 
 from ...utils.validation import check_integer
 from .recording import Recording, Signals
-from .unpacking import Allowance
 
 SUFFIXES = (".csv", ".txt", ".tsv", ".csv.gz", ".txt.gz", ".tsv.gz")
 SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
@@ -72,10 +71,6 @@ def read_table(
     """
     packed = path.suffix.lower() == ".gz"
     try:
-        if packed:
-            with gzip.open(path) as content:
-                Allowance(path.stat().st_size).take_all(content)
-
         # The signature of UTF-8, which spreadsheets write, is none of the first column's name.
         def opened() -> Any:
             return (gzip.open if packed else open)(path, "rt", encoding="utf-8-sig")
