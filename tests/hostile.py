@@ -1,4 +1,4 @@
-"""Logs and URDF files that somebody has damaged, or made so that they do harm: each damage (bytes, rng) -> bytes."""
+"""Damaged logs, and URDF files that are damaged or made to do harm: each damage (bytes, rng) -> bytes."""
 
 import gzip
 import re
@@ -209,14 +209,10 @@ def in_another_codec(data, rng):
 
 
 def packed(data, rng):
-    """As .gz, and damaged afterwards; or a bomb."""
-    kind = rng.randint(5)
-    if kind == 0:
-        return gzip.compress(data + bytes(2**26), 9)
-    if kind == 1:
-        return gzip.compress(data.split(b"\n")[1].join([b"\n"] * 300_000), 9)
+    """As .gz, and damaged afterwards or before."""
     whole = gzip.compress(data)
-    return [whole, chosen(rng, BYTES)(whole, rng), whole + gzip.compress(chosen(rng, BYTES)(data, rng))][kind - 2]
+    damaged = chosen(rng, BYTES)
+    return chosen(rng, [whole, damaged(whole, rng), whole + gzip.compress(damaged(data, rng))])
 
 
 OF_TABLES = [
@@ -271,18 +267,6 @@ _SCRIPTS = [
     "UPDATE topics SET serialization_format = 'pickle'",
     "DELETE FROM messages",
     "DELETE FROM topics",
-    "ALTER TABLE messages RENAME TO old; CREATE VIEW messages AS SELECT * FROM old",
-    "ALTER TABLE messages ADD COLUMN more AS (zeroblob(900000000))",
-    "ALTER TABLE messages RENAME COLUMN data TO old; ALTER TABLE messages ADD COLUMN data AS (zeroblob(900000000))",
-    """CREATE VIEW IF NOT EXISTS metadata AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)
-       SELECT count(*) AS metadata_version FROM c""",
-    """DROP TABLE IF EXISTS schema;
-       CREATE VIEW schema AS WITH RECURSIVE c(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM c)
-       SELECT count(*) AS schema_version FROM c""",
-    "CREATE TRIGGER t AFTER INSERT ON messages BEGIN SELECT load_extension('/tmp/x'); END",
-    "CREATE INDEX more ON messages (abs(timestamp))",
-    "CREATE TABLE more (x CHECK (length(zeroblob(900000000)) > 0)); PRAGMA ignore_check_constraints=1;"
-    "INSERT INTO more VALUES (1)",
 ]
 
 

@@ -1,4 +1,4 @@
-"""Logs and URDF files that somebody has damaged or made to do harm: each must be refused by a ValueError that names the
+"""Damaged logs, and URDF files that are damaged or made to do harm: each must be refused by a ValueError that names the
 file, or give finite numbers; in a minute, in little memory, and without an end of the interpreter (Pinocchio, SQLite
 and decompressors are C and C++).
 

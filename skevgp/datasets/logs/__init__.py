@@ -1,4 +1,4 @@
-"""What a robot wrote down of itself: files are read, their signals made ready for learning."""
+"""Read a robot's own logs and prepare their signals for learning."""
 
 from .load import load_log
 from .transitions import log_transitions

@@ -1,9 +1,9 @@
-"""Whether a recorded velocity is the derivative of the recorded position; if not, what it seems to be.
+"""Check that a recorded velocity is the derivative of the recorded position; if it is not, find the likely cause.
 
-The integral of the velocity is compared with the change of position, in windows so long that the change is far above
-the noise and the resolution of the position. The slope of one over the other is 1 if they agree, however noisy the
-velocity is, and it has a standard error: a velocity is refused only where its slope is clearly another one, in all
-windows, or in those of one direction or half of the record.
+The integral of the velocity is compared with the change of position. Windows are so long that this change is far above
+the noise and the resolution of the position. The slope of the integral over the change is 1 if they agree, also for a
+noisy velocity. A velocity is refused only if its slope differs from 1 by many standard errors: in all windows, in those
+of one direction, or in those of half of the record.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from dataclasses import dataclass
 import numpy as np
 
 _SHORTEST, _LONGEST = 4, 0.5  # of windows: steps, and s
-_MOST = 5000  # windows that are compared: of more, some
-_FEWEST = 12  # windows in which the joint moves, or nothing is said
+_MOST = 5000  # windows that are compared; of more windows, a random sample
+_FEWEST = 12  # windows in which the joint moves; with fewer, nothing is checked
 _NOISES = 10.0  # a window's change of position, in standard deviations of its noise
 _SLOWEST = {"velocity": 0.02, "acceleration": 0.2}  # per s, or per s²: drivers round what is slower to 0
 _SLOW = 0.02  # ... and what is slower than this part of what joints reach
@@ -44,13 +44,14 @@ _NEAR = 0.03  # of a unit's factor
 
 @dataclass(frozen=True)
 class _Windows:
-    """Where a joint moves: the change of its position, and that of the other signal's integral."""
+    """Windows in which a joint moves, and the change of its position in each."""
 
     first: np.ndarray  # rows
     last: np.ndarray
     change: np.ndarray  # (k,)
 
     def of(self, integral: np.ndarray) -> np.ndarray:
+        """Return the change of an integral in each window."""
         return integral[self.last] - integral[self.first]
 
     def at(self, some: np.ndarray) -> _Windows:
@@ -68,29 +69,11 @@ def check_agreement(
     wrapped: np.ndarray | None = None,
     what: str = "velocity",
 ) -> None:
-    """Refuse a recorded derivative that contradicts what it is the derivative of.
+    """Raise if the rate is not the derivative of the position; the error names each joint and the likely cause.
 
-    Parameters
-    ----------
-    time : ndarray of shape (n,)
-        Ascending, s.
-    position, rate : ndarray of shape (n, n_joints)
-        A continuous signal within pieces, and its recorded derivative.
-    pieces : sequence of slice
-        Rows between gaps.
-    names : sequence of str
-        Of the joints.
-    slowest : float
-        Slower motion counts as rest, per s.
-    wrapped : ndarray of shape (n - 1, n_joints) of bool
-        Steps at which the recorded position wrapped.
-    what : {"velocity", "acceleration"}
-        Name of ``rate``.
-
-    Raises
-    ------
-    ValueError
-        If it contradicts. The message names each such joint and the likely cause.
+    The position is continuous within pieces. Motion below `slowest` (per s) counts as rest. `wrapped`, of shape
+    (n - 1, n_joints), marks the steps at which the recorded position wrapped. `what` names the rate. Accelerations are
+    checked against velocities in the same way.
     """
     integral = np.zeros_like(rate)
     integral[1:] = np.cumsum((rate[1:] + rate[:-1]) / 2.0 * np.diff(time)[:, np.newaxis], axis=0)
@@ -121,9 +104,9 @@ def check_agreement(
 def _windows(
     time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], length: int
 ) -> tuple[_Windows, np.ndarray, float]:
-    """All windows of so many steps, their speeds, and how long the usual one is.
+    """Return all windows of so many steps, the speed in each, and their mean duration.
 
-    Stamps that come in bursts make short windows of time, not fast joints.
+    Stamps that come in bursts make windows short, so the speed is the change over at least the mean duration.
     """
     first = np.concatenate([np.arange(rows.start, rows.stop - length, length) for rows in pieces])
     last = first + length
@@ -134,7 +117,7 @@ def _windows(
 
 
 def _usual(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> float:
-    """Of the speeds that joints reach, the median over those that move."""
+    """Return the median, over the joints that move, of the speed that each reaches."""
     reached = []
     for column in position.T:
         _, speed, _ = _windows(time, column, pieces, _SHORTEST)
@@ -144,14 +127,14 @@ def _usual(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> f
 
 
 def _some(values: np.ndarray) -> np.ndarray:
-    """At most as many as are needed, in their order; at random, as stamps may repeat a pattern."""
+    """Draw a random sample in order; every k-th window could follow a pattern of the stamps."""
     if len(values) <= _MOST:
         return values
     return values[np.sort(np.random.default_rng(0).choice(len(values), _MOST, replace=False))]
 
 
 def _moving(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], slow: float) -> _Windows | None:
-    """The shortest windows in which enough motion is well above the noise; None if there are none."""
+    """Return the shortest windows of which enough have motion well above the noise, or None."""
     noise = _noise(time, position, pieces)
     length = _SHORTEST
     while True:
@@ -165,12 +148,13 @@ def _moving(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice], slo
 
 
 def _resolution(values: np.ndarray) -> float:
+    """Return the smallest step that is not 0."""
     sizes = np.abs(np.diff(values))
     return float(sizes[sizes > 0.0].min()) if sizes.any() else 0.0
 
 
 def _noise(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> float:
-    """Standard deviation, of what lines through two neighbours leave; not below that of rounding to the resolution."""
+    """Return the noise's standard deviation, from residuals of lines through neighbours; at least that of rounding."""
     left = []
     for rows in pieces:
         t, q = time[rows], position[rows]
@@ -182,7 +166,7 @@ def _noise(time: np.ndarray, position: np.ndarray, pieces: Sequence[slice]) -> f
 
 
 def _slope(change: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """Of a line through 0 by least absolute deviations, with its standard error."""
+    """Fit a line through 0 by least absolute deviations; return its slope and standard error."""
     ratio, weight = other / change, np.abs(change)
     order = np.argsort(ratio)
     middle = np.searchsorted(np.cumsum(weight[order]), 0.5 * weight.sum())
@@ -193,17 +177,17 @@ def _slope(change: np.ndarray, other: np.ndarray) -> tuple[float, float]:
 
 
 def _mean_slope(change: np.ndarray, other: np.ndarray) -> tuple[float, float]:
-    """The same by least squares.
+    """Fit a line through 0 by least squares; return its slope and standard error.
 
-    They see the mean where few rows hold all of a velocity: it was differenced at a higher rate, or stamps of time come
-    in bursts.
+    Least squares see the mean where a few rows hold all of a velocity: it was differenced at a higher rate, or stamps
+    come in bursts.
     """
     slope = float(change @ other / (change @ change))
     return slope, float(np.sqrt(np.mean((other - slope * change) ** 2) / (change @ change)))
 
 
 def _agrees(change: np.ndarray, other: np.ndarray, factor: float) -> bool:
-    """Whether one of the slopes is near 1, or both are uncertain."""
+    """Whether one of the two slopes is near 1, or both are uncertain."""
     slopes = [_slope(change, other), _mean_slope(change, other)]
     return any(1.0 / factor <= slope <= factor for slope, _ in slopes) or all(
         abs(slope - 1.0) <= _ERRORS * error for slope, error in slopes
@@ -211,7 +195,7 @@ def _agrees(change: np.ndarray, other: np.ndarray, factor: float) -> bool:
 
 
 def _contradicting(change: np.ndarray, other: np.ndarray, what: str) -> tuple[str, np.ndarray] | None:
-    """The windows whose slope is another one, and where these are; None if there are none."""
+    """Return where the slope is not 1, in words and as windows; None if it is 1 everywhere."""
     everything, rises = np.arange(len(change)), change > 0.0
     if not _agrees(change, other, _AGREES):
         return "", everything
@@ -233,7 +217,7 @@ def _contradicting(change: np.ndarray, other: np.ndarray, what: str) -> tuple[st
 
 
 def _deviation(change: np.ndarray, other: np.ndarray, slope: float = 1.0) -> float:
-    """Median deviation from the line, relative to the median change."""
+    """Return the median deviation from the line, relative to the median change."""
     return float(np.median(np.abs(other - slope * change)) / np.median(np.abs(slope * change)))
 
 
@@ -247,7 +231,7 @@ def _cause(
     names: Sequence[str],
     what: str,
 ) -> str | None:
-    """What a contradicting signal seems to be; None if it agrees."""
+    """Return the likely cause of a contradiction; None if the signals agree."""
     change, other = windows.change, windows.of(integral[:, joint])
     if cause := _unsigned(change, other):
         return cause
@@ -276,6 +260,7 @@ def _cause(
 
 
 def _scale(slope: float, what: str) -> str:
+    """Name the unit that explains the slope."""
     for factor, words in _UNITS[what].items():
         for sign in (1.0, -1.0):
             if abs(slope / (sign * factor) - 1.0) <= _NEAR:
@@ -286,6 +271,7 @@ def _scale(slope: float, what: str) -> str:
 
 
 def _other_column(windows: _Windows, joint: int, integral: np.ndarray, names: Sequence[str]) -> str | None:
+    """Name another joint whose column fits."""
     fits = {
         other: _deviation(windows.change, windows.of(integral[:, other]))
         for other in range(len(names))
@@ -298,6 +284,7 @@ def _other_column(windows: _Windows, joint: int, integral: np.ndarray, names: Se
 
 
 def _unsigned(change: np.ndarray, other: np.ndarray) -> str | None:
+    """Detect a speed without sign."""
     falls, other = change < 0.0, other if other.sum() >= 0.0 else -other
     back = np.abs(change[falls]).sum() / np.abs(change).sum()
     if not 0.1 <= back <= 0.9 or (other < 0.0).any():
@@ -309,7 +296,7 @@ def _unsigned(change: np.ndarray, other: np.ndarray) -> str | None:
 
 
 def _offset(change: np.ndarray, other: np.ndarray, lasting: np.ndarray, enough: float) -> str | None:
-    """A constant without which the deviation falls below ``enough``."""
+    """Find a constant offset without which the deviation is below ``enough``."""
     apart = (other - change) / lasting
     offset = float(np.median(apart))
     error = 1.2533**2 * np.mean(np.abs(apart - offset)) / np.sqrt(len(apart))
@@ -321,7 +308,7 @@ def _offset(change: np.ndarray, other: np.ndarray, lasting: np.ndarray, enough: 
 def _late(
     windows: _Windows, joint: int, time: np.ndarray, integral: np.ndarray, pieces: Sequence[slice], enough: float
 ) -> str | None:
-    """A delay with which the deviation falls below ``enough``, in most windows."""
+    """Find a delay with which the deviation is below ``enough``, and lower in most windows."""
     column = integral[:, joint]
     ends = np.concatenate([np.full(rows.stop - rows.start, time[rows.stop - 1]) for rows in pieces])
     starts = np.concatenate([np.full(rows.stop - rows.start, time[rows.start]) for rows in pieces])
@@ -342,7 +329,7 @@ def _late(
         ]
     )  # (n_delays, n_windows)
     found = np.median(missed, axis=1) / np.median(np.abs(windows.change))
-    # Of a periodic motion several delays explain as much: the shortest.
+    # Several delays fit a periodic motion equally well. The shortest is chosen.
     lowest = (found <= np.r_[np.inf, found[:-1]]) & (found <= np.r_[found[1:], np.inf])
     lowest &= found <= found.min() + _ALIAS
     best = min(np.flatnonzero(lowest).tolist(), key=lambda one: abs(delays[one]))
@@ -358,7 +345,7 @@ def _late(
 
 
 def _differenced(time: np.ndarray, position: np.ndarray, rate: np.ndarray, wrapped: np.ndarray) -> str | None:
-    """A velocity that was computed from the wrapped angle jumps where that does."""
+    """Detect a velocity that was computed from the wrapped angle: it jumps where the angle does."""
     steps = np.flatnonzero(wrapped)
     if not len(steps):
         return None

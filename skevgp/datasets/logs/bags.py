@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Collection, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -10,44 +12,29 @@ import numpy as np
 
 from ...utils.optional import require
 from .recording import Recording, Signals
-from .unpacking import Allowance, check_files, check_storages
 
 SUFFIXES = (".db3", ".mcap")
 _STATES, _TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+# Signals, and what messages of a type, or the points of a trajectory, call them.
+_FIELDS = {
+    _STATES: {"position": "position", "velocity": "velocity", "effort": "effort"},
+    _TRAJECTORY: {
+        "position": "positions",
+        "velocity": "velocities",
+        "acceleration": "accelerations",
+        "effort": "effort",
+    },
+}
 _NANO = 1e-9
 
 
 def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignored: Collection[str] = ()) -> Recording:
-    """Read joint states, or a trajectory.
-
-    Parameters
-    ----------
-    path : Path
-        A file (its metadata.yaml is not needed) or a folder with a metadata.yaml.
-    topic : str or None
-        None is the only one with such messages.
-    joints : sequence of str or None
-        Which, in which order; None is those of the messages, in theirs.
-    ignored : collection of {"velocity", "acceleration"}
-        What is not read, so that it may be incomplete.
-
-    Returns
-    -------
-    recording : Recording
-
-    Raises
-    ------
-    ValueError
-        If the file cannot be read, there is no such topic or joint, or no message has positions or efforts.
-    ImportError
-        If rosbags is not installed; the message gives the pip command.
-    """
+    """Read joint states or trajectories from a file, or from a folder with a metadata.yaml."""
     kind, received, messages = _messages(path, topic)
-    rows: list[tuple[Any, ...]]
     if kind == _STATES:
         stamps = np.array([_nanoseconds(message.header.stamp) for message in messages], dtype=np.int64)
         times = stamps if stamps.all() else received  # a driver that leaves one out sets none that can be trusted
-        rows = [(m.name, m.position, m.velocity, (), m.effort) for m in messages]
+        rows = [(message.name, message) for message in messages]
     else:
         points = [
             (_nanoseconds(m.header.stamp) or start, m.joint_names, point)
@@ -55,56 +42,55 @@ def read_bag(path: Path, topic: str | None, joints: Sequence[str] | None, ignore
             for point in m.points
         ]
         times = np.array([start + _nanoseconds(p.time_from_start) for start, _, p in points], dtype=np.int64)
-        rows = [(names, p.positions, p.velocities, p.accelerations, p.effort) for _, names, p in points]
+        rows = [(names, point) for _, names, point in points]
     if not rows:
         raise ValueError("the topic has no rows.")
-    for column, field in ((2, "velocity"), (3, "acceleration")):
-        if field in ignored:
-            rows = [(*row[:column], (), *row[column + 1 :]) for row in rows]
-    names = _joints([row[0] for row in rows], joints)
-    whole = [index for index, row in enumerate(rows) if set(names) <= set(row[0])]
-    told = [_twice(row[0], names) for row in rows]
-    mine = sorted({*whole, *(index for index, why in enumerate(told) if why)})
-    passed = [
-        index
-        for index in (*range(mine[0]), *range(mine[-1] + 1, len(rows)))
-        if not rows[index][0] or set(names) & set(rows[index][0])
-    ]
-    other = "" if joints is not None else "; say by joints which you mean, if you do not need it"
-    refused = {at: told[index] + other for at, index in enumerate(mine) if told[index]}
+    names = _joints([its for its, _ in rows], joints)
+    twice = {index: why for index, (its, _) in enumerate(rows) if (why := _twice(its, names))}
+    mine = sorted({*twice, *(index for index, (its, _) in enumerate(rows) if set(names) <= set(its))})
+    at_ends = [*rows[: mine[0]], *rows[mine[-1] + 1 :]]
+    n_passed = sum(not its or not set(names).isdisjoint(its) for its, _ in at_ends)
+    hint = "" if joints is not None else "; say by joints which you mean, if you do not need it"
+    refused = {row: twice[index] + hint for row, index in enumerate(mine) if index in twice}
     problems: dict[int, str] = {}
-    position, velocity, acceleration, effort = (
-        _signal([(rows[index][0], rows[index][column]) for index in mine], names, title, needed, problems)
-        for column, (title, needed) in enumerate(
-            [("position", True), ("velocity", False), ("acceleration", False), ("effort", True)], start=1
-        )
-    )
-    assert position is not None
-    assert effort is not None
+    signals = {
+        title: _signal([(rows[index][0], getattr(rows[index][1], field)) for index in mine], names, title, problems)
+        for title, field in _FIELDS[kind].items()
+        if title not in ignored
+    }
+    for title in ("position", "effort"):
+        if signals[title] is None:
+            raise ValueError(f"no message has a value of the {title}.")
     times = times[mine]
     # The difference first: nanoseconds since 1970 have more digits than a float.
     time = (times - times[0]) * _NANO
-    signals = Signals(time, position, velocity, acceleration, effort)
-    return Recording(signals, names, float(times[0] * _NANO), problems, refused, len(passed))
+    return Recording(
+        Signals(time, signals["position"], signals.get("velocity"), signals.get("acceleration"), signals["effort"]),
+        names,
+        float(times[0] * _NANO),
+        problems,
+        refused,
+        n_passed,
+    )
 
 
 def _twice(names: list[str], wanted: list[str]) -> str:
-    """What is said of a message that has one of the wanted joints twice; empty if all is well."""
+    """Return an error's words if a message has one of the wanted joints twice, else ""."""
     twice = next((name for place, name in enumerate(names) if name in names[:place] and name in wanted), None)
     return "" if twice is None else f"names the joint {twice!r} twice, so that its values are not known"
 
 
 def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]]:
-    """The type of a topic's messages, when they were received (ns), and they."""
+    """Return the type of a topic's messages, the times at which they were received (ns), and the messages."""
     if path.suffix.lower() != ".mcap" and set("#?%") & set(str(path)):
         # rosbags makes the path part of an address as it is, by which SQLite may find another file.
         raise ValueError("SQLite recordings whose path has #, ? or % in it cannot be read: rename it.")
     rosbag2 = require("rosbags.rosbag2", "Reading rosbag2 files")
     typesys = require("rosbags.typesys", "Reading rosbag2 files")
     try:
-        size = check_files(path)
+        path.stat()
+        _check_databases(path)
         with rosbag2.Reader(path) as reader:
-            check_storages(reader, size)
             topics = {connection.topic: connection.msgtype for connection in reader.connections}
             chosen = _topic(topics, topic)
             # The message types that ROS defines, not those that the file does, of which rosbags would make code.
@@ -112,22 +98,33 @@ def _messages(path: Path, topic: str | None) -> tuple[str, np.ndarray, list[Any]
             connections = [connection for connection in reader.connections if connection.topic == chosen]
             found = [
                 (received, store.deserialize_cdr(data, topics[chosen]))
-                for _, received, data in Allowance(size).messages(reader.messages(connections=connections))
+                for _, received, data in reader.messages(connections=connections)
             ]
     except _TopicError:
         raise
-    except Exception as error:  # of broken files rosbags raises whatever comes, also MemoryError
-        raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {error}).") from error
+    except Exception as error:  # rosbags raises any type for a broken file; MemoryError for a wrong size in it
+        why = str(error) or "a size in it may be wrong"
+        raise ValueError(f"it cannot be read as a rosbag2 recording ({type(error).__name__}: {why}).") from error
     if not found:
         raise ValueError(f"the topic {chosen!r} has no messages.")
     return topics[chosen], np.array([received for received, _ in found], dtype=np.int64), [m for _, m in found]
 
 
+def _check_databases(path: Path) -> None:
+    """Refuse damaged SQLite files, of which SQLite itself may read wrong rows in silence."""
+    for file in path.glob("*.db3") if path.is_dir() else [path] * (path.suffix.lower() == ".db3"):
+        with closing(sqlite3.connect(f"{file.absolute().as_uri()}?mode=ro&immutable=1", uri=True)) as database:
+            (state,) = database.execute("PRAGMA quick_check(1)").fetchone()
+        if state != "ok":
+            raise ValueError(f"SQLite finds it damaged: {state}")
+
+
 class _TopicError(ValueError):
-    """An error of ours, which needs no other words."""
+    """An error about the topic, which passes unchanged."""
 
 
 def _topic(topics: dict[str, str], topic: str | None) -> str:
+    """Choose the topic that is asked for, or the only one with joint states or trajectories."""
     known = [name for name, kind in topics.items() if kind in (_STATES, _TRAJECTORY)]
     if topic is not None and topic not in known:
         raise _TopicError(f"topic={topic!r} is none of those with joint states or trajectories; it has {topics}.")
@@ -140,7 +137,7 @@ def _topic(topics: dict[str, str], topic: str | None) -> str:
 
 
 def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
-    """Whose signals are taken: all messages that have all of them count, those of other robots or hands do not."""
+    """Choose the joints: those asked for, or those of the messages if all of these have the same."""
     if joints is None:
         # A driver's first and last messages may name few joints, or none.
         most = max(sets, key=lambda names: len(set(names)))
@@ -159,13 +156,9 @@ def _joints(sets: list[list[str]], joints: Sequence[str] | None) -> list[str]:
     return list(joints)
 
 
-def _signal(
-    rows: list[tuple[list[str], Any]], joints: list[str], title: str, needed: bool, problems: dict[int, str]
-) -> np.ndarray | None:
-    """Values (n, n_joints) of the joints, NaN of messages without them; None if no message has any."""
+def _signal(rows: list[tuple[list[str], Any]], joints: list[str], title: str, problems: dict[int, str]) -> Any:
+    """Return the joints' values (n, n_joints), NaN of messages without them; None if no message has any."""
     if not any(len(values) for _, values in rows):
-        if needed:
-            raise ValueError(f"no message has a value of the {title}.")
         return None
     found = np.full((len(rows), len(joints)), np.nan)
     for row, (names, values) in enumerate(rows):

@@ -1,7 +1,7 @@
-"""Positions that jump: an angle that wraps is unwrapped, any other jump cuts the record.
+"""Find jumps of positions: an angle that wraps is unwrapped, any other jump cuts the record.
 
-A jump is a step between two rows that the steps before and after it do not announce. Three questions decide about it,
-and none needs the recorded velocity, which a driver may have computed from the same wrapped angles:
+A jump is a step between two rows that differs from the steps before and after it. Three questions decide about it. None
+uses the recorded velocity, which a driver may have computed from the same wrapped angles:
 
 * Does the step equal a whole number of periods (2π or 360) plus the step that its neighbours predict?
 * Is it far beyond the fastest step elsewhere, or do all positions lie within one period, as those of an encoder do that
@@ -24,7 +24,7 @@ from ...utils.validation import check_real
 
 RADIANS, DEGREES = 2.0 * np.pi, 360.0
 _SIDE = 3  # neighbours on each side of a step that predict it
-_FEWEST = 3  # neighbours without which nothing is said of a step
+_FEWEST = 3  # neighbours that a step needs; with fewer it is no jump
 # A wrap's step, without its periods, may differ from the prediction by this part of a period, plus twice the largest
 # deviation of a neighbour from the prediction.
 _LOOSE, _TIGHT = 0.02, 0.002
@@ -36,7 +36,7 @@ _STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is 
 _RANGE = 0.9  # of the positions: where it is more than a turn they may be in degrees or mm, and steps are larger
 _SPIKE = 3  # rows that are away and come back, at most
 _MOST = 0.02  # of the steps in which it moves: a joint with more lone steps is one that moves in steps
-_BINS = 16  # of the positions' range: an angle that several turns lead away from and back was in more than half of them
+_BINS = 16  # of the positions' range; an angle that turned several times, there and back, was in most of them
 _UNLIMITED = 1e10  # limits beyond it are none
 
 Kind = str  # "any", "turns" (revolute without limits) or "bounded" (prismatic, or with limits)
@@ -45,7 +45,7 @@ Wish = bool | float | str  # True, False, "auto" or a period
 
 @dataclass(frozen=True)
 class Jumps:
-    """What was found in the positions of a recording."""
+    """Unwrapped positions of a recording, and where they jump."""
 
     position: np.ndarray  # (n, n_joints), unwrapped
     wraps: list[int]  # per joint: how many jumps were unwrapped
@@ -55,7 +55,7 @@ class Jumps:
 
 
 def check_wrap(wrap: Any) -> None:
-    """Refuse what is no wish about wrapping, whatever the joints."""
+    """Check the argument `wrap` before the joints are known."""
     if isinstance(wrap, Mapping):
         for key, one in wrap.items():
             if not isinstance(key, str):
@@ -69,7 +69,7 @@ def check_wrap(wrap: Any) -> None:
 
 
 def wishes(wrap: Any, names: Sequence[str]) -> list[Wish]:
-    """What is wished for each joint: True, False, "auto" or a period."""
+    """Return True, False, "auto" or a period for each joint."""
     if isinstance(wrap, Mapping):
         unknown = sorted(set(wrap) - set(names))
         if unknown:
@@ -96,21 +96,7 @@ def _plain(one: Any) -> Wish:
 
 
 def kinds_of(robot: Any, names: Sequence[str], named: bool) -> list[Kind]:
-    """Whether each joint of a log can turn without end.
-
-    Parameters
-    ----------
-    robot : str, path-like, System, pinocchio.Model or None
-        As in `load_robot`; None says nothing.
-    names : sequence of str
-        Of the log's joints.
-    named : bool
-        Whether the names are the user's or the file's. Otherwise only their order counts.
-
-    Returns
-    -------
-    kinds : list of {"any", "turns", "bounded"}
-    """
+    """Find which joints of a log can turn without end; joints are matched by order if the names are not `named`."""
     if robot is None:
         return ["any"] * len(names)
     if named_system(robot) is not None:
@@ -137,23 +123,8 @@ def find_jumps(
 ) -> Jumps:
     """Unwrap angles, and find the jumps that are no wraps.
 
-    Parameters
-    ----------
-    time : ndarray of shape (n,)
-        Ascending, s.
-    position : ndarray of shape (n, n_joints)
-    step, gap : float
-        The median step, and the longest one that is no gap, s.
-    asked : sequence of {True, False, "auto"} or float
-        Per joint; a number is a period.
-    kinds : sequence of {"any", "turns", "bounded"}
-        Per joint.
-
-    Returns
-    -------
-    jumps : Jumps
-        Between two gaps or jumps, positions are continuous. Across a gap, or a jump that is no wrap, the turn of an
-        unwrapped angle is unknown: the next piece begins at the turn that is nearest to the end of the last one.
+    Across a gap, or a jump that is no wrap, the turn of an unwrapped angle is unknown: the next piece begins at the
+    turn that is nearest to the end of the last one.
     """
     steps = np.diff(time)
     whole = steps <= gap * (1.0 + 1e-9)
@@ -195,9 +166,9 @@ def find_jumps(
 
 
 def _how(asked: Wish, kind: Kind, column: _Steps, period: float) -> str:
-    """How much evidence is needed: little for a period that the user gives, or says that there is one.
+    """Return how much evidence of a wrap is needed: little if the user gives a period, or asks to unwrap.
 
-    Positions beyond one period may be in another unit, and then each of their steps looks like so many periods.
+    Positions that exceed one period may be in another unit. Then each of their steps looks like several periods.
     """
     if asked is True:
         return "forced" if np.ptp(column.position) <= (1.0 + _LOOSE) * period else "turns"
@@ -205,7 +176,7 @@ def _how(asked: Wish, kind: Kind, column: _Steps, period: float) -> str:
 
 
 def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[Kind]) -> list[float | None]:
-    """By which period each joint may be unwrapped: all joints of a log have the same unit."""
+    """Return the period of each joint that may be unwrapped; all joints of a log have the same unit."""
     wanted = [one is True or (one == "auto" and kind != "bounded") for one, kind in zip(asked, kinds, strict=True)]
     degrees = any(
         wish and column.turns(DEGREES, _how(one, kind, column, DEGREES)).any()
@@ -218,23 +189,15 @@ def _periods(columns: Sequence[_Steps], asked: Sequence[Wish], kinds: Sequence[K
 
 
 class _Steps:
-    """The steps of one joint.
-
-    Parameters
-    ----------
-    steps : ndarray of shape (n - 1,)
-        Of time, s.
-    whole : ndarray of shape (n - 1,) of bool
-        Where there is no gap.
-    position : ndarray of shape (n,)
-    step : float
-        The median one, s.
-    """
+    """The steps of one joint."""
 
     def __init__(self, steps: np.ndarray, whole: np.ndarray, position: np.ndarray, step: float):
-        self.steps, self.whole, self.position, self.step = steps, whole, position, step
+        self.steps = steps  # (n - 1,), of time, s
+        self.whole = whole  # (n - 1,) of bool: no gap
+        self.position = position  # (n,)
+        self.step = step  # the median step of time, s
         self.d = np.diff(position)
-        # Stamps that come in bursts make short steps of time, not fast joints.
+        # Stamps that come in bursts make steps of time short, so that joints seem fast.
         self.lasting = np.maximum(steps, step)
 
     @property
@@ -243,18 +206,15 @@ class _Steps:
         return float(sizes[sizes > 0.0].min(initial=np.inf)) if (sizes > 0.0).any() else 0.0
 
     def unwrapped(self, jumps: np.ndarray) -> _Steps:
-        """With these parts of the steps taken away."""
+        """Subtract these jumps from the steps."""
         position = self.position - np.r_[0.0, np.cumsum(jumps)]
         return _Steps(self.steps, self.whole, position, self.step)
 
     def turns(self, period: float, how: str) -> np.ndarray:
-        """How many periods are in each step, 0 where it is motion.
+        """Count the periods in each step; 0 for motion.
 
-        Parameters
-        ----------
-        period : float
-        how : {"any", "turns", "forced"}
-            How much evidence is needed: the most, less for a joint that can turn without end, or little.
+        `how` is the evidence that a wrap needs: the most for "any" joint, less for one that "turns" without end, and
+        little if it is "forced".
         """
         none = np.zeros(len(self.d))
         whole = self.whole
@@ -279,7 +239,7 @@ class _Steps:
             loose &= np.abs(turns) == 1.0
         if self._starts_again(period, turns, loose) and np.quantile(error[known], 0.95) <= _SMOOTH * period:
             return np.where(loose, turns, 0.0)
-        # A turn that was lost, at any place: only where it stands among slow steps.
+        # A turn that was lost may be anywhere. It counts only among slow steps.
         alone = self._share(turns == 0.0) >= 0.5
         others = whole & ~(loose & alone)
         for before, after in self.lone(self.resolution):
@@ -290,7 +250,7 @@ class _Steps:
         return np.where(tight & alone & fast, turns, 0.0)
 
     def _goes_to_and_fro(self, turns: np.ndarray) -> bool:
-        """Whether jumps of several turns lead there and back, and little is between, as of a joint with two states."""
+        """Whether jumps of several turns lead there and back with few positions between, as between two states."""
         several = turns[np.abs(turns) > 1.0]
         if not ((several > 0.0).any() and (several < 0.0).any()):
             return False
@@ -298,7 +258,7 @@ class _Steps:
         return bool(visited.mean() <= 0.5)
 
     def _starts_again(self, period: float, turns: np.ndarray, jumps: np.ndarray) -> bool:
-        """Whether all positions lie within what one jump spans, and come near its ends."""
+        """Whether all jumps have one size, and all positions lie within it."""
         sizes = np.unique(np.abs(turns[jumps]))
         if len(sizes) != 1:
             return False
@@ -306,13 +266,7 @@ class _Steps:
         return bool(reach <= (1.0 + _LOOSE) * sizes[0] * period)
 
     def lone(self, resolution: float) -> list[tuple[int, int]]:
-        """Jumps: the last row before each, and the first one after it.
-
-        Parameters
-        ----------
-        resolution : float
-            The smallest step of the positions that is not 0.
-        """
+        """Return the last row before each jump and the first row after it."""
         middle, deviation = self._neighbours(self.d, same_direction=True)
         error = self.d - middle * self.steps
         size = np.abs(error)
@@ -331,7 +285,7 @@ class _Steps:
         return self._grouped(np.flatnonzero(lone), error)
 
     def _grouped(self, lone: np.ndarray, error: np.ndarray) -> list[tuple[int, int]]:
-        """Steps away and back are one jump; none if the joint only ever moves in such steps."""
+        """Join steps away and back to one jump; return no jump if the joint moves only in such steps."""
         groups: list[list[int]] = []
         for index in lone.tolist():
             if groups and index - groups[-1][-1] <= _SPIKE and self.whole[groups[-1][-1] : index].all():
@@ -344,7 +298,7 @@ class _Steps:
         return [(group[0], group[-1] + 1) for group in groups]
 
     def _around(self, values: np.ndarray) -> np.ndarray:
-        """The neighbours of each step, without those beyond a gap (NaN), of shape (2 * _SIDE, n - 1)."""
+        """Return the neighbours of each step, (2 * _SIDE, n - 1); NaN beyond a gap."""
         n = len(values)
         runs = np.r_[0, np.cumsum(~self.whole[1:] | ~self.whole[:-1])] if n else np.empty(0)
         found = np.full((2 * _SIDE, n), np.nan)
@@ -356,9 +310,9 @@ class _Steps:
         return found
 
     def _neighbours(self, d: np.ndarray, same_direction: bool = False) -> tuple[np.ndarray, np.ndarray]:
-        """Median rate of each step's neighbours, and the largest deviation of one from it; NaN where there are few.
+        """Return the median rate of each step's neighbours and their largest deviation from it; NaN if they are few.
 
-        With ``same_direction`` a deviation counts only if it has the direction of the step's own.
+        With ``same_direction`` a deviation counts only if it has the direction of that of the step.
         """
         rates = d / self.lasting
         around = self._around(rates)
@@ -372,14 +326,14 @@ class _Steps:
         return middle, deviation
 
     def _share(self, flags: np.ndarray) -> np.ndarray:
-        """Of each step's neighbours, how many have the flag."""
+        """Return the share of each step's neighbours that have the flag."""
         around = self._around(flags.astype(np.float64))
         there = np.isfinite(around)
         return np.where(there, around, 0.0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
 
 
 def _merged(found: list[tuple[int, int]]) -> Iterator[tuple[int, int]]:
-    """Jumps of all joints in order; those that touch are one."""
+    """Yield the jumps of all joints in order; jumps that touch are one."""
     last: tuple[int, int] | None = None
     for before, after in sorted(found):
         if last is not None and before <= last[1] + _SPIKE - 2:

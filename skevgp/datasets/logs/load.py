@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral
 from pathlib import Path
-from typing import Any, Literal, overload
+from typing import Any, Literal, TypedDict, Unpack, overload
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -31,49 +31,34 @@ Keep = slice | tuple[float | None, float | None]
 Wrap = bool | float | str | Sequence[bool | float | str] | Mapping[str, bool | float | str]
 
 
+class _Options(TypedDict, total=False):
+    """Arguments of load_log, for its overloads."""
+
+    columns: Columns | None
+    time_unit: Literal["s", "ms", "us", "ns"]
+    decimal: Literal[".", ","]
+    topic: str | None
+    joints: Sequence[str] | None
+    gains: ArrayLike
+    velocity: Literal["recorded", "derive"]
+    acceleration: Literal["recorded", "derive"]
+    wrap: Wrap
+    robot: Robot
+    keep: Keep | Sequence[Keep | None] | None
+    dt: float | None
+    cutoff: float | None
+    max_gap: float | None
+    rest_velocity: float
+    rest_time: float
+
+
 @overload
 def load_log(
-    path: PathLike | Sequence[PathLike],
-    *,
-    columns: Columns | None = ...,
-    time_unit: Literal["s", "ms", "us", "ns"] = ...,
-    decimal: Literal[".", ","] = ...,
-    topic: str | None = ...,
-    joints: Sequence[str] | None = ...,
-    gains: ArrayLike = ...,
-    velocity: Literal["recorded", "derive"] = ...,
-    acceleration: Literal["recorded", "derive"] = ...,
-    wrap: Wrap = ...,
-    robot: Robot = ...,
-    keep: Keep | Sequence[Keep | None] | None = ...,
-    dt: float | None = ...,
-    cutoff: float | None = ...,
-    max_gap: float | None = ...,
-    rest_velocity: float = ...,
-    rest_time: float = ...,
-    return_X_y: Literal[False] = ...,
+    path: PathLike | Sequence[PathLike], *, return_X_y: Literal[False] = ..., **options: Unpack[_Options]
 ) -> Bunch: ...
 @overload
 def load_log(
-    path: PathLike | Sequence[PathLike],
-    *,
-    columns: Columns | None = ...,
-    time_unit: Literal["s", "ms", "us", "ns"] = ...,
-    decimal: Literal[".", ","] = ...,
-    topic: str | None = ...,
-    joints: Sequence[str] | None = ...,
-    gains: ArrayLike = ...,
-    velocity: Literal["recorded", "derive"] = ...,
-    acceleration: Literal["recorded", "derive"] = ...,
-    wrap: Wrap = ...,
-    robot: Robot = ...,
-    keep: Keep | Sequence[Keep | None] | None = ...,
-    dt: float | None = ...,
-    cutoff: float | None = ...,
-    max_gap: float | None = ...,
-    rest_velocity: float = ...,
-    rest_time: float = ...,
-    return_X_y: Literal[True],
+    path: PathLike | Sequence[PathLike], *, return_X_y: Literal[True], **options: Unpack[_Options]
 ) -> tuple[np.ndarray, np.ndarray]: ...
 def load_log(
     path: PathLike | Sequence[PathLike],
@@ -98,89 +83,75 @@ def load_log(
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
     """Load a robot's own logs as data for inverse dynamics: [q, q̇, q̈] and the torques.
 
-    Reads tables (.csv, .txt, .tsv, perhaps with .gz; separator and header are found) and rosbag2 recordings
-    (.db3, .mcap, or their folder), without ROS. With each file this is done:
+    Reads tables (.csv, .txt, .tsv, also with .gz) and rosbag2 recordings (.db3, .mcap, or their folder), without ROS.
+    With each file this is done:
 
-    1. What ``keep`` leaves out goes. Then incomplete rows at the beginning and the end are left out: a motor that does
-       not answer yet, a row of units, a last line that is cut off. An incomplete row between complete ones is an error.
-       Rows are sorted by time, and of rows with the same time the first one stays. A clock that goes back by more than
-       a gap is an error.
-    2. Efforts become torques, times ``gains``.
-    3. Steps above ``max_gap`` cut the recording in pieces. Angles that wrap, such as those in [-π, π), are unwrapped
-       (``wrap``). Any other jump of a position cuts the recording, too. Nothing that follows reaches across a gap or a
-       jump.
-    4. Recorded velocities and accelerations are compared with derivatives of the positions. A contradiction is an
-       error, which names the joint and the likely cause.
-    5. Signals are interpolated (cubic, without overshoot) to a regular grid of ``dt``, or a finer one where rows are
-       closer than that.
-    6. All signals pass a Butterworth filter of fourth order forth and back, which shifts none in time; at ``cutoff``
-       amplitudes are halved. Then the grid is thinned out to ``dt``.
-    7. Velocities that are not recorded are central differences of the filtered positions, and so are accelerations of
-       the filtered velocities.
-    8. Two periods of ``cutoff`` (0.4 s) are cut at each end of a piece, where the filter guesses what comes (without a
-       filter: the row or two where differences are one-sided).
-    9. Rest is cut: where all joints are slower than ``rest_velocity`` for ``rest_time`` or longer, friction can have
-       any value.
+    1. Rows that ``keep`` leaves out are dropped, and so are incomplete rows at the beginning and the end. Rows are
+       sorted by time.
+    2. Efforts are multiplied by ``gains``.
+    3. Angles that wrap are unwrapped. The recording is cut into pieces at steps above ``max_gap`` and at other jumps of
+       a position.
+    4. Recorded velocities and accelerations are compared with the positions. A contradiction is an error.
+    5. Signals are interpolated to a regular grid and filtered forth and back, without a shift in time.
+    6. Velocities and accelerations that were not recorded are central differences.
+    7. The ends of each piece, and rest, are cut.
+
+    :doc:`Read a log </howto/logs>` describes each step.
 
     Parameters
     ----------
     path : str, path-like or sequence of them
-        One file or several, each a group; all of the same joints.
+        One file or several. Each file is a group. All files have the same joints.
     columns : dict, default=None
-        For tables: which columns hold ``"time"``, ``"position"``, ``"effort"`` or ``"current"`` and, if they are there,
-        ``"velocity"`` and ``"acceleration"``. Each a number from 0, a name, a pattern of names such as
-        ``"actual_q_*"``, or a sequence of those (``range(1, 7)``), in the order of the joints.
+        Columns of a table that hold ``"time"``, ``"position"``, ``"effort"`` or ``"current"`` and, if they are there,
+        ``"velocity"`` and ``"acceleration"``. Each is a number from 0, a name, a pattern of names such as
+        ``"actual_q_*"``, or a sequence of those, in the order of the joints.
     time_unit : {"s", "ms", "us", "ns"}, default="s"
-        Of a table's times.
+        Unit of a table's times.
     decimal : {".", ","}, default="."
-        What sets off decimals in a table. Cells are separated by tabs, semicolons, commas or spaces.
+        Decimal sign of a table.
     topic : str, default=None
-        For rosbag2: where the messages are, of type ``sensor_msgs/msg/JointState`` or
-        ``trajectory_msgs/msg/JointTrajectory``. None is the only one with such messages. Times are those in the
-        messages' headers; if some have none, those at which messages were received.
+        Topic of a rosbag2 recording, with messages of type ``sensor_msgs/msg/JointState`` or
+        ``trajectory_msgs/msg/JointTrajectory``. If None, the only topic with such messages.
     joints : sequence of str, default=None
-        For rosbag2: names of the joints, in the order wanted; messages without them are passed over. None is those of
-        the messages, in the order of the first. For tables: how the joints are called, by default q1, q2, ...
+        Joints of a rosbag2 recording, in the order wanted; messages without them are passed over. If None, the joints
+        of the messages. For a table: names for its joints, by default q1, q2, ...
     gains : float or array-like of shape (n_joints,), default=1.0
         Torque per effort: 1 where efforts are in N m, else N m per A.
     velocity : {"recorded", "derive"}, default="recorded"
-        ``"derive"`` ignores recorded velocities, even if they are incomplete or NaN, and differentiates positions.
-        ``"recorded"`` takes them where they are there.
+        Whether to use recorded velocities, where there are any, or differences of the positions. ``"derive"`` ignores
+        recorded velocities, even if they are incomplete or NaN.
     acceleration : {"recorded", "derive"}, default="recorded"
         The same for accelerations.
     wrap : {"auto", True, False}, float, sequence or dict of them, default="auto"
-        Whether to unwrap the jumps of angles that start again after a turn. A sequence has a value for each joint. A
-        dict has values by the joints' names, and other joints are ``"auto"``.
-
-        - ``"auto"`` unwraps a jump that is near a whole number of turns (2π, or 360 for degrees) and far beyond the
-          joint's motion between two rows.
-        - ``True`` unwraps each step above half a turn whose neighbours are steady, and a number is the period.
-        - ``False`` takes positions as they are. The recording is not cut at jumps of this joint.
+        Whether to unwrap angles that start again after a turn; a number is the period. ``"auto"`` unwraps jumps that
+        are clearly turns of 2π or 360, ``True`` also less clear ones, and ``False`` takes positions as they are,
+        without cuts at their jumps. A sequence has a value for each joint, and a dict has values by the joints' names.
     robot : str, path-like, System or pinocchio.Model, default=None
-        As in `load_robot`. With it, ``"auto"`` never unwraps a joint with limits or a prismatic joint. Joints are
+        Robot, as in `load_robot`. ``"auto"`` then never unwraps a joint with limits or a prismatic joint. Joints are
         matched by ``joints`` or the names in a rosbag2 recording, or else by their order.
     keep : slice, tuple or sequence of them, default=None
-        What to read: ``slice(first, stop)``, rows or messages of the file from 0, or ``(first, last)``, seconds since
-        its first row, of which either may be None. A header does not count, a row of units does. Rows that are left out
-        may be incomplete. For several files a list with one for each, None to read all of it.
+        Rows to read: ``slice(first, stop)`` counts rows or messages from 0, and ``(first, last)`` are seconds since the
+        first row, either of which may be None. A header does not count as a row, a row of units does. For several
+        files, a list with one value for each; None reads all rows.
     dt : float, default=0.01
-        Step of the grid, s. None keeps the recorded times, if steps differ by less than 5 %.
+        Step of the grid, s. If None, the recorded times are kept; their steps must differ by less than 5 %.
     cutoff : float, default=5.0
-        Of the filter, Hz; below half the rate of the recording and of the grid. None: no filter, but at 0.8 times half
-        the rate of the grid where it is coarser than the recording.
+        Cutoff frequency of the filter, Hz, below half the rate of the recording and of the grid. If None, signals are
+        filtered only against aliasing, where the grid is coarser than the recording.
     max_gap : float, default=None
-        Longest step that is no gap, s; None is 5 times the median step.
+        Longest step that is no gap, s. If None, 5 times the median step.
     rest_velocity : float, default=0.01
-        In rad/s or m/s, not negative; 0 cuts no rest.
+        Velocity in rad/s or m/s, at least 0, below which a joint is at rest. 0 cuts no rest.
     rest_time : float, default=0.5
-        In s, not negative.
+        Shortest rest of all joints that is cut, s, at least 0.
     return_X_y : bool, default=False
-        Whether to return ``(data, target)`` in place of a Bunch.
+        Whether to return ``(data, target)`` instead of a Bunch.
 
     Returns
     -------
     log : :class:`~sklearn.utils.Bunch`
-        With
+        Dictionary-like object with
 
         - ``data`` : ndarray of shape (n_rows, 3 * n_joints): positions (rad or m), velocities (per s) and accelerations
           (per s²);
@@ -188,16 +159,20 @@ def load_log(
         - ``groups`` : ndarray of shape (n_rows,): the file of each row, for `GroupKFold`;
         - ``pieces`` : ndarray of shape (n_rows,): numbers that differ where a gap or rest lies between rows;
         - ``time`` : ndarray of shape (n_rows,): s since the first row of its file;
-        - ``recordings`` : list of Bunch, one per file, with ``raw`` and ``processed``: each a Bunch of ``time``,
-          ``position``, ``velocity``, ``acceleration`` and ``torque`` (raw ones None where they were not recorded or
-          ignored; raw positions are unwrapped);
-          ``processed`` has also ``why`` of shape (n,), which is empty for the rows in ``data`` and ``"edge"`` or
-          ``"rest"`` for those that were cut; ``cuts``, a list of (first second, last second, ``"gap"``, ``"jump"``,
-          ``"edge"``, ``"rest"`` or ``"too short"``); ``wrapped``, a dict of how many jumps of each joint were
-          unwrapped; ``periods``, a dict of their periods, without joints that never wrap; ``start``, the first
-          row's time by the file's own clock, s; ``n_repeated``,
-          how many rows had the time of another; ``n_incomplete``, how many rows at its beginning and end were left out
-          because values were missing; and ``filename``;
+        - ``recordings`` : list of Bunch, one per file, with
+
+          - ``raw`` and ``processed``: each a Bunch of ``time``, ``position``, ``velocity``, ``acceleration`` and
+            ``torque``. Raw signals are None where they were not recorded or ignored, and raw positions are unwrapped.
+            ``processed`` also has ``why`` of shape (n,): ``"edge"`` or ``"rest"`` for rows that were cut, and empty for
+            the rows in ``data``;
+          - ``cuts``: list of (first second, last second, ``"gap"``, ``"jump"``, ``"edge"``, ``"rest"`` or
+            ``"too short"``);
+          - ``wrapped``: dict of the number of jumps of each joint that were unwrapped; ``periods``: dict of their
+            periods, without joints that never wrap;
+          - ``start``: the first row's time by the file's own clock, s;
+          - ``n_repeated``: number of rows with the time of another row; ``n_incomplete``: number of incomplete rows at
+            the beginning and the end; and ``filename``;
+
         - ``joint_names``, ``feature_names``, ``target_names``, ``filenames``, ``DESCR``.
     (data, target) : tuple of ndarray
         If ``return_X_y``.
@@ -205,14 +180,13 @@ def load_log(
     Raises
     ------
     ValueError
-        If a file cannot be read, lacks columns, a topic or joints, holds values that are not finite or a clock that
-        goes back, is too short for the filter or all at rest; a recorded velocity or acceleration contradicts the
-        positions (never filled, another unit or sign, before the gear, another joint's, delayed); files differ in
-        their joints; or an argument does not fit them. What is wrong with a file begins with its name.
+        If a file cannot be read, lacks columns, a topic or joints, has missing values between complete rows, a clock
+        that goes back, or signals that contradict each other, is too short for the filter or all at rest. Also if files
+        differ in their joints, or an argument does not fit them. An error about a file begins with its name.
     TypeError
         If an argument is of the wrong type.
     OSError
-        If a file is not there or must not be read.
+        If a table is not there or must not be read.
     ImportError
         If a rosbag2 file is given and rosbags is not installed; the message gives the pip command.
 
@@ -223,19 +197,13 @@ def load_log(
 
     Notes
     -----
-    Neighbouring rows of filtered signals say much the same: n_rows is more than what there is to learn from.
-    Cross-validate by ``groups``, never by rows.
-
-    Between gaps and jumps, unwrapped positions are continuous. On which turn a joint was across a gap is unknown: each
-    piece begins on the turn that is nearest to the end of the piece before it. A jump that is no whole number of turns
-    is found from the steps around it. It is far longer than any other step of the joint and stands alone, or positions
-    come back after at most three rows. A joint that moves only in such steps is not cut.
+    Neighbouring rows of filtered signals are nearly the same. Cross-validate by ``groups``, never by rows.
 
     Units of positions are not converted. Degrees stay degrees, and are unwrapped by 360.
 
     Examples
     --------
-    A joint that swings, written down at 125 Hz with a few milliseconds of jitter:
+    A joint that swings, recorded at 125 Hz with a few milliseconds of jitter:
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -258,31 +226,34 @@ def load_log(
     how = Processing(dt, cutoff, max_gap, rest_velocity, rest_time)
     if not isinstance(time_unit, str) or time_unit not in SECONDS:
         raise ValueError(f"time_unit must be one of {list(SECONDS)}; got {time_unit!r}.")
-    ignored = []
-    for name, source in (("velocity", velocity), ("acceleration", acceleration)):
+    sources = {"velocity": velocity, "acceleration": acceleration}
+    for name, source in sources.items():
         if not isinstance(source, str) or source not in ("recorded", "derive"):
             raise ValueError(f'{name} must be "recorded" or "derive"; got {source!r}.')
-        if source == "derive":
-            ignored.append(name)
+    ignored = [name for name, source in sources.items() if source == "derive"]
     check_wrap(wrap)
     if not isinstance(decimal, str) or decimal not in (".", ","):
         raise ValueError(f"decimal must be '.' or ','; got {decimal!r}.")
-    names_of_joints = [] if joints is None else joints
-    if (
-        not isinstance(names_of_joints, (list, tuple, np.ndarray))
-        or not all(isinstance(name, str) for name in names_of_joints)
-        or len(set(names_of_joints)) != len(names_of_joints)
+    if joints is not None and (
+        not isinstance(joints, (list, tuple, np.ndarray))
+        or not all(isinstance(name, str) for name in joints)
+        or len(set(joints)) != len(joints)
     ):
         raise ValueError(f"joints must be a list of different names; got {joints!r}.")
-    asked = None if columns is None else check_columns(columns)
-    if asked is not None:
-        asked = {name: places for name, places in asked.items() if name not in ignored}
+    asked = None
+    if columns is not None:
+        asked = {name: places for name, places in check_columns(columns).items() if name not in ignored}
     files, limits = _files(path, keep)
     recordings, names = [], None if joints is None else list(joints)
     given = None if robot is None else read_once(robot)
     for file, limit in zip(files, limits, strict=True):
         with naming(file):
-            read = _read(file, asked, time_unit, topic, names, ignored, decimal)
+            if file.is_dir() or file.suffix.lower() in BAGS:
+                if asked is not None:
+                    raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
+                read = read_bag(file, topic, names, ignored)
+            else:
+                read = _table(file, asked, time_unit, topic, names, decimal)
             names = read.joint_names
             wanted = wishes(wrap, names)
             kinds = kinds_of(given, names, named=joints is not None or asked is None)
@@ -293,7 +264,7 @@ def load_log(
 
 
 def _files(path: Any, keep: Any) -> tuple[list[Path], list[Any]]:
-    """The files, and what is kept of each."""
+    """Return the files, and which rows are kept of each."""
     if isinstance(path, (str, os.PathLike)):
         return [Path(path)], [_check_keep(keep)]
     if not isinstance(path, (list, tuple)) or not all(isinstance(one, (str, os.PathLike)) for one in path):
@@ -322,7 +293,7 @@ def _check_keep(keep: Any) -> Keep | None:
 
 
 def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
-    """The numbers of the rows that are kept; by seconds, those without a time between them too."""
+    """Return the numbers of the rows that are kept; a row without a time stays if its neighbours do."""
     rows = np.arange(len(time))
     if isinstance(keep, tuple):
         first, last = (-np.inf if keep[0] is None else keep[0]), (np.inf if keep[1] is None else keep[1])
@@ -336,20 +307,16 @@ def _kept(time: np.ndarray, keep: Keep | None) -> np.ndarray:
     return kept
 
 
-def _read(
+def _table(
     file: Path,
     columns: dict[str, list[int | str]] | None,
     time_unit: str,
     topic: str | None,
     names: list[str] | None,
-    ignored: Sequence[str],
     decimal: Literal[".", ","],
 ) -> Recording:
+    """Read a table whose joints have these names."""
     ending = "".join(file.suffixes[-2:]).lower()
-    if file.is_dir() or file.suffix.lower() in BAGS:
-        if columns is not None:
-            raise ValueError("columns are those of a table; in a rosbag2 recording choose topic and joints.")
-        return read_bag(file, topic, names, ignored)
     if not ending.endswith(TABLES):
         hint = " Convert it with: rosbags-convert --src in.bag --dst out" if ending == ".bag" else ""
         raise ValueError(f"its name must end in one of {', '.join([*TABLES, *BAGS])}.{hint}")
@@ -372,7 +339,7 @@ def _recording(
     wrap: Sequence[Wish],
     kinds: Sequence[str],
 ) -> Bunch:
-    """What was recorded and what became of it."""
+    """Check and process the signals of a file."""
     kept, n_incomplete = completed(read, _kept(read.signals.time, keep))
     factor, n_joints = as_floats(gains, "gains"), len(read.joint_names)
     if factor.shape not in ((), (n_joints,)) or not np.isfinite(factor).all():
@@ -400,7 +367,7 @@ def _recording(
 
 
 def _check_derivatives(raw: Signals, parts: list[slice], names: list[str], found: Jumps, how: Processing) -> None:
-    """Refuse recorded velocities that contradict the positions, and accelerations that contradict velocities."""
+    """Raise if recorded velocities contradict positions, or accelerations contradict velocities."""
     if raw.velocity is not None:
         check_agreement(
             raw.time, raw.position, raw.velocity, parts, names, slowest=how.rest_velocity, wrapped=found.wrapped
@@ -416,7 +383,7 @@ def _check_derivatives(raw: Signals, parts: list[slice], names: list[str], found
 
 
 def _log(recordings: list[Bunch], names: list[str], how: Processing) -> Bunch:
-    """The rows of all files that are left."""
+    """Join the rows of all files that were not cut."""
     kept = [recording.processed.why == "" for recording in recordings]
 
     def rows(name: str) -> np.ndarray:
@@ -441,6 +408,7 @@ def _log(recordings: list[Bunch], names: list[str], how: Processing) -> Bunch:
 
 
 def _description(recordings: list[Bunch], lengths: list[int], names: list[str], how: Processing) -> str:
+    """Describe what was done to the signals."""
     files = "; ".join(_story(recording, length) for recording, length in zip(recordings, lengths, strict=True))
     grid = "the recorded times" if how.dt is None else f"a grid of {how.dt:g} s"
     filtered = (
@@ -458,6 +426,7 @@ def _description(recordings: list[Bunch], lengths: list[int], names: list[str], 
 
 
 def _story(recording: Bunch, length: int) -> str:
+    """Describe what became of a file."""
     raw, cuts = recording.raw, recording.cuts
     lost = [
         f"{sum(last - first for first, last, why in cuts if why == kind):.3g} s of {kind}"

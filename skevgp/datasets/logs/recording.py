@@ -1,4 +1,4 @@
-"""What readers return, whatever the file."""
+"""The record that all readers return."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ class Signals:
     position: np.ndarray  # (n, n_joints), rad or m, as all that follow
     velocity: np.ndarray | None  # per s
     acceleration: np.ndarray | None  # per s²
-    torque: np.ndarray  # N m or N; A or whatever a file has, before it is multiplied by the gains
+    torque: np.ndarray  # N m or N; before multiplication by the gains, A or the unit of the file
 
     def each(self, function: Callable[[np.ndarray], np.ndarray], time: np.ndarray | None = None) -> Signals:
-        """What a function makes of each signal, at other times if there are any."""
+        """Apply a function to each signal but the time."""
         position, velocity, acceleration, torque = (
             None if signal is None else function(signal)
             for signal in (self.position, self.velocity, self.acceleration, self.torque)
@@ -37,38 +37,23 @@ class Signals:
 
 @dataclass(frozen=True)
 class Recording:
-    """A file's signals, their times counted from its first row. What a row lacks is NaN."""
+    """Signals of a file, with times since its first row. A missing value is NaN."""
 
     signals: Signals
     joint_names: list[str]
     start: float  # the first row's time by the file's own clock, s
-    # Of rows by number: what they lack, where a NaN does not say enough, and what no ``keep`` but theirs makes good.
+    # By numbers of rows: why values are missing, and why a row is an error unless ``keep`` leaves it out.
     problems: Mapping[int, str] = field(default_factory=dict)
     refused: Mapping[int, str] = field(default_factory=dict)
     n_passed: int = 0  # messages at the beginning and end that do not name all joints
 
 
 def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
-    """Rows of a recording without the incomplete ones at their beginning and end, and how many of these there were.
+    """Drop incomplete rows at the beginning and the end of the kept rows; return the others and how many were dropped.
 
-    Drivers publish before the motors answer, tables have a line of units, and the last line may be cut off. A velocity
-    or acceleration that a joint never has counts for nothing here: `in_order` names it.
-
-    Parameters
-    ----------
-    read : Recording
-    rows : ndarray of int
-        The numbers of those that are kept, at least one.
-
-    Returns
-    -------
-    signals : Signals
-    n_incomplete : int
-
-    Raises
-    ------
-    ValueError
-        If a row between complete ones is incomplete, or more than half of the rows are.
+    Drivers publish before the motors answer, tables have a line of units, and the last line may be cut off. An
+    incomplete row between complete ones is an error. A velocity or acceleration that a joint never has does not count
+    here: `in_order` names it.
     """
     for row in rows:
         if row in read.refused:
@@ -86,7 +71,7 @@ def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
     whole = np.flatnonzero(~incomplete)
 
     def told(at: int) -> str:
-        """What a row lacks."""
+        """Name what a row lacks."""
         row, hint = int(rows[at]), ""
         name, lack = next((name, lack[at]) for name, lack in lacks if lack[at].any())
         if name in ("velocity", "acceleration"):
@@ -110,7 +95,7 @@ def completed(read: Recording, rows: np.ndarray) -> tuple[Signals, int]:
 
 @contextmanager
 def naming(path: Path) -> Iterator[None]:
-    """Errors about what a file holds begin with its name."""
+    """Begin errors about a file with its name."""
     try:
         yield
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""What is done to recorded signals: cut where there are gaps, put on a grid, filtered, differentiated, cut at rest."""
+"""Cut recorded signals at gaps, interpolate them to a grid, filter and differentiate them, and cut rest."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from .recording import Signals
 _ORDER = 4  # of the filter, which passes twice
 _GAP = 5.0  # median steps
 _JITTER = 0.05  # of the median step: times that differ by less are regular
-_EDGE = 2.0  # what is cut at each end of what was filtered, periods of the cutoff frequency
+_EDGE = 2.0  # periods of the cutoff frequency that are cut at each end of a filtered piece
 _BAND = 0.8  # of the grid's Nyquist frequency is left where no cutoff is asked for and the grid is coarser
 _FINEST = 0.1  # of the median step: a finer grid has nothing to show
 
@@ -24,7 +24,7 @@ Cut = tuple[float, float, str]
 
 @dataclass(frozen=True)
 class Processing:
-    """What is asked for, as in `load_log`."""
+    """Arguments of `load_log` about the processing."""
 
     dt: float | None
     cutoff: float | None
@@ -40,7 +40,7 @@ class Processing:
         check_real(self.rest_time, "rest_time", minimum=0.0)
 
     def check_frequencies(self, step: float) -> None:
-        """Of a recording with such a step."""
+        """Raise if the grid or the filter does not fit a recording with this median step."""
         if self.dt is not None and self.dt < _FINEST * step:
             raise ValueError(
                 f"dt={self.dt:g} s is far below the recording's step of {step:g} s: it would show nothing."
@@ -55,7 +55,7 @@ class Processing:
 
 @dataclass(frozen=True)
 class Processed:
-    """What became of a recording: all rows of its grid, and what is said of them."""
+    """Signals on all rows of the grid, and why some of them are cut."""
 
     signals: Signals
     why: np.ndarray  # (n,) of str: why a row is left out, "" where it is not
@@ -63,10 +63,10 @@ class Processed:
 
 
 def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple[Signals, float, float]:
-    """Rows by their times, one for each, with the median step and what is taken for a gap.
+    """Sort rows by time and drop repeated times; return them, the median step and the longest step that is no gap.
 
-    Rows that come late by less than a gap are put where they belong (messages overtake each other); a clock that goes
-    back by more tells of a second recording, which sorting would mix with the first.
+    Messages overtake each other, so rows that are late by less than a gap are sorted. A clock that goes back by more is
+    that of a second recording, which sorting would mix with the first.
     """
     for name, signal in vars(raw).items():
         if signal is not None and not np.isfinite(signal).all():
@@ -95,9 +95,9 @@ def in_order(raw: Signals, max_gap: float | None, names: Sequence[str]) -> tuple
 
 
 def pieces(time: np.ndarray, gap: float, jumps: Sequence[tuple[int, int]] = ()) -> Iterator[slice]:
-    """Rows between which no step exceeds the gap (rounding apart) and no position jumps.
+    """Yield the pieces of rows without a gap or a jump.
 
-    Of each jump there is the last row before it and the first one after it. Rows between them are in no piece.
+    A jump is the last row before it and the first row after it. Rows between them are in no piece.
     """
     gaps = np.flatnonzero(np.diff(time) > gap * (1.0 + 1e-9))
     start = 0
@@ -108,33 +108,13 @@ def pieces(time: np.ndarray, gap: float, jumps: Sequence[tuple[int, int]] = ()) 
 
 
 def runs(flags: np.ndarray) -> Iterator[slice]:
-    """Where flags are True without a break."""
+    """Yield the runs of consecutive True."""
     for start, stop in np.flatnonzero(np.diff(np.r_[False, flags, False])).reshape(-1, 2):
         yield slice(start, stop)
 
 
 def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Sequence[tuple[int, int]] = ()) -> Processed:
-    """Filter and differentiate a recording, each piece between gaps and jumps for itself.
-
-    Parameters
-    ----------
-    raw : Signals
-        In order.
-    step, gap : float
-        The median step and what is taken for a gap, s.
-    how : Processing
-    jumps : sequence of (int, int)
-        The last row before each jump of a position, and the first row after it.
-
-    Returns
-    -------
-    processed : Processed
-
-    Raises
-    ------
-    ValueError
-        If times are not regular and dt is None, or no row remains.
-    """
+    """Filter and differentiate each piece of a sorted recording; raise if no row remains."""
     how.check_frequencies(step)
     parts, reasons = [], []
     cuts: list[Cut] = []
@@ -182,7 +162,7 @@ def process(raw: Signals, step: float, gap: float, how: Processing, jumps: Seque
 
 @dataclass(frozen=True)
 class _Grid:
-    """Where signals are filtered and differentiated."""
+    """The grid on which signals are filtered and differentiated."""
 
     h: float  # its step, s
     inside: int  # steps in one of the rows that are returned
@@ -191,7 +171,7 @@ class _Grid:
 
     @classmethod
     def of(cls, raw: Signals, step: float, how: Processing) -> _Grid:
-        """No coarser than the recording: filtered there, and thinned out afterwards, fast signals do not alias."""
+        """Choose a grid that is no coarser than the recording: it is thinned out after the filter, against aliasing."""
         dt = step if how.dt is None else how.dt
         inside = max(1, int(np.ceil(dt / step - 1e-6)))
         cutoff = _BAND * 0.5 / dt if how.cutoff is None and inside > 1 else how.cutoff
@@ -202,7 +182,7 @@ class _Grid:
 
 
 def _process_piece(piece: Signals, grid: _Grid, how: Processing) -> tuple[Signals, np.ndarray] | None:
-    """The signals on the grid, and why a row is left out; None if nothing is left."""
+    """Return the signals on the grid, and why rows are cut; None if the piece is too short."""
     fine = _regular(piece, grid.h) if how.dt is None else _on_grid(piece, grid.h)
     n_rows = (len(fine.time) - 1) // grid.inside + 1
     if n_rows <= 2 * grid.edge:
@@ -222,7 +202,7 @@ def _process_piece(piece: Signals, grid: _Grid, how: Processing) -> tuple[Signal
 
 
 def _regular(piece: Signals, step: float) -> Signals:
-    """The piece as it is, if its steps are all the same."""
+    """Return the piece unchanged if its steps are regular, else raise."""
     irregular = np.abs(np.diff(piece.time) - step).max(initial=0.0)
     if irregular > _JITTER * step:
         raise ValueError(
@@ -233,7 +213,7 @@ def _regular(piece: Signals, step: float) -> Signals:
 
 
 def _on_grid(piece: Signals, h: float) -> Signals:
-    """Interpolated: cubic, but never beyond the recorded values."""
+    """Interpolate by cubic polynomials that never exceed the recorded values."""
     if len(piece.time) < 2:
         return piece
     first, last = piece.time[[0, -1]]
@@ -243,7 +223,7 @@ def _on_grid(piece: Signals, h: float) -> Signals:
 
 
 def _filtered(signals: Signals, cutoff: float, h: float) -> Signals:
-    """By the same filter, forth and back, so that no signal leads another."""
+    """Filter all signals forth and back, so that no signal leads another."""
     sos = butter(_ORDER, cutoff, fs=1.0 / h, output="sos")
     padding = min(len(signals.time) - 1, int(np.ceil(2.0 / (cutoff * h))))
     return signals.each(lambda signal: sosfiltfilt(sos, signal, axis=0, padlen=padding))

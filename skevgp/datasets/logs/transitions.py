@@ -1,4 +1,4 @@
-"""The same logs as state transitions, for forward dynamics."""
+"""State transitions of logs, for forward dynamics."""
 
 from __future__ import annotations
 
@@ -16,26 +16,26 @@ def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[False]
 @overload
 def log_transitions(log: Bunch, *, stride: int = ..., return_X_y: Literal[True]) -> tuple[np.ndarray, np.ndarray]: ...
 def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """State transitions of logs, each with its own time step: data for forward dynamics.
+    """Turn logs into state transitions, each with its own time step: data for forward dynamics.
 
-    A row is the recorded state and the torque that acted until the next row, which is its target. Nothing is resampled
-    or filtered. Angles that wrap are unwrapped, as `load_log` did it. Left out are transitions across a gap, across a
-    jump of a position or through rest, as `load_log` found them, and rows with the time of another.
+    A row of ``data`` has the recorded state and the torque that acted until the next row. The state of the next row is
+    the target. Nothing is resampled or filtered. Angles are unwrapped as by `load_log`. Transitions across a gap,
+    across a jump of a position or through rest, and rows with the time of another row, are left out.
 
     Parameters
     ----------
     log : Bunch
-        What `load_log` returned.
+        Logs, as returned by `load_log`.
     stride : int, default=1
-        Recorded rows from a state to the next, at least 1. Above 1 transitions follow each other without overlap, and
-        the torque is the mean of the rows on the way, each for as long as it lasted.
+        Number of recorded rows from a state to the next, at least 1. Above 1, transitions follow each other without
+        overlap. The torque is then the mean of the rows between, weighted by their durations.
     return_X_y : bool, default=False
-        Whether to return ``(data, target)`` in place of a Bunch.
+        Whether to return ``(data, target)`` instead of a Bunch.
 
     Returns
     -------
     transitions : :class:`~sklearn.utils.Bunch`
-        With
+        Dictionary-like object with
 
         - ``data`` : ndarray of shape (n_rows, 3 * n_joints + 1): positions (rad or m), velocities (per s), torques
           (N m or N) and, last, the time to the target, ``"dt"`` (s, above 0);
@@ -60,12 +60,12 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
     Notes
     -----
-    The torque of a row is held until the next: what acts between two rows is known only at their ends, and that of the
-    second knows already of the noise of the target's state, where the robot is controlled.
+    The torque of a row is held until the next row. The torque of the next row is not used: where the robot is
+    controlled, it depends on the noise of the target.
 
     Examples
     --------
-    A mass of 2 kg that a force pushes to and fro, written down at times of its own:
+    A mass of 2 kg that a force pushes to and fro, recorded at irregular times:
 
     >>> import tempfile
     >>> from pathlib import Path
@@ -112,7 +112,7 @@ def log_transitions(log: Bunch, *, stride: int = 1, return_X_y: bool = False) ->
 
 
 def _transitions(recording: Bunch, stride: int) -> np.ndarray:
-    """Rows of state, torque, dt, next state and time."""
+    """Return rows of state, torque, dt, next state and time."""
     raw = recording.raw
     if raw.velocity is None:
         raise ValueError(

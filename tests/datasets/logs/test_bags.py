@@ -1,11 +1,12 @@
 import shutil
+import struct
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from skevgp.datasets import load_log
@@ -116,6 +117,25 @@ def test_recordings_are_read_with_and_without_their_metadata(tmp_path, plugin, w
     assert_recorded(log)
     assert log.recordings[0].start == pytest.approx((START + NS[0]) * 1e-9)
     assert log.joint_names == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "plugin"),
+    [
+        (CompressionMode.STORAGE, StoragePlugin.MCAP),
+        (CompressionMode.FILE, StoragePlugin.SQLITE3),
+        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
+    ],
+    ids=["chunks", "file", "messages"],
+)
+def test_compressed_recordings_are_read(tmp_path, mode, plugin):
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
+        for received, message in states():
+            writer.write(connection, received, STORE.serialize_cdr(message, STATES))
+    assert_recorded(load_log(tmp_path / "bag"))
 
 
 def test_without_stamps_the_times_are_those_of_reception(tmp_path):
@@ -236,6 +256,36 @@ def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
     file.write_bytes(data[: int(share * len(data))])
     with pytest.raises(ValueError, match=f"bag{file.suffix}: it cannot be read as a rosbag2 recording"):
         load_log(file)
+
+
+def test_an_mcap_record_longer_than_its_file_raises(tmp_path):
+    header = b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 12) + struct.pack("<I4sI", 4, b"ros2", 0)
+    footer = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
+    file = tmp_path / "log.mcap"
+    file.write_bytes(header + struct.pack("<BQ", 3, 2**40) + footer)
+    with pytest.raises(ValueError, match=r"log.mcap: it cannot be read as a rosbag2 recording \(\w+: .+\)"):
+        load_log(file)
+
+
+def test_a_database_with_a_page_in_two_places_raises(tmp_path):
+    """SQLite would read the rows of that page twice."""
+    data = bytearray(UR10.read_bytes())
+    size = int.from_bytes(data[16:18], "big")
+    pages = range(size, len(data), size)
+    tree = next(page for page in pages if data[page] == 5 and int.from_bytes(data[page + 3 : page + 5], "big") > 1)
+    cells = [int.from_bytes(data[tree + 12 + 2 * i : tree + 14 + 2 * i], "big") for i in range(2)]
+    data[tree + cells[1] : tree + cells[1] + 4] = data[tree + cells[0] : tree + cells[0] + 4]
+    file = tmp_path / "log.db3"
+    file.write_bytes(data)
+    with pytest.raises(ValueError, match=r"log.db3: it cannot be read as .* SQLite finds it damaged: "):
+        load_log(file)
+
+
+@pytest.mark.parametrize("name", ["log.db3", "log.mcap"])
+def test_a_missing_recording_raises_and_is_not_created(tmp_path, name):
+    with pytest.raises(ValueError, match=f"{name}: it cannot be read as a rosbag2 recording .FileNotFoundError"):
+        load_log(tmp_path / name)
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):

@@ -184,3 +184,11 @@ def test_other_kinds_of_files_are_refused(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"")
     with pytest.raises(ValueError, match=f"{name}: .*{message}"):
         load_log(tmp_path / name)
+
+
+def test_signals_that_overflow_are_named(tmp_path):
+    table = table_of(irregular_times(3.0))
+    table[100, 6] = 1e308  # a position would be cut out as a jump
+    path = write_table(tmp_path / "log.csv", table)
+    with pytest.raises(ValueError, match=r"log\.csv: its \w+ overflows when it is filtered and differentiated"):
+        load_log(path, columns=BY_NUMBER)

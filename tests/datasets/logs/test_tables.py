@@ -151,6 +151,32 @@ def test_names_need_a_header(tmp_path):
         load_log(write_table(tmp_path / "log.csv", TABLE, None), columns=BY_NAME)
 
 
+def test_a_title_without_a_column_is_a_problem_of_the_rows(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("# t,q,u\n0,1\n1,2\n")
+    with pytest.raises(ValueError, match="none of its 2 rows is complete: .*it has 2 cells, and column 2 is read"):
+        load_log(file, columns={"time": "t", "position": "q", "effort": "u"})
+
+
+@pytest.mark.parametrize("state", ["RUNNING", '"NOT RUNNING"'])
+def test_quoted_cells_among_spaces_are_one_cell(tmp_path, expected, state):
+    lines = write_table(tmp_path / "body.csv", TABLE, delimiter="  ").read_text().replace("  0  ", f"  {state}  ")
+    file = tmp_path / "log.csv"
+    file.write_text(lines.replace("mode", '"mode of it"'))
+    assert_equal(load_log(file, columns=BY_NAME), expected)
+
+
+@pytest.mark.parametrize(
+    ("quote", "message"),
+    [("", r"row 1 lacks the position .*'a{79} in column 1 \(q\) is no number"), ('"', "it is no text, .*field limit")],
+)
+def test_a_cell_of_a_million_letters_is_named(tmp_path, quote, message):
+    file = tmp_path / "log.csv"
+    file.write_text(f"t,q,u\n0,1,2\n1,{quote}{'a' * 10**6}{quote},2\n2,3,4\n")
+    with pytest.raises(ValueError, match=f"log.csv: {message}"):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
 def test_a_name_of_two_columns_is_an_error(tmp_path):
     file = write_table(tmp_path / "log.csv", TABLE, ["t", "t", *HEADER[2:]])
     with pytest.raises(ValueError, match="asks for 't', but several columns have this name"):
