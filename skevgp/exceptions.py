@@ -1,4 +1,4 @@
-"""Warnings of skevgp's own."""
+"""Warnings of skevgp."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ _filters = RLock()
 
 
 class DependentRowsWarning(UserWarning):
-    """Rows near each other are alike, and nobody said which belong together.
+    """Neighbouring rows are similar, but ``groups`` were not given.
 
-    Given by `EVGPRegressor.fit` without ``groups``: its standard deviations are then those of rows like these, not of
-    new trajectories.
+    `EVGPRegressor.fit` gives this warning. Its standard deviations are then valid for rows near the training rows, but
+    not for new trajectories.
 
     See Also
     --------
-    EVGPRegressor : Its ``fit`` takes ``groups``, by which ``noise_cv`` leaves out rows.
+    EVGPRegressor : Its ``fit`` takes ``groups``, which ``noise_cv`` leaves out one at a time.
 
     Examples
     --------
-    Where rows are sorted but independent:
+    Ignore it if rows are sorted but independent:
 
     >>> import warnings
     >>> from skevgp.exceptions import DependentRowsWarning
@@ -35,17 +35,19 @@ class DependentRowsWarning(UserWarning):
 
 
 class InconsistentVersionWarning(UserWarning):
-    """A model is loaded by another version than it was saved with, and nobody knows whether it predicts the same.
+    """A model was saved with another version, and may predict something else.
 
-    Given for pickles, and files of `skops.io.dump`, of another version of skevgp; and by `skevgp.io.load` for those few
-    models that it cannot try, if they are of another version of scikit-learn. As an error:
+    It is given for pickles, and files of `skops.io.dump`, of another version of skevgp. `skevgp.io.load` gives it for
+    models of another version of scikit-learn whose predictions cannot be compared.
 
     See Also
     --------
-    skevgp.io.save : A model of its files has to predict what it did.
+    skevgp.io.save : Write a file whose predictions are compared when it is loaded.
 
     Examples
     --------
+    Turn it into an error:
+
     >>> import warnings
     >>> from skevgp.exceptions import InconsistentVersionWarning
     >>> with warnings.catch_warnings():
@@ -54,14 +56,14 @@ class InconsistentVersionWarning(UserWarning):
 
 
 class RobotModelWarning(UserWarning):
-    """A robot's file or model has numbers that no robot can have, and is used all the same.
+    """The file or model of a robot has unphysical numbers.
 
-    Given by `skevgp.datasets.load_robot`, and by what loads a robot, for moments of inertia that violate the triangle
-    inequality and for numbers of a URDF file that are not used, such as a negative limit of effort.
+    `skevgp.datasets.load_robot`, and everything that loads a robot, gives it for moments of inertia that violate the
+    triangle inequality, and for numbers of a URDF file that are not used, such as a negative effort limit.
 
     See Also
     --------
-    skevgp.InverseDynamics : Its ``write_urdf`` writes inertias that bodies can have.
+    skevgp.InverseDynamics : Its ``write_urdf`` writes physical inertias.
 
     Examples
     --------
@@ -73,7 +75,7 @@ class RobotModelWarning(UserWarning):
 
 
 def warn_user(message: str, category: type[Warning]) -> None:
-    """Warn of the user's line: the first on the stack that is neither of this package nor of scikit-learn."""
+    """Warn at the line of the user: the innermost frame outside of this package and scikit-learn."""
     frame, level = inspect.currentframe(), 1
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] in ("skevgp", "sklearn"):
         frame, level = frame.f_back, level + 1
@@ -82,11 +84,9 @@ def warn_user(message: str, category: type[Warning]) -> None:
 
 @contextmanager
 def ignored(message: str = "", category: type[Warning] = Warning) -> Iterator[None]:
-    """Ignore warnings of a category whose text begins so (a regular expression).
-
-    Filters are the process's: two threads that changed them at once would each put back what it found, and leave those
-    of the other for ever. So it is one after the other.
-    """
+    """Ignore warnings of a category whose text begins with ``message`` (a regular expression)."""
+    # Filters belong to the process. Two threads that change them at the same time would restore the filters of each
+    # other, so that a lock lets one thread in at a time.
     with _filters, warnings.catch_warnings():
         warnings.filterwarnings("ignore", message, category)
         yield

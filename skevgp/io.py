@@ -1,7 +1,7 @@
-"""Models as files, by skops: loading runs no code of the file, and the model has to predict what it did.
+"""Save and load models by skops, without running code of a file.
 
-A file is a zip archive: what skops makes of the model and of a few rows with the model's predictions for them, and
-`skevgp.json` with the versions of the libraries. The versions are read first, so that each error can name them.
+A file is a zip archive. It holds the model and a few rows with their predictions, as skops writes them, and
+`skevgp.json` with the versions of the libraries. Versions are read first, so that errors can name them.
 """
 
 from __future__ import annotations
@@ -39,21 +39,21 @@ from .utils.validation import check_fitted
 __all__ = ["TRUSTED_TYPES", "load", "save"]
 
 _ABOUT, _FORMAT = "skevgp.json", 2
-# A file may hold as many times its size, and as many bytes more; those of `save` hold some ten times their size.
+# A file may unpack to this many times its size, plus this many bytes. Files of `save` unpack to about ten times.
 _TIMES, _MORE = 100, 2**24
-# Number of rows that a model has to predict again.
+# Number of rows whose predictions are compared.
 _ROWS = 4
-# What a prediction may differ by where other libraries compute it: shares of its standard deviation, and of itself; its
-# standard deviation by a share of the largest mean too, since it is rounding where there is no noise.
+# Allowed differences of predictions by other libraries, as shares of the standard deviation and of the mean. The
+# standard deviation may differ by a share of the largest mean too, because it is a rounding error if there is no noise.
 _OF_STD, _OF_MEAN, _OF_LARGEST = 1e-2, 1e-6, 1e-4
-# Parts of the package whose classes are in no fitted model.
+# Parts of the package whose classes do not occur in fitted models.
 _WITHOUT_MODELS = (
     *("skevgp.datasets", "skevgp.exceptions", "skevgp.io", "skevgp.metrics", "skevgp.plotting"),
     *("skevgp.data.dask", "skevgp.data.threads", "skevgp.utils.files", "skevgp.utils.monitor"),
 )
-# Parts of a covariance: they take a tuple apart. A range is a user's list of outputs.
+# Two functions of a covariance that select from a tuple. A range is a user's list of outputs.
 _FUNCTIONS = ("builtins.range", "operator.itemgetter", "skevgp.kernels.base._all_of_it")
-# Parts of ColumnTransformer, SplineTransformer, SimpleImputer and searches, some of them in some versions only.
+# Parts of ColumnTransformer, SplineTransformer, SimpleImputer and searches. Some exist in some versions only.
 _OF_SCIKIT_LEARN = (
     "numpy.dtype",
     "numpy.number",
@@ -93,33 +93,33 @@ def _name(value: Any) -> str:
 
 
 TRUSTED_TYPES: list[str] = sorted(set(_names_of_types()))
-"""Names of the types that a fitted model of skevgp is made of, for ``skops.io.load(path, trusted=TRUSTED_TYPES)``: its
-own classes, and some of scikit-learn, SciPy and NumPy. None of them runs what a file says. Functions and transformers
-of yours are not among them: ``skops.io.get_untrusted_types(file=path)`` lists these.
+"""Names of the types in a fitted model of skevgp, for ``skops.io.load(path, trusted=TRUSTED_TYPES)``.
+
+They are classes of skevgp, and some of scikit-learn, SciPy and NumPy. None of them runs code of a file. Your own
+functions and transformers are not in the list; ``skops.io.get_untrusted_types(file=path)`` names them.
 """
 
 
 def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> None:
     """Write a fitted model to a file from which loading runs no code.
 
-    A loaded model predicts the same to the bit, and goes on with ``partial_fit``. What is written is loaded once before
-    it is written. The file is written next to ``path`` and then replaces it: if anything fails, the old file is still
-    there.
+    A loaded model predicts exactly the same, and can go on with ``partial_fit``. The data are loaded once as a test
+    before they are written. If anything fails, the old file is still there.
 
     Parameters
     ----------
     model : estimator
-        Fitted: a regressor or transformer of skevgp, or a scikit-learn estimator of these.
+        A fitted regressor or transformer of skevgp, or a scikit-learn estimator that contains one.
     path : str or path-like
-        File to write, for example ``"arm.skevgp"``. It is replaced.
+        File to write, for example ``"arm.skevgp"``. An existing file is replaced.
     trusted : sequence of str, default=()
-        Names of further types in the model, such as transformers and functions of yours:
-        ``["my_package.MyMap"]``. `load` needs the same list.
+        Names of further types in the model, such as your own transformers: ``["my_package.MyMap"]``. `load` needs the
+        same list.
 
     Raises
     ------
     ImportError
-        If skops is not installed; the message gives the pip command.
+        If skops is not installed.
     ValueError
         If the model holds other types, which the message names, or could not be loaded again.
     sklearn.exceptions.NotFittedError
@@ -133,9 +133,9 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 
     Notes
     -----
-    A named system is stored as its name. What a fitted map knows of any other robot is stored as numbers: neither its
-    URDF file nor example-robot-data has to be there when the model is loaded. The path that was given as ``robot``
-    stays in the parameters, as text that only another ``fit`` or `InverseDynamics.write_urdf` follows.
+    A named system is stored as its name, and any other robot as numbers. Its URDF file and example-robot-data are not
+    needed to load the model. A path that was given as ``robot`` stays in the parameters as text, and is used by another
+    ``fit`` or by `InverseDynamics.write_urdf` only.
 
     Examples
     --------
@@ -168,39 +168,38 @@ def save(model: BaseEstimator, path: str | os.PathLike[str], *, trusted: Sequenc
 
 
 def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
-    """Read a model from a file of `save`.
+    """Read a model from a file that `save` has written.
 
-    Only types on a list are made: `TRUSTED_TYPES`, those that skops trusts, and ``trusted``. No code of the file is
-    run, so that files of strangers may be read. Finally, the model has to predict what it predicted for a few rows when
-    it was saved.
+    Only types in `TRUSTED_TYPES`, in ``trusted``, and those that skops trusts are created. No code of the file is run,
+    so that files from unknown sources are safe to load. The model must predict the same for a few rows as when it was
+    saved.
 
     Parameters
     ----------
     path : str or path-like
         File to read.
     trusted : sequence of str, default=()
-        Names of further types to trust, such as transformers of yours: ``["my_package.MyMap"]``.
+        Names of further types to trust, such as your own transformers: ``["my_package.MyMap"]``.
 
     Returns
     -------
     model : estimator
-        As it was saved.
+        The model as it was saved.
 
     Raises
     ------
     ValueError
-        If the file is damaged, no such file, of another version, needs other types, or the model does not predict what
-        it did, which may happen with other versions of scikit-learn. The message names the file and says what is wrong.
+        If the file is damaged, was not written by `save`, has another format or needs other types, or if the model
+        predicts something else than before, which may happen with another version of scikit-learn.
     ImportError
-        If skops is not installed, or the model needs Pinocchio, or a package of data frames, that is not installed; the
-        message gives the pip command.
+        If skops, Pinocchio or a package of data frames is needed and not installed.
     OSError
         If the file cannot be read.
 
     Warns
     -----
     skevgp.exceptions.InconsistentVersionWarning
-        If the model was saved with another version of scikit-learn, and could not be tried when it was.
+        If the model was saved with another version of scikit-learn, and its predictions could not be compared.
 
     See Also
     --------
@@ -227,7 +226,7 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
     except ImportError:
         raise
     except Exception as error:
-        # Whatever a damaged file makes of skops, of NumPy and of our classes.
+        # A damaged file may cause any error in skops, NumPy and this package.
         raise ValueError(f"{os.fspath(path)!r} cannot be loaded: {_said(error)}.") from error
     if not tried and made_with.get("scikit-learn") != sklearn.__version__:
         warn_user(
@@ -239,7 +238,7 @@ def load(path: str | os.PathLike[str], *, trusted: Sequence[str] = ()) -> Any:
 
 
 def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, Any]]:
-    """The model of a file, whether it has predicted what it did, and the versions that made the file."""
+    """Return the model of a file, whether its predictions were compared, and the versions that wrote the file."""
     with ZipFile(BytesIO(data)) as archive:
         names, size = archive.namelist(), sum(member.file_size for member in archive.infolist())
         if "model.json" in names:
@@ -263,7 +262,7 @@ def _opened(data: bytes, trusted: Sequence[str]) -> tuple[Any, bool, dict[str, A
 
 
 def _made(data: bytes, trusted: list[str]) -> tuple[Any, bool]:
-    """The model of a file, and whether it has predicted what it did."""
+    """Return the model of a file, and whether its predictions were compared."""
     skops = require("skops.io", "Loading a model")
     if unknown := sorted(set(skops.get_untrusted_types(data=data)) - set(trusted)):
         raise ValueError(
@@ -287,11 +286,11 @@ def _said(error: Exception) -> str:
     return text if type(error) in (ValueError, BadZipFile) else f"{type(error).__name__}: {text}"
 
 
-# --- a few rows, and what is predicted of them -----------------------------------------------------------------------
+# --- a few rows and their predictions --------------------------------------------------------------------------------
 
 
 def _trial(model: Any) -> dict[str, Any] | None:
-    """Rows, mean and standard deviation; None for a model of which nobody knows what rows it takes."""
+    """Return rows, mean and standard deviation, or None if no valid rows are known for the model."""
     rows = _rows_for(model)
     try:
         with ignored(), np.errstate(all="ignore"):
@@ -305,7 +304,7 @@ def _trial(model: Any) -> dict[str, Any] | None:
 
 
 def _rows_for(model: Any) -> Any:
-    """A few rows that a fitted model has seen, or that look like them: a data frame if it was fitted to one."""
+    """Return a few rows that a fitted model has seen, or similar ones; a data frame if it was fitted to one."""
     model = getattr(model, "best_estimator_", model)
     posterior = getattr(model, "_posterior", None)
     example = getattr(model, "_example", None) if posterior is None else posterior.maps.example
@@ -323,7 +322,7 @@ def _rows_for(model: Any) -> Any:
 
 
 def _categories(transformer: Any, columns: Any) -> Iterator[tuple[int, Any]]:
-    """Columns that an encoder takes, by index, and the values it knows of each."""
+    """Yield the indices of the columns of an encoder, and the values that it knows for each."""
     if hasattr(transformer, "steps"):
         yield from _categories(transformer.steps[0][1], columns)
     elif hasattr(transformer, "transformers_"):
@@ -335,14 +334,14 @@ def _categories(transformer: Any, columns: Any) -> Iterator[tuple[int, Any]]:
 
 
 def _predicted(model: Any, rows: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation, or 0 of what has none."""
+    """Return mean and standard deviation, which is 0 if the model has none."""
     if not hasattr(model, "predict"):
         mean, std = model.transform(rows), 0.0
     else:
         try:
             mean, std = model.predict(rows, return_std=True)
         except Exception:
-            # Each estimator refuses return_std in its own way.
+            # Estimators without return_std raise various errors.
             mean, std = model.predict(rows), 0.0
     mean = np.asarray(mean.toarray() if hasattr(mean, "toarray") else mean, dtype=np.float64)
     return mean, np.broadcast_to(np.asarray(std, dtype=np.float64), mean.shape).copy()

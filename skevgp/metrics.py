@@ -1,4 +1,4 @@
-"""The paper's metrics of a probabilistic prediction (its section IV-B), proper scores, calibration, and scorers."""
+"""Metrics of probabilistic predictions (section IV-B of the paper), proper scores, calibration and scorers."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ __all__ = [
 
 
 def _matrix(values: ArrayLike, name: str) -> np.ndarray:
-    """(n_samples,) or (n_samples, n_outputs) -> (n_samples, n_outputs)."""
+    """Return values as an array (n_samples, n_outputs)."""
     matrix = check_array(values, ensure_2d=False, dtype=np.float64, input_name=name)
     if matrix.ndim == 1:
         matrix = matrix[:, np.newaxis]
@@ -56,12 +56,12 @@ def prediction_error(y_true: ArrayLike, y_pred: ArrayLike) -> float:
     Parameters
     ----------
     y_true, y_pred : array-like of shape (n_samples,) or (n_samples, n_outputs)
-        What was observed and what was predicted.
+        Observations and predicted means.
 
     Returns
     -------
     error : float
-        In the units of y.
+        The error in units of y.
 
     Raises
     ------
@@ -89,7 +89,7 @@ def std_norm(std: ArrayLike) -> float:
     Returns
     -------
     norm : float
-        In the units of y.
+        The norm in units of y.
 
     Raises
     ------
@@ -110,19 +110,19 @@ def containing_ratios(
 ) -> np.ndarray:
     """Share of the values within k predicted standard deviations (CR-k in the paper).
 
-    For Gaussian errors with the right standard deviation it tends to 0.683, 0.954 and 0.997 at k = 1, 2, 3.
+    For Gaussian errors with a correct standard deviation it tends to 0.683, 0.954 and 0.997 at k = 1, 2, 3.
 
     Parameters
     ----------
     y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
         Observations, predicted means and predicted standard deviations (with noise).
     k : float or sequence of float, default=(1, 2, 3)
-        Half widths of the interval, in standard deviations, not negative.
+        Half width of the interval in standard deviations, at least 0.
 
     Returns
     -------
     ratios : ndarray of shape (len(k),)
-        Shares of all (row, output) pairs with ``|y_true - y_pred| <= k * std``.
+        Share of all (row, output) pairs with ``|y_true - y_pred| <= k * std``.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: A
     Returns
     -------
     nlpd : float
-        In nats per row.
+        The score in nats per row.
 
     Raises
     ------
@@ -177,12 +177,12 @@ def negative_log_predictive_density(y_true: ArrayLike, y_pred: ArrayLike, std: A
 def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
     r"""Mean over rows of the continuous ranked probability score of N(mean, std²), summed over outputs.
 
-    A proper score as `negative_log_predictive_density` is, lower is better, but in the units of y, and hardly moved by
-    single rows far off. With z = (y - mean) / std it is (Gneiting & Raftery 2007, section 4.2)
+    It is a proper score, and lower is better. Compared with `negative_log_predictive_density`, it is in units of y and
+    less sensitive to outliers. With z = (y - mean) / std it is (Gneiting & Raftery 2007, section 4.2)
 
     .. math:: \int (F(x) - 1_{x \geq y})^2 dx = \sigma \, [z (2 \Phi(z) - 1) + 2 \varphi(z) - 1 / \sqrt{\pi}],
 
-    and the absolute error where the standard deviation is 0.
+    and the absolute error if the standard deviation is 0.
 
     Parameters
     ----------
@@ -192,7 +192,7 @@ def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
     Returns
     -------
     score : float
-        In the units of y, at least 0.
+        The score in units of y, at least 0.
 
     Raises
     ------
@@ -219,18 +219,17 @@ def crps(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
 
 
 def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> float:
-    r"""How far shares of values inside intervals are from what the intervals promise, on average over all of them.
+    r"""Mean absolute difference between the coverage of central intervals and their probability.
 
     With :math:`\hat c(p)` the share of all (row, output) pairs inside the central interval of probability p of
     N(mean, std²), it is the area between the reliability curve and the diagonal,
 
-    .. math:: \int_0^1 |\hat c(p) - p| \, dp,
+    .. math:: \int_0^1 |\hat c(p) - p| \, dp.
 
-    in closed form, without bins: the calibration error of Kuleshov et al. (2018, eq. 9) with absolute differences, all
-    levels alike, and central intervals in place of quantiles (the "mean absolute calibration error" of Tran et al.
-    2020). 0 is the best, 0.5 the worst: nothing or everything is inside of any interval. It is no proper score, since
-    wide intervals of what varies little are calibrated too: read it beside `crps`. Of n independent calibrated values
-    it is about 0.3 / sqrt(n).
+    The integral is exact, without bins. It is the calibration error of Kuleshov et al. (2018, eq. 9) with absolute
+    differences and central intervals (the "mean absolute calibration error" of Tran et al. 2020). The best value is 0
+    and the worst 0.5. For n independent calibrated values it is about 0.3 / sqrt(n). It is not a proper score:
+    uninformative wide intervals can be calibrated too. Use it together with `crps`.
 
     Parameters
     ----------
@@ -240,7 +239,7 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
     Returns
     -------
     error : float
-        From 0 to 0.5.
+        The calibration error, from 0 to 0.5.
 
     Raises
     ------
@@ -249,7 +248,7 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
 
     See Also
     --------
-    skevgp.plotting.CalibrationDisplay : The curve.
+    skevgp.plotting.CalibrationDisplay : Plot of the reliability curve.
 
     References
     ----------
@@ -258,14 +257,14 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
 
     Examples
     --------
-    Of four values all are inside of the 60 % interval, and none inside the 50 % interval:
+    All of four values are inside the 60 % interval, and none is inside the 50 % interval:
 
     >>> from skevgp.metrics import calibration_error
     >>> round(calibration_error([0.7, -0.7, 0.8, -0.8], [0.0] * 4, [1.0] * 4), 2)
     0.23
     """
     levels = np.sort(interval_levels(y_true, y_pred, std).ravel())
-    # Between the i-th and the next level the share is i / n; each piece is the area of |share - p|.
+    # Between the i-th and the next level the share is i / n. Each piece is an integral of |share - p|.
     share = np.arange(len(levels) + 1) / len(levels)
     ends = np.concatenate([[0.0], levels, [1.0]])
     area = [0.5 * (end - share) * np.abs(end - share) for end in (ends[1:], ends[:-1])]
@@ -273,7 +272,7 @@ def calibration_error(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> f
 
 
 def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.ndarray:
-    """The probability of the smallest central interval of N(mean, std²) that holds y, of each value.
+    """Probability of the smallest central interval of N(mean, std²) that contains y, for each value.
 
     Parameters
     ----------
@@ -283,7 +282,7 @@ def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.
     Returns
     -------
     levels : ndarray of shape (n_samples, n_outputs)
-        From 0 to 1; uniform if predictions are calibrated.
+        Probabilities from 0 to 1. They are uniform if predictions are calibrated.
 
     Raises
     ------
@@ -303,7 +302,7 @@ def interval_levels(y_true: ArrayLike, y_pred: ArrayLike, std: ArrayLike) -> np.
         return 2.0 * ndtr(np.divide(error, std, out=unreached, where=std > 0)) - 1.0
 
 
-# For ``scoring=``; higher is better.
+# Scorers for ``scoring=``. Higher is better.
 neg_nlpd = make_std_scorer(negative_log_predictive_density, greater_is_better=False)
 neg_crps = make_std_scorer(crps, greater_is_better=False)
 neg_calibration_error = make_std_scorer(calibration_error, greater_is_better=False)

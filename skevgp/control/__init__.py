@@ -1,1 +1,1 @@
-"""What controllers ask of a fitted model: fast rows, sampled functions, rollouts, CasADi and C code."""
+"""Requests of controllers to a fitted model: fast predictions, sampled functions, rollouts, CasADi and C code."""

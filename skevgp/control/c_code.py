@@ -100,31 +100,8 @@ def write_c(
     columns: Iterable[str] | None = None,
     include_noise: bool = True,
 ) -> tuple[Path, Path]:
-    """Write a function x -> (mean, variance) to a source and a header; see `Exportable.to_c`.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Whose name is what those of C begin with.
-    path : path-like
-        A folder, or the source.
-    jacobian : bool
-        Whether there are functions of derivatives.
-    columns : iterable of str, optional
-        Names of the inputs, for the comment.
-    include_noise : bool, default=True
-        For the comment.
-
-    Returns
-    -------
-    source, header : Path
-
-    Raises
-    ------
-    ValueError
-        If the folder is not there, or the name is taken in C.
-    """
-    ca, name = casadi(), function.name()
+    """Write a `casadi.Function` x -> (mean, variance) as C; return the paths of source and header."""
+    ca, name = casadi(), function.name()  # names in C begin with the function's name
     if name in _TAKEN or name.startswith(_TAKEN_STARTS):
         raise ValueError(f"name={name!r} means something else in C; give it another one.")
     source = Path(path)
@@ -167,13 +144,13 @@ def write_c(
 
 
 def _as_macro(stem: str) -> str:
-    """A file's name as that of a macro."""
+    """Turn the stem of a file name into the name of a macro."""
     macro = re.sub(r"\W", "_", stem, flags=re.ASCII).upper()
     return f"MODEL_{macro}" if macro[0].isdigit() else macro
 
 
 def _parts_of(function: Any, jacobian: bool) -> dict[str, tuple[Any, list[str]]]:
-    """The functions in C: name -> what computes it, and the names of its results."""
+    """Return the C functions to write: name -> (casadi.Function, names of its results)."""
     ca, name = casadi(), function.name()
     x = ca.MX.sym("x", function.size_in(0))
     mean, variance = function(x)
@@ -205,11 +182,11 @@ def _definition(declaration: str, part: Any, results: list[str]) -> str:
 
 
 def _version() -> str:
-    """The package's, which imports all that stands above this module."""
+    """Return the version of the package, whose __init__ imports this module."""
     return importlib.import_module(__name__.partition(".")[0]).__version__
 
 
 def _stack(part: Any) -> int:
-    """Bytes of a function's work, with some for its calls."""
+    """Bound the bytes of stack that a function needs, with 1 kB for the calls themselves."""
     numbers = int(np.sum([part.sz_arg(), part.sz_res(), part.sz_iw(), part.sz_w()]))
     return 8 * numbers + 1024

@@ -1,4 +1,4 @@
-"""A fitted Gaussian process as a CasADi function: mean and variance in MX, and by CasADi all of their derivatives."""
+"""A fitted Gaussian process as a CasADi function of x: mean and variance, with exact derivatives by CasADi."""
 
 from __future__ import annotations
 
@@ -13,56 +13,28 @@ from ..maps import Map, NoExpressionError
 from ..model.predictor import Predictor, PredictorGroup
 from ..utils.casadi import casadi
 
-# In another function derivatives of the mean then leave out those of the variance, which cost more.
+# An inlined function lets a caller differentiate the mean without the variance, whose derivatives cost more.
 INLINED = {"always_inline": True}
-# Of k̃(x, x): what of k̃(x, x) - |v|² may be rounding, as in predictions.
+# Lower limit of the residual variance k̃(x, x) - |v|², as a share of k̃(x, x). Below it there is only rounding.
 _ROUNDING = 4.0 * np.finfo(float).eps
-# What may be left beside the diagonal: so many times what rounding leaves of |V|² at the inducing points.
+# Largest allowed part off the diagonal, in units of the rounding error of |V|² at the inducing points.
 _BESIDE = 10.0
 
-# The expression of one row: a column (width, 1), or one for each output.
+# The expression of one row: a column (width, 1), or a list with one column for each output.
 Mapped = Any
 
 
 @dataclass(frozen=True)
 class Exported:
-    """What is exported of an estimator.
+    """A fitted model as it is exported to CasADi."""
 
-    Attributes
-    ----------
-    predictor : Predictor
-        In the user's units.
-    feature_map, kernel_map : Map or None
-    n_columns : int
-        Of X.
-    """
-
-    predictor: Predictor
+    predictor: Predictor  # in the user's units
     feature_map: Map | None
     kernel_map: Map | None
-    n_columns: int
+    n_columns: int  # columns of X
 
     def function(self, name: str, include_noise: bool, parametric: bool) -> Any:
-        """(x) or (x, parameters) -> (mean, variance), as a `casadi.Function`.
-
-        Parameters
-        ----------
-        name : str
-        include_noise : bool
-        parametric : bool
-            Whether what `parameters` returns is a second argument.
-
-        Returns
-        -------
-        function : casadi.Function
-
-        Raises
-        ------
-        ImportError
-            If CasADi is not installed.
-        ValueError, TypeError
-            If the name is none, or the kernel or a map has no expression in CasADi.
-        """
+        """Return (x) -> (mean, variance) as a `casadi.Function`; if parametric, (x, parameters) -> (mean, variance)."""
         ca = casadi()
         if not (isinstance(name, str) and ca.Function.check_name(name)):
             raise ValueError(f"name must be letters, digits and single underscores, a letter first; got {name!r}.")
@@ -81,20 +53,19 @@ class Exported:
         return ca.Function(name, given, outputs, ["x", "parameters"][: len(given)], ["mean", "variance"], INLINED)
 
     def parameters(self, out: np.ndarray | None = None) -> np.ndarray:
-        """What new rows may change, as one vector, put into ``out`` if that is given.
-
-        Of each group of outputs that share inducing points the weights of the mean, (o, m + p), and then the roots of
-        the covariance, (o, k, m + p); after all groups the coefficients that the features' weights are added to,
-        (n_outputs, p), what is added to the mean, (n_outputs,), and the noise variances, (n_outputs,).
-        """
+        """Return all numbers that new rows may change as one vector, written to ``out`` if that is given."""
         return np.concatenate([np.ravel(part) for part in self._parts()], out=out)
 
     def _parts(self) -> list[np.ndarray]:
+        """List the arrays of `parameters` in their order."""
+        # For each group of o outputs with the same m inducing points: weights of the mean (o, m + p), then roots of the
+        # covariance (o, k, m + p). After all groups: the offset of the features' weights (n_outputs, p), the intercept
+        # (n_outputs,) and the noise variances (n_outputs,).
         each = [part for group in self.predictor.groups for part in (group.mean, group.root)]
         return [*each, self.predictor.offset, self.predictor.intercept, self.predictor.noise]
 
     def _frozen(self, inputs: Mapped, features: Mapped, include_noise: bool) -> list[Any]:
-        """Mean and variance with all numbers put in."""
+        """Return mean and variance with all numbers as constants."""
         ca, predictor = casadi(), self.predictor
         own = [_frozen_group(group, *_at(group, inputs, features)) for group in predictor.groups]
         mean = self._in_order([mean for mean, _ in own]) + self._by_features(features, predictor.offset)
@@ -103,7 +74,7 @@ class Exported:
         return [ca.densify(mean + ca.DM(predictor.intercept)), ca.densify(variance)]
 
     def _given(self, inputs: Mapped, features: Mapped, given: Any, include_noise: bool) -> list[Any]:
-        """Mean and variance with what `parameters` lists left open."""
+        """Return mean and variance with the numbers of `parameters` as symbols."""
         ca = casadi()
         parts = self._parts()
         ends = np.cumsum([0, *(part.size for part in parts)]).tolist()
@@ -122,7 +93,7 @@ class Exported:
         return [ca.densify(mean + intercept), ca.densify(variance + noise if include_noise else variance)]
 
     def _by_features(self, features: Mapped, offset: Any) -> Any:
-        """Features times the coefficients (o, p), or of a symbol (p, o), of each output."""
+        """Multiply features by the coefficients of each output: an array (o, p) or a symbol (p, o)."""
         ca = casadi()
         by_output = offset if isinstance(offset, ca.MX) else ca.DM(np.ascontiguousarray(offset.T))
         if not by_output.shape[0]:
@@ -132,14 +103,14 @@ class Exported:
         return ca.mtimes(features.T, by_output).T
 
     def _in_order(self, parts: list[Any]) -> Any:
-        """What each group has of its outputs as one column of all outputs."""
+        """Stack the columns of all groups into one column in the order of the outputs."""
         ca, n_outputs = casadi(), len(self.predictor.noise)
         order = np.concatenate([np.arange(n_outputs)[group.outputs] for group in self.predictor.groups])
         joined = ca.vertcat(*parts)
         return joined if (order == np.arange(n_outputs)).all() else joined[np.argsort(order).tolist()]
 
     def _check_widths(self, inputs: Mapped, features: Mapped) -> None:
-        """A map's own to_casadi may have returned anything."""
+        """Raise ValueError if the ``to_casadi`` of a user's map returned other shapes than its ``transform``."""
         ca = casadi()
         wanted = self.predictor.groups[0].points.shape[1], self.predictor.offset.shape[1]
         for name, row, width in zip(("kernel_map", "feature_map"), (inputs, features), wanted, strict=True):
@@ -154,7 +125,7 @@ class Exported:
 
 
 def _expression(own: Map, x: Any, argument: str) -> Mapped:
-    """What a map makes of a row, or an error that names the argument it is from."""
+    """Return the expression of a mapped row, or raise an error that names the argument with the map."""
     try:
         return own.casadi(x)
     except NoExpressionError as error:
@@ -162,24 +133,22 @@ def _expression(own: Map, x: Any, argument: str) -> Mapped:
 
 
 def _at(group: PredictorGroup, inputs: Mapped, features: Mapped) -> tuple[Any, Any, Any]:
-    """k̃(X_m, x), k̃(x, x) and the features of a group."""
+    """Return k̃(X_m, x), k̃(x, x) and the features of a group."""
     kernel: Any = group.kernel  # the mathematics names no class
     own = kernel.expression(np.log(group.hyperparameters), group.points, _of(inputs, group.outputs))
     return *own, _of(features, group.outputs)
 
 
 def _of(row: Mapped, outputs: Columns) -> Any:
-    """The row of a group, which is that of its only output if each has one."""
+    """Return the row of a group. If each output has a row of its own, each group has one output."""
     return row[outputs.start if isinstance(outputs, slice) else outputs[0]] if isinstance(row, list) else row
 
 
 def _frozen_group(group: PredictorGroup, cross: Any, diagonal: Any, features: Any) -> tuple[Any, Any]:
-    """Mean (but for the offset) and variance of a group's outputs.
-
-    The mean does not need V: its weights are multiplied by L⁻¹ once, which makes its derivatives cheap.
-    """
+    """Return mean (without the offset) and variance of a group's outputs."""
     ca = casadi()
     m, deviations = len(group.points), Deviations.of(group)
+    # The mean does not need V: with W L⁻¹ (o, m) multiplied once, its derivatives are cheap.
     weights = np.hstack([group.mean[:, :m] @ group.whitening.L_inv, group.mean[:, m:]])
     mean = ca.mtimes(ca.DM(weights), ca.vertcat(cross, features))
     V = ca.mtimes(ca.DM(deviations.projection), cross)
@@ -197,7 +166,7 @@ def _frozen_group(group: PredictorGroup, cross: Any, diagonal: Any, features: An
 def _open_group(
     group: PredictorGroup, cross: Any, diagonal: Any, features: Any, weights: Any, root: Any
 ) -> tuple[Any, Any]:
-    """The same with the weights (m + p, o) of the mean and the root (m + p, o k) as symbols."""
+    """Do the same with symbols for the weights (m + p, o) of the mean and the root (m + p, o k) of the covariance."""
     ca = casadi()
     V = ca.mtimes(ca.DM(group.whitening.L_inv), cross)
     P = ca.vertcat(V, features).T
@@ -207,29 +176,17 @@ def _open_group(
 
 
 def _unexplained(diagonal: Any, squares: Any) -> Any:
-    """What the inducing points leave of k̃(x, x)."""
+    """Return k̃(x, x) - |v|², the variance that the inducing points do not explain."""
     return casadi().fmax(diagonal - squares, _ROUNDING * diagonal)
 
 
 def _sums_of(sizes: list[int]) -> np.ndarray:
-    """The matrix that sums so many rows of each output."""
+    """Return the matrix that sums the given numbers of rows, one sum for each output."""
     return np.repeat(np.eye(len(sizes)), sizes, axis=1)
 
 
 def with_base(function: Any, columns: np.ndarray) -> Any:
-    """The same function with some columns of x added to its mean.
-
-    Parameters
-    ----------
-    function : casadi.Function
-        Of x (and parameters), with the mean first.
-    columns : ndarray of shape (n_outputs,)
-        Indices.
-
-    Returns
-    -------
-    function : casadi.Function
-    """
+    """Return a function that adds columns of x, by their indices (k, n_outputs), to the mean of a `casadi.Function`."""
     ca = casadi()
     names_in, names_out = function.name_in(), function.name_out()
     given = [ca.MX.sym(name, function.size_in(i)) for i, name in enumerate(names_in)]
@@ -238,32 +195,24 @@ def with_base(function: Any, columns: np.ndarray) -> Any:
     return ca.Function(function.name(), given, outputs, names_in, names_out, INLINED)
 
 
-# --- the variance that is left of a group's outputs ------------------------------------------------------------------
-# The variance of g(x) is |root P|², P = [V; h], with a root (k, m + p) of each output: most of a prediction's time. But
-# the rows of root that see V alone are, for all outputs, functions of one matrix V Vᵀ of the training rows: in its
-# eigenvectors U they are diagonal (simultaneous diagonalisation). One product with Uᵀ L⁻¹ then serves all outputs.
+# --- the posterior variance of a group's outputs ---------------------------------------------------------------------
+# The variance of g(x) is |root P|², P = [V; h], with a root (k, m + p) of each output. It takes most of a prediction's
+# time. The rows of root that multiply V alone are, for all outputs, functions of one matrix V Vᵀ of the training rows.
+# In its eigenvectors U they are diagonal (simultaneous diagonalisation), and one product with Uᵀ L⁻¹ serves all
+# outputs.
 
 
 @dataclass(frozen=True)
 class Deviations:
-    """Of o outputs: V' = ``projection`` k̃(X_m, x) is as long as V; variances are ``squares`` V'² plus |others P'|².
+    """The posterior variances of o outputs as ``squares`` V'² + |others P'|² with V' = ``projection`` k̃(X_m, x)."""
 
-    Attributes
-    ----------
-    projection : ndarray of shape (m, m)
-    squares : ndarray of shape (o, m), or None
-        None are zeros.
-    others : list of ndarray of shape (q, m + p)
-        Of each output, for P' = [V'; h].
-    """
-
-    projection: np.ndarray
-    squares: np.ndarray | None
-    others: list[np.ndarray]
+    projection: np.ndarray  # (m, m): |V'| = |V|
+    squares: np.ndarray | None  # (o, m); None stands for zeros
+    others: list[np.ndarray]  # of each output (q, m + p), for P' = [V'; h]
 
     @classmethod
     def of(cls, group: PredictorGroup) -> Deviations:
-        """What a group's roots say, or the roots themselves where rounding made them too different."""
+        """Diagonalise the roots of a group. Roots that rounding made too different are kept as they are."""
         m, L_inv = len(group.points), group.whitening.L_inv
         used = [own[own.any(axis=1)] for own in group.root]
         beside = [own[:, m:].any(axis=1) for own in used]
@@ -279,10 +228,8 @@ class Deviations:
 
 
 def _common_eigenvectors(roots: list[np.ndarray], group: PredictorGroup) -> tuple[np.ndarray, np.ndarray]:
-    """An orthogonal matrix (m, m), and what is on the diagonal in it (o, m): NaN of outputs with too much beside it.
-
-    Those of one output's root serve all, but it depends on its noise how well they are known: the best are taken.
-    """
+    """Return an orthogonal U (m, m) and the diagonals (o, m) of all outputs in it, NaN where the rest is too large."""
+    # The eigenvectors of one output's covariance serve all, but their accuracy depends on its noise. Take the best.
     L, L_inv = group.whitening.L, group.whitening.L_inv
     covariances = np.array([own.T @ own for own in roots])
     V = L.T  # at the inducing points

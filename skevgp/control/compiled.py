@@ -16,26 +16,26 @@ from ..utils.validation import check_fitted
 from .derivatives import MappedRows, chained, mapped
 
 _NONE = np.empty((0, 0))
-# What two points may differ by that are the same but for rounding, as a share of the largest.
+# Two points are the same if they differ by rounding only: by at most this share of the largest.
 _ROUNDING = 1e-9
 
 
 class CompiledPredictor:
-    """What `EVGPRegressor.compile` returns: the frozen model, as fast as NumPy is.
+    """A fitted model for control loops, as `EVGPRegressor.compile` returns it.
 
-    It checks nothing: rows are float64 arrays with the columns of `fit`, finite and not empty. Predictions are those of
-    ``predict``, to rounding. It keeps no state between calls, so that threads may share it, and can be pickled.
+    Predictions equal those of ``predict`` up to rounding. Rows are not validated: pass finite float64 arrays with the
+    columns of `fit` and at least one row. Threads may share the object, and it can be pickled.
 
     Parameters
     ----------
     predictor : Predictor
-        Frozen, in the user's units.
+        The posterior, in the user's units.
     feature_map, kernel_map : Map or None
-        Of plain arrays.
+        The fitted transformers as functions of arrays.
     include_noise : bool, default=True
-        Whether standard deviations are of y, with the learned noise, or of the noise-free g(x).
+        Whether standard deviations are those of y, with the learned noise, or those of the noise-free g(x).
     base : ndarray of shape (k, n_outputs), default=None
-        Indices of columns that are added to the mean (of a `ResidualRegressor`).
+        Indices of columns that are added to the mean. A `ResidualRegressor` has them.
 
     Examples
     --------
@@ -48,10 +48,10 @@ class CompiledPredictor:
     >>> mean.shape, fast.value_and_jacobian(X)[1].shape
     ((2,), (60, 2, 1))
 
-    As a ``ResidualModel`` of L4acados, whose Jacobians have the axis of outputs first, and always have it, and whose
-    zero-order controller reads the variances of the rows that were asked for last:
+    A ``ResidualModel`` of L4acados has Jacobians with the axis of outputs first. Its zero-order controller reads the
+    variances of the last rows:
 
-    >>> class LearnedResidual:  # or of l4acados.models.ResidualModel, of which no more is asked
+    >>> class LearnedResidual:  # or a subclass of l4acados.models.ResidualModel
     ...     def __init__(self, model):
     ...         self.model = model
     ...
@@ -78,21 +78,21 @@ class CompiledPredictor:
         self._freeze(predictor)
 
     def update(self, model: Any) -> None:
-        """Take on the weights of a model that has seen further rows, by ``partial_fit``.
+        """Copy the weights of a model that has learned further rows by ``partial_fit``.
 
-        Calls that run in other threads end with the weights that they began with.
+        Calls that run in other threads end with the old weights.
 
         Parameters
         ----------
         model : EVGPRegressor, EGPRegressor or ResidualRegressor
-            Of the same fit: with the same maps, kernel and inducing points.
+            The model that was compiled, not fitted again since: with the same maps, kernel and inducing points.
 
         Raises
         ------
         ValueError
-            If it is of another fit.
+            If the model was fitted again, or is another one.
         NotFittedError
-            If it is of none.
+            If the model is not fitted.
         """
         check_fitted(model)
         predictor = model._posterior.predictor
@@ -118,9 +118,9 @@ class CompiledPredictor:
         Returns
         -------
         mean : ndarray of shape (n_outputs,) or (n_samples, n_outputs)
-            Without the axis of outputs if there is one.
+            The posterior mean. The axis of outputs is left out if y has one column.
         std : ndarray of the same shape
-            If ``return_std``.
+            The standard deviation. Only if ``return_std=True``.
         """
         rows, state = X if X.ndim == 2 else X[np.newaxis], self._state
         inputs = rows if self._kernel_map is None else self._kernel_map.value(rows)
@@ -130,7 +130,7 @@ class CompiledPredictor:
         return (mean, like_y(std if X.ndim == 2 else std[0])) if return_std else mean
 
     def value_and_jacobian(self, X: np.ndarray, return_std: bool = False) -> Any:
-        """Predict y, and how that changes with the columns of X.
+        """Predict y and the derivatives of the prediction with respect to the columns of X.
 
         Parameters
         ----------
@@ -142,11 +142,11 @@ class CompiledPredictor:
         Returns
         -------
         mean : ndarray of shape (n_outputs,) or (n_samples, n_outputs)
-            As of `predict`.
+            The posterior mean, as `predict` returns it.
         jacobian : ndarray of shape (n_outputs, n_features) or (n_samples, n_outputs, n_features)
-            ∂mean/∂x. (Neither has the axis of outputs if there is one.)
+            ∂mean/∂x. The axis of outputs is left out if y has one column.
         std, std_jacobian : ndarray of these shapes
-            If ``return_std``.
+            The standard deviation and its derivatives. Only if ``return_std=True``.
         """
         rows, state = X if X.ndim == 2 else X[np.newaxis], self._state
         predictor, groups, _ = state
@@ -166,7 +166,7 @@ class CompiledPredictor:
     def _said(
         self, state: _State, rows: np.ndarray, inputs: np.ndarray, features: np.ndarray, return_std: bool
     ) -> tuple[list[_Moments], np.ndarray, Any]:
-        """What each group says of rows behind both maps, and mean and (or None) std (n, o) of all outputs."""
+        """Return the moments of each group at mapped rows, and mean and std (n, o) of all outputs; std may be None."""
         predictor, groups, noise = state
         found = [group.moments(inputs, features, return_std) for group in groups]
         mean = predictor.in_order([each.mean for each in found]).T + predictor.intercept
@@ -178,13 +178,10 @@ class CompiledPredictor:
 
 
 def _goes_on(before: Predictor, predictor: Predictor) -> bool:
-    """Whether they are of one fit, as far as kernels, inducing points and numbers of weights tell.
-
-    The points of an exact fit are its rows. Its first update leaves some of them out, and those that are left are the
-    same but for rounding.
-    """
+    """Whether two predictors come from one fit, judged by kernels, inducing points and numbers of weights."""
     if before.offset.shape != predictor.offset.shape:
         return False
+    # The points of an exact fit are its rows. Its first update leaves some out and keeps the others up to rounding.
     return all(
         _are_among(new.points, old.points) and np.array_equal(old.hyperparameters, new.hyperparameters)
         for old, new in zip(before.by_output, predictor.by_output, strict=True)
@@ -192,7 +189,7 @@ def _goes_on(before: Predictor, predictor: Predictor) -> bool:
 
 
 def _are_among(points: np.ndarray, others: np.ndarray) -> bool:
-    """Whether each of some points (n, d) is one of the others, but for rounding."""
+    """Whether each of some points (n, d) is one of the others, up to rounding."""
     if points.shape == others.shape and np.array_equal(points, others):
         return True
     if points.shape[1] != others.shape[1]:
@@ -203,50 +200,28 @@ def _are_among(points: np.ndarray, others: np.ndarray) -> bool:
 
 
 class _Moments(NamedTuple):
-    """What a group of o outputs says of n rows.
+    """Mean and variance of a group of o outputs at n rows, with the parts that derivatives need."""
 
-    Attributes
-    ----------
-    mean, variance : ndarray of shape (o, n)
-        Of the noise-free g(x), but for the intercept; the variance is None if it is not asked for.
-    prepared : object
-        What the kernel makes of the rows.
-    P : ndarray of shape (m + p, n)
-        [V; Hᵀ].
-    deviation : ndarray of shape (o, k, n)
-        root @ P, or None.
-    """
-
-    mean: np.ndarray
-    variance: Any
-    prepared: Any
-    P: np.ndarray
-    deviation: Any
+    mean: np.ndarray  # (o, n), of the noise-free g(x) without the intercept
+    variance: Any  # (o, n), of the noise-free g(x), or None
+    prepared: Any  # the kernel's own form of the rows
+    P: np.ndarray  # (m + p, n): [V; Hᵀ]
+    deviation: Any  # (o, k, n): R P, or None
 
 
 @dataclass(frozen=True)
 class _Group:
-    """A group of outputs, made ready.
+    """The posterior of a group of outputs, with the matrices that do not depend on the rows computed once."""
 
-    With P = [V; Hᵀ] the mean is W P and the variance s² (k̃(x, x) - |v|²) + |R P|² (`inference.posterior`); their
-    derivatives are pulled back through P to the kernel's inputs and the features, and through the maps to X.
-
-    Attributes
-    ----------
-    own : PredictorGroup
-    product : ndarray of shape (o + o k, m + p)
-        W (with the offset of the weights) and R of each output, below each other.
-    from_cross : ndarray of shape (o, m)
-        W L⁻¹: the mean's derivative in k̃(z, x).
-    """
-
+    # With P = [V; Hᵀ] (m + p, n) the mean is W P and the variance s² (k̃(x, x) - |v|²) + |R P|² (`model.predictor`).
+    # Their derivatives go back through P to the kernel's inputs and the features, and through the maps to X.
     own: PredictorGroup
-    product: np.ndarray
-    from_cross: np.ndarray
+    product: np.ndarray  # (o + o k, m + p): W (with the offset of the weights) above the R of each output
+    from_cross: np.ndarray  # (o, m): W L⁻¹, the derivative of the mean with respect to k̃(z, x)
 
     @classmethod
     def of(cls, group: PredictorGroup, offset: np.ndarray) -> _Group:
-        """With the offset (o, p) of its weights."""
+        """Prepare a group with the offset (o, p) of its weights."""
         (o, k, size), m = group.root.shape, len(group.points)
         product = np.empty((o + o * k, size))
         product[:o], product[o:] = group.mean, group.root.reshape(o * k, size)
@@ -254,7 +229,7 @@ class _Group:
         return cls(group, product, group.mean[:, :m] @ group.whitening.L_inv)
 
     def moments(self, inputs: np.ndarray, features: np.ndarray, return_variance: bool) -> _Moments:
-        """Mean and variance at rows, given what both maps make of them (without features, whatever these are)."""
+        """Return mean and variance at mapped rows. Without a feature map, features are ignored."""
         group = self.own
         own = of_outputs(inputs, group.outputs)
         (o, k, size), m, n = group.root.shape, len(group.points), len(own)
@@ -274,7 +249,7 @@ class _Group:
         return _Moments(found[:o], variance, prepared, P, deviation)
 
     def slopes(self, found: _Moments, rows: MappedRows) -> tuple[np.ndarray, Any]:
-        """Derivatives of mean and (or None) variance in X, (o, n, D) each."""
+        """Return derivatives of mean and variance (None if the moments have none) with respect to X, (o, n, D) each."""
         group, covariance = self.own, self.own.whitening.covariance
         (o, _, size), m, (by_inputs, by_features) = group.root.shape, len(group.points), rows.of(group)
         slopes = covariance.slopes(found.prepared)  # (m, n, d)
@@ -298,10 +273,10 @@ class _Group:
 
 
 def _shaped(X: np.ndarray, values: np.ndarray, slopes: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Values (n, o) and slopes (o, n, D) as `value_and_jacobian` returns them for X."""
+    """Give values (n, o) and slopes (o, n, D) the shapes that `value_and_jacobian` returns for X."""
     slopes, values = slopes[0] if len(slopes) == 1 else slopes.transpose(1, 0, 2), like_y(values)
     return (values, slopes) if X.ndim == 2 else (values[0], slopes[0])
 
 
-# What predictions are made from: weights, groups made ready, and the noise of each output.
+# The numbers of all predictions: weights, prepared groups, and the noise of each output.
 _State = tuple[Predictor, tuple[_Group, ...], np.ndarray]

@@ -1,4 +1,4 @@
-"""Rows behind both maps with their Jacobians, and the posterior of the gradient of g(x) = h(x)ᵀβ + f(x)."""
+"""Mapped rows with the Jacobians of the maps, and the posterior of the gradient of g(x) = h(x)ᵀβ + f(x)."""
 
 from __future__ import annotations
 
@@ -12,25 +12,15 @@ from ..model.predictor import Predictor, PredictorGroup
 
 
 class MappedRows(NamedTuple):
-    """Rows X (n, D) behind both maps, with the maps' Jacobians.
+    """Rows X (n, D) after both maps, with the Jacobians of the maps."""
 
-    Attributes
-    ----------
-    inputs : ndarray of shape (n, d) or (n, o, d)
-        The kernel's.
-    features : ndarray of shape (n, p) or (n, o, p)
-    input_slopes : ndarray of shape (n, d, D) or (n, o, d, D), or None
-        ∂inputs/∂X; None if the inputs are X.
-    feature_slopes : ndarray of shape (n, p, D) or (n, o, p, D)
-    """
-
-    inputs: np.ndarray
-    features: np.ndarray
-    input_slopes: np.ndarray | None
-    feature_slopes: np.ndarray
+    inputs: np.ndarray  # of the kernel, (n, d) or (n, o, d)
+    features: np.ndarray  # (n, p) or (n, o, p)
+    input_slopes: np.ndarray | None  # ∂inputs/∂X, (n, d, D) or (n, o, d, D); None if the inputs are X
+    feature_slopes: np.ndarray  # (n, p, D) or (n, o, p, D)
 
     def of(self, group: PredictorGroup) -> tuple[np.ndarray | None, np.ndarray]:
-        """The Jacobians (n, d, D) and (n, p, D) of the rows that a group sees."""
+        """Return the Jacobians (n, d, D) and (n, p, D) of the rows of a group."""
         inputs, features = self.input_slopes, self.feature_slopes
         return None if inputs is None else _of_group(inputs, group), _of_group(features, group)
 
@@ -43,7 +33,7 @@ def _of_group(slopes: np.ndarray, group: PredictorGroup) -> np.ndarray:
 
 
 def mapped(X: np.ndarray, feature_map: Map | None, kernel_map: Map | None) -> MappedRows:
-    """Rows X (n, D) through the maps, of which either may be None."""
+    """Apply both maps to rows X (n, D); either may be None."""
     n, columns = X.shape
     features, feature_slopes = np.empty((n, 0)), np.empty((n, 0, columns))
     if feature_map is not None:
@@ -54,13 +44,9 @@ def mapped(X: np.ndarray, feature_map: Map | None, kernel_map: Map | None) -> Ma
 
 
 def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
-    """Cov[∂g/∂x] of each output and row, (n, o, D, D): a derivative is linear (Rasmussen & Williams 2006, section 9.4).
-
-    Raises
-    ------
-    ValueError
-        If functions of the kernel have no gradient.
-    """
+    """Return Cov[∂g/∂x] of each row and output, (n, o, D, D); ValueError if the kernel has no gradient."""
+    # A derivative is linear, so that the gradient of a Gaussian process is one (Rasmussen & Williams 2006, section
+    # 9.4).
     parts = []
     for group, own in zip(predictor.groups, predictor.projected(rows.inputs, rows.features), strict=True):
         covariance, (by_inputs, by_features) = group.whitening.covariance, rows.of(group)
@@ -71,7 +57,7 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
         if by_inputs is not None:
             left = by_inputs.transpose(0, 2, 1) @ left @ by_inputs
         left = left - V.transpose(0, 2, 1) @ V
-        # What the points leave of a direction that they know is rounding, perhaps below 0.
+        # Where the inducing points explain a direction fully, only rounding is left, which may be negative.
         unknown = np.einsum("nii->ni", left) > 0.0
         left *= unknown[:, :, np.newaxis] & unknown[:, np.newaxis]
         deviation = group.root[:, np.newaxis] @ P  # (o, n, k, D)
@@ -81,5 +67,5 @@ def gradient_covariance(predictor: Predictor, rows: MappedRows) -> np.ndarray:
 
 
 def chained(slopes: np.ndarray, by_inputs: np.ndarray | None) -> np.ndarray:
-    """From derivatives (n, k, d) in the kernel's inputs to those in X (n, k, D)."""
+    """Turn derivatives (n, k, d) with respect to the kernel's inputs into those with respect to X (n, k, D)."""
     return slopes if by_inputs is None else slopes @ by_inputs

@@ -1,7 +1,7 @@
 """Functions drawn from the posterior.
 
-`FunctionSamples` can be evaluated anywhere, by random waves. `Paths` are exact, but each function is evaluated only
-along a path that it makes itself, one row after the other.
+`FunctionSamples` can be evaluated anywhere and approximate f by random waves. `Paths` are exact, but each function is
+evaluated only along a path, one row after the other.
 """
 
 from __future__ import annotations
@@ -20,53 +20,45 @@ from ..model.predictor import Predictor, PredictorGroup, Projected
 from ..utils.shapes import like_y
 from .derivatives import MappedRows, chained, mapped
 
-# Numbers at once in the derivatives of all waves, and in what all paths keep that are followed together.
+# Largest numbers of floats in memory: in the derivatives of all waves, and in the paths that are followed together.
 _NUMBERS_OF_WAVES, _NUMBERS_OF_PATHS = 2**22, 2**24
-# In units of k̃(x, x): a row of which less is left is known from those before.
+# A row counts as known from earlier rows if its residual variance is less than this share of k̃(x, x).
 _KNOWN = 1e-13
 
 
 @dataclass(frozen=True)
 class Functions:
-    """The posterior of a fitted model as functions of X, to be drawn and followed.
-
-    Attributes
-    ----------
-    predictor : Predictor
-    feature_map, kernel_map : Map or None
-    base : ndarray of shape (k, o), optional
-        The columns of X that are added to the outputs.
-    """
+    """The posterior of a fitted model as functions of X."""
 
     predictor: Predictor
     feature_map: Map | None
     kernel_map: Map | None
-    base: np.ndarray | None = None
+    base: np.ndarray | None = None  # columns of X (k, o) that are added to the outputs
 
     @property
     def noise(self) -> np.ndarray:
-        """σ² of each output, (o,)."""
+        """Noise variance σ² of each output, (o,)."""
         return self.predictor.noise
 
     def mapped(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's inputs and the features of rows (n, D)."""
+        """Return the kernel's inputs and the features of rows (n, D)."""
         features = np.empty((len(X), 0)) if self.feature_map is None else self.feature_map.value(X)
         return X if self.kernel_map is None else self.kernel_map.value(X), features
 
     def between(self, X: np.ndarray) -> np.ndarray:
-        """Covariances (n, o, o) of different outputs of a row, which are 0 but where outputs share their weights."""
+        """Return covariances (n, o, o) between different outputs of a row; 0 unless outputs share weights."""
         if not self.predictor.shared:
             return np.zeros((len(X), len(self.noise), len(self.noise)))
         common = self.predictor.common(*self.mapped(X))
         return np.einsum("kni,knj->nij", common, common) * (1.0 - np.eye(len(self.noise)))
 
     def at_once(self, n_steps: int) -> int:
-        """How many paths of so many steps to follow at once, so that memory stays small."""
+        """Number of paths to follow at once, so that memory stays small."""
         points = sum(len(group.points) for group in self.predictor.groups)
         return max(1, _NUMBERS_OF_PATHS // (n_steps * (n_steps * len(self.predictor.groups) + points)))
 
     def draw(self, n: int, n_steps: int, rng: np.random.RandomState) -> Callable[[np.ndarray], np.ndarray]:
-        """A function of rows (n, D), one for each path, that returns the next g(x) of each, (n, o)."""
+        """Draw n paths: returns a function of their current rows (n, D) that gives the next g(x) of each, (n, o)."""
         paths = Paths(self.predictor, n, n_steps, rng)
 
         def step(X: np.ndarray) -> np.ndarray:
@@ -77,12 +69,12 @@ class Functions:
 
 
 def common_normals(predictor: Predictor, n: int, rng: np.random.RandomState) -> np.ndarray:
-    """The normals (n, 1, p) of weights that all outputs share; p is 0 if they share none."""
+    """Draw the normals (n, 1, p) of weights that all outputs share; p is 0 if they share none."""
     return rng.standard_normal((n, 1, predictor.offset.shape[1] if predictor.shared else 0))
 
 
 def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.random.RandomState) -> np.ndarray:
-    """What P = [V; Hᵀ] is multiplied by in n functions drawn from q, (n, o, m + p)."""
+    """Draw the weights (n, o, m + p) of P = [V; Hᵀ] in n functions from q."""
     o, k, _ = group.root.shape
     normals, p = rng.standard_normal((n, o, k)), common.shape[2]
     if p:
@@ -91,28 +83,19 @@ def drawn_weights(group: PredictorGroup, n: int, common: np.ndarray, rng: np.ran
 
 
 # --- anywhere: random waves ------------------------------------------------------------------------------------------
-# A function of the prior, made of random waves, is moved to what a draw of q says at the inducing points: with
-# P = [V; Hᵀ], weights W drawn from q and f₀ = s aᵀΦ(x), a ~ N(0, I),
+# A function drawn from the prior, made of random waves, is moved to the values at the inducing points that are drawn
+# from q. With P = [V; Hᵀ], weights W drawn from q and f₀ = s aᵀΦ(x), a ~ N(0, I),
 #
 #     g(x) = W P + f₀(x) - vᵀ L⁻¹ f₀(X_m)
 #
-# (Matheron's rule; Wilson et al. 2020). Its mean and what comes from q are exact; how f varies between inducing points
-# is as good as the waves are many.
+# (Matheron's rule; Wilson et al. 2020). The mean and the part from q are exact. The variance of f between inducing
+# points is approximate, and gets better with the number of waves.
 
 
 class FunctionSamples(Sequence["SampledFunction"]):
-    """Functions drawn from a posterior: a sequence of callables that can be called itself, for all of them at once.
+    """Functions drawn from a posterior: a sequence of callables, which can be called itself to evaluate all at once.
 
-    What it is called with is not validated: rows are float64 arrays with the columns of `fit`, finite and not empty.
-
-    Parameters
-    ----------
-    posterior : Functions
-    n : int
-        How many functions.
-    n_waves : int
-        Random waves of each term of a kernel.
-    rng : RandomState
+    Rows are not validated: pass finite float64 arrays with the columns of `fit`.
     """
 
     def __init__(self, posterior: Functions, n: int, n_waves: int, rng: np.random.RandomState):
@@ -134,35 +117,12 @@ class FunctionSamples(Sequence["SampledFunction"]):
         return SampledFunction(self, position % len(self))
 
     def __call__(self, X: np.ndarray) -> np.ndarray:
-        """All functions at rows.
-
-        Parameters
-        ----------
-        X : ndarray of shape (n_features,) or (n_rows, n_features)
-            One row or several.
-
-        Returns
-        -------
-        values : ndarray of shape (n_functions, n_rows, n_outputs)
-            Without the axis of rows if X is one row, and without that of outputs if there is one.
-        """
+        """Evaluate all functions at rows (n_rows, n_features) or at one row: (n_functions, n_rows, n_outputs)."""
+        # The axis of rows is left out for one row, and that of outputs for one output.
         return self._values(X, slice(None))
 
     def value_and_jacobian(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """All functions at rows, and how they change with the columns of X.
-
-        Parameters
-        ----------
-        X : ndarray of shape (n_features,) or (n_rows, n_features)
-            One row or several.
-
-        Returns
-        -------
-        values : ndarray of shape (n_functions, n_rows, n_outputs)
-            As of a call.
-        jacobians : ndarray of shape (n_functions, n_rows, n_outputs, n_features)
-            Likewise.
-        """
+        """Return the values of a call and their derivatives with respect to X, of the same shape + (n_features,)."""
         return self._values_and_jacobians(X, slice(None))
 
     def _values(self, X: np.ndarray, which: slice) -> np.ndarray:
@@ -196,7 +156,7 @@ class FunctionSamples(Sequence["SampledFunction"]):
         return (rows[first : first + size] for first in range(0, len(rows), size))
 
     def _finished(self, rows: np.ndarray, parts: list[np.ndarray]) -> np.ndarray:
-        """Of the groups' values (o, k, n) those of all outputs, (k, n, o), with what is added."""
+        """Join the groups' values (o, k, n) to those of all outputs (k, n, o), and add intercept and base."""
         predictor = self._posterior.predictor
         values = predictor.in_order(parts).transpose(1, 2, 0) + predictor.intercept
         return values if self._posterior.base is None else values + rows[:, self._posterior.base].sum(axis=1)
@@ -208,25 +168,17 @@ class FunctionSamples(Sequence["SampledFunction"]):
 
 @dataclass(frozen=True)
 class SampledFunction:
-    """One function drawn from a posterior.
-
-    Attributes
-    ----------
-    of : FunctionSamples
-        All that were drawn.
-    index : int
-        Which of them it is.
-    """
+    """Function number ``index`` of the functions that were drawn from a posterior."""
 
     of: FunctionSamples
     index: int
 
     def __call__(self, X: np.ndarray) -> np.ndarray:
-        """The noise-free g(x), of the shape that ``predict`` of the compiled model returns."""
+        """Evaluate the noise-free g(x); shapes are those of ``predict`` of the compiled model."""
         return self.of._values(X, self._which)[0]
 
     def value_and_jacobian(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The same, and its derivatives in the columns of X."""
+        """Return the values of a call and their derivatives with respect to the columns of X."""
         values, jacobians = self.of._values_and_jacobians(X, self._which)
         return values[0], jacobians[0]
 
@@ -237,24 +189,13 @@ class SampledFunction:
 
 @dataclass(frozen=True)
 class _Waves:
-    """What the functions are of one group's outputs: weights times [V; Hᵀ; Φ].
-
-    Attributes
-    ----------
-    group : PredictorGroup
-    waves : RandomFunctions
-        Φ.
-    by_points : ndarray of shape (o, k, m)
-        Of k functions.
-    by_features : ndarray of shape (o, k, p)
-    by_waves : ndarray of shape (o, k, L)
-    """
+    """k functions of one group's outputs: weights times [V; Hᵀ; Φ]."""
 
     group: PredictorGroup
-    waves: RandomFunctions
-    by_points: np.ndarray
-    by_features: np.ndarray
-    by_waves: np.ndarray
+    waves: RandomFunctions  # Φ
+    by_points: np.ndarray  # (o, k, m)
+    by_features: np.ndarray  # (o, k, p)
+    by_waves: np.ndarray  # (o, k, L)
 
     @classmethod
     def drawn(
@@ -272,7 +213,7 @@ class _Waves:
         at_points = waves.value(group.points)
         weights = drawn_weights(group, k, common, rng).transpose(1, 0, 2)
         by_waves = rng.standard_normal((len(group.signal), k, len(at_points)))
-        # What is added to K's diagonal: the noise of the exact model, whose points are the rows; else a jitter.
+        # The diagonal of L Lᵀ - K: the noise of an exact model, whose points are the rows, else a jitter.
         L, K = group.whitening.L, group.whitening.covariance.matrix()
         added = np.maximum(np.einsum("ij,ij->i", L, L) - np.diagonal(K), 0.0)
         seen = by_waves @ at_points + np.sqrt(added) * rng.standard_normal((len(by_waves), k, m))
@@ -283,11 +224,11 @@ class _Waves:
 
     @property
     def n_waves(self) -> int:
-        """L of all terms."""
+        """Number L of waves of all terms of the kernel."""
         return self.by_waves.shape[2]
 
     def values(self, inputs: np.ndarray, features: np.ndarray, which: slice) -> np.ndarray:
-        """Of some of the functions, at rows: (o, k, n)."""
+        """Evaluate some of the functions at rows: (o, k, n)."""
         group = self.group
         own, features = of_outputs(inputs, group.outputs), of_outputs(features, group.outputs)
         V = group.whitening.L_inv @ group.whitening.covariance.cross(group.kernel.prepare(own))
@@ -295,7 +236,7 @@ class _Waves:
         return found + self.by_features[:, which] @ features.T
 
     def slopes(self, rows: MappedRows, which: slice) -> np.ndarray:
-        """∂/∂X, (o, k, n, D)."""
+        """Differentiate some of the functions with respect to X: (o, k, n, D)."""
         group, (by_inputs, by_features) = self.group, rows.of(self.group)
         own = of_outputs(rows.inputs, group.outputs)
         (o, _, m), (n, d) = self.by_points.shape, own.shape
@@ -310,24 +251,14 @@ class _Waves:
 
 
 # --- along a path: exact ---------------------------------------------------------------------------------------------
-# A draw of ω = (v, w) from q is what a function has of the inducing points and the weights. What these leave of f, a
-# Gaussian process with the covariance k_res(x, x') = s² (k̃(x, x') - v(x)ᵀv(x')), is drawn at one row of the path after
-# the other, given all rows before: with k_res = s² L Lᵀ along the path, f_res = s L ξ, where ξ is a standard normal per
-# row and output, and L grows by a row. (Rasmussen & Williams 2006, appendix A.2: a Gaussian conditioned on part of it.)
+# A draw of ω = (v, w) from q sets the values at the inducing points and the weights. The residual of f is a Gaussian
+# process with the covariance k_res(x, x') = s² (k̃(x, x') - v(x)ᵀv(x')). It is drawn at one row of the path after the
+# other, given all earlier rows: with k_res = s² L Lᵀ along the path, f_res = s L ξ, where ξ is a standard normal per
+# row and output, and L grows by a row (Rasmussen & Williams 2006, appendix A.2, on conditioned Gaussians).
 
 
 class Paths:
-    """n functions, evaluated at a row each, step by step.
-
-    Parameters
-    ----------
-    predictor : Predictor
-    n : int
-        How many functions.
-    n_steps : int
-        How many rows each path will have.
-    rng : RandomState
-    """
+    """n functions of ``n_steps`` steps: each step evaluates each function at one row."""
 
     def __init__(self, predictor: Predictor, n: int, n_steps: int, rng: np.random.RandomState):
         self.predictor = predictor
@@ -335,14 +266,7 @@ class Paths:
         self._groups = [_Path(group, n, n_steps, common, rng) for group in predictor.groups]
 
     def step(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """The noise-free g(x) of each function at its row, (n, o).
-
-        Parameters
-        ----------
-        inputs : ndarray of shape (n, d) or (n, o, d)
-            The kernel's; row i is function i's.
-        features : ndarray of shape (n, p) or (n, o, p)
-        """
+        """Return the noise-free g(x) of each function at its row, (n, o), from inputs (n, d) and features (n, p)."""
         projected = self.predictor.projected(inputs, features)
         parts = [own.step(rows).T for own, rows in zip(self._groups, projected, strict=True)]
         values = self.predictor.in_order(parts).T
@@ -350,16 +274,7 @@ class Paths:
 
 
 class _Path:
-    """What the functions are of one group's outputs.
-
-    Parameters
-    ----------
-    group : PredictorGroup
-    n, n_steps : int
-    common : ndarray of shape (n, 1, p)
-        `common_normals`.
-    rng : RandomState
-    """
+    """The part of n functions that belongs to one group of outputs."""
 
     def __init__(self, group: PredictorGroup, n: int, n_steps: int, common: np.ndarray, rng: np.random.RandomState):
         o = len(group.signal)
@@ -372,7 +287,7 @@ class _Path:
         self._t = 0
 
     def step(self, rows: Projected) -> np.ndarray:
-        """What f and the weights give, of each function at its row, (n, o of the group)."""
+        """Return f + P weights of each function at its own row, (n, o of the group)."""
         group, t = self.group, self._t
         V = rows.P[: len(group.points)].T
         values = np.einsum("noj,jn->no", self._weights, rows.P)
@@ -394,5 +309,5 @@ class _Path:
 
 
 def _times(matrices: np.ndarray, vectors: np.ndarray) -> np.ndarray:
-    """Matrices (n, t, k) times vectors (n, k): (n, t)."""
+    """Multiply matrices (n, t, k) by vectors (n, k): (n, t)."""
     return np.matmul(matrices, vectors[:, :, np.newaxis])[:, :, 0]

@@ -1,7 +1,6 @@
-"""The posterior of a fitted model. Everything that is asked of a fitted model is asked of it.
+"""The posterior of a fitted model, which answers all requests to a fitted model.
 
-An estimator validates X, and hands it on. Methods take X in one of two ways: as ``Rows``, what the maps see and what
-the kernel sees without a map, or as numbers.
+An estimator validates X and passes it on, either as numbers or as `Rows`.
 """
 
 from __future__ import annotations
@@ -28,12 +27,12 @@ from .compiled import CompiledPredictor
 from .derivatives import gradient_covariance, mapped
 from .functions import Functions, FunctionSamples
 
-# Of the derivatives of all rows at once.
+# Largest number of floats in the derivatives of all rows at once.
 _NUMBERS = 2**20
 
 
 class Rows(NamedTuple):
-    """Validated rows: as the maps see them (a data frame stays one), and as the kernel sees them without a map."""
+    """Validated rows: ``given`` for the maps (a data frame stays one), ``array`` for a kernel without a map."""
 
     given: Any
     array: Any
@@ -41,24 +40,14 @@ class Rows(NamedTuple):
 
 @dataclass(frozen=True)
 class Posterior:
-    """Maps and frozen predictor of a fitted model, and columns of X that are added to its predictions.
+    """Maps and frozen predictor of a fitted model, with columns of X that are added to its predictions."""
 
-    Attributes
-    ----------
-    predictor : Predictor
-        In the user's units.
-    maps : Maps
-        Fitted.
-    base : ndarray of shape (k, n_outputs), optional
-        Indices of columns of X: k columns are added to the mean of each output.
-    """
-
-    predictor: Predictor
-    maps: Maps
-    base: np.ndarray | None = None
+    predictor: Predictor  # in the user's units
+    maps: Maps  # fitted
+    base: np.ndarray | None = None  # indices (k, n_outputs): k columns of X are added to the mean of each output
 
     def with_base(self, columns: np.ndarray) -> Posterior:
-        """The posterior of y where this one is that of y minus some columns of X, one for each output."""
+        """Add columns of X, one for each output, to the predictions: turns a posterior of residuals into one of y."""
         base = np.atleast_2d(columns)
         return replace(self, base=base if self.base is None else np.vstack([self.base, base]))
 
@@ -71,7 +60,7 @@ class Posterior:
         return_cov: bool | Literal["joint"] = False,
         include_noise: bool = True,
     ) -> Any:
-        """Predict y: the mean, and with it the standard deviation or the covariance between rows."""
+        """Return the mean of y, and if asked for the standard deviation or the covariance between rows."""
         noise = self.predictor.noise if include_noise else np.zeros_like(self.predictor.noise)
         if return_cov is not False:
             rows = self.maps.rows(*X, slice(None))
@@ -90,23 +79,22 @@ class Posterior:
     def sample_y(
         self, X: Rows, n_samples: int, random_state: int | np.random.RandomState | None, include_noise: bool
     ) -> np.ndarray:
-        """Draw functions at rows, exactly: (n, n_samples) or (n, n_outputs, n_samples)."""
+        """Draw functions exactly at rows: (n, n_samples) or (n, n_outputs, n_samples)."""
         noise = self.predictor.noise if include_noise else np.zeros_like(self.predictor.noise)
         rows = self.maps.rows(*X, slice(None))
         samples = self.predictor.sample(*rows, noise, n_samples, check_random_state(random_state))
         return samples[:, 0] if samples.shape[1] == 1 else samples
 
     def novelty(self, X: ArrayLike) -> np.ndarray:
-        """Say how far rows are outside of the data, as the kernel sees them.
+        """Measure how far rows are from the training data.
 
-        It is the share of the prior variance of f that is left, Var[f(x) | data] / Var[f(x)]: near 0 where f is known,
-        and 1 where the data say nothing of it: there only the features speak. It has no unit, so that one threshold
-        serves all outputs.
+        Novelty is the share of the prior variance of f that the data leave, Var[f(x) | data] / Var[f(x)]. It is near 0
+        where f is known, and 1 where predictions depend on the features alone. It has no unit.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            As of `predict`.
+            Rows, as for `predict`.
 
         Returns
         -------
@@ -130,40 +118,39 @@ class Posterior:
         return like_y(np.concatenate([self.predictor.novelty(*rows) for rows in self._pieces(X)]))
 
     def _pieces(self, X: Any) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """Kernel inputs and features of rows, so many at once that memory stays small and products are large."""
+        """Yield kernel inputs and features of a few thousand rows at a time, so that memory stays small."""
         size = self.predictor.rows_at_once
         return (self.maps.rows(X.given, X.array, slice(first, first + size)) for first in range(0, len(X.array), size))
 
     # --- derivatives --------------------------------------------------------------------------------------------------
 
     def value_and_jacobian(self, X: ArrayLike, return_std: bool = False, include_noise: bool = True) -> Any:
-        """Predict y, and how that changes with the columns of X.
+        """Predict y and the derivatives of the prediction with respect to the columns of X.
 
-        Derivatives go through kernel, kernel map and feature map. They are exact for this package's transformers and
-        kernels, for scikit-learn's scalers, PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD, for pipelines
-        and unions of these, and for any map with a method ``jacobian(X)`` that returns (n_samples, n_features_out,
-        n_features). Of other maps they are central differences, good to about ten digits where the map is smooth on the
-        scale of the rows of `fit`.
+        Derivatives are exact for the transformers and kernels of this package, for scikit-learn's scalers,
+        PolynomialFeatures, SplineTransformer, PCA and TruncatedSVD, and for pipelines and unions of these. A map of
+        your own is exact with a method ``jacobian(X)`` that returns (n_samples, n_features_out, n_features). Other maps
+        are differentiated by central differences, to about ten digits if the map is smooth.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers.
+            Numeric rows.
         return_std : bool, default=False
             Whether to return the standard deviation and its derivatives too.
         include_noise : bool, default=True
-            Whether the standard deviation is of y, with the learned noise, or of the noise-free g(x).
+            Whether the standard deviation is that of y, with the learned noise, or that of the noise-free g(x).
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            As of `predict`.
+            The posterior mean, as `predict` returns it.
         jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
             ∂mean/∂x.
         std : ndarray of the shape of ``mean``
-            If ``return_std``.
+            The standard deviation. Only if ``return_std=True``.
         std_jacobian : ndarray of the shape of ``jacobian``
-            If ``return_std``: ∂std/∂x; 0 where std is 0.
+            ∂std/∂x, and 0 where std is 0. Only if ``return_std=True``.
 
         Raises
         ------
@@ -172,7 +159,7 @@ class Posterior:
 
         See Also
         --------
-        predict_gradient : The gradient of g with its own standard deviation.
+        predict_gradient : Gradient of g with the standard deviation of the gradient.
 
         Examples
         --------
@@ -191,35 +178,35 @@ class Posterior:
         return tuple(np.concatenate(each) for each in zip(*parts, strict=True))
 
     def jacobian(self, X: ArrayLike) -> np.ndarray:
-        """Differentiate the mean in the columns of X.
+        """Differentiate the posterior mean with respect to the columns of X.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers.
+            Numeric rows.
 
         Returns
         -------
         jacobian : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            ∂mean/∂x, as of `value_and_jacobian`.
+            ∂mean/∂x, as `value_and_jacobian` returns it.
 
         Raises
         ------
         ValueError, TypeError
-            As of `value_and_jacobian`.
+            If X does not fit the training data, is not finite, or is a Dask array.
         """
         return self.value_and_jacobian(X)[1]
 
     def predict_gradient(self, X: ArrayLike, return_std: bool = False, return_cov: bool = False) -> Any:
-        """Predict the gradient of the noise-free g(x), with its uncertainty.
+        """Predict the gradient of the noise-free g(x) with its uncertainty.
 
-        The gradient of a Gaussian process is one too (Rasmussen & Williams 2006, section 9.4). Where the model knows g
-        but not how it changes, as between rows that are far from each other, the standard deviation says so.
+        The gradient of a Gaussian process is a Gaussian process too (Rasmussen & Williams 2006, section 9.4). Its
+        standard deviation is large where few rows determine the slope of g, even if they determine its value.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers.
+            Numeric rows.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool, default=False
@@ -228,17 +215,17 @@ class Posterior:
         Returns
         -------
         gradient : ndarray of shape (n_samples, n_features) or (n_samples, n_outputs, n_features)
-            Its mean: that of `jacobian`.
+            The posterior mean of the gradient, as `jacobian` returns it.
         std : ndarray of the same shape
-            If ``return_std``.
+            The standard deviation of each entry. Only if ``return_std=True``.
         cov : ndarray of shape (n_samples, n_features, n_features) or (n_samples, n_outputs, n_features, n_features)
-            If ``return_cov``.
+            The covariance of each gradient. Only if ``return_cov=True``.
 
         Raises
         ------
         ValueError, TypeError
-            As of `value_and_jacobian`; if both std and covariance are asked for; and if functions of the kernel have no
-            gradient, as those of a Matern kernel with nu=0.5.
+            If X does not fit the training data, is not finite, or is a Dask array; if both ``return_std`` and
+            ``return_cov`` are true; and if functions of the kernel have no gradient, such as Matern with nu=0.5.
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
@@ -256,7 +243,7 @@ class Posterior:
         return gradient, cov if return_cov else np.sqrt(np.einsum("...ii->...i", cov))
 
     def _few(self, X: Any) -> Iterator[np.ndarray]:
-        """Rows as floats, few enough at once that derivatives fit into memory."""
+        """Yield rows as floats, few enough at a time that derivatives fit into memory."""
         rows = np.asarray(X, dtype=np.float64)
         stacked = sum(group.root.shape[0] * group.root.shape[2] for group in self.predictor.groups)
         size = int(np.clip(_NUMBERS // (stacked * rows.shape[1]), 1, 1024))
@@ -265,25 +252,26 @@ class Posterior:
     # --- what control loops and optimisers call -----------------------------------------------------------------------
 
     def compile(self, include_noise: bool = True) -> CompiledPredictor:
-        """Make a predictor for control loops: of few rows, several times as fast, without validation.
+        """Make a predictor for control loops, which is several times as fast for few rows and does not validate.
 
         Parameters
         ----------
         include_noise : bool, default=True
-            Whether its standard deviations are of y, with the learned noise, or of the noise-free g(x).
+            Whether standard deviations are those of y, with the learned noise, or those of the noise-free g(x).
 
         Returns
         -------
         compiled : CompiledPredictor
-            With ``predict`` and ``value_and_jacobian`` of arrays (n_features,) or (n_samples, n_features); and
-            ``update(model)`` for the weights after a ``partial_fit``. Threads may share it, and it can be pickled.
+            It has ``predict`` and ``value_and_jacobian`` for arrays (n_features,) or (n_samples, n_features). Its
+            method ``update(model)`` copies the weights after a ``partial_fit``. Threads may share it, and it can be
+            pickled.
 
         Raises
         ------
         NotFittedError
-            Before `fit`.
+            If the model is not fitted.
         ValueError
-            If columns of X were no numbers.
+            If X had columns that are not numbers.
 
         Examples
         --------
@@ -300,33 +288,33 @@ class Posterior:
     def sample_functions(
         self, n: int = 1, random_state: int | np.random.RandomState | None = 0, *, n_waves: int = 3000
     ) -> FunctionSamples:
-        """Draw functions from the posterior, to be evaluated and differentiated anywhere.
+        """Draw functions from the posterior that can be evaluated and differentiated anywhere.
 
-        For scenarios in control and policy search. (`sample_y` draws exactly, at given rows; `rollout` exactly along
-        paths.) The mean is exact, and the variance within a few percent at most rows: f between inducing points is a
-        sum of random waves (Wilson et al. 2020, with frequencies drawn wider).
+        Use them as scenarios in control and policy search. The mean is exact. The variance is within a few percent at
+        most rows, because f between inducing points is a sum of random waves (Wilson et al. 2020, with frequencies
+        drawn wider). `sample_y` draws exactly at given rows, and `rollout` exactly along paths.
 
         Parameters
         ----------
         n : int, default=1
-            How many functions.
+            Number of functions.
         random_state : int, RandomState instance or None, default=0
-            Draws them: an integer gives the same at each call.
+            Seed of the functions. An integer gives the same functions at each call.
         n_waves : int, default=3000
-            Random waves for each term of a kernel; time and memory are in proportion.
+            Number of random waves for each term of the kernel. Time and memory are proportional to it.
 
         Returns
         -------
         functions : FunctionSamples
-            A sequence of n callables: ``functions[i](X)`` is the noise-free g of an array (n_features,) or (n_rows,
-            n_features), without validation, and ``functions[i].value_and_jacobian(X)`` has its derivatives too.
-            ``functions(X)`` are all of them at once, with a first axis of n.
+            A sequence of n callables. ``functions[i](X)`` is the noise-free g of an array (n_features,) or (n_rows,
+            n_features), without validation, and ``functions[i].value_and_jacobian(X)`` adds its derivatives.
+            ``functions(X)`` evaluates all functions at once, with a first axis of length n.
 
         Raises
         ------
         ValueError, TypeError
-            If ``n`` or ``n_waves`` is not a positive integer, columns of X were no numbers, or functions of the kernel
-            cannot be drawn, as those of a `FunctionKernel`.
+            If ``n`` or ``n_waves`` is not a positive integer, X had columns that are not numbers, or functions of the
+            kernel cannot be drawn, as those of a `FunctionKernel`.
 
         References
         ----------
@@ -349,7 +337,7 @@ class Posterior:
         return FunctionSamples(self.functions(), n, n_waves, check_random_state(random_state))
 
     def functions(self) -> Functions:
-        """The posterior as functions to be drawn, and followed along the paths that they make."""
+        """Return the posterior as functions that can be drawn and followed along their own paths."""
         return Functions(self.predictor, *as_maps(self.maps), self.base)
 
     def to_casadi(self, name: str = "evgp", *, include_noise: bool = True, parametric: bool = False) -> Any:
@@ -358,36 +346,35 @@ class Posterior:
         Parameters
         ----------
         name : str, default="evgp"
-            Of the function.
+            Name of the function.
         include_noise : bool, default=True
-            Whether the variance is of y, with the learned noise, or of the noise-free g(x).
+            Whether the variance is that of y, with the learned noise, or that of the noise-free g(x).
         parametric : bool, default=False
-            Whether all that `partial_fit` changes is a second argument, ``parameters``, which `to_casadi_parameters`
-            returns: then an optimal control problem that is built once goes on with a model that learns. Its variance
-            takes a few times as long.
+            Whether the function has a second argument ``parameters``, which `to_casadi_parameters` returns. An optimal
+            control problem that is built once can then follow a model that learns by `partial_fit`. The variance takes
+            a few times as long.
 
         Returns
         -------
         function : casadi.Function
-            x of shape (n_features,) -> (mean, variance), each of shape (n_outputs,), in MX; the names of arguments and
-            results are ``x``, ``parameters``, ``mean`` and ``variance``. Where it is called with symbols it is put in
-            as expressions.
+            An inlined MX function from ``x`` of shape (n_features,), and ``parameters`` if parametric, to ``mean`` and
+            ``variance`` of shape (n_outputs,) each.
 
         Raises
         ------
         ImportError
-            If CasADi is not installed; the message gives the pip command.
+            If CasADi is not installed.
         ValueError, TypeError
-            If the kernel, or a map, has no expression in CasADi: the message names it and lists those that have one. A
-            map of your own gets one by a method ``to_casadi(x)``, from an MX of shape (n_features, 1) to one of shape
-            (n_features_out, 1), or a list of these if it returns a row for each output.
+            If the kernel or a map has no expression in CasADi. A map of your own needs a method ``to_casadi(x)``, from
+            an MX of shape (n_features, 1) to one of shape (n_features_out, 1), or to a list of these if it returns a
+            row for each output.
         sklearn.exceptions.NotFittedError
             If the model is not fitted.
 
         Notes
         -----
-        Numbers are those of `predict` but for rounding, which grows where inducing points are hard to tell apart. The
-        standard deviation is left to the caller: a square root has no derivative where the variance is 0.
+        Values equal those of `predict` up to rounding, which grows if inducing points are close to each other. The
+        function returns the variance because a square root has no derivative where the variance is 0.
 
         Examples
         --------
@@ -409,21 +396,20 @@ class Posterior:
         return function if self.base is None else with_base(function, self.base)
 
     def to_casadi_parameters(self, out: np.ndarray | None = None) -> np.ndarray:
-        """Give what the function of ``to_casadi(parametric=True)`` takes beside x, as the model now is.
+        """Return the current ``parameters`` of the function ``to_casadi(parametric=True)``.
 
         Parameters
         ----------
         out : ndarray of shape (n_parameters,), default=None
-            Where to put it; None makes a new array.
+            Array to write to. If None, a new array is made.
 
         Returns
         -------
         parameters : ndarray of shape (n_parameters,)
-            For each group of outputs that share inducing points, of which there are m, in the order of their first
-            outputs: the weights of the mean, of shape (outputs of the group, m + n_h), then the roots of the
-            covariance, (outputs of the group, m + n_h, m + n_h). After all groups what is added to the weights of
-            features, (n_outputs, n_h), what is added to the mean, (n_outputs,), and the noise variances, (n_outputs,).
-            Rows follow each other. Of these `partial_fit` changes weights and roots.
+            For each group of outputs with the same m inducing points: the weights of the mean, of shape (outputs of the
+            group, m + n_h), then the roots of the covariance, (outputs of the group, m + n_h, m + n_h). After all
+            groups: the offsets of the features' weights (n_outputs, n_h), the intercepts (n_outputs,) and the noise
+            variances (n_outputs,). `partial_fit` changes weights and roots only.
 
         Raises
         ------
@@ -445,36 +431,36 @@ class Posterior:
         Parameters
         ----------
         path : str or path-like
-            A folder, or the file that ends in ``.c``; the header goes beside it.
+            A folder, or a file that ends in ``.c``. The header is written next to it.
         name : str, default="evgp"
-            What the names of the C functions begin with, and of the files in a folder.
+            Prefix of the names of the C functions, and of the files if ``path`` is a folder.
         jacobian : bool, default=True
-            Whether there are functions for the Jacobians too.
+            Whether to write functions for the Jacobians too.
         include_noise : bool, default=True
-            Whether the variance is of y, with the learned noise, or of the noise-free g(x).
+            Whether the variance is that of y, with the learned noise, or that of the noise-free g(x).
 
         Returns
         -------
         source, header : Path
-            The files. ``gcc -std=c99 -O2 -c evgp.c`` builds them, with ``-lm`` where it is linked.
+            The files. ``gcc -std=c99 -O2 -c evgp.c`` compiles them; link with ``-lm``.
 
         Raises
         ------
         ImportError, ValueError, TypeError, sklearn.exceptions.NotFittedError
-            As `to_casadi`, and if there is no such folder, or the name is taken in C, as ``int`` and ``sin`` are.
+            As for `to_casadi`, and if the folder does not exist, or the name has a meaning in C, such as ``int``.
 
         Notes
         -----
-        The header declares, with rows of Jacobians following each other (one per output)::
+        The header declares these functions, with Jacobians stored row by row (a row per output)::
 
             int evgp_predict(const double *x, double *mean, double *variance);
             int evgp_mean_jacobian(const double *x, double *mean, double *mean_jacobian);
             int evgp_jacobian(const double *x, double *mean, double *variance,
                               double *mean_jacobian, double *variance_jacobian);
 
-        They return 0, take no memory but the stack (the header says how much), keep nothing from call to call, and so
-        may run in several threads and in an interrupt. Any result may be NULL. The compiled library also is what
-        ``casadi.external("evgp", ...)`` loads.
+        They return 0. Any result may be NULL. They use stack memory only (the header gives the size) and keep no state,
+        so that they may run in several threads and in an interrupt. ``casadi.external("evgp", ...)`` loads the compiled
+        library.
         """
         function = self.to_casadi(name, include_noise=include_noise)
         return write_c(function, path, jacobian, self.maps.columns, include_noise)
@@ -485,7 +471,7 @@ class Posterior:
         return Exported(self.predictor, features, inputs, maps.n_columns)
 
 
-# The methods that take rows, and the estimator's method that validates these.
+# The methods that take rows, and the method of the estimator that validates the rows.
 _TAKES = {
     "novelty": "_checked",
     "value_and_jacobian": "_checked_numbers",
@@ -495,7 +481,7 @@ _TAKES = {
 
 
 def delegate(name: str) -> Any:
-    """A method of a fitted estimator that asks its posterior, with the documentation of the method of `Posterior`."""
+    """Make a method of an estimator that calls the method of its posterior, with the same docstring."""
     method: Callable[..., Any] = getattr(Posterior, name)
     takes = _TAKES.get(name)
 

@@ -1,4 +1,4 @@
-"""Multi-step prediction: a learned one-step model, applied to its own predictions."""
+"""Multi-step prediction with a learned one-step model."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Controller = Callable[[np.ndarray, int], ArrayLike]
 
 _METHODS = ("sample", "linearized", "mean")
 _NOISES = ("learned", "none")
-# Of standard deviations: differences over as much.
+# Width of finite differences, as a share of the standard deviations.
 _SHARE = 0.01
 
 
@@ -40,43 +40,34 @@ def rollout(
     Parameters
     ----------
     regressor : estimator
-        Fitted to rows x = [z, u] and next states z', with ``predict(X, return_std=True)``: `EVGPRegressor`,
-        `EGPRegressor`, `ResidualRegressor`, or any other.
+        Model of one step: fitted to rows x = [z, u] and next states z'. Any regressor with ``predict(X,
+        return_std=True)`` will do.
     z0 : array-like of shape (n_states,) or (n_batch, n_states)
         Initial states.
     U_or_controller : array-like of shape (n_steps, n_inputs) or (n_batch, n_steps, n_inputs), or callable
-        Inputs, or ``controller(z, t)`` of states (n, n_states) and the step t = 0, 1, ..., which returns inputs (n,
-        n_inputs): a function of these two alone. A system without inputs has an array of shape (n_steps, 0). Of maps
-        with ``dt="column"`` inputs are [u, Δt]: the time step of each step is the last.
+        Inputs, or a function ``controller(z, t)`` of states (n, n_states) and the step t = 0, 1, ..., which returns
+        inputs (n, n_inputs). A system without inputs has an array of shape (n_steps, 0). With maps that have
+        ``dt="column"``, inputs are [u, Δt].
     n_steps : int, default=None
-        How many steps; only with a controller, and then needed.
+        Number of steps. Required with a controller, and not allowed otherwise.
     n_samples : int, default=100
-        Particles for each initial state, with ``method="sample"``.
+        Number of particles for each initial state, with ``method="sample"``.
     method : {"sample", "linearized", "mean"}, default="sample"
-        ``"sample"``: particles, of which each follows one function drawn from the posterior: what is not known of the
-        system is the same at each step and each time that it comes back to a state. For `EVGPRegressor` and
-        `EGPRegressor`, also within a `ResidualRegressor`, that is exact: inducing values and weights are drawn from q,
-        and what they leave of f is drawn given the particle's own path so far: time for a particle grows with the cube
-        of the steps (under a second for 400 particles of 100 steps, minutes for 100 of 1000). Other regressors draw
-        each step anew.
-
-        ``"linearized"``: mean and covariance to first order, Σ' = A Σ Aᵀ + Q, with A by the regressor's ``jacobian``
-        (else differences) and Q what it does not know of a step. Steps count as independent, which they are not if
-        what is not known is the same at each step: std is then too small or, where errors cancel, too large.
-
-        ``"mean"``: the mean is fed back; std is that of the last step alone.
+        - ``"sample"``: each particle follows one function drawn from the posterior, exactly. Time grows with the cube
+          of the steps. Regressors of other packages draw each step independently.
+        - ``"linearized"``: mean and covariance to first order, Σ' = A Σ Aᵀ + Q. It treats the errors of the steps as
+          independent.
+        - ``"mean"``: feed the mean back. The std is that of the last step alone.
     process_noise : {"learned", "none"}, default="learned"
-        Whether the learned noise σ² is drawn anew at each step. It stands for noise in the system itself, and, where
-        data have none, for what the model cannot represent. ``"none"`` leaves it out, as is right where states were
-        measured with noise that is not in the system (of other regressors only if their ``predict`` has
-        ``include_noise``).
+        Whether to add the learned noise at each step. Use ``"none"`` if the noise was in the measurement of the states
+        and not in the system.
     random_state : int, RandomState instance or None, default=None
-        Draws the particles.
+        Seed of the particles.
 
     Returns
     -------
     rollout : Bunch
-        After each step, with a first axis of length n_batch if z0 has one:
+        Values after each step, with a first axis of length n_batch if z0 has one:
 
         - mean, std : ndarray of shape (n_steps, n_states)
         - covariance : ndarray of shape (n_steps, n_states, n_states)
@@ -92,10 +83,14 @@ def rollout(
     NotFittedError
         If the regressor is not fitted.
 
+    Notes
+    -----
+    See the user guide, :doc:`/guide/rollouts`, on the choice of the method.
+
     References
     ----------
-    - J. T. Wilson et al. (2020): Efficiently Sampling Functions from Gaussian Process Posteriors (why one function).
-    - A. Girard et al. (2003): Gaussian Process Priors with Uncertain Inputs (the linearised step).
+    - J. T. Wilson et al. (2020): Efficiently Sampling Functions from Gaussian Process Posteriors.
+    - A. Girard et al. (2003): Gaussian Process Priors with Uncertain Inputs.
 
     Examples
     --------
@@ -109,7 +104,7 @@ def rollout(
     >>> ahead.samples.shape, ahead.mean.shape
     ((100, 50, 2), (50, 2))
 
-    With rows of 10 ms and of 30 ms, and steps of 20 ms ahead:
+    Fit rows with time steps of 10 ms and 30 ms, and predict steps of 20 ms:
 
     >>> import numpy as np
     >>> logs = [make_dynamics("pendulum", 10, 30, dt=dt, random_state=0) for dt in (0.01, 0.03)]
@@ -143,14 +138,7 @@ def rollout(
 
 @dataclass(frozen=True)
 class _Drive:
-    """What the system is driven by.
-
-    Attributes
-    ----------
-    n_steps, n_inputs : int
-    inputs : ndarray of shape (n_batch, n_steps, n_inputs), or None
-    controller : callable or None
-    """
+    """The inputs of the system: an array (n_batch, n_steps, n_inputs), or a controller."""
 
     n_steps: int
     n_inputs: int
@@ -158,7 +146,7 @@ class _Drive:
     controller: Controller | None
 
     def at(self, t: int, states: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """The inputs (n, n_inputs) of states (n, n_states), each of one of the initial states ``of`` (n,)."""
+        """Return the inputs (n, n_inputs) of states (n, n_states); ``of`` (n,) gives the initial state of each."""
         if self.inputs is not None:
             return self.inputs[of, t]
         assert self.controller is not None
@@ -171,18 +159,18 @@ class _Drive:
         return np.broadcast_to(given, (len(states), self.n_inputs))
 
     def slopes(self, t: int, states: np.ndarray, deviations: np.ndarray, of: np.ndarray) -> np.ndarray:
-        """∂u/∂z (n, n_inputs, n_states), of states with deviations (n, n_states), by central differences."""
+        """Return ∂u/∂z (n, n_inputs, n_states) by central differences, for states with deviations (n, n_states)."""
         if self.inputs is not None:
             return np.zeros((len(states), self.n_inputs, states.shape[1]))
         return _differences(lambda own: self.at(t, own, of), states, deviations)
 
 
 class _OneStep:
-    """A regressor as a model of one step, with whatever it can do."""
+    """A regressor as a model of one step, with as much of its posterior as it offers."""
 
     def __init__(self, regressor: Any, n_states: int, noisy: bool):
         self.regressor, self.n_states, self.noisy = regressor, n_states, noisy
-        # The posterior as functions to be drawn, or None.
+        # The posterior as functions that can be drawn, or None for regressors of other packages.
         posterior = getattr(regressor, "_posterior", None)
         self.functions = None if posterior is None else posterior.functions()
         self._package = package_of(None if posterior is None else posterior.maps.example)
@@ -190,19 +178,17 @@ class _OneStep:
         anything = any(each.kind == each.VAR_KEYWORD for each in parameters.values())
         if "return_std" not in parameters and not anything:
             raise TypeError(f"{type(regressor).__name__}.predict has no return_std, which a rollout needs.")
-        # What passes arguments on may pass them to what does not know this one.
+        # A regressor with **kwargs may pass them on to one that does not have include_noise.
         self._options = {"include_noise": noisy} if "include_noise" in parameters or self.functions else {}
 
     def predict(self, X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and std (n, n_states)."""
+        """Return mean and std (n, n_states)."""
         mean, std = self._asked(self.regressor.predict, X, return_std=True, **self._options)
         return self._checked(mean, len(X)), self._checked(std, len(X))
 
     def linearised(self, X: np.ndarray, deviations: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean, its derivatives in X (n, n_states, D), and the covariance Q (n, n_states, n_states) of a step.
-
-        Deviations (n, D) are those of X: differences, if there are to be any, are of a share of them.
-        """
+        """Return mean, its derivatives in X (n, n_states, D), and covariance Q (n, n_states, n_states) of a step."""
+        # Deviations (n, D) are those of X. Finite differences, if needed, are taken over a share of them.
         mean, std = self.predict(X)
         if hasattr(self.regressor, "jacobian"):
             slopes = np.asarray(self._asked(self.regressor.jacobian, X)).reshape(*mean.shape, X.shape[1])
@@ -212,10 +198,10 @@ class _OneStep:
         return mean, slopes, Q if self.functions is None else Q + self.functions.between(X)
 
     def _asked(self, method: Callable[..., Any], X: np.ndarray, **options: Any) -> Any:
-        """What a method says of rows [z, u], whose columns have the names that the regressor was fitted to."""
+        """Call a method with rows [z, u], whose columns get the names that the regressor was fitted to."""
         rows = as_fitted(self.regressor, X, self._package)
         if rows is X and hasattr(self.regressor, "feature_names_in_"):
-            # Without a package of data frames they have none.
+            # The data frame package is not installed, so that rows have no names.
             with ignored("X does not have valid feature names"):
                 return method(rows, **options)
         return method(rows, **options)
@@ -256,7 +242,7 @@ def _sampled(
 def _steps(
     model: _OneStep, functions: Any, n: int, n_steps: int, rng: np.random.RandomState
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """A function of rows (n, D) that returns the particles' next states."""
+    """Return a function from rows (n, D) to the next states of the particles."""
     if functions is None:
 
         def independent(X: np.ndarray) -> np.ndarray:
@@ -299,7 +285,7 @@ def _fed_back(model: _OneStep, batch: np.ndarray, drive: _Drive, linearised: boo
 
 
 def _drive(regressor: Any, batch: np.ndarray, given: ArrayLike | Controller, n_steps: int | None) -> _Drive:
-    """Inputs or a controller, checked."""
+    """Check the given inputs or controller."""
     n_states, columns = batch.shape[1], getattr(regressor, "n_features_in_", None)
     if columns is not None and columns < n_states:
         raise ValueError(
@@ -345,11 +331,9 @@ def _deviations(covariance: np.ndarray) -> np.ndarray:
 
 
 def _differences(function: Callable[[np.ndarray], np.ndarray], rows: np.ndarray, deviations: np.ndarray) -> np.ndarray:
-    """Central differences (n, k, d) of function(rows) (n, k), for rows that have deviations (n, d).
-
-    Over a small share of these: there a linear step has to hold, and little is lost to rounding. Derivatives in what
-    does not deviate lead to nothing, and are 0.
-    """
+    """Return central differences (n, k, d) of function(rows) (n, k), for rows with deviations (n, d)."""
+    # A small share of the deviations: the linear step has to be valid there, and rounding is small. Columns that do not
+    # deviate contribute nothing, so that their derivatives are set to 0.
     step = np.where(deviations > 0.0, np.maximum(_SHARE * deviations, 256.0 * np.spacing(np.abs(rows))), 0.0)
     found = []
     for column in range(rows.shape[1]):

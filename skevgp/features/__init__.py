@@ -1,4 +1,4 @@
-"""Explicit features h(x): scikit-learn transformers that say what physics knows."""
+"""Explicit features h(x) from physics, as scikit-learn transformers."""
 
 from .angles import AngleEncoder
 from .gravity import LinkGravity

@@ -1,4 +1,4 @@
-"""Angles as the kernel should see them: the same after a full turn."""
+"""Angles as sines and cosines, which are the same after a full turn."""
 
 from __future__ import annotations
 
@@ -10,27 +10,27 @@ from numpy.typing import ArrayLike
 from sklearn.utils.validation import check_array, check_is_fitted
 
 from ..robots.loading import Robot
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import StrOptions
-from .robot_map import RobotTransformer, same_for_all
+from .robot_map import RobotTransformer
 
 
 class AngleEncoder(RobotTransformer):
     """Replace each angle by its sine and cosine; other columns stay as they are.
 
-    For the regressor's ``kernel_map``: a kernel of (sin q, cos q) takes q and q + 2π for the same, and sees nearby
-    angles on both sides of the turn as near. It is a transformer of its own too.
+    Pass it as the ``kernel_map`` of a regressor. A kernel of (sin q, cos q) has the same value at q and q + 2π, and
+    nearby angles on both sides of a full turn are close to each other.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        As in `skevgp.datasets.load_robot`; the named systems need no Pinocchio. X then has the columns [q, q̇, u].
-        Without one, any number of columns is taken.
+        Robot as in `skevgp.datasets.load_robot`. X then has the columns [q, q̇, u]. If None, X may have any number of
+        columns.
     angles : sequence of int or str, default=None
-        Which columns are angles (rad), by index or by name: a column of the data frame, or a position of the robot.
-        None means all revolute positions of the robot, and no column without a robot.
+        Columns that are angles in rad, by index or by name: of a column of the data frame, or of a position of the
+        robot. If None, all revolute positions of the robot.
     dt : "column" or None, default=None
-        ``"column"``: beside the robot's, X has a last column, the time step of each row in seconds, which stays as it
-        is.
+        If ``"column"``, X has an additional last column, the time step of each row in seconds. It stays as it is.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class AngleEncoder(RobotTransformer):
 
     Notes
     -----
-    The sine and the cosine take the angle's place, in this order; the order of the columns stays. Scale after encoding:
+    Sine and cosine replace the angle, in this order. Scale after encoding:
     ``make_pipeline(AngleEncoder("acrobot"), StandardScaler())``.
 
     Examples
@@ -71,17 +71,17 @@ class AngleEncoder(RobotTransformer):
     }
 
     def inverse_transform(self, X: ArrayLike) -> np.ndarray:
-        """Give back the angles of sines and cosines.
+        """Turn sines and cosines back into angles.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features_out)
-            As `transform` returns them; a sine and a cosine may share a positive factor.
+            Encoded rows, as `transform` returns them. A sine and its cosine may have a common positive factor.
 
         Returns
         -------
         X_original : ndarray of shape (n_samples, n_features)
-            The angles lie in (-π, π].
+            Rows with angles in (-π, π].
 
         Raises
         ------
@@ -108,7 +108,7 @@ class AngleEncoder(RobotTransformer):
         self._source = np.repeat(np.arange(self.n_features_in_), copies)  # the column of X of each encoded one
         self._sines = np.searchsorted(self._source, self._angles)
         self._cosines = self._sines + 1
-        self._of_others = np.eye(self.n_features_in_)[self._source]  # the Jacobian but for the angles' entries
+        self._of_others = np.eye(self.n_features_in_)[self._source]  # the Jacobian without the angles' entries
         self._of_others[:, self._angles] = 0.0
 
     def _columns_of_angles(self) -> list[int]:
@@ -150,7 +150,7 @@ class AngleEncoder(RobotTransformer):
 
 
 def _index(column: Any, names: dict[str, int]) -> int:
-    """The index of a column, or -1 if it cannot be one."""
+    """Return the index of a column, or -1 if there is no such column."""
     if isinstance(column, str):
         return names.get(column, -1)
     return int(column) if isinstance(column, (int, np.integer)) and not isinstance(column, bool) else -1

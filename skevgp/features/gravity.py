@@ -1,4 +1,4 @@
-"""Gravity's torque on each link as explicit features, section III-B of the paper."""
+"""Torque of gravity on each link as explicit features (section III-B of the paper)."""
 
 from __future__ import annotations
 
@@ -11,19 +11,20 @@ import numpy as np
 
 from ..robots import GravityTerm, Layout, get_system, layout_of
 from ..robots.loading import Robot, joint_axes, known_robot
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import RobotMap, indices_of, same_for_all
+from .robot_map import RobotMap, indices_of
 
-# An axis is vertical up to this angle, rad: URDF files round π/2.
+# An axis counts as vertical up to this angle in rad, because URDF files round π/2.
 _TILT = 1e-3
-# Rows at a time: their rotations stay in the cache.
+# Number of rows at a time, so that their rotations stay in the cache.
 _BLOCK = 1024
 # Of w = Rᵀg along (u_x, u_y, u_z): (u_x × w)·u_z = w·u_y, (u_y × w)·u_z = -w·u_x; a slider's axis is its u_z.
 _COMPONENTS = {"u_x": (1, 1.0), "u_y": (0, -1.0), "": (2, 1.0)}
 
 
 class GravityMap(RobotMap):
-    """Features of gravity alone; the prior knows which joints each of them accelerates, and no more."""
+    """Features of gravity alone, with a prior that knows which joints each feature accelerates."""
 
     unknown_scale: float
     free_scale: float
@@ -35,11 +36,11 @@ class GravityMap(RobotMap):
     }
 
     def _terms(self) -> Sequence[GravityTerm | Lever]:
-        """One per feature; before `fit` too, if there is a robot."""
+        """List one term for each feature; works before `fit` if there is a robot."""
         raise NotImplementedError
 
     def _acts_on(self, layout: Layout) -> np.ndarray:
-        """Whether gravity by each feature accelerates each joint, (n_joints, n_features_out)."""
+        """Whether each feature accelerates each joint, (n_joints, n_features_out)."""
         terms = self._terms()
         acts_on = np.zeros((layout.n_joints, len(terms)), dtype=bool)
         for column, term in enumerate(terms):
@@ -54,7 +55,7 @@ class GravityMap(RobotMap):
 
 
 class SineGravity(GravityMap):
-    """The sine of each angle against the vertical of a planar system; without a robot that of every column."""
+    """The sine of each angle against the vertical of a planar system, or of every column without a robot."""
 
     def __init__(self, robot: Robot | None, unknown_scale: float, free_scale: float):
         self.robot = robot
@@ -96,56 +97,44 @@ class SineGravity(GravityMap):
 
 @dataclass(frozen=True)
 class Lever:
-    """A feature of `LinkGravity`.
-
-    Attributes
-    ----------
-    link : int
-    name : str
-        ``"u_x"`` or ``"u_y"``; empty for a prismatic joint, which has none.
-    acts_on : tuple of int
-        The joints that bear the link.
-    """
+    """A feature of `LinkGravity`: gravity on one link along one lever."""
 
     link: int
-    name: str
-    acts_on: tuple[int, ...]
+    name: str  # "u_x" or "u_y"; empty for a prismatic joint, which has no lever
+    acts_on: tuple[int, ...]  # joints between the base and the link
 
 
 class LinkGravity(GravityMap):
-    r"""Gravity's torque about each joint's axis, for a unit mass at the end of a unit lever on its link.
+    r"""Torque of gravity about the axis of each joint, for a unit mass at the end of a unit lever on its link.
 
-    For each link i that a revolute joint turns
+    The features of a link i with a revolute joint are
 
     .. math:: (u_x \times R_i^\top g) \cdot u_z, \qquad (u_y \times R_i^\top g) \cdot u_z
 
-    (the paper's section III-B has the first), where :math:`R_i` is the rotation of the link by forward
-    kinematics, :math:`g` the gravity vector of the model and :math:`u_z` the joint's axis in its own frame. For a
-    prismatic joint there is one feature, gravity along its axis, :math:`u_z \cdot R_i^\top g`. All are in m/s². Where
-    the link's centre of mass is, and how heavy it is, the weights have to learn.
+    (the paper's section III-B has the first). Here :math:`R_i` is the rotation of the link by forward kinematics,
+    :math:`g` the gravity vector of the model and :math:`u_z` the joint's axis in its own frame. A prismatic joint has
+    one feature, gravity along its axis, :math:`u_z \cdot R_i^\top g`. All features are in m/s². The weights learn the
+    mass and the centre of mass of the link.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
-        A named system (``"iiwa14"``, ``"acrobot"``, ...), a robot of example-robot-data (``"panda"``, ``"ur5"``, ...),
-        the path of a URDF file or a model, as in `skevgp.datasets.load_robot`. Without one, X passes through and the
-        weights get the regressor's wide default prior.
+        A named system (``"iiwa14"``, ``"acrobot"``, ...) or any other robot as in `skevgp.datasets.load_robot`. If
+        None, X passes through and the weights get the regressor's wide default prior.
     axes : {"xy", "x"}, default="xy"
-        The levers: :math:`u_x` and :math:`u_y`, which stand for any centre of mass, or :math:`u_x` alone (the paper's
-        formula).
+        The levers: both :math:`u_x` and :math:`u_y`, which represent any centre of mass, or :math:`u_x` alone (the
+        formula of the paper).
     links : sequence of int or str, default=None
-        The links, by the name of their joint or its index from 0 (the paper counts from 1); None means all.
+        The links, by the name of their joint or its index from 0 (the paper counts from 1). If None, all links.
     outputs : sequence of int or str, default=None
-        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all of them, [q, q̇].
     unknown_scale : float, default=1.0
-        Prior standard deviation of the weights for the velocities of the joints that bear the link: its own and those
-        between it and the base.
+        Prior standard deviation of the weights for the velocities of the joints between the base and the link.
     free_scale : float, default=1.0
-        Prior standard deviation of the other weights; 0 pins them to 0.
+        Prior standard deviation of the other weights. With 0 they stay 0.
     dt : "column" or None, default=None
-        ``"column"``: X has a last column, the time step Δt of each row in seconds, with which the features are
-        multiplied. Weights are then rates (1/m for a lever) of any Δt; their prior standard deviations are those above
-        divided by 0.03 s.
+        If ``"column"``, X has a last column, the time step Δt of each row in seconds, and features are multiplied by
+        it. Weights are then rates (1/m for a lever), with the standard deviations above divided by 0.03 s.
 
     Attributes
     ----------
@@ -155,7 +144,7 @@ class LinkGravity(GravityMap):
 
     See Also
     --------
-    InertiaForceGravity : The whole row of x and these.
+    InertiaForceGravity : These features together with x = [q, q̇, u].
 
     Notes
     -----
@@ -163,15 +152,14 @@ class LinkGravity(GravityMap):
     :math:`u_z` (x follows z, y follows x, z follows y) made orthogonal to :math:`u_z`; for a joint that turns about z
     the levers are its frame's x and y.
 
-    The features of a link span the torque that its own weight, and that of all it carries at a fixed place, exerts
-    about its own joint. So gravity's torque is linear in them at a joint if all later ones turn about parallel axes:
-    at the last joint of any arm, at every joint of a planar one. At the others it is not: there a later link acts
-    about an axis that turns in the link's frame.
+    The torque of gravity at a joint is linear in the features of its link if all later joints turn about parallel axes:
+    at the last joint of any arm, and at every joint of a planar arm. At other joints it is not, because a later link
+    acts about an axis that turns in the frame of the link.
 
-    A link whose axis is always vertical (the first of most arms) has features that are 0.
+    Features of a link whose axis is always vertical, such as the first link of most arms, are 0.
 
-    X is the whole row, of which q alone is used (and Δt, if it is a column). Do not scale its columns before this map:
-    scaling belongs in the regressor's ``kernel_map``, which only the kernel sees.
+    X has all columns [q, q̇, u]; only q is used, and Δt if it is a column. Do not scale the columns of X before this
+    map. Scale in the ``kernel_map`` of the regressor, which only the kernel uses.
 
     Examples
     --------
@@ -183,7 +171,7 @@ class LinkGravity(GravityMap):
     >>> features.get_feature_names_out().tolist()
     ['gravity(q, u_x)', 'gravity(q, u_y)']
 
-    Beside other features:
+    Join them to other features:
 
     >>> from sklearn.pipeline import FeatureUnion
     >>> from skevgp.features import InertiaForce
@@ -271,13 +259,11 @@ class LinkGravity(GravityMap):
 
 
 class Links:
-    """Forward kinematics of many rows at once, as far as gravity needs it: rotations alone.
-
-    Gravity is passed on from each link to the next, as components along (u_x, u_y, u_z) of its joint. The rotation of
-    a link in its parent is ``fixed + cos(q) * cosine + sin(q) * sine``.
-    """
+    """Forward kinematics of many rows at once: rotations only, which is all that gravity needs."""
 
     def __init__(self, model: Any):
+        # Gravity is passed on from each link to the next, as components along (u_x, u_y, u_z) of its joint. The
+        # rotation of a link in its parent is fixed + cos(q) * cosine + sin(q) * sine.
         axes = joint_axes(model)
         self._turns = np.any(axes[:, 3:], axis=1).astype(float)[:, np.newaxis, np.newaxis, np.newaxis]
         self._parents = [parent - 1 for parent in list(model.parents)[1:]]
@@ -293,18 +279,16 @@ class Links:
         )
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """Rᵢᵀg along u_x, u_y and u_z of each link i, (n, 3 * n_joints), of positions (n, n_joints)."""
+        """Return Rᵢᵀg along u_x, u_y and u_z of each link i, (n, 3 * n_joints), at positions (n, n_joints)."""
         weights: list[np.ndarray] = []  # of (n, 1, 3)
         for parent, rotation in zip(self._parents, self._rotations(q), strict=True):
             weights.append((weights[parent] if parent >= 0 else self._weight) @ rotation)
         return np.concatenate(weights, axis=2)[:, 0]
 
     def gravity_jacobian(self, q: np.ndarray) -> np.ndarray:
-        """Derivatives of `gravity` by the positions, (n, 3 * n_joints, n_joints).
-
-        They are passed on as gravity itself is: a later link's are its parent's, rotated; and seen from a link that
-        turns about its u_z, (w_x, w_y, w_z) turns the other way, by (w_y, -w_x, 0).
-        """
+        """Return derivatives of `gravity` with respect to positions, (n, 3 * n_joints, n_joints)."""
+        # The derivatives of a link are its parent's, rotated. In the frame of a link that turns about its own u_z,
+        # (w_x, w_y, w_z) turns the other way: its derivative is (w_y, -w_x, 0).
         n_joints = q.shape[1]
         at_base = np.concatenate([self._weight, np.zeros((1, n_joints, 3))], axis=1)
         passed: list[np.ndarray] = []  # of (n, 1 + n_joints, 3): gravity, then its derivative by each position
@@ -316,7 +300,7 @@ class Links:
         return np.concatenate([here[:, 1:] for here in passed], axis=2).transpose(0, 2, 1)
 
     def _rotations(self, q: np.ndarray) -> np.ndarray:
-        """Of each link in its parent, (n_joints, n, 3, 3)."""
+        """Return the rotation of each link in its parent, (n_joints, n, 3, 3)."""
         angles = q.T[:, :, np.newaxis, np.newaxis] * self._turns
         rotations = np.cos(angles) * self._cosine
         rotations += np.sin(angles) * self._sine
@@ -325,7 +309,7 @@ class Links:
 
 
 def _right_handed(axis: np.ndarray) -> np.ndarray:
-    """The columns u_x, u_y and u_z, the joint's axis."""
+    """Return the columns u_x, u_y and u_z, which is the joint's axis."""
     lever = np.eye(3)[(np.argmax(np.abs(axis)) + 1) % 3]
     lever = lever - (lever @ axis) * axis
     lever /= np.linalg.norm(lever)
@@ -333,18 +317,7 @@ def _right_handed(axis: np.ndarray) -> np.ndarray:
 
 
 def links_under_gravity(robot: Robot) -> list[int]:
-    """The links of which a feature of `LinkGravity` differs from 0 in some position.
-
-    Parameters
-    ----------
-    robot : str, path-like, System or pinocchio.Model
-
-    Returns
-    -------
-    links : list of int
-        Seen in a few fixed random positions; an axis within a thousandth of a radian of the vertical counts as
-        vertical.
-    """
+    """List the links with a feature of `LinkGravity` that is not 0 in some of a few fixed random positions."""
     X = np.random.RandomState(0).uniform(-np.pi, np.pi, (5, layout_of(robot).n_columns))
     features = LinkGravity(robot).fit(X)
     pulled = np.abs(features.transform(X)).max(axis=0) > _TILT * np.linalg.norm(features._links._weight)

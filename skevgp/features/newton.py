@@ -12,14 +12,15 @@ from sklearn.base import clone
 
 from ..robots import Layout
 from ..robots.loading import Robot, named_system, read_once
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
 from ..utils.validation import as_floats
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
-from .robot_map import STEP, RobotMap, same_for_all
+from .robot_map import STEP, RobotMap
 
 
 class _NewtonFeatures(RobotMap):
-    """What `InertiaForce` and `InertiaForceGravity` share: h starts with x = [q, q̇, u]."""
+    """Common part of `InertiaForce` and `InertiaForceGravity`: h(x) starts with x = [q, q̇, u]."""
 
     dt: float | Literal["column"]
     inverse_inertia: ArrayLike
@@ -38,11 +39,8 @@ class _NewtonFeatures(RobotMap):
     }
 
     def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Euler's rule (the paper's eq. inertia_prior).
-
-        Known entries (1 and Δt) have ``known_scale``; unknown ones (Δt/J) the user's guess and ``unknown_scale``; the
-        rest mean 0 and ``free_scale``.
-        """
+        # Euler's rule (the paper's eq. inertia_prior). Known entries (1 and Δt) have known_scale. Unknown entries
+        # (Δt/J) have the user's guess as mean and unknown_scale. All other entries have mean 0 and free_scale.
         n, n_inputs = layout.n_joints, layout.n_inputs
         joints = np.arange(n)
         mean = np.zeros((2 * n, layout.n_columns))
@@ -79,21 +77,20 @@ class InertiaForce(_NewtonFeatures):
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
         A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
-        Without one, any number of columns is taken as it is and the weights get the regressor's wide default prior.
+        If None, X passes through and the weights get the regressor's wide default prior.
     dt : float or "column", default=0.03
-        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
-        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
+        rates (see Notes).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     outputs : sequence of int or str, default=None
-        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all of them, [q, q̇].
     known_scale : float, default=0.1
-        Prior standard deviation of the entries that physics knows (1 and Δt): narrower than the others, and wide enough
-        for what Euler's rule neglects.
+        Prior standard deviation of the known entries (1 and Δt). It allows for the error of Euler's rule.
     unknown_scale : float, default=1.0
-        Prior standard deviation of the entries that physics names but does not know (γ).
+        Prior standard deviation of the entries γ, whose values physics does not know.
     free_scale : float, default=1.0
-        Prior standard deviation of the entries that are 0 in the prior mean; 0 pins them there.
+        Prior standard deviation of all other entries, whose mean is 0. With 0 they stay 0.
 
     Attributes
     ----------
@@ -107,17 +104,15 @@ class InertiaForce(_NewtonFeatures):
 
     Notes
     -----
-    Do not scale the columns of x before this map: the prior is in SI units. Scaling belongs in the regressor's
-    ``kernel_map``, which only the kernel sees.
+    Do not scale the columns of X before this map, because the prior is in SI units. Scale in the ``kernel_map`` of the
+    regressor, which only the kernel uses.
 
     With ``dt="column"`` the features are :math:`[z, \Delta t\,z, \Delta t\,u]` with the state :math:`z = [q, \dot q]`,
-    for :math:`z' = z + \Delta t\,(A z + B u)`. In no time nothing moves: the weights of z itself are pinned to 1 and 0.
-    All others are rates, in SI units and the same for any Δt: 1 for :math:`\dot q` in the rows of positions,
-    ``inverse_inertia`` for u, and 0. Their prior standard deviations are those above divided by 0.03 s, so that mean
-    and covariance of h(x)β are those of ``dt=0.03`` where the column is 0.03, and the standard deviation of h(x)β is
-    proportional to Δt. A column that is any other constant has the prior mean of that ``dt``. What Euler's rule
-    neglects, ½ Δt times the rate of a rate, gets into the weights beyond their standard deviations: short steps tell
-    most about physics.
+    for :math:`z' = z + \Delta t\,(A z + B u)`. The weights of z are fixed to 1 and 0. All others are rates in SI units
+    and the same for any Δt: 1 for :math:`\dot q` in the rows of positions, ``inverse_inertia`` for u, and 0. Their
+    prior standard deviations are those above divided by 0.03 s, so that the prior of h(x)β equals that of ``dt=0.03``
+    if the column is 0.03. Euler's rule neglects ½ Δt times the second derivative, which biases the weights. Short steps
+    identify physics best.
 
     Examples
     --------
@@ -130,7 +125,7 @@ class InertiaForce(_NewtonFeatures):
     array([[1.  , 0.03, 0.  ],
            [0.  , 1.  , 0.  ]])
 
-    Of a log whose rows have a time step each, and 1/J about 4:
+    Features of a log whose rows have different time steps, with 1/J about 4:
 
     >>> features = InertiaForce("pendulum", dt="column", inverse_inertia=4.0)
     >>> features.fit_transform([[0.1, 1.0, 2.0, 0.01], [0.1, 1.0, 2.0, 0.02]])
@@ -173,41 +168,38 @@ class InertiaForce(_NewtonFeatures):
 
 
 class InertiaForceGravity(_NewtonFeatures):
-    r"""Inertia + force + gravity features (IFG): IF and gravity's pull on each link.
+    r"""Inertia + force + gravity features (IFG): those of `InertiaForce` and the pull of gravity on each link.
 
     For a planar system of the paper :math:`h(x) = [q, \dot q, u, \sin(\cdot)]` (its eq. gravity_prior and section
     III-B), with the sine of each link's angle against the vertical: :math:`\sin q` (pendulum), :math:`\sin\theta`
-    (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot). For any other robot the features of
-    `LinkGravity` take the place of the sines. Gravity slows a link down by :math:`\Delta t` times its gain times the
-    feature.
+    (cartpole), :math:`\sin q_1` and :math:`\sin(q_1 + q_2)` (acrobot). Other robots have the features of `LinkGravity`
+    instead of sines. Gravity decelerates a link by its gain times the feature.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model, default=None
         A named system (``"pendulum"``, ``"iiwa14"``, ...), or any other robot as in `skevgp.datasets.load_robot`.
-        Without one, the sine of every column is added and the weights get the regressor's wide default prior.
+        If None, the sine of every column is added and the weights get the regressor's wide default prior.
     dt : float or "column", default=0.03
-        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
-        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
+        rates (see Notes).
     inverse_inertia : float or array-like of shape (n_inputs,), default=0.0
         Guess of 1/J, the acceleration per unit of input: (rad/s²)/(N m) or (m/s²)/N.
     gravity : LinkGravity, default=None
-        Other features of gravity, with their own prior scales; their robot is this one if they have none. None means
-        the sines for the pendulum, cartpole and acrobot, and for other robots `LinkGravity` with ``axes="xy"`` and
-        the links whose features differ from 0 in some position (iiwa14: all but the first, whose axis is vertical).
+        Other features of gravity, with their own prior scales. If None, the sines for the pendulum, cartpole and
+        acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
     gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
-        Guess of gravity's deceleration per unit of each feature of gravity: one for all, one per feature, or one per
-        joint and feature (of which those that the prior names are used). For a sine in rad/s² (g/l for a point mass);
-        for a lever of `LinkGravity` in 1/m (1/l for a point mass that lies at -l times the lever).
+        Guess of the deceleration by gravity per unit of each feature: one for all, one per feature, or one per joint
+        and feature. For a sine it is in rad/s² (g/l for a point mass), for a lever of `LinkGravity` in 1/m (1/l for a
+        point mass at -l times the lever).
     outputs : sequence of int or str, default=None
-        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all of them, [q, q̇].
     known_scale : float, default=0.1
-        Prior standard deviation of the entries that physics knows (1 and Δt): narrower than the others, and wide enough
-        for what Euler's rule neglects.
+        Prior standard deviation of the known entries (1 and Δt). It allows for the error of Euler's rule.
     unknown_scale : float, default=1.0
-        Prior standard deviation of the entries that physics names but does not know (γ).
+        Prior standard deviation of the entries γ and those of gravity, whose values physics does not know.
     free_scale : float, default=1.0
-        Prior standard deviation of the entries that are 0 in the prior mean; 0 pins them there.
+        Prior standard deviation of all other entries, whose mean is 0. With 0 they stay 0.
 
     Attributes
     ----------
@@ -222,11 +214,11 @@ class InertiaForceGravity(_NewtonFeatures):
 
     Notes
     -----
-    Do not scale the columns of x before this map: the sine of a z-score is not gravity. Scaling belongs in the
-    regressor's ``kernel_map``, which only the kernel sees.
+    Do not scale the columns of X before this map, because the sine of a scaled angle is not gravity. Scale in the
+    ``kernel_map`` of the regressor, which only the kernel uses.
 
-    With ``dt="column"`` features of gravity are multiplied by Δt too, the mean of their weights is minus
-    ``gravity_gain``, and all is as `InertiaForce` says: standard deviations are those above divided by 0.03 s.
+    With ``dt="column"``, see the Notes of `InertiaForce`. Features of gravity are multiplied by Δt too, and the mean of
+    their weights is minus ``gravity_gain``.
 
     Examples
     --------
@@ -246,7 +238,7 @@ class InertiaForceGravity(_NewtonFeatures):
     >>> arm.get_feature_names_out()[21:24].tolist()
     ['gravity(q2, u_x)', 'gravity(q2, u_y)', 'gravity(q3, u_x)']
 
-    Rows that were logged whenever there was time, each with the time until the next one:
+    Rows of a log with irregular time steps, each with the time until the next row:
 
     >>> logged = InertiaForceGravity("pendulum", dt="column", inverse_inertia=4.0, gravity_gain=20.0)
     >>> logged.fit([[0.1, 0.0, 1.0, 0.008]]).get_feature_names_out().tolist()
@@ -289,7 +281,7 @@ class InertiaForceGravity(_NewtonFeatures):
         self._gravity = self._gravity_map(robot, self.n_features_in_ - self._timed)
 
     def _gravity_map(self, robot: Robot | None, n_columns: int) -> GravityMap:
-        """The fitted features of gravity."""
+        """Return the fitted features of gravity."""
         if self.gravity is not None:
             features = clone(self.gravity)
             if features.outputs is not None or features.dt is not None:

@@ -1,4 +1,4 @@
-"""What an approximate rigid-body model says of the next state."""
+"""Accelerations and torques of an approximate rigid-body model as explicit features."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 
 from ..robots import Layout, RigidBody
 from ..robots.loading import Robot, known_robot
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import STEP, RobotMap, same_for_all
+from .robot_map import STEP, RobotMap
 
 _NAMES = {
     "acceleration": "acc({})",
@@ -22,41 +23,41 @@ _NAMES = {
 
 
 class NominalDynamics(RobotMap):
-    r"""Features from an approximate model of the robot: a URDF whose masses are wrong, without friction.
+    r"""Features from an approximate model of the robot, such as a URDF with inaccurate masses and no friction.
 
     The model's equation of motion is
 
     .. math:: M(q) \ddot q + C(q, \dot q) \dot q + D \dot q + g(q) = B u
 
-    with its viscous damping D and the inputs on the driven joints. Each term gives one column per joint. Beside
-    `InertiaForce`, as in the example, a true model and the prior mean alone predict what Euler's rule does,
+    with its viscous damping D and the inputs on the driven joints. Each term has one column per joint. Join them to
+    `InertiaForce`, as in the example: with an exact model, the prior mean then predicts Euler's rule
     :math:`\dot q' = \dot q + \Delta t\,\ddot q`.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        The approximate model, as in `skevgp.datasets.load_robot`. Without one X passes through and the weights get the
+        The approximate model, as in `skevgp.datasets.load_robot`. If None, X passes through and the weights get the
         regressor's wide default prior.
     terms : sequence of str, default=("acceleration",)
-        Which columns, in this order:
+        Groups of columns, in the given order:
 
         - ``"acceleration"``: :math:`\ddot q`, rad/s² or m/s²;
         - ``"gravity"``: :math:`g(q)`, N m or N;
         - ``"bias"``: :math:`C \dot q + g`, N m or N;
-        - ``"input"``: :math:`M^{-1} B u`, the part of the acceleration that is the input's.
+        - ``"input"``: :math:`M^{-1} B u`, the acceleration by the input.
     dt : float or "column", default=0.03
-        Length of a time step Δt, s; that of the data. ``"column"``: each row has its own, the last column of X, which
-        is [q, q̇, u, Δt]; weights are then those of a second (see Notes).
+        Time step Δt of the data, s. If ``"column"``, X is [q, q̇, u, Δt] with the time step of each row, and weights are
+        rates (see Notes).
     outputs : sequence of int or str, default=None
-        Which states, by index or name, the columns of y hold; None means all of them, [q, q̇].
+        States in the columns of y, by index or name. If None, all of them, [q, q̇].
     known_scale : float, default=0.3
-        Prior standard deviation of the weights whose mean is Δt (of a joint's acceleration in the row of its velocity),
-        as a multiple of Δt: the relative error of the model's accelerations.
+        Relative error of the model's accelerations: prior standard deviation, as a multiple of Δt, of the weights of a
+        joint's acceleration for its velocity. Their mean is Δt.
     unknown_scale : float, default=1.0
-        Prior standard deviation of the weights of ``"gravity"`` and ``"bias"`` in the rows of velocities. They are Δt
-        times an inverse inertia; their mean is 0.
+        Prior standard deviation of the weights of ``"gravity"`` and ``"bias"`` for velocities. They are Δt times an
+        inverse inertia, and their mean is 0.
     free_scale : float, default=1.0
-        Prior standard deviation of all other weights, as a multiple of Δt; their mean is 0, and 0 pins them there.
+        Prior standard deviation of all other weights, as a multiple of Δt. Their mean is 0; with 0 they stay 0.
 
     Attributes
     ----------
@@ -66,24 +67,24 @@ class NominalDynamics(RobotMap):
 
     See Also
     --------
-    InertiaForce : The other half of Euler's rule.
-    skevgp.datasets.perturb_robot : A wrong model, for experiments.
+    InertiaForce : Features of the state and the input, the other half of Euler's rule.
+    skevgp.datasets.perturb_robot : Make an inaccurate model for experiments.
 
     Notes
     -----
-    Scales are multiples of Δt because an acceleration can be in the hundreds, where a weight of 1 means nothing: the
-    weights themselves are about Δt. Masses that are wrong by 20 % change the known ones by about as much; the default
-    is somewhat wider.
+    Scales are multiples of Δt because the weights of accelerations are about Δt. Masses with an error of 20 % change
+    the known weights by about as much; the default is somewhat wider.
 
-    With ``"acceleration"`` the weights of ``"input"`` are corrections, of mean 0; without it their mean is Δt.
+    If ``terms`` has ``"acceleration"``, the weights of ``"input"`` are corrections with mean 0. Otherwise their mean is
+    Δt.
 
-    With ``dt="column"`` the features are multiplied by the Δt of their row. What says Δt above is then 1: the weight of
-    a joint's acceleration has mean 1 and ``known_scale``, and mean and covariance of h(x)β are those of ``dt=0.03``
-    where the column is 0.03. So they are at any other constant, but for ``"gravity"`` and ``"bias"``: their weights in
-    the rows of velocities are inverse inertias of scale ``unknown_scale`` divided by 0.03 s.
+    With ``dt="column"`` the features are multiplied by the Δt of their row, and replace Δt by 1 in the scales above:
+    the weight of a joint's acceleration has mean 1 and standard deviation ``known_scale``. Weights of ``"gravity"`` and
+    ``"bias"`` for velocities have the standard deviation ``unknown_scale`` divided by 0.03 s. The prior of h(x)β equals
+    that of ``dt=0.03`` if the column is 0.03.
 
-    Effort limits are not applied: u is what acted. Dry friction is left out. Do not scale the columns of x before this
-    map; scaling belongs in the regressor's ``kernel_map``, which only the kernel sees.
+    Effort limits are not applied, and dry friction is left out. Do not scale the columns of X before this map. Scale in
+    the ``kernel_map`` of the regressor, which only the kernel uses.
 
     Examples
     --------
@@ -144,7 +145,7 @@ class NominalDynamics(RobotMap):
         if robot is None:
             return
         self._body = RigidBody(known_robot(robot))
-        # A massless tip makes the mass matrix singular in nearly every configuration: say so before the data are seen.
+        # A massless tip makes the mass matrix singular in nearly every configuration. This row raises the error early.
         self._features(np.random.RandomState(0).uniform(-1.0, 1.0, (1, self._layout.n_columns)))
 
     def _check_terms(self) -> None:
@@ -190,7 +191,7 @@ class NominalDynamics(RobotMap):
             raise ValueError(self._why_not_finite(q[bad][0]))
 
     def _why_not_finite(self, q: np.ndarray) -> str:
-        """An error's text, for one configuration."""
+        """Return the text of the error for one configuration."""
         names, inertias = self._layout.position_names, np.diag(self._body.mass_matrix(q))
         light = [name for name, inertia in zip(names, inertias, strict=True) if inertia == 0.0]
         return f"The dynamics of the robot {self._layout.name!r} are not finite: " + (
@@ -205,7 +206,7 @@ class NominalDynamics(RobotMap):
         return [_NAMES[term].format(name) for term in self._terms for name in columns[: self._layout.n_joints]]
 
     def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Blocks (2 * n_joints, n_joints) of the terms, side by side."""
+        """Return blocks (2 * n_joints, n_joints) of the terms, next to each other."""
         self._check_terms()
         n = layout.n_joints
         own = np.eye(n, dtype=bool)

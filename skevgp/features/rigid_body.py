@@ -1,4 +1,4 @@
-"""Torques of a rigid body with friction, linear in masses, first moments, inertias and friction: one row per joint."""
+"""Torques of a rigid body with friction as explicit features, linear in inertial parameters: one row per joint."""
 
 from __future__ import annotations
 
@@ -12,17 +12,18 @@ from sklearn.utils.metaestimators import available_if
 
 from ..robots import RigidBody, load_robot
 from ..robots.loading import Robot, effort_limits, known_robot
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval
 from ..utils.validation import as_floats
-from .robot_map import RobotTransformer, has_robot, same_for_all
+from .robot_map import RobotTransformer, has_robot
 
 FRICTION = ("viscous", "coulomb", "offset", "armature")
 _INERTIAL = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz")
-# Gravity of the links beyond a joint, where no motor's limit says how large its torque may be.
+# Standard gravity, for the largest torque of a joint without effort limit.
 _G = 9.81
-# rad/s or m/s, rad/s² or m/s²: at which viscous friction and a rotor's inertia may be as large as Coulomb's friction.
+# Speed and acceleration (rad or m, s) at which viscous friction and rotor inertia have the prior scale of dry friction.
 _SPEED, _ACCELERATION = 1.0, 10.0
-# Of the central differences; their error, of fourth order, is then that of rounding.
+# Step of the central differences of fourth order, whose error is then mostly rounding.
 _STEP = 1e-3
 
 
@@ -33,55 +34,55 @@ class RigidBodyRegressor(RobotTransformer):
 
     .. math:: \tau = Y(q, \dot q, \ddot q)\,\pi + F(\dot q, \ddot q)\,\varphi
 
-    where π holds ten inertial parameters of each link (mass m, first moments m c, moments of inertia about the joint's
-    frame), and φ the friction of each joint: viscous, Coulomb's, an offset, and the reflected inertia of its rotor
-    ("armature"). The map gives the matrix [Y F] of each row, a row per joint; `EVGPRegressor` then fits one β = (π, φ)
-    that all joints share, as `share_coef` tells it. The prior mean is the robot's model, a URDF with wrong masses for
-    example. What torques do not show (the mass of a base that never moves) stays at the prior, with its uncertainty.
+    Here π holds ten inertial parameters of each link (mass m, first moments m c, moments of inertia about the joint's
+    frame), and φ the friction of each joint: viscous friction, Coulomb friction, an offset, and the reflected inertia
+    of its rotor ("armature"). The map returns the matrix [Y F] of each row, with one row per joint. `EVGPRegressor`
+    then fits one β = (π, φ) for all joints. The prior mean is the model of the robot, such as a URDF with inaccurate
+    masses. Parameters that torques do not depend on, such as the mass of a fixed base, keep their prior.
 
     Parameters
     ----------
     robot : str, path-like, System, pinocchio.Model or None, default=None
-        As in `skevgp.datasets.load_robot`. Without one X passes through, a row for all outputs, and nothing is shared.
+        Robot as in `skevgp.datasets.load_robot`. If None, X passes through and outputs have their own weights.
     friction : sequence of str, default=("viscous", "coulomb", "offset", "armature")
-        What each joint has beside its links: a torque :math:`\dot q`, :math:`\tanh(\dot q / v_s)`, 1 and
-        :math:`\ddot q` times a weight.
+        Torques of each joint that are not those of its links: a weight times :math:`\dot q`,
+        :math:`\tanh(\dot q / v_s)`, 1 and :math:`\ddot q`.
     stiction_velocity : float or array-like of shape (n_joints,), default=0.01
-        v_s, rad/s or m/s, of all joints or of each: below it Coulomb's friction has no sign yet. Above 0.
+        v_s in rad/s or m/s, for all joints or for each. Coulomb friction changes its sign smoothly within it. Above 0.
     mass_scale : float, default=0.2
-        Prior standard deviation of each link's mass, as a share of it.
+        Prior standard deviation of the mass of each link, as a share of the mass.
     com_scale : float, default=0.2
-        That of each coordinate of its centre of mass, as a share of the link's size (see Notes).
+        Prior standard deviation of each coordinate of the centre of mass, as a share of the link's size (see Notes).
     inertia_scale : float, default=0.3
-        That of its moments of inertia, as a share of mass times squared size.
+        Prior standard deviation of the moments of inertia, as a share of mass times squared size.
     friction_scale : float, default=0.3
-        That of Coulomb's friction and of the offset, as a share of the largest torque of the joint's motor; viscous
-        friction may be as large at 1 rad/s, the rotor's torque at 10 rad/s².
+        Prior standard deviation of Coulomb friction and offset, as a share of the largest torque of the motor. It is
+        also that of viscous friction at 1 rad/s and of the rotor's torque at 10 rad/s².
 
     Attributes
     ----------
     share_coef : bool
-        Whether all outputs have the same weights: with a robot.
+        Whether all outputs have the same weights. True if there is a robot.
     model_ : pinocchio.Model
-        The robot; only with one.
+        The robot, if there is one.
     n_features_in_ : int
     feature_names_in_ : ndarray of str
         If X had column names.
 
     See Also
     --------
-    skevgp.InverseDynamics : The estimator of torques, parameters and bands that is made of it.
-    NominalDynamics : The other direction, accelerations from torques.
+    skevgp.InverseDynamics : Estimator of torques and parameters that uses this map.
+    NominalDynamics : Features of forward dynamics.
 
     Notes
     -----
-    A link's size is the largest of three lengths: from its joint to the next one, from its joint to its centre of mass,
-    and the radius of gyration about that. An error of its mass changes first moments and inertias too, so the prior is
-    a covariance (`coef_prior`). Where the model knows no limits of effort, the weight of all links, times the sum of
-    their sizes, stands for the motor's largest torque.
+    A link's size is the largest of three lengths: from its joint to the next joint, from its joint to its centre of
+    mass, and the radius of gyration about the centre of mass. The prior is a covariance (`coef_prior`), because an
+    error of the mass changes first moments and inertias too. If the model has no effort limits, the largest torque of a
+    motor is the weight of all links times the sum of their sizes.
 
-    Rows need accelerations: `skevgp.datasets.load_log` makes them from a robot's log. Do not scale the columns of x
-    before this map.
+    X has the columns [q, q̇, q̈]. `skevgp.datasets.load_log` computes accelerations from a robot's log. Do not scale the
+    columns of X before this map.
 
     References
     ----------
@@ -146,7 +147,7 @@ class RigidBodyRegressor(RobotTransformer):
     def _prepare(self, robot: Robot | None) -> None:
         self._terms = self._checked_friction()
         self._velocity = self._checked_velocity()
-        # Rows have a matrix each with a robot, which no frame can hold, whatever `set_output` says.
+        # With a robot each row has a matrix, which a data frame cannot hold, so that `set_output` does not apply.
         self._sklearn_auto_wrap_output_keys = {"transform"} if robot is None else set()
         if robot is not None:
             self.model_ = known_robot(robot).copy()
@@ -179,7 +180,7 @@ class RigidBodyRegressor(RobotTransformer):
         return np.concatenate([self._body.torque_regressor(q, v, a), self._friction(v, a)], axis=2)
 
     def _friction(self, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """F(q̇, q̈), (n, n_joints, n_terms * n_joints): of each term a diagonal matrix."""
+        """Return F(q̇, q̈), (n, n_joints, n_terms * n_joints): a diagonal matrix for each term."""
         n, n_joints = v.shape
         values = {
             "viscous": v,
@@ -193,9 +194,9 @@ class RigidBodyRegressor(RobotTransformer):
         return friction.reshape(n, n_joints, -1)
 
     def _jacobian(self, X: np.ndarray) -> np.ndarray:
-        """Of Y by differences of fourth order: it is quadratic in q̇, linear in q̈ and made of sines of q."""
         if self.robot is None:
             return same_for_all(np.eye(X.shape[1]), len(X))
+        # Y is quadratic in q̇, linear in q̈ and made of sines of q: differences of fourth order suffice.
         v = np.split(X, 3, axis=1)[1]
         n, n_joints = v.shape
         width = 10 * n_joints
@@ -225,19 +226,19 @@ class RigidBodyRegressor(RobotTransformer):
 
     @available_if(has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give the prior of the weights β = (π, φ), which all joints share.
+        """Return the prior of the weights β = (π, φ), which all joints share.
 
         Parameters
         ----------
         n_outputs : int
-            How many torques are predicted: one per joint.
+            Number of predicted torques: one per joint.
 
         Returns
         -------
         mean : ndarray of shape (n_features_out,)
-            Of the robot's model: its links, armatures, damping and dry friction; offsets 0.
+            Parameters of the robot's model: links, armatures, damping and dry friction. Offsets are 0.
         covariance : ndarray of shape (n_features_out, n_features_out)
-            Of independent links; to first order in the errors of mass, centre of mass and shape.
+            Covariance, with independent links, to first order in the errors of mass, centre of mass and shape.
 
         Raises
         ------
@@ -273,7 +274,7 @@ class RigidBodyRegressor(RobotTransformer):
 
 
 def _sizes(model: Any) -> np.ndarray:
-    """Of each link: the distance to the farthest joint on it, or to its centre of mass, or its radius of gyration."""
+    """Return the size of each link: distance to the farthest joint or centre of mass on it, or radius of gyration."""
     sizes = np.zeros(model.nv)
     for joint in range(1, model.njoints):
         link = model.inertias[joint]
@@ -286,7 +287,7 @@ def _sizes(model: Any) -> np.ndarray:
 
 
 def _largest_torques(model: Any, sizes: np.ndarray) -> np.ndarray:
-    """What the motor of each joint can give, or what the links weigh, times their reach."""
+    """Return the effort limit of each joint, or the weight of all links times their reach if it has none."""
     least, largest = effort_limits(model)
     limits = np.maximum(np.abs(least), np.abs(largest))
     weight = _G * sum(link.mass for link in list(model.inertias)[1:]) * sizes.sum()
@@ -294,9 +295,8 @@ def _largest_torques(model: Any, sizes: np.ndarray) -> np.ndarray:
 
 
 def _link_errors(link: np.ndarray, size: float, mass: float, com: float, inertia: float) -> np.ndarray:
-    """C (10, 10) with the prior covariance C Cᵀ of a link's parameters, to first order in the errors of its mass, its
-    centre of mass and its inertia about that.
-    """
+    """Return a root C (10, 10) of the prior covariance C Cᵀ of a link's parameters."""
+    # To first order in the errors of its mass, its centre of mass c, and its inertia about c.
     m, moment = link[0], link[1:4]
     c = moment / m if m > 0.0 else np.zeros(3)
     root = np.zeros((10, 10))
@@ -304,7 +304,7 @@ def _link_errors(link: np.ndarray, size: float, mass: float, com: float, inertia
     for axis in range(3):
         shift = np.zeros(3)
         shift[axis] = com * size * m
-        # I about the joint has m (cᵀc 1 - c cᵀ), which moves with c.
+        # The inertia about the joint contains m (cᵀc 1 - c cᵀ), which changes with c.
         moved = 2.0 * (c @ shift) * np.eye(3) - np.outer(c, shift) - np.outer(shift, c)
         root[1:4, 1 + axis] = shift
         root[4:, 1 + axis] = moved[[0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2]]

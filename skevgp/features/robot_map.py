@@ -1,4 +1,4 @@
-"""What all maps of a robot share: rows x = [q, q̇, u] or [q, q̇, u, Δt]; those of features know which states y holds."""
+"""Base classes of all maps of a robot, for rows x = [q, q̇, u] or [q, q̇, u, Δt]."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from ..utils.sklearn import check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
 from ..utils.validation import is_plain
 
-# s: the time step of which default prior scales are.
+# Time step in s that the default prior scales belong to.
 STEP = 0.03
 
 
 def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str, things: str) -> list[int]:
-    """Indices from 0 of what a user chose by index or name, or an error that names the argument and lists the names."""
+    """Return indices from 0 of choices by index or name, or raise an error that lists the names."""
     indices = [names.index(choice) if choice in names else choice for choice in chosen]
     for index in indices:
         if isinstance(index, bool) or not isinstance(index, (int, np.integer)) or not 0 <= index < len(names):
@@ -34,10 +34,8 @@ def indices_of(chosen: Sequence[int | str], names: Sequence[str], argument: str,
 
 
 def joints_named(names: Sequence[str], joints: Sequence[str]) -> list[str] | None:
-    """The joint that each column bears in its name, such as "elbow" in "position/elbow"; None if one bears none.
-
-    Of several the longest counts. A name that goes on with a letter or a digit is another one.
-    """
+    """Return the joint in each name, such as "elbow" in "position/elbow"; None if a name has none."""
+    # If a name contains several joints, the longest counts. A joint ends where no letter or digit follows.
     longest = sorted(joints, key=len, reverse=True)
     words = [re.compile(rf"(?<![A-Za-z0-9]){re.escape(joint)}(?![A-Za-z0-9])") for joint in longest]
     found = [
@@ -47,16 +45,16 @@ def joints_named(names: Sequence[str], joints: Sequence[str]) -> list[str] | Non
 
 
 class RobotTransformer(TransformerMixin, StatefulEstimator):
-    """A transformer of rows x = [q, q̇, u] of a robot; without a robot it takes any number of columns.
+    """A transformer of rows x = [q, q̇, u] of a robot, or of any columns without a robot.
 
-    What a subclass says: `_features`, their `_jacobian` and `_names`, and `_prepare` what it needs of the robot. With
-    ``dt="column"`` rows of a robot have their time step as a last column.
+    A subclass defines `_features`, `_jacobian`, `_names`, and `_prepare` for data that it needs from the robot. With
+    ``dt="column"`` rows of a robot have their time step as last column.
     """
 
     robot: Robot | None
     dt: float | Literal["column"] | None = None
-    _timed = False  # whether rows end with their time step, as of the last fit
-    _n_blocks: ClassVar[int] = 2  # of columns, of which each has one of every joint: [q, q̇]
+    _timed = False  # whether rows ended with their time step in the last fit
+    _n_blocks: ClassVar[int] = 2  # number of blocks with one column per joint: [q, q̇]
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {"robot": "no_validation"}
 
@@ -67,8 +65,8 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``; of `RigidBodyRegressor` [q, q̇, q̈]; any width
-            without a robot.
+            Rows [q, q̇, u], or [q, q̇, u, Δt] with ``dt="column"``. For `RigidBodyRegressor`, rows [q, q̇, q̈]. Without a
+            robot, any columns.
         y : None
             Ignored.
 
@@ -80,15 +78,15 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Raises
         ------
         ImportError
-            If the robot needs Pinocchio and it is not installed; the message gives the pip command.
+            If the robot needs Pinocchio and it is not installed.
         ValueError, TypeError
-            If the robot is unknown, X does not have its columns (and one for the time step), or a time step is not
-            positive. If X is a data frame whose columns bear the names of the robot's joints in another order.
+            If the robot is unknown, X has other columns than the robot, a time step is not positive, or X is a data
+            frame with the robot's joints in another order.
 
         Warns
         -----
         RobotModelWarning
-            As `skevgp.datasets.load_robot`.
+            If the model of the robot is unphysical, as in `skevgp.datasets.load_robot`.
         """
         self._timed = self._takes_steps()
         rows: np.ndarray = validate_data(self, X, dtype=np.float64, ensure_all_finite=not self._timed)
@@ -107,7 +105,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         return self._layout.column_names + ["dt"] * self._timed
 
     def _check_columns(self) -> None:
-        """As many as the robot has; those that bear its joints' names must be in its order, and dt the last."""
+        """Raise ValueError unless X has the robot's columns in the robot's order, and dt last."""
         wanted, names = self._column_names(), list(getattr(self, "feature_names_in_", []))
         if self.n_features_in_ != len(wanted):
             hint = "."
@@ -132,7 +130,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             )
 
     def _check_steps(self, X: np.ndarray) -> None:
-        """Where rows end with their time step, X has not been checked for what is not finite."""
+        """Check time steps first, then that all of X is finite."""
         if self._timed:
             _steps_of(X)
             assert_all_finite(X, estimator_name=type(self).__name__, input_name="X")
@@ -148,12 +146,12 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Returns
         -------
         H : ndarray of shape (n_samples, n_features_out) or (n_samples, n_joints, n_features_out)
-            The features h(x) of each row; of `RigidBodyRegressor` with a robot a row for each joint.
+            The features h(x) of each row. `RigidBodyRegressor` with a robot returns a row for each joint.
         """
         return self._values(self._checked(X))
 
     def jacobian(self, X: ArrayLike) -> np.ndarray:
-        """Differentiate the features by the columns of X.
+        """Differentiate the features with respect to the columns of X.
 
         Parameters
         ----------
@@ -163,14 +161,14 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Returns
         -------
         J : ndarray of the shape of H, and (n_features,)
-            The derivatives dh(x)/dx of each row: analytic, but for Y of `RigidBodyRegressor`, which are central
-            differences of fourth order with errors of rounding.
+            The derivatives dh(x)/dx of each row. They are analytic, except for `RigidBodyRegressor`, whose derivatives
+            of Y are central differences of fourth order.
 
         Notes
         -----
-        Gravity as link i sees it, from which `LinkGravity` makes its features, turns with each joint j that turns and
-        bears the link, about the axis a_j: ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j). The derivatives of `NominalDynamics` are
-        Pinocchio's (Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018).
+        `LinkGravity` uses ∂(Rᵢᵀ g)/∂q_j = Rᵢᵀ (g × a_j) for each revolute joint j with axis a_j between the base and
+        link i. `NominalDynamics` uses the derivatives of Pinocchio (Carpentier & Mansard, "Analytical derivatives of
+        rigid body dynamics algorithms", RSS 2018).
         """
         return self._slopes(self._checked(X))
 
@@ -189,7 +187,7 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         Parameters
         ----------
         input_features : array-like of str, default=None
-            Names of the columns of X; by default those seen in `fit`, or the robot's own.
+            Names of the columns of X. If None, those seen in `fit`, or those of the robot.
 
         Returns
         -------
@@ -202,35 +200,35 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
         return np.array(self._labels(check_feature_names_in(self, input_features)), dtype=object)
 
     def _prepare(self, robot: Robot | None) -> None:
-        """What `fit` keeps of the robot (read) besides the layout; nothing here."""
+        """Store data of the robot at `fit`, besides the layout; the base class stores nothing."""
 
     def _values(self, X: np.ndarray) -> np.ndarray:
-        """What `transform` returns, of rows that are known to be good."""
+        """Return the result of `transform` for validated rows."""
         return self._features(X)
 
     def _slopes(self, X: np.ndarray) -> np.ndarray:
-        """What `jacobian` returns, of rows that are known to be good."""
+        """Return the result of `jacobian` for validated rows."""
         return self._jacobian(X)
 
     def _labels(self, columns: np.ndarray) -> list[str]:
-        """Names of what `transform` returns, given those of the columns of X."""
+        """Return the names of the columns of `transform`, given those of X."""
         return self._names(columns)
 
     def _features(self, X: np.ndarray) -> np.ndarray:
-        """h(x) of rows (n, n_features_in_); without a robot too."""
+        """Return h(x) of rows (n, n_features_in_), also without a robot."""
         raise NotImplementedError
 
     def _jacobian(self, X: np.ndarray) -> np.ndarray:
-        """dh/dx of the same rows, (n, n_features_out, n_features_in_)."""
+        """Return dh/dx of rows (n, n_features_in_), (n, n_features_out, n_features_in_)."""
         raise NotImplementedError
 
     def _names(self, columns: np.ndarray) -> list[str]:
-        """Names of the features, given those of the columns of X."""
+        """Return the names of the features, given those of the columns of X."""
         raise NotImplementedError
 
 
 def _steps_of(X: np.ndarray) -> np.ndarray:
-    """The time step of each row, (n, 1)."""
+    """Return the time step of each row, (n, 1); ValueError if one is not positive and finite."""
     dt = X[:, -1:]
     if not (dt > 0.0).all() or not (dt < np.inf).all():
         row = np.argmin((dt > 0.0) & (dt < np.inf))
@@ -241,13 +239,6 @@ def _steps_of(X: np.ndarray) -> np.ndarray:
     return dt
 
 
-def same_for_all(jacobian: np.ndarray, n_rows: int) -> np.ndarray:
-    """A copy of one row's Jacobian (n_features_out, n_features_in_) for each of the rows."""
-    copies = np.empty((n_rows, *jacobian.shape))
-    copies[:] = jacobian
-    return copies
-
-
 def has_robot(transformer: RobotMap) -> bool:
     if transformer.robot is None:
         raise AttributeError("coef_prior needs a robot: without one the weights have no physical meaning.")
@@ -255,11 +246,10 @@ def has_robot(transformer: RobotMap) -> bool:
 
 
 class RobotMap(RobotTransformer):
-    """Features of a robot that know which states y holds, and a prior of their weights: `_prior`.
+    """Features for predicting states, with a prior of their weights.
 
-    What a subclass says is h(x) of x = [q, q̇, u] and the prior for one time step. With ``dt="column"`` its features are
-    multiplied by the row's Δt, and its prior is per second; features that begin with the state, which has been there
-    before the step, come after it: [z, Δt h(x)].
+    A subclass defines h(x) of x = [q, q̇, u] and `_prior` for one time step. With ``dt="column"`` features are
+    multiplied by the row's Δt, and the prior is per second. Features that begin with the state z become [z, Δt h(x)].
     """
 
     outputs: Sequence[int | str] | None
@@ -272,12 +262,12 @@ class RobotMap(RobotTransformer):
 
     @available_if(has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Give the prior of the weights β.
+        """Return the prior of the weights β.
 
         Parameters
         ----------
         n_outputs : int
-            How many states are predicted: all 2 * n_joints, or as many as ``outputs`` says.
+            Number of predicted states: 2 * n_joints, or the length of ``outputs``.
 
         Returns
         -------
@@ -309,7 +299,7 @@ class RobotMap(RobotTransformer):
         return indices_of(self.outputs, names, "outputs", "states")
 
     def _prior_of_steps(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Of rows with a time step each: the prior of `STEP`, but for the state before it, divided by it."""
+        """Return the prior; if rows have time steps, that of `STEP` without the state itself, divided by `STEP`."""
         mean, scale = self._prior(layout, float(self.dt) if isinstance(self.dt, Real) else STEP)
         if not self._takes_steps():
             return mean, scale
@@ -318,17 +308,17 @@ class RobotMap(RobotTransformer):
         return np.hstack([before, mean / STEP]), np.hstack([np.zeros_like(before), scale / STEP])
 
     def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and scale (2 * n_joints, n_features) of the weights for all states; before `fit` too."""
+        """Return mean and scale (2 * n_joints, n_features) of the weights for all states; works before `fit`."""
         raise NotImplementedError
 
     def _n_kept(self, layout: Layout) -> int:
-        """How many columns of the state stand before the features that are multiplied by Δt."""
+        """Number of columns of the state before the features that are multiplied by Δt."""
         return 2 * layout.n_joints if self._begins_with_state else 0
 
     def _values(self, X: np.ndarray) -> np.ndarray:
         if not self._timed:
             return self._features(X)
-        x, dt = X[:, :-1], _steps_of(X)  # which rollouts have not checked
+        x, dt = X[:, :-1], _steps_of(X)  # rollouts have not checked the time steps
         return np.concatenate((x[:, : self._n_kept(self._layout)], dt * self._features(x)), axis=1)
 
     def _slopes(self, X: np.ndarray) -> np.ndarray:

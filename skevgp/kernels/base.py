@@ -1,11 +1,7 @@
-"""Covariance functions: what all families have in common, their sums and products, and the registry of families.
+"""Covariance functions: the interface of all families, sums and products, and the registry of families.
 
-Each family is a file next to this one. It holds a `Covariance`, the `CovarianceAt` that this makes, and a function
-under the decorator `reads`, which makes the `Covariance` of a scikit-learn kernel.
-
-Inputs and inducing points are in the user's coordinates. A covariance of differences subtracts a centre from both, so
-that large coordinates cost it no digits. Gradients follow the sum and product rules; each family has its own, written
-by hand.
+Each family is a file next to this one. It holds a `Covariance`, the `CovarianceAt` that it makes, and a function with
+the decorator `reads`, which makes the `Covariance` from a scikit-learn kernel.
 """
 
 from __future__ import annotations
@@ -22,21 +18,24 @@ import numpy as np
 
 from ..utils.casadi import casadi
 
-# A derivative per row of k(x, x): an array (n,), or one number for all rows.
+# Inputs and inducing points are in the user's coordinates. A covariance of differences subtracts a centre from both, so
+# that large coordinates cost no digits. Gradients follow the sum and product rules; each family has its own by hand.
+
+# A derivative of k(x, x) for each row: an array (n,), or one number for all rows.
 PerRow = np.ndarray | float
-# Rows (n, d) -> what a covariance needs of them, which depends on no parameter.
+# Rows (n, d) -> the form in which a covariance uses them, which depends on no parameter.
 Preparation = Callable[[np.ndarray], Any]
 
 
 class Reader(Protocol):
-    """Makes the covariance of a scikit-learn kernel of one class, in so many columns."""
+    """Makes the covariance of a scikit-learn kernel of one class, for inputs with n_columns columns."""
 
     def __call__(self, kernel: Any, n_columns: int, /) -> Covariance:
-        """The hyperparameters are the kernel's, in its order."""
+        """Hyperparameters are those of the kernel, in its order."""
 
 
 _R = TypeVar("_R", bound=Reader)
-# The registry: a class of kernels -> who reads it, and whether its covariance has an expression in CasADi.
+# The registry: class of kernels -> its reader; and the names of those with an expression in CasADi.
 READERS: dict[type, Reader] = {}
 _IN_CASADI: list[str] = []
 
@@ -54,18 +53,18 @@ def reads(kind: type, in_casadi: bool = True) -> Callable[[_R], _R]:
 
 
 def known_kernels() -> str:
-    """Which kernels work, for people."""
+    """List the supported kernels, for messages and documentation."""
     names = ", ".join(kind.__name__ for kind in READERS)
     return f"{names}, sums and products of these, and a WhiteKernel as one of the terms of the outermost sum"
 
 
 def exported_kernels() -> str:
-    """Which kernels can be exported to CasADi, for people."""
+    """List the kernels that can be exported to CasADi, for messages."""
     return f"These can be exported: {', '.join(_IN_CASADI)}, sums and products of these."
 
 
 def one_lengthscale(kernel: Any, n_columns: int) -> bool:
-    """Whether a kernel has one lengthscale for all columns; an error if it has neither one nor one per column."""
+    """Whether a kernel has one length scale for all columns; ValueError if it has neither one nor one per column."""
     if kernel.anisotropic and len(kernel.length_scale) != n_columns:
         raise ValueError(
             f"kernel={kernel!r} has {len(kernel.length_scale)} length scales, but its inputs have {n_columns} columns: "
@@ -78,7 +77,7 @@ def one_lengthscale(kernel: Any, n_columns: int) -> bool:
 
 
 class Sums(tuple[Any, ...]):
-    """Sums over rows side by side (arrays, or `Sums` again): ``+`` adds them one by one."""
+    """Several sums over rows (arrays, or `Sums` again); ``+`` adds them one by one."""
 
     __slots__ = ()
 
@@ -87,29 +86,23 @@ class Sums(tuple[Any, ...]):
 
 
 def sum_of_rows(per_row: PerRow, n_rows: int) -> float:
-    """Σ over rows."""
+    """Sum over rows of an array (n,), or of one number for all rows."""
     return float(np.sum(per_row)) if np.ndim(per_row) else float(per_row) * n_rows
 
 
 def no_columns(inputs: np.ndarray) -> np.ndarray:
-    """How many rows there are, as the length of an array that takes no memory."""
+    """Keep only the number of rows, as the length of an array without memory."""
     return np.empty((len(inputs), 0))
 
 
 def as_they_are(inputs: np.ndarray) -> np.ndarray:
-    """The rows themselves."""
+    """Return the rows themselves."""
     return np.ascontiguousarray(inputs)
 
 
 @dataclass(frozen=True)
 class CentredSquares:
-    """Rows -> [x - c, 1, (x - c)²] as columns, (2 d + 1, n).
-
-    Parameters
-    ----------
-    centre : tuple of d floats, default=()
-        c; 0 if there are none.
-    """
+    """Rows -> [x - c, 1, (x - c)²] as columns, (2 d + 1, n), with the centre c or 0."""
 
     centre: tuple[float, ...] = ()
 
@@ -122,11 +115,11 @@ class CentredSquares:
         return found
 
     def centred(self, points: np.ndarray) -> np.ndarray:
-        """The same points, seen from c."""
+        """Subtract c from points."""
         return points - np.array(self.centre) if self.centre else points
 
     def symbol(self, x: Any) -> Any:
-        """The same of a row x of symbols in CasADi, (d, 1)."""
+        """Subtract c from a row (d, 1) of CasADi symbols."""
         return x - casadi().DM(np.array(self.centre)) if self.centre else x
 
 
@@ -134,111 +127,90 @@ class CentredSquares:
 
 
 class CovarianceAt(ABC):
-    """A covariance with its hyperparameters and inducing points put in; see `statistics.KernelAt`."""
+    """A covariance at given hyperparameters and inducing points; see `statistics.KernelAt`."""
 
     @abstractmethod
     def matrix(self) -> np.ndarray:
-        """k(X_m, X_m) of shape (m, m), from exact differences."""
+        """Return k(X_m, X_m) (m, m) from exact differences."""
 
     @abstractmethod
     def cross(self, prepared: Any) -> np.ndarray:
-        """k(X_m, X) of shape (m, n)."""
+        """Return k(X_m, X) (m, n)."""
 
     def diagonal(self, prepared: Any) -> PerRow:
-        """k(x, x) of each row, (n,), or one number for all."""
+        """Return k(x, x) of each row, (n,), or one number for all rows."""
         return 1.0
 
     @abstractmethod
     def start_pullback(self) -> Any:
-        """An empty sum."""
+        """Return an empty sum over blocks of rows."""
 
     @abstractmethod
     def slopes(self, prepared: Any) -> np.ndarray:
-        """∂k(z, x) / ∂x of each inducing point and row, (m, n, d)."""
+        """Return ∂k(z, x) / ∂x of each inducing point and row, (m, n, d)."""
 
     def diagonal_slopes(self, prepared: Any) -> np.ndarray | float:
-        """∂k(x, x) / ∂x of each row, (n, d), or one number for all."""
+        """Return ∂k(x, x) / ∂x of each row, (n, d), or one number for all rows."""
         return 0.0
 
     @abstractmethod
     def mixed_slopes(self, prepared: Any) -> np.ndarray:
-        """∂²k(x, x') / ∂x ∂x'ᵀ of each row at x' = x, (n, d, d): the covariance of the gradient of a function.
-
-        Raises
-        ------
-        ValueError
-            If functions of this covariance have none.
-        """
+        """Return ∂²k(x, x') / ∂x ∂x'ᵀ at x' = x, (n, d, d): Cov[∂f/∂x]; ValueError if functions have no gradient."""
 
     @abstractmethod
     def cross_pullback(self, prepared: Any, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow) -> Any:
-        """What one block adds to the sum, given U = k(X_m, X) and gradients in it and in each k(x, x).
-
-        It may overwrite ``U_bar``, and not U.
-        """
+        """Return a block's part of the sum from U = k(X_m, X), its gradient (may be overwritten), that of k(x, x)."""
 
     @abstractmethod
     def finish_pullback(self, total: Any, K_bar: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients in the hyperparameters and the inducing points; ``K_bar``, that in `matrix`, is symmetric."""
+        """Return gradients in hyperparameters and inducing points; ``K_bar``, that in `matrix`, is symmetric."""
 
 
 class Covariance(ABC):
-    """A covariance k̃ with positive hyperparameters, which the inference sees as their logarithms.
+    """A covariance k̃ with positive hyperparameters, which all methods take as logarithms.
 
-    Two are equal if they are the same function of hyperparameters and inputs, whatever is subtracted on the way.
+    Two are equal if they are the same function of hyperparameters and inputs, with any centre.
     """
 
     @property
     @abstractmethod
     def n_hyperparameters(self) -> int:
-        """How many hyperparameters there are."""
+        """Number of hyperparameters."""
 
     @property
     @abstractmethod
     def rows(self) -> Preparation:
-        """What is computed once of rows; parts of a sum or product share what equal ones compute."""
+        """Function that prepares rows once; parts of a sum or product share it if theirs are equal."""
 
     def prepare(self, inputs: np.ndarray) -> Any:
-        """What `CovarianceAt` needs of rows (n, d)."""
+        """Return rows (n, d) in the form that `CovarianceAt` takes."""
         return self.rows(inputs)
 
     def centred(self, centre: np.ndarray) -> Covariance:
-        """The same covariance, which keeps its digits around ``centre`` (d,), however far from 0 that is."""
+        """Return the same covariance, accurate around ``centre`` (d,) even if that is far from 0."""
         return self
 
     @abstractmethod
     def paired(self, hyperparameters: np.ndarray, inputs: np.ndarray, others: np.ndarray) -> np.ndarray:
-        """k(x, x') of rows x and x' in pairs, (..., d) and (..., d): (...), at log hyperparameters (n_hyper,)."""
+        """Return k(x, x') of pairs of rows, (..., d) and (..., d): (...), at log hyperparameters (n_hyper,)."""
 
     @abstractmethod
     def at(self, hyperparameters: np.ndarray, inducing_points: np.ndarray) -> CovarianceAt:
-        """The covariance with log hyperparameters (n_hyper,) and inducing points (m, d) put in."""
+        """Return the covariance at log hyperparameters (n_hyper,) and inducing points (m, d)."""
 
     def random_terms(
         self, hyperparameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> list[tuple[Any, ...]]:
-        """Terms of random functions whose mean product is k, (L, d) of each; see `waves`.
-
-        Raises
-        ------
-        ValueError
-            If no spectral density is known.
-        """
+        """Return terms of random functions whose mean product is k, (L, d) each (see `waves`); may raise ValueError."""
         raise ValueError(no_functions(type(self).__name__))
 
     def expression(self, hyperparameters: np.ndarray, points: np.ndarray, x: Any) -> tuple[Any, Any]:
-        """k(X_m, x), (m, 1), and k(x, x) of a row x of symbols in CasADi, (d, 1).
-
-        Raises
-        ------
-        ValueError
-            If it cannot be written in CasADi.
-        """
+        """Return k(X_m, x) (m, 1) and k(x, x) for a row (d, 1) of CasADi symbols, or raise ValueError."""
         raise ValueError(f"The kernel {self!r} cannot be written in CasADi. {exported_kernels()}")
 
 
 def no_functions(of: str) -> str:
-    """Why no random functions can be drawn."""
+    """Explain why no random functions can be drawn."""
     return (
         f"No functions can be drawn of a kernel with a {of}: its spectral density is not known. sample_y draws at "
         "given rows, and rollout along paths."
@@ -250,13 +222,7 @@ def no_functions(of: str) -> str:
 
 @dataclass(frozen=True)
 class _Combination(Covariance):
-    """Several covariances of the same inputs; their hyperparameters one after the other.
-
-    Parameters
-    ----------
-    parts : tuple of Covariance
-        At least two.
-    """
+    """At least two covariances of the same inputs; their hyperparameters follow each other."""
 
     parts: tuple[Covariance, ...]
 
@@ -266,12 +232,12 @@ class _Combination(Covariance):
 
     @property
     def preparations(self) -> tuple[Preparation, ...]:
-        """Those of all parts, each once."""
+        """Preparations of all parts, each once."""
         return tuple(dict.fromkeys(each for part in self.parts for each in _preparations(part)))
 
     @property
     def rows(self) -> Preparation:
-        """What the only preparation computes, or a tuple if there are several."""
+        """The only preparation, or a function that returns a tuple if there are several."""
         only, *others = self.preparations
         return (lambda inputs: tuple(each(inputs) for each in (only, *others))) if others else only
 
@@ -279,7 +245,7 @@ class _Combination(Covariance):
         return replace(self, parts=tuple(part.centred(centre) for part in self.parts))
 
     def own(self, hyperparameters: np.ndarray) -> Iterator[tuple[Covariance, np.ndarray]]:
-        """Each part with its hyperparameters."""
+        """Yield each part with its hyperparameters."""
         ends = np.cumsum([part.n_hyperparameters for part in self.parts])[:-1]
         return zip(self.parts, np.split(hyperparameters, ends), strict=True)
 
@@ -293,7 +259,7 @@ class _Combination(Covariance):
 
 @dataclass(frozen=True)
 class _Part:
-    """A part put in, and which of the combination's prepared rows are its own."""
+    """A part at given parameters, and a function that selects its prepared rows from those of the combination."""
 
     at: CovarianceAt
     own: Callable[[Any], Any]
@@ -304,7 +270,7 @@ def _preparations(covariance: Covariance) -> tuple[Preparation, ...]:
 
 
 def _choice(wanted: tuple[Preparation, ...], given: tuple[Preparation, ...]) -> Callable[[Any], Any]:
-    """From what some preparations computed to what some of them did, as a part takes it."""
+    """Return a function that selects the results of the wanted preparations."""
     return _all_of_it if wanted == given else itemgetter(*(given.index(each) for each in wanted))
 
 
@@ -354,7 +320,7 @@ class Product(_Combination):
 
 
 class _CombinationAt(CovarianceAt):
-    # How values are combined.
+    # How values of two parts are combined.
     combine: Callable[[Any, Any], Any]
 
     def __init__(self, parts: list[_Part]):
@@ -376,7 +342,7 @@ class _CombinationAt(CovarianceAt):
         return self._pulled(prepared, self._values(prepared), U_bar, diagonal_bar)
 
     def _values(self, prepared: Any) -> list[tuple[np.ndarray, Any]]:
-        """k(X_m, X) of each part and, if the part is a sum or product, the same of its own parts."""
+        """Return k(X_m, X) of each part and, if the part is a sum or product, the values of its own parts."""
         found: list[tuple[np.ndarray, Any]] = []
         for part in self.parts:
             own = part.own(prepared)
@@ -389,10 +355,10 @@ class _CombinationAt(CovarianceAt):
 
     @abstractmethod
     def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-        """As `cross_pullback`, with the values of the parts."""
+        """Do the same as `cross_pullback`, given the values of the parts."""
 
     def _each(self, prepared: Any, values: list[Any], U_bars: Iterable[Any], diagonal_bars: Iterable[Any]) -> Sums:
-        """What each part adds to the sum."""
+        """Return the addends of all parts."""
         found = []
         for part, (U, within), *bars in zip(self.parts, values, U_bars, diagonal_bars, strict=True):
             own = part.own(prepared)
@@ -408,7 +374,7 @@ class _CombinationAt(CovarianceAt):
 
 
 class SumAt(_CombinationAt):
-    """A `Sum` with hyperparameters and inducing points put in."""
+    """A `Sum` at given hyperparameters and inducing points."""
 
     combine = staticmethod(add)
 
@@ -422,7 +388,7 @@ class SumAt(_CombinationAt):
         return reduce(add, (part.at.mixed_slopes(part.own(prepared)) for part in self.parts))
 
     def _pulled(self, prepared: Any, values: list[Any], U_bar: np.ndarray, diagonal_bar: PerRow) -> Sums:
-        # Each part may overwrite what it gets; the last one may have the original.
+        # Each part may overwrite its gradient, so that all but the last get a copy.
         U_bars = chain((U_bar.copy() for _ in self.parts[1:]), [U_bar])
         return self._each(prepared, values, U_bars, [diagonal_bar] * len(self.parts))
 
@@ -431,7 +397,7 @@ class SumAt(_CombinationAt):
 
 
 class ProductAt(_CombinationAt):
-    """A `Product` with hyperparameters and inducing points put in."""
+    """A `Product` at given hyperparameters and inducing points."""
 
     combine = staticmethod(mul)
 
@@ -446,7 +412,7 @@ class ProductAt(_CombinationAt):
     def mixed_slopes(self, prepared: Any) -> np.ndarray:
         first, *others = (self._at_the_row(part, prepared) for part in self.parts)
         for other in others:
-            # With ∂k/∂x = ∂k/∂x' at x' = x, since k is symmetric.
+            # ∂k/∂x = ∂k/∂x' at x' = x, because k is symmetric.
             (f, f_x, f_xx), (g, g_x, g_xx) = first, other
             outer = f_x[:, :, np.newaxis] * g_x[:, np.newaxis]
             mixed = f_xx * g[:, :, np.newaxis] + outer + outer.transpose(0, 2, 1) + f[:, :, np.newaxis] * g_xx
@@ -455,7 +421,7 @@ class ProductAt(_CombinationAt):
 
     @staticmethod
     def _at_the_row(part: _Part, prepared: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Value k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
+        """Return value k (n, 1), ∂k/∂x (n, d) and ∂²k/∂x ∂x'ᵀ (n, d, d) of a part at x' = x."""
         own = part.own(prepared)
         mixed = part.at.mixed_slopes(own)
         n, d = mixed.shape[:2]
@@ -476,5 +442,5 @@ class ProductAt(_CombinationAt):
 
 
 def _times_others(bar: Any, values: Sequence[Any]) -> list[Any]:
-    """The product rule: for each factor, the gradient times all other factors (none is divided out: it may be 0)."""
+    """Multiply a gradient by all other factors, for each factor (product rule without divisions by 0)."""
     return [reduce(mul, (*values[:i], *values[i + 1 :]), bar) for i in range(len(values))]

@@ -37,7 +37,7 @@ class Constant(Covariance):
 
 
 class ConstantAt(CovarianceAt):
-    """A `Constant` with its value put in."""
+    """A `Constant` at a given value."""
 
     def __init__(self, constant: float, shape: tuple[int, ...]):
         self.constant, self.shape = constant, shape
@@ -46,7 +46,7 @@ class ConstantAt(CovarianceAt):
         return np.full((self.shape[0],) * 2, self.constant)
 
     def cross(self, prepared: np.ndarray) -> np.ndarray:
-        # One number that looks like a matrix.
+        # A view of one number in the shape of a matrix.
         return np.broadcast_to(self.constant, (self.shape[0], len(prepared)))
 
     def diagonal(self, prepared: np.ndarray) -> float:
@@ -72,5 +72,5 @@ class ConstantAt(CovarianceAt):
 
 @reads(sk.ConstantKernel)
 def constant(kernel: Any, n_columns: int) -> Constant:
-    """The covariance of a ConstantKernel."""
+    """Return the covariance of a ConstantKernel."""
     return Constant()

@@ -1,4 +1,4 @@
-"""A wave that never fades: as a scikit-learn kernel, and as the inference sees it."""
+"""An undamped wave as a scikit-learn kernel and as a covariance."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from .waves import Waves
 
 
 class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
-    r"""A wave that never fades, periodic in the scaled distance.
+    r"""An undamped wave: periodic in the scaled difference of inputs.
 
     .. math:: k(x, x') = \cos\Bigl(2 \pi \sum_d \frac{x_d - x'_d}{\ell_d}\Bigr)
 
-    Functions drawn from it are sinusoids of one frequency along each column, with a phase and a size of their own. It
-    is a spectral mixture of one component without width (Wilson & Adams 2013): a covariance in any number of columns
-    (Rasmussen & Williams 2006, eq. 4.5), as the cosine of a Euclidean distance is not. Times an `RBF` the wave fades.
+    Functions drawn from it are sinusoids with random phase and amplitude. It is a spectral mixture of one component
+    without width (Wilson & Adams 2013), and a covariance for any number of columns (Rasmussen & Williams 2006, eq.
+    4.5). Multiply it by an `RBF` for a damped wave.
 
     It works in `EVGPRegressor`, in scikit-learn's GaussianProcessRegressor, and in sums and products with other
     kernels.
@@ -28,7 +28,7 @@ class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
     Parameters
     ----------
     length_scale : float or array-like of shape (n_features,), default=1.0
-        ℓ, the period along each column, in its units: one for all columns, or one per column.
+        Period ℓ in units of the columns: one for all columns, or one per column.
     length_scale_bounds : pair of floats, "fixed", or array-like of shape (n_features, 2), default=(1e-5, 1e5)
         Bounds of the length scale.
 
@@ -68,22 +68,7 @@ class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
         return sk.Hyperparameter("length_scale", "numeric", self.length_scale_bounds, np.size(self.length_scale))
 
     def __call__(self, X: Any, Y: Any = None, eval_gradient: bool = False) -> Any:
-        """The matrix k(X, Y), and its gradient in the logarithms of the length scales.
-
-        Parameters
-        ----------
-        X : array-like of shape (n, d)
-        Y : array-like of shape (m, d), default=None
-            None means X.
-        eval_gradient : bool, default=False
-            Only if Y is None.
-
-        Returns
-        -------
-        K : ndarray of shape (n, m)
-        K_gradient : ndarray of shape (n, n, n_dims)
-            If ``eval_gradient``.
-        """
+        """Return k(X, Y) (n, m), and if asked for its gradient (n, n, n_dims) in the log length scales."""
         X = np.atleast_2d(X)
         if Y is not None and eval_gradient:
             raise ValueError("Gradient can only be evaluated when Y is None.")
@@ -106,20 +91,11 @@ class Cosine(sk.StationaryKernelMixin, sk.NormalizedKernelMixin, sk.Kernel):
 
 @dataclass(frozen=True)
 class Wave(Covariance):
-    """k̃(x, x') = cos(2π Σ_d (x_d - x'_d) / ℓ_d); hyperparameters log ℓ.
-
-    Parameters
-    ----------
-    n_columns : int
-        d.
-    isotropic : bool, default=False
-        Whether one lengthscale serves all columns.
-    rows : CentredSquares
-        What is computed once of rows; the squares are not used, but may be another part's.
-    """
+    """k̃(x, x') = cos(2π Σ_d (x_d - x'_d) / ℓ_d); hyperparameters log ℓ."""
 
     n_columns: int
-    isotropic: bool = False
+    isotropic: bool = False  # whether all columns have the same length scale
+    # The squares are not used, but another part of a sum or product may share them.
     rows: CentredSquares = field(default=CentredSquares(), compare=False)
 
     @property
@@ -147,15 +123,12 @@ class Wave(Covariance):
         return ca.cos(phases - ca.dot(ca.DM(np.array(frequencies)), self.rows.symbol(x))), 1.0
 
     def frequencies(self, hyperparameters: np.ndarray) -> np.ndarray:
-        """2π / ℓ of each column."""
+        """Return 2π / ℓ of each column."""
         return np.broadcast_to(2.0 * np.pi * np.exp(-hyperparameters), self.n_columns)
 
 
 class WaveAt(CovarianceAt):
-    """A `Wave` with 2π / ℓ (d,) and centred inducing points (m, d) put in.
-
-    With S = Ū sin(phase differences), all gradients follow from S [x, 1].
-    """
+    """A `Wave` at given 2π / ℓ (d,) and centred inducing points (m, d)."""
 
     def __init__(self, frequencies: np.ndarray, points: np.ndarray, isotropic: bool):
         self.frequencies, self.points, self.isotropic = frequencies, points, isotropic
@@ -180,6 +153,7 @@ class WaveAt(CovarianceAt):
     def cross_pullback(
         self, prepared: np.ndarray, U: np.ndarray, U_bar: np.ndarray, diagonal_bar: PerRow
     ) -> np.ndarray:
+        # With S = Ū sin(phase differences), all gradients follow from S [x, 1].
         U_bar *= np.sin(self._differences(prepared))
         return U_bar @ prepared[: len(self.frequencies) + 1].T
 
@@ -191,11 +165,11 @@ class WaveAt(CovarianceAt):
         return length_bar.sum(keepdims=True) if self.isotropic else length_bar, -np.outer(of_phase, self.frequencies)
 
     def _differences(self, prepared: np.ndarray) -> np.ndarray:
-        """Of phases, (m, n)."""
+        """Return differences of phases, (m, n)."""
         return np.subtract.outer(self._phases, self.frequencies @ prepared[: len(self.frequencies)])
 
 
 @reads(Cosine)
 def wave(kernel: Cosine, n_columns: int) -> Wave:
-    """The covariance of a Cosine."""
+    """Return the covariance of a Cosine."""
     return Wave(n_columns, one_lengthscale(kernel, n_columns))

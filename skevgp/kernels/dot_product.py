@@ -37,7 +37,7 @@ class DotProduct(Covariance):
 
 
 class DotProductAt(CovarianceAt):
-    """A `DotProduct` with σ₀² and inducing points put in."""
+    """A `DotProduct` at given σ₀² and inducing points."""
 
     def __init__(self, bias: float, inducing_points: np.ndarray):
         self.bias, self.inducing_points = bias, inducing_points
@@ -78,5 +78,5 @@ class DotProductAt(CovarianceAt):
 
 @reads(sk.DotProduct)
 def dot_product(kernel: Any, n_columns: int) -> DotProduct:
-    """The covariance of a DotProduct."""
+    """Return the covariance of a DotProduct."""
     return DotProduct()

@@ -1,4 +1,4 @@
-"""A user's own covariance, a function in autograd.numpy: as a scikit-learn kernel, and as the inference sees it."""
+"""A user's covariance function in autograd.numpy, as a scikit-learn kernel and as a covariance."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from sklearn.gaussian_process import kernels as sk
 
 from .base import Covariance, CovarianceAt, PerRow, Sums, as_they_are, reads
 
-# k(x, x) of this many rows is the diagonal of one matrix, where the user has no function for it: fewer calls of the
-# user's function against fewer numbers that are thrown away.
+# Without a function for k(x, x), it is the diagonal of matrices of this many rows. More rows would need fewer calls of
+# the user's function, but waste more numbers off the diagonal.
 _CHUNK = 128
 
 
@@ -30,31 +30,31 @@ class FunctionKernel(sk.Kernel):
     Parameters
     ----------
     function : callable
-        ``function(X, Z, **hyperparameters)`` -> array of shape (len(X), len(Z)), in autograd.numpy: symmetric and
-        positive semi-definite. Its parameters with a float as default are the hyperparameters; all are positive, and
-        start there. Other defaults (integers, strings) stay as they are.
+        Symmetric, positive semi-definite function in autograd.numpy: ``function(X, Z, **hyperparameters)`` -> array of
+        shape (len(X), len(Z)). Its parameters with a float as default are the hyperparameters. They are positive, and
+        start at the default.
     values : dict of str to float, default=None
-        Where hyperparameters start, if not at their defaults.
+        Start values of hyperparameters that replace the defaults.
     values_bounds : pair of floats, "fixed", or dict of str to either, default=(1e-5, 1e5)
-        Bounds of all hyperparameters, or of those named (the others then have the default).
+        Bounds of all hyperparameters, or of those named in a dict.
     diagonal : callable, default=None
-        ``diagonal(X, **hyperparameters)`` -> k(x, x) of each row, (len(X),), in autograd.numpy. None takes it from
-        ``function`` in chunks of rows, which takes longer.
+        Function in autograd.numpy: ``diagonal(X, **hyperparameters)`` -> k(x, x) of each row, (len(X),). If None, it is
+        computed from ``function``, which takes longer.
 
     Attributes
     ----------
     hyperparameters : list of Hyperparameter
-        In the order of the function's parameters.
+        Hyperparameters in the order of the function's parameters.
 
     Raises
     ------
     ValueError
-        When used: if a default is not positive, a name is unknown or taken, the function returns another shape or
-        numbers that are not finite, or autograd cannot trace it.
+        When the kernel is used: if a default is not positive, a name is unknown or taken, the function returns another
+        shape or numbers that are not finite, or autograd cannot trace it.
 
     Examples
     --------
-    A wave whose size grows with x:
+    A wave whose amplitude grows with x:
 
     >>> import autograd.numpy as np
     >>> from sklearn.gaussian_process.kernels import ConstantKernel
@@ -84,17 +84,17 @@ class FunctionKernel(sk.Kernel):
         self.diagonal = diagonal
 
     def get_params(self, deep: bool = True) -> dict[str, Any]:
-        """The arguments of the constructor and, if ``deep``, the hyperparameters by name.
+        """Return the arguments of the constructor and, if ``deep``, the hyperparameters.
 
         Parameters
         ----------
         deep : bool, default=True
-            Whether the hyperparameters are among them.
+            Whether to include the hyperparameters.
 
         Returns
         -------
         params : dict
-            Each by its name.
+            Values by name.
         """
         params = super().get_params(deep=False)
         return {**params, **self._values()} if deep else params
@@ -105,7 +105,7 @@ class FunctionKernel(sk.Kernel):
         Parameters
         ----------
         **params : dict
-            Each by its name.
+            Values by name.
 
         Returns
         -------
@@ -120,7 +120,7 @@ class FunctionKernel(sk.Kernel):
         return self
 
     def __sklearn_clone__(self) -> Self:
-        # The same functions, not copies of them: a clone is then the same covariance, from which a fit can go on.
+        # Keep the same functions, so that the clone is an equal covariance and a fit can go on from it.
         return type(self)(self.function, deepcopy(self.values), deepcopy(self.values_bounds), self.diagonal)
 
     @property
@@ -129,32 +129,17 @@ class FunctionKernel(sk.Kernel):
         return [sk.Hyperparameter(name, "numeric", self._bounds(name)) for name in self._values()]
 
     def covariance(self) -> Function:
-        """What the inference differentiates.
+        """Return the covariance that a fit differentiates.
 
         Returns
         -------
         covariance : Function
-            Of the hyperparameters' logarithms.
+            A function of the logarithms of the hyperparameters.
         """
         return Function(self.function, tuple(self._values()), self.diagonal)
 
     def __call__(self, X: Any, Y: Any = None, eval_gradient: bool = False) -> Any:
-        """The matrix k(X, Y), and its gradient in the free logarithms of the hyperparameters.
-
-        Parameters
-        ----------
-        X : array-like of shape (n, d)
-        Y : array-like of shape (m, d), default=None
-            None means X.
-        eval_gradient : bool, default=False
-            Only if Y is None.
-
-        Returns
-        -------
-        K : ndarray of shape (n, m)
-        K_gradient : ndarray of shape (n, n, n_dims)
-            If ``eval_gradient``.
-        """
+        """Return k(X, Y) (n, m), and if asked for its gradient (n, n, n_dims) in the free log hyperparameters."""
         X = np.atleast_2d(X)
         if Y is not None and eval_gradient:
             raise ValueError("Gradient can only be evaluated when Y is None.")
@@ -171,7 +156,7 @@ class FunctionKernel(sk.Kernel):
         return K, np.stack(gradient, axis=2) if gradient else np.empty((*K.shape, 0))
 
     def diag(self, X: Any) -> np.ndarray:
-        """The variance k(x, x) of each row.
+        """Return the variance k(x, x) of each row.
 
         Parameters
         ----------
@@ -181,12 +166,12 @@ class FunctionKernel(sk.Kernel):
         Returns
         -------
         diagonal : ndarray of shape (n,)
-            One number of each row.
+            The variances.
         """
         return np.asarray(self.covariance().diagonal_values(self._log_values(), np.atleast_2d(X)), dtype=float)
 
     def is_stationary(self) -> bool:
-        """Whether it depends on differences of inputs only: not known, so no.
+        """Whether the kernel depends on differences of inputs only. It is not known, so that the answer is False.
 
         Returns
         -------
@@ -200,7 +185,7 @@ class FunctionKernel(sk.Kernel):
         return f"{type(self).__name__}({', '.join([name_of(self.function), *values])})"
 
     def _defaults(self) -> dict[str, float]:
-        """The function's parameters with a float as default."""
+        """Return the function's parameters with a float as default."""
         parameters = inspect.signature(self.function).parameters.values()
         defaults = {p.name: float(p.default) for p in parameters if isinstance(p.default, float)}
         taken = {"function", "values", "values_bounds", "diagonal"} & set(defaults)
@@ -247,21 +232,11 @@ class FunctionKernel(sk.Kernel):
 
 @dataclass(frozen=True)
 class Function(Covariance):
-    """k̃(x, x') = function(X, X', **hyperparameters); its gradients come from autograd.
+    """k̃(x, x') = function(X, X', **hyperparameters), with gradients by autograd."""
 
-    Parameters
-    ----------
-    function : callable
-        function(X, Z, **hyperparameters) -> (len(X), len(Z)), in autograd.numpy.
-    names : tuple of str
-        Of the hyperparameters.
-    diagonal : callable, default=None
-        diagonal(X, **hyperparameters) -> (len(X),), in autograd.numpy.
-    """
-
-    function: Callable[..., Any]
-    names: tuple[str, ...]
-    diagonal: Callable[..., Any] | None = None
+    function: Callable[..., Any]  # function(X, Z, **hyperparameters) -> (len(X), len(Z))
+    names: tuple[str, ...]  # of the hyperparameters
+    diagonal: Callable[..., Any] | None = None  # diagonal(X, **hyperparameters) -> (len(X),)
     rows = staticmethod(as_they_are)
 
     @property
@@ -281,20 +256,14 @@ class Function(Covariance):
         return FunctionAt(self, hyperparameters, inducing_points)
 
     def values(self, hyperparameters: Any, X: Any, Z: Any) -> Any:
-        """k(X, Z) of shape (len(X), len(Z)) at log hyperparameters.
-
-        Raises
-        ------
-        ValueError
-            If the function returns another shape.
-        """
-        # The optimiser looks at what is not finite.
+        """Return k(X, Z) (len(X), len(Z)) at log hyperparameters; ValueError if the function returns another shape."""
+        # The optimiser handles numbers that are not finite.
         with np.errstate(all="ignore"):
             found = self.function(_own(X), _own(Z), **self._arguments(hyperparameters))
         return self._checked(self.function, found, (len(X), len(Z)))
 
     def diagonal_values(self, hyperparameters: Any, X: Any) -> Any:
-        """k(x, x) of each row, (len(X),), at log hyperparameters."""
+        """Return k(x, x) of each row, (len(X),), at log hyperparameters."""
         if self.diagonal is None:
             chunks: Iterator[Any] = (X[first : first + _CHUNK] for first in range(0, len(X), _CHUNK))
             return anp.concatenate([anp.diag(self.values(hyperparameters, chunk, chunk)) for chunk in chunks])
@@ -303,13 +272,7 @@ class Function(Covariance):
         return self._checked(self.diagonal, found, (len(X),))
 
     def pulled_back(self, function: Callable[[Any], Any], argument: Any, bar: np.ndarray) -> Any:
-        """The gradient in the argument, given that in the function's value.
-
-        Raises
-        ------
-        ValueError
-            If autograd cannot trace the function.
-        """
+        """Return the gradient in the argument, given that in the value; ValueError if autograd fails."""
         return self._traced(lambda: make_vjp(function)(argument)[0](bar))
 
     def _traced(self, differentiate: Callable[[], Any]) -> Any:
@@ -323,13 +286,7 @@ class Function(Covariance):
             ) from error
 
     def along(self, function: Callable[[Any], Any], rows: Any, column: int) -> Any:
-        """The derivative of function(rows) in one column of all rows.
-
-        Raises
-        ------
-        ValueError
-            If autograd cannot trace the function, or knows no forward derivative of a part of it.
-        """
+        """Return the derivative of function(rows) in one column of all rows; ValueError if autograd cannot trace it."""
         direction = np.zeros(np.shape(rows))
         direction[:, column] = 1.0
         return self._traced(lambda: make_jvp(function)(rows)(direction)[1])
@@ -345,7 +302,7 @@ class Function(Covariance):
 
 
 class FunctionAt(CovarianceAt):
-    """A `Function` with hyperparameters and inducing points (m, d) put in."""
+    """A `Function` at given hyperparameters and inducing points (m, d)."""
 
     def __init__(self, covariance: Function, hyperparameters: np.ndarray, inducing_points: np.ndarray):
         self.covariance, self.hyperparameters, self.inducing_points = covariance, hyperparameters, inducing_points
@@ -399,7 +356,7 @@ class FunctionAt(CovarianceAt):
         )
         if not covariance.names:
             return Sums(cross_bar)
-        # Autograd warns of a diagonal that does not depend on the hyperparameters, as are many: it shall seem to.
+        # Autograd warns if the diagonal does not depend on the hyperparameters. Adding 0 times one of them avoids that.
         hyper_bar = covariance.pulled_back(
             lambda hyper: covariance.diagonal_values(hyper, prepared) + 0.0 * hyper[0],
             self.hyperparameters,
@@ -419,16 +376,16 @@ class FunctionAt(CovarianceAt):
 
 
 def _own(rows: Any) -> Any:
-    """A copy of rows, which may be the user's data: a function of his may change what it gets."""
+    """Copy rows that may be the user's data, because the user's function may change them."""
     return rows.copy() if isinstance(rows, np.ndarray) else rows
 
 
 def name_of(function: Callable[..., Any]) -> str:
-    """What a message calls a function."""
+    """Return the name of a function for messages."""
     return str(getattr(function, "__name__", repr(function)))
 
 
 @reads(FunctionKernel, in_casadi=False)
 def function(kernel: FunctionKernel, n_columns: int) -> Function:
-    """The covariance of a FunctionKernel."""
+    """Return the covariance of a FunctionKernel."""
     return kernel.covariance()

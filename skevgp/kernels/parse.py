@@ -1,4 +1,4 @@
-"""scikit-learn kernels -> covariances that the inference can differentiate, and back."""
+"""From scikit-learn kernels to covariances that a fit can differentiate, and back."""
 
 from __future__ import annotations
 
@@ -14,39 +14,22 @@ from sklearn.gaussian_process import kernels as sk
 from .base import READERS, Covariance, Product, Sum, known_kernels
 from .function import FunctionKernel
 
-# Their squares neither vanish nor overflow.
+# Limits of values whose squares neither vanish nor overflow.
 SMALLEST, LARGEST = 1e-100, 1e100
 
 
 @dataclass(frozen=True)
 class Start:
-    """What a user says of a positive parameter; what is None is chosen from the data.
+    """Start, bounds and fixed entries of a positive parameter; None is chosen from the data."""
 
-    Attributes
-    ----------
-    value : ndarray of shape (n,), or None
-    bounds : ndarray of shape (n, 2), or None
-    fixed : bool or ndarray of shape (n,)
-    """
-
-    value: np.ndarray | None = None
-    bounds: np.ndarray | None = None
-    fixed: bool | np.ndarray = False
+    value: np.ndarray | None = None  # (n,)
+    bounds: np.ndarray | None = None  # (n, 2)
+    fixed: bool | np.ndarray = False  # of all, or (n,)
 
 
 @dataclass(frozen=True)
 class Starts:
-    """What the user says of the kernel and the noise.
-
-    Attributes
-    ----------
-    hyperparameters : Start
-        Of k̃.
-    signal : Start
-        s², the same for all outputs.
-    noise : Start
-        σ², the same for all outputs.
-    """
+    """Starts of the hyperparameters of k̃, of s² and of σ²; the latter two are the same for all outputs."""
 
     hyperparameters: Start
     signal: Start
@@ -55,39 +38,23 @@ class Starts:
 
 @dataclass(frozen=True)
 class KernelSpec:
-    """What a user's kernel says: k = s² k̃ (+ noise).
+    """A user's kernel, read: k = s² k̃ (+ noise)."""
 
-    Attributes
-    ----------
-    covariance : Covariance
-        k̃.
-    starts : Starts
-        Of k̃'s hyperparameters, s² and, from a top-level WhiteKernel, σ².
-    tree : Kernel
-        s² k̃ as a scikit-learn kernel.
-    signal : Kernel
-        The ConstantKernel in it that is s².
-    given : Kernel, optional
-        What the user gave, of which ``tree`` is made; None if that was no kernel.
-    stays : bool, default=False
-        Whether nothing of it is learned: the fitted kernel is ``tree``, to the last digit.
-    """
-
-    covariance: Covariance
-    starts: Starts
-    tree: sk.Kernel
-    signal: sk.Kernel
-    given: sk.Kernel | None = None
-    stays: bool = False
+    covariance: Covariance  # k̃
+    starts: Starts  # σ² is that of a WhiteKernel in the outermost sum
+    tree: sk.Kernel  # s² k̃
+    signal: sk.Kernel  # the ConstantKernel in the tree that is s²
+    given: sk.Kernel | None = None  # the user's kernel, if it was one
+    stays: bool = False  # whether nothing is learned, so that the fitted kernel is exactly the tree
 
     def with_noise(self, noise_variance: float, fixed: bool = False) -> KernelSpec:
-        """The same kernel with a start of the noise, or a noise that stays where it starts."""
+        """Return the same kernel with a start of the noise, which may be fixed."""
         value = np.array([float(noise_variance)])
         noise = Start(value, np.array([[value[0], value[0]]]), np.ones(1, dtype=bool)) if fixed else Start(value)
         return replace(self, starts=replace(self.starts, noise=noise))
 
     def as_given(self) -> KernelSpec:
-        """The same kernel, of which nothing is learned: what the user does not say is 1."""
+        """Return the same kernel without learning; values that the user did not give are 1."""
         starts, one = self.starts, np.ones(1)
         shape, signal = starts.hyperparameters, starts.signal
         if shape.value is None:
@@ -98,21 +65,7 @@ class KernelSpec:
     def to_sklearn(
         self, hyperparameters: np.ndarray, hyper_bounds: np.ndarray, signal: float, signal_bounds: np.ndarray
     ) -> sk.Kernel:
-        """The fitted s² k̃ as a scikit-learn kernel, of the user's form and with the user's bounds.
-
-        Parameters
-        ----------
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        hyper_bounds : ndarray of shape (n_hyper, 2)
-        signal : float
-            s².
-        signal_bounds : ndarray of shape (1, 2)
-
-        Returns
-        -------
-        kernel : Kernel
-        """
+        """Return the fitted s² k̃ as a scikit-learn kernel of the user's form, with the user's bounds."""
         if self.stays:
             return clone(self.tree)
         rows = iter(np.column_stack([hyperparameters, hyper_bounds]))
@@ -128,37 +81,21 @@ class KernelSpec:
 
     @property
     def order(self) -> np.ndarray:
-        """Where in (k̃'s hyperparameters, s²) each entry of theta is: theta is ``np.log(numbers[order])``.
-
-        Gradients in the logarithms go the same way.
-        """
+        """Indices with theta = ``np.log(numbers[order])`` for numbers (hyperparameters of k̃, s²)."""
         return self._order_in(self.tree)
 
     @property
     def adds_signal(self) -> bool:
-        """Whether s² is none of the constants that the user gave."""
+        """Whether s² is not one of the constants in the user's kernel."""
         return self.given is None or all(part is not self.signal for part in _simple_kernels(self.given))
 
     @property
     def given_order(self) -> np.ndarray:
-        """The same for theta of the kernel that the user gave, in (k̃'s hyperparameters, s², σ²)."""
+        """Indices as `order`, for theta of the user's kernel in (hyperparameters of k̃, s², σ²)."""
         return self._order_in(self.tree if self.given is None else self.given)
 
     def at_bounds(self, hyperparameters: np.ndarray, signal: float, noise: float) -> list[str]:
-        """Which parameters of the user's kernel are at its bounds, in scikit-learn's words.
-
-        Parameters
-        ----------
-        hyperparameters : ndarray of shape (n_hyper,)
-            Of k̃.
-        signal, noise : float
-            s² and σ².
-
-        Returns
-        -------
-        found : list of str
-            What `GaussianProcessRegressor` warns of; a sentence for each.
-        """
+        """List the warnings of GaussianProcessRegressor on parameters of the user's kernel that are at their bounds."""
         if self.given is None:
             return []
         theta = np.log(np.append(hyperparameters, [signal, noise]))[self._order_in(self.given)]
@@ -175,7 +112,7 @@ class KernelSpec:
         ]
 
     def _order_in(self, tree: sk.Kernel) -> np.ndarray:
-        """Where in (k̃'s hyperparameters, s², σ²) each entry of a tree's theta is."""
+        """Return indices of a tree's theta in (hyperparameters of k̃, s², σ²)."""
         n_hyper = self.covariance.n_hyperparameters
         following, found = iter(range(n_hyper)), list[int]()
         for kernel in _simple_kernels(tree):
@@ -189,7 +126,7 @@ class KernelSpec:
 
 
 def _simple_kernels(tree: Any) -> Iterator[Any]:
-    """The leaves of a tree, from left to right as theta has them."""
+    """Yield the leaves of a tree from left to right, in the order of theta."""
     if isinstance(tree, sk.KernelOperator):
         yield from _simple_kernels(tree.k1)
         yield from _simple_kernels(tree.k2)
@@ -198,11 +135,11 @@ def _simple_kernels(tree: Any) -> Iterator[Any]:
 
 
 def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kernel:
-    """A copy of a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""
+    """Copy a simple kernel with values (and bounds) from the next rows (value, lower, upper)."""
     found = clone(kernel)
     for hyperparameter in kernel.hyperparameters:
         own = np.array(list(islice(rows, hyperparameter.n_elements)))
-        # What is fixed keeps all its digits.
+        # Fixed parameters keep all their digits.
         if not hyperparameter.fixed:
             one = len(own) == 1
             found.set_params(**{hyperparameter.name: float(own[0, 0]) if one else own[:, 0]})
@@ -212,28 +149,7 @@ def _fitted(kernel: sk.Kernel, rows: Iterator[Any], set_bounds: bool) -> sk.Kern
 
 
 def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) -> KernelSpec:
-    """Read a scikit-learn kernel.
-
-    Parameters
-    ----------
-    kernel : sklearn.gaussian_process.kernels.Kernel, callable or None
-        A callable is the function of a `FunctionKernel`. None is a squared exponential with one lengthscale per column,
-        all starts taken from the data.
-    n_columns : int
-        Width of the kernel's inputs.
-
-    Returns
-    -------
-    spec : KernelSpec
-
-    Raises
-    ------
-    TypeError
-        If it is not a kernel.
-    ValueError
-        If part of it does not work (the message names it and lists what does), its length scales do not fit the
-        columns, or a value or bound is out of range.
-    """
+    """Read a scikit-learn kernel or a function of inputs (n, n_columns); None is an RBF with starts from the data."""
     signal = sk.ConstantKernel()
     if kernel is None:
         shape = sk.RBF(np.ones(n_columns) if n_columns > 1 else 1.0)
@@ -245,7 +161,8 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
             "kernel must be a kernel of sklearn.gaussian_process.kernels, a function k(X, Z) in autograd.numpy, or "
             f"None; got {kernel!r}. These work: {known_kernels()}."
         )
-    # A copy: the same kernel may be in a tree twice.
+    # Raises TypeError if it is no kernel, and ValueError if a part is not supported or a value or bound is out of
+    # range. A copy, because the same kernel object may be in a tree twice.
     given = clone(kernel)
     tree, noise = _without_noise(given)
     if tree is None or len(noise) > 1:
@@ -270,7 +187,7 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
 
 
 def _without_noise(kernel: Any) -> tuple[Any, list[Any]]:
-    """The kernel without the WhiteKernels of its outermost sum (None if that leaves nothing), and these."""
+    """Split off the WhiteKernels of the outermost sum; the rest is None if there is nothing else."""
     if isinstance(kernel, sk.WhiteKernel):
         return None, [kernel]
     if type(kernel) is not sk.Sum:
@@ -282,7 +199,7 @@ def _without_noise(kernel: Any) -> tuple[Any, list[Any]]:
 
 
 def _outermost_constant(kernel: Any) -> Any:
-    """The ConstantKernel that is a factor of all else with the fewest products around it; None if there is none."""
+    """Find the ConstantKernel that multiplies everything else within the fewest products; None if there is none."""
     level = [kernel]
     while level := [part for product in level if type(product) is sk.Product for part in (product.k1, product.k2)]:
         for part in level:
@@ -292,7 +209,7 @@ def _outermost_constant(kernel: Any) -> Any:
 
 
 def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -> Covariance | None:
-    """The covariance of (part of) a tree, None for s²; appends what the user says of its hyperparameters."""
+    """Return the covariance of (part of) a tree, None for s²; appends the starts of its hyperparameters."""
     if kernel is signal:
         return None
     if type(kernel) in (sk.Sum, sk.Product):
@@ -315,7 +232,7 @@ def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
 
 
 def _operands(kernel: Any, operator: Any) -> Iterator[Any]:
-    """The operands of nested sums (or products), from left to right."""
+    """Yield the operands of nested sums (or products) from left to right."""
     if type(kernel) is operator:
         yield from _operands(kernel.k1, operator)
         yield from _operands(kernel.k2, operator)
@@ -324,13 +241,13 @@ def _operands(kernel: Any, operator: Any) -> Iterator[Any]:
 
 
 def _starts(kernel: sk.Kernel) -> Start:
-    """Values and bounds of a simple kernel's hyperparameters, checked."""
+    """Return checked values and bounds of a simple kernel's hyperparameters."""
     values = kernel.get_params()
     return _joined([_start(hyperparameter, values[hyperparameter.name]) for hyperparameter in kernel.hyperparameters])
 
 
 def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
-    """A hyperparameter's value and bounds, checked."""
+    """Return the checked value and bounds of a hyperparameter."""
     value = np.atleast_1d(np.asarray(value, dtype=float))
     if not ((value >= SMALLEST) & (value <= LARGEST)).all():
         raise ValueError(f"kernel: {hyperparameter.name} must be between {SMALLEST:g} and {LARGEST:g}; got {value}.")
@@ -350,7 +267,7 @@ def _start(hyperparameter: sk.Hyperparameter, value: Any) -> Start:
 
 
 def _joined(starts: list[Start]) -> Start:
-    """Several starts one after the other."""
+    """Concatenate several starts."""
     return Start(
         np.concatenate([np.empty(0), *(start.value for start in starts)]),
         np.concatenate([np.empty((0, 2)), *(start.bounds for start in starts)]),

@@ -13,7 +13,7 @@ from ..utils.casadi import casadi
 from .base import no_functions, reads
 from .stationary import TINY, Derivatives, Stationary
 
-# Of the Fourier series.
+# Number of terms of the Fourier series.
 _HARMONICS = 10_000
 
 
@@ -38,7 +38,7 @@ class ExpSineSquared:
 
     @staticmethod
     def _squared(r: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """sin²(π r) / ℓ²."""
+        """Return sin²(π r) / ℓ²."""
         return (np.sin(np.pi * r) * np.exp(-parameters[0])) ** 2
 
     def spectrum(
@@ -60,5 +60,5 @@ class ExpSineSquared:
 
 @reads(sk.ExpSineSquared)
 def exp_sine_squared(kernel: Any, n_columns: int) -> Stationary:
-    """The covariance of an ExpSineSquared, whose periodicity is the lengthscale."""
+    """Return the covariance of an ExpSineSquared, whose periodicity is the length scale."""
     return Stationary(ExpSineSquared(), n_columns, isotropic=True)

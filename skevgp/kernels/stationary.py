@@ -1,12 +1,4 @@
-"""Stationary covariances: functions of the scaled distance between inputs.
-
-With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each is a profile φ of the exponent E = -½ r², which for a block of rows is one
-matrix product: E is linear in [x, 1, x²]. So is the way back: with W = Ū φ'(E), all gradients follow from W [x, 1, x²].
-There x is centred: r² is a small difference of squares that would be large far from 0.
-
-In CasADi, distances that a root is taken of are kept from 0, so that no derivative, of any order that a solver asks
-for, is NaN where x is an inducing point.
-"""
+"""Stationary covariances: functions of the scaled distance between inputs."""
 
 from __future__ import annotations
 
@@ -25,19 +17,25 @@ from ..utils.casadi import casadi
 from .base import CentredSquares, Covariance, CovarianceAt, PerRow, Sums, exported_kernels, one_lengthscale, reads
 from .waves import Waves, widened
 
-# Of a Matérn covariance by Bessel functions, which overflow beyond it (it is then almost a squared exponential).
+# With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each covariance is a profile φ of the exponent E = -½ r². E is linear in
+# [x, 1, x²], so that it is one matrix product for a block of rows. The way back is too: with W = Ū φ'(E), all gradients
+# follow from W [x, 1, x²]. Here x is centred, because r² is a small difference of squares that are large far from 0.
+#
+# In CasADi, distances under a root are kept away from 0. Otherwise derivatives would be NaN if x is an inducing point.
+
+# Largest ν of a Matérn covariance, which is then almost a squared exponential; Bessel functions overflow above.
 LARGEST_NU = 150.0
-# In units of the largest |x/ℓ|² + |z/ℓ|²: the matrix product leaves r² only 8 digits below this, ...
+# In units of the largest |x/ℓ|² + |z/ℓ|²: below this, the matrix product leaves r² fewer than 8 digits, ...
 _NEAR = 1e-8
-# ... and (x - x') / r only 8 below this: there a profile that is not smooth at r = 0 counts as flat.
+# ... and below this (x - x') / r has fewer than 8. A profile that is not smooth at r = 0 then counts as flat.
 _COINCIDENT = 1e-16
-# In CasADi added to r² under a root: too little to change a value, enough to leave second derivatives their digits.
+# Added to r² under a root in CasADi: too small to change a value, and large enough for accurate second derivatives.
 TINY = 1e-18
-# In CasADi, of ν - ½: sums of so many terms.
+# Largest ν - ½ of a Matérn in CasADi, which is the number of terms of a sum.
 _MOST_TERMS = 20
-# How much wider than by the spectral density frequencies are drawn too: one that falls fast, or with heavy tails.
+# Factors by which frequencies are drawn wider than the spectral density, if it falls fast or has heavy tails.
 _WIDER, _MUCH_WIDER = np.array([1.0, 1.5, 2.0]), 2.0 ** np.arange(10)
-# Above this a rational quadratic is as a squared exponential, and its density's Bessel functions overflow.
+# Above this α, a rational quadratic is almost a squared exponential, and the Bessel functions of its density overflow.
 _LARGE_ALPHA = 50.0
 
 Derivatives = tuple[np.ndarray, list[np.ndarray]]
@@ -47,7 +45,7 @@ Derivatives = tuple[np.ndarray, list[np.ndarray]]
 
 
 class Profile(Protocol):
-    """φ(E); parameters of its own come before the lengthscales in the vector of hyperparameters, as logarithms."""
+    """φ(E); the logarithms of its own parameters come before the length scales in the vector of hyperparameters."""
 
     n_parameters: int
 
@@ -57,21 +55,21 @@ class Profile(Protocol):
 
     @property
     def has_root(self) -> bool:
-        """Whether it takes the root of r², which then has to be known to the last digit."""
+        """Whether φ takes the root of r², which then needs all its digits."""
 
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
-        """φ(E)."""
+        """Return φ(E)."""
 
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
-        """φ'(E), and the derivative in the logarithm of each parameter; ``value`` is φ(E), which saves exponentials."""
+        """Return φ'(E) and the derivative in each log parameter, given φ(E)."""
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Frequencies (L, d) for lengthscales of 1, and how much each counts (L,), 1 in the mean."""
+        """Return frequencies (L, d) for length scales of 1, and their weights (L,) with mean 1."""
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        """φ of symbols r² in CasADi."""
+        """Return φ for CasADi symbols r²."""
 
 
 @dataclass(frozen=True)
@@ -117,7 +115,7 @@ class Matern12:
         return _student_t(0.5, shape, rng)
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        # The least r² is not 0, so that no derivative is NaN.
+        # A lower limit of r² above 0 keeps derivatives from being NaN.
         ca = casadi()
         return ca.exp(-ca.sqrt(ca.fmax(squared, 1e-60)))
 
@@ -198,15 +196,7 @@ class Matern52:
 
 @dataclass(frozen=True)
 class Matern:
-    """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r (Rasmussen & Williams 2006, eq. 4.14).
-
-    Its derivative follows from d/dt [t^ν K_ν(t)] = -t^ν K_(ν-1)(t) (DLMF 10.29.4).
-
-    Parameters
-    ----------
-    nu : float
-        At most `LARGEST_NU`.
-    """
+    """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r, ν up to `LARGEST_NU` (Rasmussen & Williams 2006, eq. 4.14)."""
 
     nu: float
     n_parameters = 0
@@ -220,15 +210,16 @@ class Matern:
         return self._bessel(E, self.nu, 1.0)
 
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
+        # d/dt [t^ν K_ν(t)] = -t^ν K_(ν-1)(t) (DLMF 10.29.4).
         slope = self._bessel(E, self.nu - 1.0, 0.5 / (self.nu - 1.0) if self.smooth else 0.0)
         slope *= 2.0 * self.nu
         return slope, []
 
     def _bessel(self, E: np.ndarray, order: float, at_zero: float) -> np.ndarray:
-        """2^(1-ν) / Γ(ν) t^order K_order(t), by logarithms: its factors overflow before it does."""
+        """Return 2^(1-ν) / Γ(ν) t^order K_order(t), by logarithms because its factors overflow."""
         t = np.sqrt(-4.0 * self.nu * E)
         positive = np.maximum(t, 1e-150)
-        # Beyond 1e3, exp(-t) is 0 and K need not be known.
+        # Beyond 1e3, exp(-t) is 0, whatever K is.
         with np.errstate(all="ignore"):
             log_bessel = np.log(kve(order, np.minimum(positive, 1e3)))
         factor = (1.0 - self.nu) * np.log(2.0) - gammaln(self.nu)
@@ -239,7 +230,7 @@ class Matern:
 
     @staticmethod
     def _near_zero(t: np.ndarray, order: float) -> np.ndarray:
-        """t^order K_order(t) over its value at 0, where K overflows: the first terms of DLMF 10.27.4 with 10.25.2."""
+        """Return t^order K_order(t) relative to t = 0, where K overflows: first terms of DLMF 10.27.4 with 10.25.2."""
         term = total = np.ones_like(t)
         for k in range(1, min(int(order), 20)):
             term = term * (0.25 * t**2) / (k * (k - order))
@@ -294,7 +285,7 @@ class RationalQuadratic:
 
     @staticmethod
     def _ratio(E: np.ndarray, alpha: float) -> np.ndarray:
-        """r² / 2α, kept finite."""
+        """Return r² / 2α, kept finite."""
         with np.errstate(over="ignore"):
             ratio = E / -alpha
         return np.minimum(ratio, 1e300, out=ratio)
@@ -302,7 +293,7 @@ class RationalQuadratic:
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
-        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): of normals, with a gamma's variance.
+        # A mixture of squared exponentials over 1/ℓ² (eq. 4.20 there): normals whose variance has a gamma distribution.
         (size, d), alpha, normals = shape, float(np.exp(parameters[0])), rng.standard_normal(shape)
         drawn = normals * np.sqrt(rng.gamma(alpha, 1.0 / alpha, size))[:, np.newaxis]
         if alpha > _LARGE_ALPHA:
@@ -315,14 +306,14 @@ class RationalQuadratic:
 
 
 def _student_t(nu: float, shape: tuple[int, int], rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    """Of a Matérn: a Student-t with 2ν degrees of freedom (Rasmussen & Williams 2006, eq. 4.15)."""
+    """Draw from the spectrum of a Matérn: a Student-t with 2ν degrees of freedom (Rasmussen & Williams 2006, 4.15)."""
     (size, d), degrees, normals = shape, 2.0 * nu, rng.standard_normal(shape)
     drawn = normals / np.sqrt(rng.chisquare(degrees, size) / degrees)[:, np.newaxis]
     return widened(drawn, lambda squares: -0.5 * (degrees + d) * np.log1p(squares / degrees), _MUCH_WIDER)
 
 
 def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
-    """Of normals (d,) with a variance from the gamma distribution of shape and rate α: the density's logarithm."""
+    """Return the log density of normals (d,) whose variance has a gamma distribution of shape and rate α."""
     order = alpha - 0.5 * d
 
     def log_density(squares: np.ndarray) -> np.ndarray:
@@ -337,23 +328,11 @@ def _variance_gamma(alpha: float, d: int) -> Callable[[np.ndarray], np.ndarray]:
 
 @dataclass(frozen=True)
 class Stationary(Covariance):
-    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then log ℓ.
+    """k̃(x, x') = φ(-½ Σ_d ((x_d - x'_d) / ℓ_d)²); hyperparameters: those of φ, then log ℓ."""
 
-    Parameters
-    ----------
-    profile : Profile
-        φ.
-    n_columns : int
-        d.
-    isotropic : bool, default=False
-        Whether one lengthscale serves all columns.
-    rows : CentredSquares
-        What is computed once of rows.
-    """
-
-    profile: Profile
+    profile: Profile  # φ
     n_columns: int
-    isotropic: bool = False
+    isotropic: bool = False  # whether all columns have the same length scale
     rows: CentredSquares = field(default=CentredSquares(), compare=False)
 
     @property
@@ -384,17 +363,17 @@ class Stationary(Covariance):
         lengths = np.full(self.n_columns, np.exp(lengths))
         scaled = self.rows.centred(points) / lengths
         if self.profile.has_root:
-            # Of differences: to the last digit where r² is small.
+            # Differences keep all digits if r² is small.
             squared = ca.sum2((ca.DM(scaled) - ca.repmat((x / ca.DM(lengths)).T, len(scaled), 1)) ** 2)
         else:
-            # By one product, as predictions have it: linear in [x, x²], and its derivatives are small.
+            # One product that is linear in [x, x²], as in predictions, has small derivatives.
             factor = np.hstack([-2.0 * scaled / lengths, np.broadcast_to(lengths**-2.0, scaled.shape)])
             squared = ca.mtimes(ca.DM(factor), ca.vertcat(x, x**2)) + ca.DM((scaled**2).sum(axis=1))
         return self.profile.expression(squared, own), 1.0
 
 
 class StationaryAt(CovarianceAt):
-    """A `Stationary` with hyperparameters and centred inducing points (m, d) put in."""
+    """A `Stationary` at given hyperparameters and centred inducing points (m, d)."""
 
     def __init__(self, profile: Profile, hyperparameters: np.ndarray, points: np.ndarray):
         lengthscales = np.exp(hyperparameters[profile.n_parameters :])
@@ -445,7 +424,7 @@ class StationaryAt(CovarianceAt):
         return np.concatenate([own, length_bar]), Z_bar
 
     def _geometry_bar(self, rows: np.ndarray, within: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gradients in log ℓ and X_m, from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
+        """Return gradients in log ℓ and X_m from Σ_rows W [x, 1, x²] (m, 2 d + 1) and the W of `matrix` (m, m)."""
         Z, d = self.points, self.points.shape[1]
         WX, W, WXX = rows[:, :d], rows[:, d, np.newaxis], rows[:, d + 1 :]
         # Within the inducing points each pair counts twice: as (i, j) and as (j, i).
@@ -460,7 +439,7 @@ class StationaryAt(CovarianceAt):
         return -0.5 * cdist(scaled, scaled, "sqeuclidean")
 
     def _exponents(self, prepared: np.ndarray) -> tuple[np.ndarray, float]:
-        """E (m, n), and ½ (|x/ℓ|² + |z/ℓ|²) at its largest, which its rounding errors are relative to."""
+        """Return E (m, n), and the largest ½ (|x/ℓ|² + |z/ℓ|²), which its rounding errors are relative to."""
         E = self._exponent @ prepared
         np.minimum(E, 0.0, out=E)
         if self.profile.smooth:
@@ -481,17 +460,7 @@ class StationaryAt(CovarianceAt):
 
 @dataclass(frozen=True)
 class SquaredExponential(Stationary):
-    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9, 5.1).
-
-    Parameters
-    ----------
-    n_columns : int
-        d.
-    isotropic : bool, default=False
-        Whether one lengthscale serves all columns.
-    rows : CentredSquares
-        What is computed once of rows.
-    """
+    """k̃(x, x') = exp(-½ Σ_d ((x_d - x'_d) / ℓ_d)²), hyperparameters log ℓ (Rasmussen & Williams 2006, eq. 4.9)."""
 
     profile: Profile = field(default=Exponential(), init=False)
 
@@ -500,7 +469,7 @@ class SquaredExponential(Stationary):
 
 
 class SquaredExponentialAt(StationaryAt):
-    """A `SquaredExponential` put in: its own derivative, so that k(X_m, X) serves the way back."""
+    """A `SquaredExponential` at given parameters. φ' = φ, so that gradients reuse k(X_m, X)."""
 
     def matrix(self) -> np.ndarray:
         scaled = self.points / self.lengthscales
@@ -529,13 +498,13 @@ class SquaredExponentialAt(StationaryAt):
 
 @reads(sk.RBF)
 def squared_exponential(kernel: Any, n_columns: int) -> SquaredExponential:
-    """The covariance of an RBF (or of a Matern with nu = inf)."""
+    """Return the covariance of an RBF (or of a Matern with nu = inf)."""
     return SquaredExponential(n_columns, one_lengthscale(kernel, n_columns))
 
 
 @reads(sk.Matern)
 def matern(kernel: Any, n_columns: int) -> Stationary:
-    """The covariance of a Matern."""
+    """Return the covariance of a Matern."""
     if kernel.nu == np.inf:
         return squared_exponential(kernel, n_columns)
     if not 0.0 < kernel.nu <= LARGEST_NU:
@@ -547,5 +516,5 @@ def matern(kernel: Any, n_columns: int) -> Stationary:
 
 @reads(sk.RationalQuadratic)
 def rational_quadratic(kernel: Any, n_columns: int) -> Stationary:
-    """The covariance of a RationalQuadratic."""
+    """Return the covariance of a RationalQuadratic."""
     return Stationary(RationalQuadratic(), n_columns, isotropic=True)

@@ -1,10 +1,4 @@
-"""Random functions whose mean product is a covariance: random Fourier features (Rahimi & Recht 2007).
-
-For a covariance of differences, √2 cos(ωᵀx + b) with ω from its spectral density and b uniform. Sums of covariances
-have the functions of each, products the products. What a sparse model leaves to be drawn is what inducing points cannot
-follow, waves far out in the spectrum; so frequencies are drawn from wider densities too, and count in proportion
-(importance sampling). Each family says in its own file which waves are its own (`Covariance.random_terms`).
-"""
+"""Random functions whose mean product is a covariance: random Fourier features (Rahimi & Recht 2007)."""
 
 from __future__ import annotations
 
@@ -18,43 +12,38 @@ import numpy as np
 
 from .base import CentredSquares, Covariance
 
+# For a covariance of differences they are √2 cos(ωᵀx + b), with ω from its spectral density and b uniform. A sum of
+# covariances has the functions of each; a product has the products of functions. The residual of a sparse model
+# consists of waves far out in the spectrum, which inducing points cannot represent. So frequencies are drawn from wider
+# densities too, with weights (importance sampling). Each family defines its waves in `Covariance.random_terms`.
+
 
 class Factor(ABC):
-    """L functions of x side by side."""
+    """L functions of x."""
 
     @abstractmethod
     def value(self, X: np.ndarray) -> np.ndarray:
-        """Of rows (n, d): (L, n)."""
+        """Return values (L, n) at rows (n, d)."""
 
     @abstractmethod
     def slopes(self, X: np.ndarray) -> np.ndarray:
-        """∂/∂x, (L, n, d)."""
+        """Return ∂/∂x, (L, n, d)."""
 
 
 @dataclass(frozen=True)
 class Waves(Factor):
-    """a cos(ωᵀ(x - c) + b).
+    """Functions a cos(ωᵀ(x - c) + b)."""
 
-    Attributes
-    ----------
-    sizes, phases : ndarray of shape (L,)
-        a and b.
-    frequencies : ndarray of shape (L, d)
-        ω.
-    rows : CentredSquares
-        Which knows c.
-    """
-
-    sizes: np.ndarray
-    phases: np.ndarray
-    frequencies: np.ndarray
-    rows: CentredSquares
+    sizes: np.ndarray  # a, (L,)
+    phases: np.ndarray  # b, (L,)
+    frequencies: np.ndarray  # ω, (L, d)
+    rows: CentredSquares  # with c
 
     @classmethod
     def drawn(
         cls, frequencies: np.ndarray, weights: np.ndarray, rows: CentredSquares, rng: np.random.RandomState
     ) -> Waves:
-        """With frequencies (L, d) that count in proportion to weights (L,), and phases at random."""
+        """Make waves with frequencies (L, d) that count in proportion to weights (L,), and random phases."""
         return cls(np.sqrt(2.0 * weights), rng.uniform(0.0, 2.0 * np.pi, len(weights)), frequencies, rows)
 
     def value(self, X: np.ndarray) -> np.ndarray:
@@ -70,7 +59,7 @@ class Waves(Factor):
 
 @dataclass(frozen=True)
 class Planes(Factor):
-    """aᵀx + b, with gradients a (L, d) and levels b (L,)."""
+    """Functions aᵀx + b, with gradients a (L, d) and levels b (L,)."""
 
     gradients: np.ndarray
     levels: np.ndarray
@@ -84,23 +73,17 @@ class Planes(Factor):
 
 @dataclass(frozen=True)
 class RandomFunctions:
-    """L functions for each term, Φ, with k(x, x') = E[Σ φ(x) φ(x')].
-
-    Attributes
-    ----------
-    terms : list of tuple of Factor
-        Each the product of its factors.
-    """
+    """L functions for each term, Φ, with k(x, x') = E[Σ φ(x) φ(x')]; a term is the product of its factors."""
 
     terms: list[tuple[Factor, ...]]
 
     def value(self, X: np.ndarray) -> np.ndarray:
-        """Φ of rows (n, d): (L * n_terms, n)."""
+        """Return Φ at rows (n, d), (L * n_terms, n)."""
         found = np.concatenate([reduce(mul, (each.value(X) for each in term)) for term in self.terms])
         return found * self._scale(found)
 
     def slopes(self, X: np.ndarray) -> np.ndarray:
-        """∂Φ/∂x, (L * n_terms, n, d)."""
+        """Return ∂Φ/∂x, (L * n_terms, n, d)."""
         found = np.concatenate([_product_rule(term, X) for term in self.terms])
         return found * self._scale(found)
 
@@ -117,34 +100,16 @@ def _product_rule(factors: tuple[Factor, ...], X: np.ndarray) -> np.ndarray:
 def random_functions(
     covariance: Covariance, hyperparameters: np.ndarray, size: int, n_columns: int, rng: np.random.RandomState
 ) -> RandomFunctions:
-    """Draw functions whose mean product is the covariance.
-
-    Parameters
-    ----------
-    covariance : Covariance
-    hyperparameters : ndarray of shape (n_hyper,)
-        Logarithms.
-    size : int
-        L.
-    n_columns : int
-        d.
-    rng : RandomState
-
-    Raises
-    ------
-    ValueError
-        If the covariance has no spectral density that is known here, as that of a user's function.
-    """
+    """Draw L = size functions whose mean product is the covariance; ValueError if its spectral density is not known."""
     return RandomFunctions(covariance.random_terms(hyperparameters, (size, n_columns), rng))
 
 
 def widened(
     frequencies: np.ndarray, log_density: Callable[[np.ndarray], np.ndarray], widths: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Frequencies (L, d) spread by widths in turns, and density over that of the mixture, (L,): at most their number.
-
-    The logarithm of their density, of |ω|² but for a constant, is ``log_density``.
-    """
+    """Widen frequencies (L, d) by the widths alternately; return them with their importance weights (L,)."""
+    # The weight is the density over that of the mixture, which is at most the number of widths. log_density is the
+    # logarithm of the density as a function of |ω|², up to a constant.
     size, d = frequencies.shape
     frequencies = frequencies * widths[np.arange(size) % len(widths), np.newaxis]
     squares = np.einsum("ld,ld->l", frequencies, frequencies)

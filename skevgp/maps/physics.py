@@ -1,4 +1,4 @@
-"""Adapters of our own transformers, and rigid-body dynamics in CasADi, which Pinocchio's wheel does not have."""
+"""Adapters of the transformers of this package, with rigid-body dynamics in CasADi (Pinocchio's wheel has none)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .sklearn import chosen
 
 @adapts(RobotTransformer)
 class Unvalidated(Map):
-    """One of our transformers, without its validation. Subclasses of it know its expression too."""
+    """A transformer of this package without its validation."""
 
     by_example = False
 
@@ -40,7 +40,7 @@ class Unvalidated(Map):
 
 @adapts(AngleEncoder)
 class Angles(Unvalidated):
-    """Angles by their sines and cosines."""
+    """Angles replaced by their sines and cosines."""
 
     def casadi(self, x: Any) -> Any:
         ca, encoder = casadi(), self.transformer
@@ -55,7 +55,7 @@ class Angles(Unvalidated):
 
 
 class _OfRobot(Unvalidated):
-    """Features of [q, q̇, u], which are multiplied by the time step where a row ends with it: see `RobotMap`."""
+    """Features of [q, q̇, u], multiplied by the time step if rows end with it (see `RobotMap`)."""
 
     def casadi(self, x: Any) -> Any:
         features = self.transformer
@@ -64,7 +64,7 @@ class _OfRobot(Unvalidated):
         return casadi().vertcat(x[: features._n_kept(features._layout)], x[-1] * self.features(x[:-1]))
 
     def features(self, x: Any) -> Any:
-        """The expression of the features of x = [q, q̇, u]."""
+        """Return the expression of the features of x = [q, q̇, u]."""
         raise NotImplementedError
 
 
@@ -78,7 +78,7 @@ class Newton(_OfRobot):
 
 @adapts(InertiaForceGravity)
 class NewtonGravity(_OfRobot):
-    """The row, and gravity."""
+    """The row itself with the features of gravity."""
 
     def features(self, x: Any) -> Any:
         gravity = self.transformer._gravity
@@ -95,7 +95,7 @@ def _sines(gravity: SineGravity, x: Any) -> Any:
 
 @adapts(LinkGravity)
 class GravityOfLinks(_OfRobot):
-    """Gravity, passed on from each link to the next as `LinkGravity` does it."""
+    """Gravity in the frame of each link, computed from its parent's as in `LinkGravity`."""
 
     def features(self, x: Any) -> Any:
         if self.transformer.robot is None:
@@ -118,7 +118,6 @@ class Nominal(_OfRobot):
     """Accelerations and torques of a rigid-body model."""
 
     def features(self, x: Any) -> Any:
-        """As a function of scalars, inside: a tenth of the time that matrices of 6 x 6 would take."""
         if self.transformer.robot is None:
             return x
         ca, layout = casadi(), self.transformer._layout
@@ -134,43 +133,33 @@ class Nominal(_OfRobot):
             "input": lambda: body.accelerations(q, None, force, gravity=False),
         }
         found = ca.vertcat(*(terms[term]() for term in self.transformer._terms))
+        # As a function of scalars it takes a tenth of the time of 6 x 6 matrices.
         return ca.Function("nominal_dynamics", [row], [found]).expand()(x)
 
 
 # --- rigid-body dynamics ---------------------------------------------------------------------------------------------
-# From the numbers of a Pinocchio model. Spatial vectors are Pinocchio's, linear part first, in the frame of their joint
-# (Featherstone 2008, chapters 5 and 7).
+# Algorithms of Featherstone (2008, chapters 5 and 7), with the numbers of a Pinocchio model. Spatial vectors are
+# Pinocchio's: linear part first, in the frame of their joint.
 
 _KNOWN = ("JointModelR", "JointModelP")
 
 
 @dataclass(frozen=True)
 class _Joint:
-    """A joint and the link that it moves.
+    """A joint and the link that it moves."""
 
-    Attributes
-    ----------
-    parent : int
-        -1 is the base.
-    axis : ndarray of shape (6,)
-        Motion per unit of velocity.
-    fixed, sine, cosine, linear : ndarray of shape (6, 6)
-        A motion in the parent's frame, seen from this one: times fixed + sine sin q + cosine cos q + linear q.
-    inertia : ndarray of shape (6, 6)
-    armature : float
-    """
-
-    parent: int
-    axis: np.ndarray
+    parent: int  # -1 is the base
+    axis: np.ndarray  # (6,): motion per unit of velocity
+    # (6, 6) each: fixed + sine sin q + cosine cos q + linear q turns a motion in the parent's frame into this frame.
     fixed: np.ndarray
     sine: np.ndarray
     cosine: np.ndarray
     linear: np.ndarray
-    inertia: np.ndarray
+    inertia: np.ndarray  # (6, 6)
     armature: float
 
     def transform(self, q: Any) -> Any:
-        """From the parent's frame to this one, for motions; its transpose brings forces back."""
+        """Return the transform of motions from the parent's frame to this one; its transpose takes forces back."""
         ca = casadi()
         if self.axis[3:].any():
             return ca.DM(self.fixed) + ca.sin(q) * ca.DM(self.sine) + ca.cos(q) * ca.DM(self.cosine)
@@ -178,18 +167,7 @@ class _Joint:
 
 
 class SymbolicRigidBody:
-    """What `skevgp.robots.RigidBody` computes, of one symbolic state.
-
-    Parameters
-    ----------
-    model : pinocchio.Model
-        As `skevgp.datasets.load_robot` returns it.
-
-    Raises
-    ------
-    ValueError
-        If a joint is neither revolute nor prismatic.
-    """
+    """The functions of `skevgp.robots.RigidBody` for one symbolic state; joints must be revolute or prismatic."""
 
     def __init__(self, model: Any):
         self._joints = _joints_of(model)
@@ -197,19 +175,7 @@ class SymbolicRigidBody:
         self._damping = np.array(model.damping, dtype=float)
 
     def forces(self, q: Any, v: Any, a: Any, gravity: bool = True) -> Any:
-        """τ = M(q) a + C(q, v) v + g(q), by the recursive Newton-Euler algorithm.
-
-        Parameters
-        ----------
-        q, v : casadi.MX of shape (n_joints, 1)
-        a : casadi.MX of shape (n_joints, 1), or None
-            None are zeros, as of ``v``.
-        gravity : bool, default=True
-
-        Returns
-        -------
-        force : casadi.MX of shape (n_joints, 1)
-        """
+        """Return τ = M(q) a + C(q, v) v + g(q) by the recursive Newton-Euler algorithm; v and a may be None for 0."""
         ca = casadi()
         transforms, motions, biases = self._kinematics(q, v)
         accelerations: list[Any] = []
@@ -231,23 +197,11 @@ class SymbolicRigidBody:
         return ca.vertcat(*found)
 
     def gravity(self, q: Any) -> Any:
-        """g(q), the joint forces (n_joints, 1) that hold the robot still."""
+        """Return g(q), the joint forces (n_joints, 1) that hold the robot still."""
         return self.forces(q, None, None)
 
     def accelerations(self, q: Any, v: Any, force: Any, gravity: bool = True) -> Any:
-        """q̈ = M(q)⁻¹ (τ - C(q, v) v - g(q)), by the articulated-body algorithm.
-
-        Parameters
-        ----------
-        q, force : casadi.MX of shape (n_joints, 1)
-        v : casadi.MX of shape (n_joints, 1), or None
-            None are zeros.
-        gravity : bool, default=True
-
-        Returns
-        -------
-        a : casadi.MX of shape (n_joints, 1)
-        """
+        """Return q̈ = M(q)⁻¹ (τ - C(q, v) v - g(q)) by the articulated-body algorithm; v may be None for zeros."""
         ca = casadi()
         transforms, motions, biases = self._kinematics(q, v)
         inertias = [ca.MX(ca.DM(joint.inertia)) for joint in self._joints]
@@ -277,11 +231,11 @@ class SymbolicRigidBody:
         return ca.vertcat(*found)
 
     def accelerations_under(self, q: Any, v: Any, force: Any) -> Any:
-        """The same of joint forces beside the model's viscous damping."""
+        """Return the accelerations under joint forces and the model's viscous damping."""
         return self.accelerations(q, v, force - casadi().DM(self._damping) * v)
 
     def _kinematics(self, q: Any, v: Any) -> tuple[list[Any], list[Any], list[Any]]:
-        """Transforms from each joint's parent, motions of the links, and accelerations that follow from these."""
+        """Return transforms from the parents, motions of the links, and the accelerations that follow from motion."""
         ca = casadi()
         transforms: list[Any] = []
         motions: list[Any] = []
@@ -298,7 +252,7 @@ class SymbolicRigidBody:
         return transforms, motions, biases
 
     def _gyroscopic(self, i: int, motion: Any) -> Any:
-        """The force v ×* I v of a link."""
+        """Return the force v ×* I v of a link."""
         ca = casadi()
         if motion is None:
             return ca.DM.zeros(6)
@@ -306,14 +260,14 @@ class SymbolicRigidBody:
 
 
 def _cross_motion(by: Any, motion: Any) -> Any:
-    """The motion v × m."""
+    """Return the motion v × m."""
     ca = casadi()
     v, w = by[:3], by[3:]
     return ca.vertcat(ca.cross(w, motion[:3]) + ca.cross(v, motion[3:]), ca.cross(w, motion[3:]))
 
 
 def _cross_force(by: Any, force: Any) -> Any:
-    """The force v ×* f."""
+    """Return the force v ×* f."""
     ca = casadi()
     v, w = by[:3], by[3:]
     return ca.vertcat(ca.cross(w, force[:3]), ca.cross(w, force[3:]) + ca.cross(v, force[:3]))
@@ -334,12 +288,12 @@ def _joints_of(model: Any) -> list[_Joint]:
 
 
 def _joint(parent: int, axis: np.ndarray, placement: Any, inertia: Any, armature: float) -> _Joint:
-    """With the joint's own transform R(q) = I + sin q [u] + (1 - cos q) [u]², or a shift by q u."""
+    """Return a joint with its transform R(q) = I + sin q [u] + (1 - cos q) [u]², or its shift by q u."""
     before, zero = np.array(placement.toActionMatrixInverse()), np.zeros((3, 3))
     slide, turn = _skew(axis[:3]), _skew(axis[3:])
     both = turn @ turn
     fixed = np.eye(6) + np.block([[both, zero], [zero, both]])
-    # Seen from the turned frame: R(q)ᵀ; from the shifted one: v - q u × w.
+    # In the turned frame a motion is multiplied by R(q)ᵀ; in the shifted frame it is v - q u × w.
     sine, cosine = -np.block([[turn, zero], [zero, turn]]), -np.block([[both, zero], [zero, both]])
     linear = -np.block([[zero, slide], [zero, zero]])
     return _Joint(
@@ -355,5 +309,5 @@ def _joint(parent: int, axis: np.ndarray, placement: Any, inertia: Any, armature
 
 
 def _skew(u: np.ndarray) -> np.ndarray:
-    """[u] with [u] a = u × a."""
+    """Return the matrix [u] with [u] a = u × a."""
     return np.array([[0.0, -u[2], u[1]], [u[2], 0.0, -u[0]], [-u[1], u[0], 0.0]])

@@ -1,4 +1,4 @@
-"""Adapters of scikit-learn's transformers, and of those that are made of others: pipelines, unions, columns."""
+"""Adapters of scikit-learn's transformers, and of pipelines, unions and column transformers."""
 
 from __future__ import annotations
 
@@ -23,15 +23,16 @@ from sklearn.preprocessing import (
 )
 
 from ..utils.casadi import casadi
+from ..utils.shapes import same_for_all
 from ..utils.sklearn import safe_indexing
-from .base import Identity, Map, NoExpressionError, adapts, as_map, copies, exportable
+from .base import Identity, Map, NoExpressionError, adapts, as_map, exportable
 
 # --- transformers made of others -------------------------------------------------------------------------------------
 
 
 @adapts(Pipeline)
 class Chained(Map):
-    """A pipeline: its steps, with the chain rule."""
+    """A pipeline: the chain rule over its steps."""
 
     def __init__(self, transformer: Pipeline, example: Any = None):
         super().__init__(transformer, example)
@@ -57,7 +58,7 @@ class Chained(Map):
 
     def _onward(self, X: np.ndarray, inner: np.ndarray | None) -> np.ndarray:
         jacobian, rows = inner, X
-        behind: list[Map] = []  # steps that the rows have still to go through; linear ones do not need them
+        behind: list[Map] = []  # steps that are not yet applied to the rows; linear steps need no rows
         for step in self._steps:
             if not step.linear:
                 for earlier in behind:
@@ -81,7 +82,7 @@ class Chained(Map):
 
 
 class _SideBySide(Map):
-    """Parts whose columns are joined, each with some columns of X and its weight."""
+    """Maps whose outputs are joined, each of some columns of X and with its own weight."""
 
     # Part, indices of columns (None: all), weight (None: 1).
     _parts: list[tuple[Map, np.ndarray | None, float | None]]
@@ -159,14 +160,14 @@ class Columns(_SideBySide):
 
 
 class ColumnsAsVectors(Map):
-    """A column transformer with a part that gets its only column as a vector: only its expression is known."""
+    """A column transformer one of whose parts takes a column as a vector: it has an expression but no adapter."""
 
     def casadi(self, x: Any) -> Any:
         return Columns(self.transformer).casadi(x)
 
 
 def _behind(step: Any, own: Map, example: Any) -> Any:
-    """What a step of a pipeline makes of an example, as the next one sees it; None if these are not rows."""
+    """Return the example after a step of a pipeline, for the next step; None if the result is not a table of rows."""
     if example is None or isinstance(own, Identity):
         return example
     found = step.transform(example)
@@ -179,14 +180,14 @@ def _is_dropped(part: Any) -> bool:
 
 
 def column_indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
-    """Indices of the columns that a column transformer was given: by index or name, a slice, a list or a mask."""
+    """Return indices of the columns that a column transformer was given by index, name, slice, list or mask."""
     if isinstance(columns, slice):
         if isinstance(columns.start, str) or isinstance(columns.stop, str):  # names: the last is taken too
             start = None if columns.start is None else names.index(columns.start)
             stop = None if columns.stop is None else names.index(columns.stop) + 1
             columns = slice(start, stop, columns.step)
         return np.arange(n_columns)[columns]
-    if isinstance(columns, UserList):  # the rest, in scikit-learn 1.6: to look into it would warn
+    if isinstance(columns, UserList):  # the remainder in scikit-learn 1.6, whose items warn when read
         columns = columns.data
     listed = np.atleast_1d(np.asarray(columns)).tolist()
     if not listed:
@@ -203,7 +204,7 @@ def _times(values: np.ndarray, weight: float | None) -> np.ndarray:
 
 
 def _joined(parts: Sequence[np.ndarray], n_rows: int, *more: int) -> np.ndarray:
-    """Parts (n_rows, width, *more) by their columns; with one for all outputs repeated, if others have one for each."""
+    """Join parts (n_rows, width, *more) along width; parts for all outputs are repeated if others have one for each."""
     if not parts:
         return np.empty((n_rows, 0, *more))
     for_all = 2 + len(more)
@@ -214,7 +215,7 @@ def _joined(parts: Sequence[np.ndarray], n_rows: int, *more: int) -> np.ndarray:
 
 
 def chosen(x: Any, indices: Any) -> Any:
-    """Some of a symbolic row's columns, in this order; the row itself if they are all of it."""
+    """Select columns of a symbolic row in the given order; returns the row itself if that is all of it."""
     indices = np.asarray(indices).tolist()
     return x if indices == list(range(x.numel())) else x[indices]
 
@@ -223,16 +224,7 @@ def chosen(x: Any, indices: Any) -> Any:
 
 
 class Elementwise(Map):
-    """Each column by itself: what a scaler does, in its own order of operations, then clipped to a range.
-
-    Parameters
-    ----------
-    transformer : transformer
-    steps : list of (ufunc, ndarray or None)
-        What is done with the columns, one after the other; a step with None is left out.
-    limits : tuple of 2 floats, optional
-        Beyond which the map is constant.
-    """
+    """A map of each column by itself: operations of a scaler in its order, then a clip to a range."""
 
     by_example = False
 
@@ -242,6 +234,7 @@ class Elementwise(Map):
         steps: list[tuple[np.ufunc, np.ndarray | None]],
         limits: tuple[float, float] | None = None,
     ):
+        # Steps with None are left out. Beyond the limits the map is constant.
         super().__init__(transformer)
         self._steps = [(step, operand) for step, operand in steps if operand is not None]
         self._limits = limits
@@ -262,7 +255,7 @@ class Elementwise(Map):
         return X
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
-        jacobian = copies(self._jacobian, len(X))
+        jacobian = same_for_all(self._jacobian, len(X))
         return jacobian if self._limits is None else jacobian * self._inside(X)
 
     def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
@@ -309,7 +302,7 @@ class Robust(Elementwise):
 
 @adapts(MinMaxScaler)
 class MinMax(Elementwise):
-    """A scale and a shift, then perhaps clipped."""
+    """A scale and a shift, and a clip if the scaler has one."""
 
     def __init__(self, transformer: MinMaxScaler, example: Any = None):
         limits = transformer.feature_range if transformer.clip else None
@@ -318,10 +311,10 @@ class MinMax(Elementwise):
 
 @adapts(MaxAbsScaler)
 class MaxAbs(Elementwise):
-    """x / max |x|, then perhaps clipped."""
+    """x / max |x|, and a clip if the scaler has one."""
 
     def __init__(self, transformer: MaxAbsScaler, example: Any = None):
-        limits = (-1.0, 1.0) if getattr(transformer, "clip", False) else None  # which not all versions have
+        limits = (-1.0, 1.0) if getattr(transformer, "clip", False) else None  # not in all versions
         super().__init__(transformer, [(np.divide, transformer.scale_)], limits)
 
 
@@ -330,7 +323,7 @@ class MaxAbs(Elementwise):
 
 @adapts(PCA, TruncatedSVD)
 class Projection(Map):
-    """What a fitted PCA or TruncatedSVD does, in its own order of operations."""
+    """A fitted PCA or TruncatedSVD, with the same order of operations."""
 
     linear = True
     by_example = False
@@ -351,7 +344,7 @@ class Projection(Map):
         return projected if self._scale is None else projected / self._scale
 
     def jacobian(self, X: np.ndarray) -> np.ndarray:
-        return copies(self._jacobian, len(X))
+        return same_for_all(self._jacobian, len(X))
 
     def chain(self, X: np.ndarray, inner: np.ndarray) -> np.ndarray:
         return self._jacobian @ inner
@@ -366,7 +359,7 @@ class Projection(Map):
 
 @adapts(PolynomialFeatures)
 class Monomials(Map):
-    """What fitted PolynomialFeatures do: each monomial is one of a degree less times its first column."""
+    """Fitted PolynomialFeatures: each monomial is a monomial of one degree less times its first column."""
 
     by_example = False
 
@@ -380,14 +373,14 @@ class Monomials(Map):
         position = {powers: index for index, powers in enumerate(ordered)}
         self._n_known = len(ordered)
         self._chosen = np.array([position[powers] for powers in chosen], dtype=int)
-        self._degrees = []  # of each: where its monomials are, those of a degree less, and the columns they lack
+        self._degrees = []  # of each degree: slice of its monomials, their parents, and the columns to multiply by
         for degree in range(1, sum(ordered[-1]) + 1):
             own = [powers for powers in ordered if sum(powers) == degree]
             first = position[own[0]]
             columns, less = zip(*(next(_one_less(powers)) for powers in own), strict=True)
             parents = np.array([position[powers] for powers in less])
             self._degrees.append((slice(first, first + len(own)), parents, np.array(columns)))
-        # Derivatives that are not 0: where, and which known monomial times which power.
+        # Nonzero derivatives: position, known monomial, and the power to multiply it by.
         entries = [
             (row * len(powers) + column, position[less], powers[column])
             for row, powers in enumerate(chosen)
@@ -410,7 +403,7 @@ class Monomials(Map):
         return jacobian.reshape(len(X), -1, X.shape[1])
 
     def casadi(self, x: Any) -> Any:
-        """Each monomial is a product of as many factors as the degree is, some of them 1."""
+        # Each monomial is a product of as many factors as the degree, some of them 1.
         ca, powers = casadi(), self.transformer.powers_
         one = powers.shape[1]
         factors = [np.repeat(np.arange(one), own).tolist() for own in powers]
@@ -423,7 +416,7 @@ class Monomials(Map):
 
 
 def _one_less(powers: tuple[int, ...]) -> Iterator[tuple[int, tuple[int, ...]]]:
-    """Each column of a monomial, and the powers of what is left without it once."""
+    """Yield each column of a monomial, and the powers that remain if it is taken out once."""
     for column, power in enumerate(powers):
         if power:
             yield column, (*powers[:column], power - 1, *powers[column + 1 :])
@@ -437,7 +430,7 @@ class Splines(Map):
 
     @classmethod
     def of(cls, transformer: SplineTransformer, example: Any) -> Map:
-        # Such splines go on from another knot in the first column than in the rest.
+        # With these options scikit-learn extrapolates the first column from another knot than the rest.
         broken_lines = transformer.extrapolation == "linear" and transformer.degree <= 1
         return Map(transformer, example) if broken_lines else cls(transformer, example)
 
@@ -462,7 +455,7 @@ class Splines(Map):
 
 @adapts(FunctionTransformer)
 class Function(Map):
-    """A function of an array, which CasADi may have too; without a function it is the identity."""
+    """A FunctionTransformer, with an expression for some functions of NumPy; without a function it is the identity."""
 
     _IN_CASADI: ClassVar[dict[Any, str]] = {
         np.sin: "sin",

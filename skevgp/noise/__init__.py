@@ -1,4 +1,4 @@
-"""Models of the noise, for ``noise=`` of the regressors."""
+"""Noise models for ``noise=`` of the regressors."""
 
 from typing import Any
 
@@ -7,18 +7,12 @@ from .student_t import StudentT
 
 __all__ = ["Gaussian", "StudentT"]
 
-# What the strings of ``noise=`` stand for.
+# Noise models by their names for ``noise=``.
 NOISES: dict[str, type[Gaussian] | type[StudentT]] = {"gaussian": Gaussian, "student-t": StudentT}
 
 
 def as_noise(noise: Any) -> Gaussian | StudentT:
-    """Return the model of the noise that ``noise=`` names or is, with its options checked.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is none, or an option is out of range.
-    """
+    """Return the noise model for ``noise=``, with checked options; ValueError or TypeError if it is not valid."""
     if isinstance(noise, str) and noise in NOISES:
         return NOISES[noise]()
     kinds = tuple(NOISES.values())

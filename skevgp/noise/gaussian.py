@@ -1,8 +1,4 @@
-"""Gaussian noise of y and, to first order, of X (McHutchon & Rasmussen 2011, eq. 8).
-
-Where x is measured as x + η, η ~ N(0, Σ), y = g(x) + ε is about g(x + η) - ∂g η + ε: as a row at x + η its noise
-variance is σ² + ∂g Σ ∂gᵀ. It depends on the slopes of the learned function, so fits and slopes take turns.
-"""
+"""Gaussian noise of y and, to first order, of X (McHutchon & Rasmussen 2011, eq. 8)."""
 
 from __future__ import annotations
 
@@ -15,9 +11,12 @@ from scipy.optimize import minimize_scalar
 from ..utils.state import StatefulEstimator
 from ..utils.validation import LARGEST, as_floats, check_magnitude, check_real
 
-# Of an output's mean squared error, what at least is its own.
+# If x is measured as x + η, η ~ N(0, Σ), then y = g(x) + ε is about g(x + η) - ∂g η + ε. As a row at x + η its noise
+# variance is σ² + ∂g Σ ∂gᵀ. It depends on the slopes of the learned function, so that fits and slopes alternate.
+
+# Least share of σ² in the mean squared error of an output.
 _LEAST = 1e-4
-# Variances below are rounded to 0 somewhere.
+# Smaller variances would be rounded to 0.
 _SMALLEST = 1e-290
 
 
@@ -27,11 +26,11 @@ class Gaussian(StatefulEstimator):
     Parameters
     ----------
     variance : float, default=None
-        Noise variance at which a fit starts, in squared units of y. None takes it from the data.
+        Noise variance at the start of a fit, in squared units of y. If None, it is taken from the data.
     inputs : float or array-like of shape (n_features,) or (n_features, n_features), default=None
-        Standard deviations, or the covariance, of noise in X. To first order, the noise variance of a row is then
-        σ² + ∂g Σ ∂gᵀ (McHutchon & Rasmussen 2011), averaged over outputs that are fitted together. Fits are repeated
-        until σ² settles. σ² and ``std`` are those of rows that are known exactly. Not for Dask arrays or Adam.
+        Standard deviations, or the covariance, of noise in X. The noise variance of a row is then σ² + ∂g Σ ∂gᵀ
+        (McHutchon & Rasmussen 2011); σ² and ``std`` are those of rows without noise in X. Not for Dask arrays or Adam.
+        See the user guide, :doc:`/guide/noise`.
 
     Examples
     --------
@@ -49,19 +48,13 @@ class Gaussian(StatefulEstimator):
         self.inputs = inputs
 
     def check(self) -> None:
-        """Refuse options that are out of range."""
+        """Raise an error if an option is out of range."""
         if self.variance is not None:
             check_real(self.variance, "variance of Gaussian", minimum=0.0, strict=True)
 
 
 def input_covariance(inputs: ArrayLike, n_features: int) -> np.ndarray:
-    """The covariance (D, D) of X's noise, from standard deviations or as it is.
-
-    Raises
-    ------
-    ValueError
-        If it is of another shape, not finite, negative, or no covariance.
-    """
+    """Return the covariance (D, D) of the noise of X from ``inputs``; ValueError if that is not valid."""
     values = as_floats(inputs, "inputs of Gaussian")
     d = n_features
     if values.shape not in ((), (d,), (d, d)):
@@ -85,20 +78,20 @@ def input_covariance(inputs: ArrayLike, n_features: int) -> np.ndarray:
 
 
 def relative_noise(by_inputs: np.ndarray, own: np.ndarray, chosen: Any) -> np.ndarray:
-    """(v σ² + ∂g Σ ∂gᵀ) / v σ² of rows and outputs, (n, o): what multiplies the noise that rows have anyway."""
+    """Return (v σ² + ∂g Σ ∂gᵀ) / v σ² of rows and outputs, (n, o): the factor on the noise of the rows."""
     _, variance = row_weights(chosen, len(by_inputs))
     return np.minimum(1.0 + by_inputs / (own * variance[:, np.newaxis]), LARGEST)
 
 
 def row_weights(chosen: Any, n: int) -> tuple[np.ndarray, np.ndarray]:
-    """How often rows count, and their noise variances v in units of σ², (n,) each."""
+    """Return how often rows count, and their noise variances v in units of σ², (n,) each."""
     if chosen.counts is None:
         return np.ones(n), np.ones(n)
     return chosen.counts, chosen.counts / chosen.precision
 
 
 def own_variance(squares: np.ndarray, by_inputs: np.ndarray, counts: np.ndarray, variance: np.ndarray) -> float:
-    """The σ² under which squared errors (n,) of variance v σ² + ∂g Σ ∂gᵀ are most likely."""
+    """Return the most likely σ² of squared errors (n,) with variance v σ² + ∂g Σ ∂gᵀ."""
     whole = float(counts @ (squares / variance) / counts.sum())
 
     def loss(log_variance: float) -> float:

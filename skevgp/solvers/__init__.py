@@ -1,4 +1,4 @@
-"""Solvers of `EVGPRegressor`: how the parameters of a model are found."""
+"""Solvers of `EVGPRegressor`, which find the parameters of a model."""
 
 from typing import Any
 
@@ -7,18 +7,12 @@ from .lbfgs import LBFGS
 
 __all__ = ["LBFGS", "Adam"]
 
-# What the strings of ``solver=`` stand for.
+# Solvers by their names for ``solver=``.
 SOLVERS: dict[str, type[LBFGS] | type[Adam]] = {"lbfgs": LBFGS, "adam": Adam}
 
 
 def as_solver(solver: Any) -> LBFGS | Adam:
-    """Return the solver that ``solver=`` names or is, with its options checked.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If it is none, or an option is out of range.
-    """
+    """Return the solver for ``solver=``, with checked options; ValueError or TypeError if it is not valid."""
     if isinstance(solver, str) and solver in SOLVERS:
         return SOLVERS[solver]()
     kinds = tuple(SOLVERS.values())

@@ -15,46 +15,49 @@ from ..utils.validation import check_integer, check_real
 from .base import Callback, Limits, Minimum, Objective, Solver
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
-# Of a gradient: the square of a larger one overflows, and no step moves after that.
+# Largest entry of a gradient. The square of a larger one overflows, after which no step moves.
 _LARGEST = 1e150
-# A plateau is looked for this often, and not before so many steps.
+# Number of steps between two tests for a plateau, and before the first last steps.
 _WINDOW, _FEWEST = 50, 1500
 
 
 class Adam(Solver):
-    """The paper's solver: Adam on mini-batches, over all parameters, those of q among them.
+    """Adam on mini-batches over all parameters, including those of q: the solver of the paper.
 
     Parameters
     ----------
     batch_size : int, default=512
-        Rows per step.
+        Number of rows per step.
     learning_rate : float, default=0.1
-        The first step size.
+        First step size.
     natural_gradient : bool, default=False
-        Only with ``posterior="full"``: whether q moves by natural gradients (Hensman et al. 2013), the last one on all
-        rows, so that Adam is left with kernel, noise and inducing points. For a million rows this is the fastest way to
-        a good bound: ``Adam(batch_size=2000, natural_gradient=True)`` with ``max_iter=20000``, 40 epochs.
+        Whether to move q by natural gradients (Hensman et al. 2013), which needs ``posterior="full"``. Adam then moves
+        kernel, noise and inducing points only. For a million rows, use ``Adam(batch_size=2000, natural_gradient=True)``
+        with ``max_iter=20000``.
     n_restarts : int, default=0
-        As of `LBFGS`.
+        Number of further fits from other starts, as in `LBFGS`.
     callback : callable, default=None
-        callback(step, lower_bound, outputs), once per step, with a mini-batch's estimate; as of `LBFGS`.
+        Function callback(step, lower_bound, outputs), called once per step with the bound of a mini-batch. See `LBFGS`.
     schedule : {"cosine", "constant"}, default="cosine"
-        Whether steps fall to zero along half a cosine, over ``max_iter`` steps or over the last ones, or stay as they
-        are until the bound does, and only the last ones fall.
+        Step size: it falls to zero along half a cosine, or it is constant until the bound is flat and falls in the last
+        steps only.
 
     posterior : {"full", "diagonal"}, default="full"
-        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
+        Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
     tol : float or "auto", default="auto"
-        Tolerance in nats. Adam goes over to its last steps, as many as before, when the loss stays flat: when its
-        median over the last third of the steps differs from that over the third before by less than this (``"auto"``:
-        0.01), or by no more than chance, which mostly decides.
+        Tolerance in nats; ``"auto"`` is 0.01. Adam begins its last steps when the median loss over a third of the steps
+        changes by less than this, or by no more than chance.
     max_time : float, default=None
-        Seconds until steps end, as of `LBFGS`.
+        Number of seconds until steps end, as in `LBFGS`.
 
     Attributes
     ----------
     default_max_iter : int
-        What ``max_iter=None`` means.
+        Number of steps for ``max_iter=None``.
+
+    Notes
+    -----
+    See the user guide, :doc:`/guide/solvers`.
 
     References
     ----------
@@ -99,7 +102,7 @@ class Adam(Solver):
         self.max_time = max_time
 
     def check(self) -> None:
-        """Refuse options that are out of range."""
+        """Raise an error if an option is out of range."""
         super().check()
         check_integer(self.batch_size, "batch_size of Adam", minimum=1)
         check_real(self.learning_rate, "learning_rate of Adam", minimum=0.0, strict=True)
@@ -125,24 +128,24 @@ class Adam(Solver):
         Parameters
         ----------
         objective : callable
-            x -> (loss, gradient) of the next mini-batch at each call.
+            Function x -> (loss, gradient) of the next mini-batch at each call.
         start : ndarray of shape (size,)
-            Where to start.
+            Start point.
         limits : tuple of ndarray of shape (size,)
             Lower and upper limits, to which steps are clipped.
         max_iter : int
-            The most steps.
+            Maximum number of steps.
         tol : float
-            The loss is flat where it changes by less.
+            Tolerance in units of the loss, below which a change counts as flat.
         monitor : Monitor
-            It is told of each step, and may end them.
+            Object that is notified of each step, and may end the steps.
         pace : callable, default=None
-            pace(share), called before each step with its size as a share of the first.
+            Function pace(share), called before each step with its size as a share of the first.
 
         Returns
         -------
         minimum : Minimum
-            The last point, the loss of each step, and other points that may be better.
+            Last point, loss of each step, and other points that may be better.
         """
         constant = self.schedule == "constant"
         return adam(objective, start, limits, max_iter, self.learning_rate, tol, monitor, pace, constant=constant)
@@ -160,41 +163,17 @@ def adam(
     stop: Callable[[np.ndarray], bool] | None = None,
     constant: bool = False,
 ) -> Minimum:
-    """Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine.
-
-    The cosine is meant to take ``max_iter`` steps (if steps are to be constant, there is none at first). When the loss
-    stays flat, a last, shorter one takes over: from the present step size to zero, in as many steps as came before. The
-    loss is flat where its median over the last third of the steps differs from that over the third before by less than
-    ``tol``, or by less than twice its standard error; it stays flat if it was so throughout the last third of the
-    steps. (A loss that rises is no sign of convergence, but of steps that are too large: the cosine goes on.)
-
-    Parameters
-    ----------
-    objective : callable
-        x -> (loss, gradient), of the next mini-batch at each call.
-    start, limits
-        Steps are clipped to the limits.
-    max_iter : int
-        The most steps.
-    learning_rate : float
-        The first step size.
-    tol : float, default=0.0
-        In units of the loss.
-    monitor : Monitor, default=None
-        Told of each step.
-    pace : callable, default=None
-        pace(share), before each step: its size as a share of the first.
-    stop : callable, default=None
-        stop(x), after each step: whether it was the last.
-    constant : bool, default=False
-        Whether the step size stays as it is until the loss stays flat.
-
-    Returns
-    -------
-    minimum : Minimum
-        ``x`` is the last point, or, if the loss did not stay finite or Ctrl-C ended the steps, the best point kept on
-        the way, judged by the median loss of the steps before it; ``others`` has that point anyway.
-    """
+    """Run Adam (Kingma & Ba 2015, algorithm 1) with a step size that falls to zero along half a cosine."""
+    # The cosine is planned for max_iter steps (if steps are constant, there is none at first). When the loss stays
+    # flat, a last, shorter cosine begins: from the present step size to zero, in as many steps as came before. The loss
+    # is flat if its median over the last third of the steps differs from that over the third before by less than tol,
+    # or by less than twice its standard error. It stays flat if it was so throughout the last third of the steps. A
+    # loss that rises is a sign of steps that are too large, not of convergence, so that the first cosine goes on.
+    #
+    # objective is called with the next mini-batch each time; pace(share) before each step with its size as a share of
+    # the first; stop(x) after each step returns whether it was the last. The result has the last point. If the loss did
+    # not stay finite or Ctrl-C ended the steps, it has the best point so far, by the median loss of the steps before
+    # it; `others` has that point anyway.
     monitor = Monitor() if monitor is None else monitor
     x = np.clip(start, *limits)
     minimum, best = Minimum(x, np.inf), _BestSoFar(x)
@@ -232,7 +211,7 @@ def adam(
 
 @dataclass(frozen=True)
 class _Typical:
-    """The median of losses (a few steps that went too far do not move it), and the variance of that median."""
+    """The median of losses, which single steps that went too far do not change, and its variance."""
 
     value: float
     variance: float
@@ -240,12 +219,12 @@ class _Typical:
     @classmethod
     def of(cls, losses: np.ndarray) -> _Typical:
         low, median, high = np.percentile(losses, [25.0, 50.0, 75.0])
-        # As for a normal distribution, whose quartiles are 1.35 standard deviations apart.
+        # Quartiles of a normal distribution are 1.35 standard deviations apart.
         return cls(float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses))
 
 
 def is_flat(losses: np.ndarray, tol: float) -> bool:
-    """Whether the last third of the losses is like the third before, up to ``tol`` and chance."""
+    """Whether the last third of the losses equals the third before, up to ``tol`` and chance."""
     n = len(losses) // 3
     if n == 0:
         return False
@@ -254,7 +233,7 @@ def is_flat(losses: np.ndarray, tol: float) -> bool:
 
 
 class _BestSoFar:
-    """The point that ended the window of steps with the lowest median loss."""
+    """The last point of the window of steps with the lowest median loss."""
 
     def __init__(self, start: np.ndarray):
         self._x, self._loss = start, np.inf
@@ -268,7 +247,7 @@ class _BestSoFar:
             self._window.clear()
 
     def point(self) -> np.ndarray:
-        """The best point, which may belong to a window that has just begun."""
+        """Return the best point, which may belong to a window that has just begun."""
         return self._better()[0]
 
     def _better(self) -> tuple[np.ndarray, float]:

@@ -1,4 +1,4 @@
-"""What a solver is given and what it returns."""
+"""The interface of solvers."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Callback = Callable[[int, float, Sequence[int]], object]
 
 @dataclass
 class Minimum:
-    """Where a solver ended; `others` are points that may be better, which a mini-batch's loss does not tell."""
+    """Result of a solver. `others` are points that may be better, which the loss of a mini-batch does not tell."""
 
     x: np.ndarray
     loss: float
@@ -38,9 +38,8 @@ class Minimum:
 class Solver(StatefulEstimator):
     """A solver with its options; a subclass has `minimise`."""
 
-    # What ``max_iter=None`` means, and whether it sees mini-batches of the rows.
-    default_max_iter: ClassVar[int]
-    stochastic: ClassVar[bool]
+    default_max_iter: ClassVar[int]  # for max_iter=None
+    stochastic: ClassVar[bool]  # whether it takes mini-batches of the rows
 
     n_restarts: int
     callback: Callback | None
@@ -49,7 +48,7 @@ class Solver(StatefulEstimator):
     max_time: float | None
 
     def check(self) -> None:
-        """Refuse options that are out of range."""
+        """Raise an error if an option is out of range."""
         name = type(self).__name__
         check_integer(self.n_restarts, f"n_restarts of {name}", minimum=0)
         if self.callback is not None and not callable(self.callback):

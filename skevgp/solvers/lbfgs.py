@@ -13,79 +13,76 @@ from ..utils.monitor import Monitor
 from ..utils.validation import check_integer
 from .base import Callback, Limits, Minimum, Objective, Solver
 
-# In units of the best loss's size plus one: what is so far above it is out of the way.
+# A loss counts as far if it is this much above the best loss, in units of the size of the best loss plus one.
 _FAR = 10.0
 # Relative size of a step that changes the loss by its rounding error only.
 _HAIR = 1e-10
-# Of a step between two gradients, in the coordinates of a `ParameterTable`.
+# Step between two gradients for the curvature, in the coordinates of a `ParameterTable`.
 _STEP = 1e-3
-# A unit is the size of a step while the curvature stays what it is, and no longer.
+# Limits of units. A unit is the size of a step over which the curvature hardly changes.
 _SHORTEST, _LONGEST = 0.1, 100.0
 
 
 @dataclass(frozen=True)
 class Descent:
-    """The numbers of L-BFGS."""
+    """Options of L-BFGS."""
 
-    # Pairs of steps and gradients from which the curvature is known.
-    memory: int = 100
-    # Where no gradient is larger, a line search has nowhere to go.
-    gradient: float = 1e-9
-    # So many iterations in a row that gain less than the tolerance are a stall.
-    patience: int = 3
-    # Pairs of gradients from which the units of the coordinates are estimated.
-    probes: int = 8
+    memory: int = 100  # number of pairs of steps and gradients for the curvature
+    gradient: float = 1e-9  # a start ends if no entry of the gradient is larger
+    patience: int = 3  # number of iterations in a row with less gain than the tolerance that count as a stall
+    probes: int = 8  # number of pairs of gradients for the units of the coordinates
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """What an iteration has to gain: ``least``, or a ``share`` of what is gained already over a loss ``origin``."""
+    """Gain that an iteration needs: ``least``, or a ``share`` of the gain so far over a loss ``origin``."""
 
     least: float
     share: float = 0.0
     origin: float = 0.0
 
     def at(self, loss: float) -> float:
-        """In units of the loss, where that is so much."""
+        """Return the tolerance at a loss, in its units."""
         return max(self.least, self.share * (self.origin - loss)) if np.isfinite(loss) else self.least
 
 
 class LBFGS(Solver):
-    """L-BFGS on the bound with q at its optimum: the solver that serves most fits best.
+    """L-BFGS on the bound with q at its optimum: the best solver for most fits.
 
     Parameters
     ----------
     n_restarts : int, default=0
-        Further fits from other starts, of which the one with the best bound is kept: other inducing points (unless
-        ``inducing_init`` gives them) and, within their bounds, kernel and noise drawn log-uniformly around the first
-        start. Each takes the time of a fit.
+        Number of further fits from other starts, with other inducing points, kernel and noise. The fit with the best
+        bound is kept. Starts are drawn log-uniformly within the bounds around the first start.
     callback : callable, default=None
-        callback(iteration, lower_bound, outputs), once per iteration; on a sample of the rows the bound is that of the
-        sample, times the number of rows over its size. ``outputs`` are the columns of y that the bound is of, a range
-        or, of a group with gaps, a tuple: where outputs share nothing, each has fits of its own, and with groups each
-        group. A StopIteration or KeyboardInterrupt that it raises ends the fit with the best parameters so far, as
-        Ctrl-C does. ``clone`` copies a callable object, and leaves a function what it is.
+        Function callback(iteration, lower_bound, outputs), called once per iteration. ``outputs`` are the columns of y
+        that the bound belongs to. Raise StopIteration or KeyboardInterrupt to end the fit with the best parameters so
+        far.
 
     posterior : {"full", "diagonal"}, default="full"
-        q as one joint Gaussian of inducing values and weights, or the paper's, diagonal in both.
+        Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
     tol : float or "auto", default="auto"
-        Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row raises the
-        bound by less, and stops when a fresh start gains no more. ``"auto"`` is 0.0015 % of what the fit has gained
-        over features and noise alone, and at least 0.01.
+        Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
+        and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.
     max_time : float, default=None
-        Seconds until iterations end, for each independent model when its share is over. The best parameters so far are
-        kept, with a ConvergenceWarning, and calibration by ``noise_cv`` is left out. Finding groups of outputs
-        (``sharing="auto"``) takes at most half of the time. Passes over the rows before and after the iterations are
-        not cut short.
+        Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
+        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations take longer.
     max_inducing : int, default=1000
         Maximum number of inducing points of ``n_inducing="auto"``.
 
     Attributes
     ----------
     descent : Descent
-        The numbers of the optimiser. A subclass may have others.
+        Options of the optimiser, which a subclass may change.
     default_max_iter : int
-        What ``max_iter=None`` means.
+        Number of iterations for ``max_iter=None``.
+
+    Notes
+    -----
+    If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number of rows over
+    the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a callable object,
+    but not a function. Independent models share ``max_time``, and finding groups of outputs (``sharing="auto"``) takes
+    at most half of it. See the user guide, :doc:`/guide/solvers`.
 
     Examples
     --------
@@ -122,7 +119,7 @@ class LBFGS(Solver):
         self.max_inducing = max_inducing
 
     def check(self) -> None:
-        """Refuse options that are out of range."""
+        """Raise an error if an option is out of range."""
         super().check()
         check_integer(self.max_inducing, "max_inducing of LBFGS", minimum=1)
 
@@ -141,32 +138,32 @@ class LBFGS(Solver):
         Parameters
         ----------
         objective : callable
-            x -> (loss, gradient). It may raise `NotPositiveDefiniteError` or return NaN away from the start.
+            Function x -> (loss, gradient). It may raise `NotPositiveDefiniteError` or return NaN away from the start.
         start : ndarray of shape (size,)
-            Where to start.
+            Start point.
         limits : tuple of ndarray of shape (size,)
             Lower and upper limits.
         max_iter : int
-            The most iterations in all.
+            Maximum number of iterations over all starts.
         tolerance : Tolerance
             A start ends when each of ``descent.patience`` iterations in a row gains less. The solver ends when a whole
             start gains no more.
         monitor : Monitor
-            It is told of each iteration, and may end them.
+            Object that is notified of each iteration, and may end the iterations.
         curvature : tuple, default=None
-            A function as ``objective``, by whose curvature at the start steps are scaled, and an integer for each
-            coordinate, equal for those that share a scale. None leaves the scale of x.
+            A function as ``objective``, whose curvature at the start gives the scale of steps, and an integer for each
+            coordinate, equal for those that have the same scale. If None, x is not scaled.
 
         Returns
         -------
         minimum : Minimum
-            The best point, its loss and the loss of each iteration.
+            Best point, its loss and the loss of each iteration.
         """
         guarded, minimum = _Guarded(objective, start), Minimum(start, np.inf)
         stalled = 0
 
         def seen(intermediate_result: OptimizeResult) -> None:
-            # The iterate's own loss: a probe of a line search may have seen a better one by chance.
+            # The loss of the iterate. A point of the line search may have a lower one by chance.
             nonlocal stalled
             loss, curve = float(intermediate_result.fun), minimum.loss_curve
             before = curve[-1] if curve else np.inf
@@ -179,7 +176,7 @@ class LBFGS(Solver):
 
         with monitor.keeping_the_best():
             guarded(start)
-            # Nothing to move, or asked not to: the start is the answer.
+            # Without coordinates or iterations the start is the result.
             minimum.converged = len(start) == 0 or max_iter == 0
             x, rng = start, np.random.RandomState(0)
             for _ in range(max_iter):  # a start whose first line search fails has no iteration
@@ -206,11 +203,11 @@ class LBFGS(Solver):
                 )
                 if result.status == 1:
                     break
-                # It stalled, or a line search failed: either it is done, or its memory led it astray.
+                # It stalled, or a line search failed. Either it has converged, or its memory is misleading.
                 if not before - guarded.loss > tolerance.at(guarded.loss):
                     minimum.converged = bool(np.isfinite(guarded.loss))
                     break
-                # A hair away, where the loss is not what rounding made of it at the best of all points.
+                # Start slightly away, because the loss of the best of all points is low by a rounding error too.
                 reach = _HAIR * np.maximum(np.abs(guarded.x), 1.0)
                 x = np.clip(guarded.x + reach * rng.randn(len(x)), *limits)
         minimum.x, minimum.loss = guarded.x, guarded.loss
@@ -218,22 +215,19 @@ class LBFGS(Solver):
 
 
 class _Guarded:
-    """An objective that never raises and never returns NaN, and remembers the best point it has seen.
-
-    A line search that stepped too far interpolates back. It takes forever from a loss of 1e10, or ends within rounding
-    errors of where it began: losses far above the best are told on a logarithmic scale, with the gradient to match.
-
-    It is asked in coordinates x / ``unit``, and has the objective's x itself.
-    """
+    """An objective of x / ``unit`` that never raises nor returns NaN, and keeps the best point so far."""
 
     def __init__(self, objective: Objective, start: np.ndarray):
         self._objective = objective
         self.x, self.loss, self.unit = start.copy(), np.inf, np.ones(len(start))
 
     def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        # A line search that stepped too far interpolates back. From a loss of 1e10 it would take forever, or end within
+        # rounding errors of its start. So losses far above the best are returned on a logarithmic scale, with the
+        # gradient to match.
         x = z * self.unit
         try:
-            # What overflows is far off, and told from what does not by its loss.
+            # Points that overflow are recognised by their loss below.
             with np.errstate(over="ignore", invalid="ignore"):
                 loss, gradient = self._objective(x)
                 gradient = gradient * self.unit
@@ -251,10 +245,10 @@ class _Guarded:
 
 
 def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_probes: int) -> np.ndarray:
-    """Size of a step along each coordinate, 1 / √|∂²loss/∂x²|; equal integers in ``alike`` share one, of their mean."""
+    """Return a step size for each coordinate, 1 / √|∂²loss/∂x²|, averaged over equal integers in ``alike``."""
     # The diagonal of the Hessian from differences of gradients along random signs v: the mean of
-    # v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). The other
-    # entries add to it by chance, which makes the units smaller and never larger.
+    # v (∇(x + εv) - ∇(x)) / ε (Bekas, Kokiopoulou & Saad 2007, "An estimator for the diagonal of a matrix"). Entries
+    # off the diagonal add to its size by chance, which only makes units smaller.
     rng, total = np.random.RandomState(0), np.zeros(len(x))
     try:
         here = objective(x)[1]

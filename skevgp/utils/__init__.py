@@ -1,1 +1,1 @@
-"""Tools that know nothing of Gaussian processes."""
+"""Tools that are independent of Gaussian processes."""

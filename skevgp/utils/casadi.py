@@ -1,4 +1,4 @@
-"""CasADi, which only those who export need."""
+"""Import of CasADi, which only exports need."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ from .optional import require
 
 
 def casadi() -> Any:
-    """The package, or an ImportError that gives the pip command."""
+    """Return the package, or raise an ImportError with the pip command."""
     return require("casadi", "The export to CasADi and C")

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
@@ -13,13 +13,11 @@ from typing import IO
 
 @contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
-    """A new file that takes the place of another when all is written, and is gone if that fails.
-
-    Whoever reads at the same time sees the old one or the new one; of several who write, one is the last.
-    """
+    """Open a new file that replaces ``path`` when all is written, and is deleted if that fails."""
+    # A concurrent reader sees the old file or the new one. Of several writers, the last one wins.
     target = Path(os.path.realpath(path))
     if target.exists() and not target.is_file():
-        # A pipe or a device stays what it is.
+        # A pipe or a device is not replaced.
         with open(path, "wb") as file:
             yield file
         return
@@ -35,7 +33,7 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[IO[bytes]]:
     except OSError as error:
         if error.filename != str(beside) and error.filename != beside:
             raise
-        # The user knows of one file.
+        # Name the file that the user gave.
         raise OSError(error.errno, error.strerror, os.fspath(path)) from None
     finally:
         with suppress(OSError):

@@ -1,4 +1,4 @@
-"""Data frames as arrays and back: for states and files, and for what was fitted to frames and gets arrays."""
+"""Data frames as arrays and back."""
 
 from __future__ import annotations
 
@@ -11,31 +11,21 @@ import numpy as np
 
 from .validation import is_frame
 
-# What they call the names of columns in a constructor that takes an array.
+# Packages, and the argument of their constructor for the names of the columns of an array.
 _NAMED = (("pandas", "columns"), ("polars", "schema"))
 _PACKAGES = {"pandas": "DataFrame", "polars": "DataFrame", "pyarrow": "table"}
 
 
 class FrameColumns(NamedTuple):
-    """A data frame as arrays.
+    """A data frame as arrays, for states and files."""
 
-    Attributes
-    ----------
-    package : str
-        pandas, polars or pyarrow.
-    names : list of str
-        Of its columns.
-    columns : list of ndarray of shape (n,)
-        Of numbers or strings.
-    """
-
-    package: str
+    package: str  # pandas, polars or pyarrow
     names: list[str]
-    columns: list[np.ndarray]
+    columns: list[np.ndarray]  # (n,) each, of numbers or strings
 
     @classmethod
     def of(cls, frame: Any) -> FrameColumns | None:
-        """A data frame of one of these packages; None of what is none."""
+        """Convert a data frame of these packages; returns None for any other object."""
         package = type(frame).__module__.partition(".")[0]
         if package not in _PACKAGES or not is_frame(frame):
             return None
@@ -43,15 +33,7 @@ class FrameColumns(NamedTuple):
         return cls(package, [str(name) for name in names], [np.asarray(frame[name]) for name in names])
 
     def frame(self) -> Any:
-        """The data frame.
-
-        Raises
-        ------
-        ImportError
-            If its package is not installed.
-        ValueError
-            If there is no such package, or columns differ in length.
-        """
+        """Return the data frame; ImportError if its package is not installed, ValueError if the columns are invalid."""
         if self.package not in _PACKAGES or len(self.names) != len(self.columns):
             raise ValueError(f"There are no data frames of {self.package!r} with {len(self.names)} columns.")
         if len({column.shape for column in self.columns}) > 1:
@@ -66,16 +48,12 @@ class FrameColumns(NamedTuple):
 
 
 def package_of(values: Any) -> str:
-    """Where the class of some values is from."""
+    """Return the top-level package of an object's class."""
     return type(values).__module__.partition(".")[0]
 
 
 def as_fitted(estimator: Any, X: np.ndarray, package: str) -> Any:
-    """Rows as an estimator takes them: as a data frame if it was fitted to one.
-
-    It is of the package, if that is one of data frames, else of one that is in use, or installed; rows are as they are
-    if there is none.
-    """
+    """Return rows as a data frame if the estimator was fitted to one, in ``package`` or any that is installed."""
     names = getattr(estimator, "feature_names_in_", None)
     if names is None:
         return X

@@ -1,4 +1,4 @@
-"""Progress of a fit, and how a fit is told to stop."""
+"""Progress of a fit, and requests to stop it."""
 
 from __future__ import annotations
 
@@ -16,28 +16,12 @@ from .optional import require
 
 # Called once per iteration, with its number (from 1), the loss, and the columns of y that are fitted.
 Report = Callable[[int, float, Sequence[int]], object]
-# Seconds between two lines: where a line is drawn over the one before, and where lines follow each other.
+# Seconds between two lines, if a line is drawn over the last one and if lines follow each other.
 _LIVE, _LOG = 0.2, 10.0
 
 
 class Monitor:
-    """The object that a fit hands down. It shows progress, and ends the fit upon Ctrl-C or when its time is over.
-
-    An optimiser calls `iteration` once per iteration and works inside `keeping_the_best`. There, Ctrl-C ends the work
-    and sets `stopped`, for this monitor and for all parts made from it, in all threads. `monitor_of` says what Ctrl-C
-    does elsewhere.
-
-    Parameters
-    ----------
-    report : callable, default=None
-        report(iteration, loss, outputs), called once per iteration.
-    progress : Progress, default=None
-        Shows iterations to the user.
-    max_time : float, default=None
-        Number of seconds from now on after which the fit ends. `out_of_time` then is True.
-    clock : callable
-        Returns seconds.
-    """
+    """Shows the progress of a fit, and ends the fit upon Ctrl-C or when its time is over."""
 
     def __init__(
         self,
@@ -46,6 +30,9 @@ class Monitor:
         max_time: float | None = None,
         clock: Callable[[], float] = time.monotonic,
     ):
+        # An optimiser calls `iteration` once per iteration and works inside `keeping_the_best`. There, Ctrl-C ends the
+        # work and sets `stopped`, for this monitor and all parts made from it, in all threads. report(iteration, loss,
+        # outputs) is called once per iteration. max_time is in seconds from now; `out_of_time` is True afterwards.
         self._report, self._progress, self.max_time, self._clock = report, progress, max_time, clock
         self._end = None if max_time is None else clock() + max_time
         # All parts share the objects below, except that `with_time` gives a part its own _late.
@@ -64,19 +51,9 @@ class Monitor:
         outputs: Sequence[int] | None = None,
         about: str = "",
     ) -> Monitor:
-        """The monitor of a part of the fit.
-
-        Parameters
-        ----------
-        n_before : int, default=0
-            Number of iterations before the first of the part.
-        factor, shift : float, default=1, 0
-            The loss of the whole is ``factor`` times the loss of the part, plus ``shift``.
-        outputs : sequence of int, default=None
-            Columns of y that the part fits. If None, those of this monitor.
-        about : str, default=""
-            Name of the part, for the user.
-        """
+        """Return the monitor of a part of the fit, whose loss times ``factor`` plus ``shift`` is that of the whole."""
+        # The part begins after n_before iterations, fits the columns ``outputs`` of y (None: those of this monitor),
+        # and is called ``about`` in the progress.
         part = copy(self)
         part._n_before += n_before
         part._shift += shift * self._factor
@@ -86,7 +63,7 @@ class Monitor:
         return part
 
     def with_time(self, share: float) -> Monitor:
-        """The monitor of a part that has a share of the time that is left. Only the part ends when that is over."""
+        """Return the monitor of a part with a share of the remaining time; only the part ends when that is over."""
         part = copy(self)
         if self._end is not None:
             now = self._clock()
@@ -94,16 +71,13 @@ class Monitor:
         return part
 
     def silent(self) -> Monitor:
-        """The monitor of a part that is not reported. It ends as the others do."""
+        """Return the monitor of a part that is not reported, and ends with the others."""
         part = copy(self)
         part._report = part._progress = None
         return part
 
     def iteration(self, number: int, loss: float) -> None:
-        """Report an iteration, or raise KeyboardInterrupt if the fit is to end.
-
-        A report may end the fit by KeyboardInterrupt, or by StopIteration as callbacks of SciPy do.
-        """
+        """Report an iteration, or raise KeyboardInterrupt if the fit is to end."""
         if self._end is not None and self._clock() >= self._end:
             self._late.set()
             self._some_late.set()
@@ -115,7 +89,7 @@ class Monitor:
         if self._report is not None:
             try:
                 self._report(number, loss, self._outputs)
-            except StopIteration:
+            except StopIteration:  # callbacks of SciPy raise it to end the fit
                 raise KeyboardInterrupt from None
 
     @property
@@ -135,7 +109,7 @@ class Monitor:
 
     @property
     def finishes(self) -> bool:
-        """Whether an error in the main thread would now lose what was found."""
+        """Whether an error in the main thread would lose the best parameters so far."""
         return self._found.is_set() and self._inside[0] == 0
 
     def stop(self) -> None:
@@ -144,13 +118,7 @@ class Monitor:
 
     @contextmanager
     def keeping_the_best(self, patient: bool = False) -> Iterator[None]:
-        """Ctrl-C ends the work inside without an error: the best found so far counts.
-
-        Parameters
-        ----------
-        patient : bool, default=False
-            Whether only a second Ctrl-C ends the work, because its result is not at hand yet.
-        """
+        """Let Ctrl-C end the work inside without an error; if patient, only a second Ctrl-C."""
         own = not patient and current_thread() is main_thread()
         self._inside[0] += own
         try:
@@ -164,23 +132,13 @@ class Monitor:
 
 
 class Progress:
-    """Show the part of the fit, iteration, bound and seconds so far.
-
-    At verbosity 1, tqdm draws one live line, if it is installed and the stream is a terminal or a notebook. Otherwise
-    there is a line every ten seconds, and the last one. From verbosity 2, there is a line for each iteration. Where
-    several models are fitted side by side, a line is about the model that has just had an iteration.
-
-    Parameters
-    ----------
-    verbose : int
-        Verbosity, at least 1.
-    stream : file, default=None
-        If None, the standard output.
-    clock : callable
-        Returns seconds.
-    """
+    """Shows the part of the fit, iteration, bound and seconds so far, for a verbosity of at least 1."""
 
     def __init__(self, verbose: int, stream: TextIO | None = None, clock: Callable[[], float] = time.monotonic):
+        # At verbosity 1, tqdm draws one live line, if it is installed and the stream (by default the standard output)
+        # is a terminal or a notebook. Otherwise there is a line every ten seconds, and the last one. From verbosity 2,
+        # there is a line for each iteration. If several models are fitted in parallel, a line is about the latest
+        # iteration.
         self._verbose, self._clock = verbose, clock
         self._stream = sys.stdout if stream is None else stream
         self._tqdm = _tqdm_on(self._stream) if verbose == 1 else None
@@ -192,7 +150,7 @@ class Progress:
         self._told: tuple[int, float, str, float] | None = None
 
     def __call__(self, number: int, loss: float, about: str) -> None:
-        """Tell of an iteration."""
+        """Record an iteration, and show it if it is time."""
         with self._lock:
             now = self._clock()
             self._told = number, loss, about, now - self._start
@@ -228,7 +186,7 @@ class Progress:
 
 
 def _tqdm_on(stream: TextIO | None) -> Any:
-    """The class of tqdm's bars, or None if it is not installed or cannot draw over a line of the stream."""
+    """Return the class of tqdm's bars, or None if it is not installed or the stream cannot draw over a line."""
     try:
         auto, plain = (require(f"tqdm.{name}", "A progress bar") for name in ("auto", "asyncio"))
     except ImportError:
@@ -239,11 +197,9 @@ def _tqdm_on(stream: TextIO | None) -> Any:
 
 @contextmanager
 def monitor_of(verbose: int, callback: Report | None = None, max_time: float | None = None) -> Iterator[Monitor]:
-    """The monitor of a fit, which shows progress as ``verbose`` says and calls callback(iteration, bound, outputs).
-
-    Once there is something to keep, the first Ctrl-C outside of `Monitor.keeping_the_best` stops the monitor without an
-    error, so that the fit is put together. A second one raises KeyboardInterrupt.
-    """
+    """Make the monitor of a fit, with progress by ``verbose`` and calls of callback(iteration, bound, outputs)."""
+    # Once there are parameters to keep, the first Ctrl-C outside of `keeping_the_best` stops the monitor without an
+    # error, so that the fit is completed. A second one raises KeyboardInterrupt.
     progress = Progress(verbose) if verbose else None
     report = callback and (lambda number, loss, outputs: callback(number, -loss, outputs))
     monitor = Monitor(report, progress, max_time)

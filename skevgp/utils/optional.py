@@ -1,4 +1,4 @@
-"""Packages that only some users need: imported where they are used, or an error that says how to get them."""
+"""Optional packages: imported when they are used, or an error with the pip command."""
 
 from __future__ import annotations
 
@@ -18,24 +18,7 @@ _PACKAGES = {
 
 
 def require(name: str, purpose: str) -> ModuleType:
-    """Import an optional package.
-
-    Parameters
-    ----------
-    name : str
-        The importable name, for example ``"pinocchio"`` or ``"matplotlib.pyplot"``.
-    purpose : str
-        What it is needed for; the subject of the error's sentence.
-
-    Returns
-    -------
-    module : module
-
-    Raises
-    ------
-    ImportError
-        With the pip command, if the package is not installed.
-    """
+    """Import an optional package or module, or raise an ImportError with ``purpose`` as subject and the pip command."""
     try:
         return importlib.import_module(name)
     except ImportError as error:

@@ -1,4 +1,4 @@
-"""Scores of a mean with its standard deviation: what cross-validation asks of any estimator that says both."""
+"""Scorers of a mean with its standard deviation, for cross-validation."""
 
 from __future__ import annotations
 
@@ -13,30 +13,20 @@ from sklearn.pipeline import Pipeline
 from sklearn.preprocessing import MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler
 
 Metric = Callable[..., float]
-# Each column by itself, times a number, plus a number: of these a Gaussian is a Gaussian again.
+# These scale and shift each column, which turns a Gaussian into a Gaussian.
 _SCALERS = (MaxAbsScaler, MinMaxScaler, RobustScaler, StandardScaler)
 
 
 class StdScorer:
-    """Predict with a standard deviation, and score both; made by `make_std_scorer`.
-
-    Parameters
-    ----------
-    metric : callable
-        ``metric(y_true, y_pred, std, **options) -> float``.
-    sign : int
-        1, or -1 if lower is better.
-    options : dict
-        For the metric.
-    """
+    """Scorer of the predicted mean and standard deviation, made by `make_std_scorer`."""
 
     def __init__(self, metric: Metric, sign: int, options: dict[str, Any]):
         self.metric = metric
-        self.sign = sign
+        self.sign = sign  # 1, or -1 if lower is better
         self.options = options
 
     def __call__(self, estimator: Any, X: Any, y: Any) -> float:
-        """Score: the higher, the better."""
+        """Return the score; higher is better."""
         mean, std = mean_and_std(estimator, X)
         return self.sign * self.metric(y, mean, std, **self.options)
 
@@ -47,35 +37,38 @@ class StdScorer:
 
 
 def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwargs: Any) -> StdScorer:
-    """Make a scorer of a metric that sees the predicted standard deviation.
+    """Make a scorer from a metric of the predicted mean and standard deviation.
 
-    For ``scoring=`` of `cross_validate`, `GridSearchCV`, `HalvingGridSearchCV`, `permutation_importance`: what
-    `sklearn.metrics.make_scorer` is for metrics of the mean. Ready are `neg_nlpd`, `neg_crps`
-    and `neg_calibration_error`.
+    Use it for ``scoring=`` of `cross_validate`, `GridSearchCV`, `HalvingGridSearchCV` and `permutation_importance`. It
+    corresponds to `sklearn.metrics.make_scorer` for metrics of the mean. The scorers `neg_nlpd`, `neg_crps` and
+    `neg_calibration_error` are ready to use.
 
     Parameters
     ----------
     score_func : callable
-        ``score_func(y_true, y_pred, std, **kwargs) -> float``, such as `crps`.
+        Metric ``score_func(y_true, y_pred, std, **kwargs) -> float``, such as `crps`.
     greater_is_better : bool, default=True
-        Whether a high number is good. If not, the scorer returns minus the number, as scikit-learn's do.
+        Whether a high number is good. If False, the scorer returns minus the number, as scikit-learn's scorers do.
     **kwargs : dict
-        For ``score_func``.
+        Arguments for ``score_func``.
 
     Returns
     -------
     scorer : callable
-        ``scorer(estimator, X, y) -> float``. The estimator's ``predict`` takes ``return_std``, as of this package's and
-        of scikit-learn's GaussianProcessRegressor and BayesianRidge (std should be that of y: of a
-        GaussianProcessRegressor it holds the noise of a WhiteKernel, not ``alpha``). It may be the last step of a
-        Pipeline, or inside of a search, of a MultiOutputRegressor, or of a TransformedTargetRegressor that scales y
-        (by one of scikit-learn's scalers of columns, or not at all). Otherwise a TypeError says what is missing: of
-        log y, say, mean and std are no Gaussian of y, and a RegressorChain hands on means only.
+        Function ``scorer(estimator, X, y) -> float`` for estimators whose ``predict`` has ``return_std``. It raises a
+        TypeError if there is no standard deviation of y.
 
     Raises
     ------
     TypeError
         If ``score_func`` is not callable.
+
+    Notes
+    -----
+    The estimator may be the last step of a Pipeline, or inside a search, a MultiOutputRegressor, or a
+    TransformedTargetRegressor with one of scikit-learn's scalers of columns. Other transformations of y, such as the
+    logarithm, have no Gaussian of y, and a RegressorChain passes on means only. The std of a GaussianProcessRegressor
+    has the noise of a WhiteKernel, but not ``alpha``.
 
     Examples
     --------
@@ -96,23 +89,7 @@ def make_std_scorer(score_func: Metric, *, greater_is_better: bool = True, **kwa
 
 
 def mean_and_std(estimator: Any, X: Any) -> tuple[np.ndarray, np.ndarray]:
-    """What a fitted estimator predicts with ``return_std``, through what scikit-learn may have put around it.
-
-    Parameters
-    ----------
-    estimator : regressor
-        Fitted.
-    X : array-like of shape (n_samples, n_features)
-
-    Returns
-    -------
-    mean, std : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-
-    Raises
-    ------
-    TypeError
-        If there is no standard deviation of y.
-    """
+    """Return mean and std of a fitted estimator, also inside scikit-learn's wrappers; TypeError if there is no std."""
     if hasattr(estimator, "best_estimator_"):  # of a search
         return mean_and_std(estimator.best_estimator_, X)
     if isinstance(estimator, Pipeline):  # itself it would have to be told by set_predict_request
@@ -140,7 +117,7 @@ def mean_and_std(estimator: Any, X: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _scaled_back(model: TransformedTargetRegressor, mean: np.ndarray, std: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """In the units of y."""
+    """Return mean and std in the units of y."""
     transformer = model.transformer_
     given = transformer.get_params(deep=False)
     identity = "inverse_func" in given and given["func"] is None and given["inverse_func"] is None

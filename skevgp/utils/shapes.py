@@ -1,4 +1,4 @@
-"""Results in the shape that GaussianProcessRegressor gives them."""
+"""Shapes of results, and of Jacobians that do not depend on the row."""
 
 from __future__ import annotations
 
@@ -6,14 +6,12 @@ import numpy as np
 
 
 def like_y(values: np.ndarray) -> np.ndarray:
-    """Without the last axis, of outputs, if there is one output.
-
-    Parameters
-    ----------
-    values : ndarray of shape (..., n_outputs)
-
-    Returns
-    -------
-    values : ndarray of shape (...) or (..., n_outputs)
-    """
+    """Drop the last axis (of outputs) if there is one output, as GaussianProcessRegressor does."""
     return values[..., 0] if values.shape[-1] == 1 else values
+
+
+def same_for_all(jacobian: np.ndarray, n_rows: int) -> np.ndarray:
+    """Copy one row's Jacobian to each of n_rows rows, (n_rows, n_features_out, n_features_in)."""
+    copies = np.empty((n_rows, *jacobian.shape))
+    copies[:] = jacobian
+    return copies

@@ -1,7 +1,4 @@
-"""What scikit-learn keeps private and an estimator of its kind needs: imported here and nowhere else.
-
-A release that moves one of these names is met in this file. They are the same in scikit-learn 1.6 to 1.9.
-"""
+"""All private names of scikit-learn that this package imports; they are the same in scikit-learn 1.6 to 1.9."""
 
 from sklearn.base import _fit_context as fit_context
 from sklearn.utils import _safe_indexing as safe_indexing

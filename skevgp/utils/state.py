@@ -1,6 +1,6 @@
-"""What estimators are in pickles and files: which version of skevgp they are of, and nothing but plain data.
+"""The state of estimators in pickles and files: the version of skevgp and plain data only.
 
-Data frames and Pinocchio's models, which skops cannot hold, are arrays there.
+Data frames and models of Pinocchio, which skops cannot store, become arrays.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from ..exceptions import InconsistentVersionWarning, warn_user
 from .frames import FrameColumns
 
 _KEY = "_skevgp_version"
-# Classes of plain data, each with what makes it of an object (None of others) and what makes the object of it.
+# Classes of plain data, each with a function that converts an object (None if it cannot) and one that converts it back.
 _STORED: dict[type, tuple[Callable[[Any], Any], Callable[[Any], Any]]] = {
     FrameColumns: (FrameColumns.of, FrameColumns.frame)
 }
 
 
 def stored_as(kind: type, of: Callable[[Any], Any], back: Callable[[Any], Any]) -> None:
-    """Let states hold plain data of a class ``kind`` in place of the objects that ``of`` knows."""
+    """Let states store objects that ``of`` converts as plain data of the class ``kind``."""
     _STORED[kind] = of, back
 
 
 class StatefulEstimator(BaseEstimator):
-    """As scikit-learn's own estimators: the version is in the state, and another one is warned of."""
+    """An estimator whose state holds the version, with a warning if it is loaded by another version."""
 
     def __getstate__(self) -> dict[str, Any]:
         state = {name: _as_data(value) for name, value in super().__getstate__().items()}
-        # Of a user's class it says nothing; scikit-learn does the same.
+        # The version says nothing about a class of the user. scikit-learn does the same.
         return {**state, _KEY: __version__} if _is_ours(self) else state
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -54,7 +54,7 @@ def _is_ours(estimator: object) -> bool:
 
 def _as_data(value: Any) -> Any:
     if isinstance(value, PurePath):
-        # Paths of another system cannot be made here.
+        # A path of another operating system could not be restored.
         return str(value)
     found = (of(value) for of, _ in _STORED.values())
     return next((data for data in found if data is not None), value)

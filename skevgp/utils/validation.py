@@ -1,4 +1,4 @@
-"""Checks of arguments whose errors name the argument, the value and what is allowed."""
+"""Checks of arguments. Errors name the argument, its value and the allowed values."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from sklearn.utils.validation import check_is_fitted, validate_data
 
 from .sklearn import safe_indexing
 
-# float32 is not copied as a whole: pieces of it become float64.
+# float32 is not copied as a whole; pieces of it become float64.
 FLOATS = (np.float64, np.float32)
 LARGEST = 1e100
-# So many rows can be looked at in one go.
+# Largest number of rows for the short check of `is_plain`.
 _FEW_ROWS = 16
-# The square of a noise far below it is not yet rounded to 0.
+# Smallest size of numbers. The square of a noise far below it is not yet rounded to 0.
 SMALLEST = 1e-140
 
 
 def check_integer(value: Any, name: str, *, minimum: int) -> int:
-    """An integer not below ``minimum``, or an error that names it."""
+    """Return an integer not below ``minimum``, or raise an error that names it."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Integral):
         raise TypeError(f"{name} must be an integer; got {value!r}.")
     if value < minimum:
@@ -34,7 +34,7 @@ def check_integer(value: Any, name: str, *, minimum: int) -> int:
 
 
 def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -> float:
-    """A finite number not below (``strict``: above) ``minimum``, or an error that names it."""
+    """Return a finite number not below (``strict``: above) ``minimum``, or raise an error that names it."""
     if isinstance(value, (bool, np.bool_)) or not isinstance(value, Real):
         raise TypeError(f"{name} must be a number; got {value!r}.")
     number = float(value)
@@ -44,7 +44,7 @@ def check_real(value: Any, name: str, *, minimum: float, strict: bool = False) -
 
 
 def is_plain(estimator: Any, X: Any) -> bool:
-    """Whether X is a few finite rows as a fitted estimator saw them: in a control loop they need no other check."""
+    """Whether X is a small finite array with the columns of fit, which needs no other check in a control loop."""
     return (
         type(X) is np.ndarray
         and X.dtype == np.float64
@@ -57,7 +57,7 @@ def is_plain(estimator: Any, X: Any) -> bool:
 
 
 def check_fitted(estimator: Any) -> None:
-    """As scikit-learn's `check_is_fitted`, of estimators that predict before a fit too (from their prior)."""
+    """Raise NotFittedError before fit, also for estimators that can predict from their prior."""
     if hasattr(estimator, "__sklearn_is_fitted__") and not estimator.__sklearn_is_fitted__():
         raise NotFittedError(f"This {type(estimator).__name__} instance is not fitted yet: call fit before.")
     check_is_fitted(estimator)
@@ -69,12 +69,12 @@ def is_dask(values: Any) -> bool:
 
 
 def is_frame(values: Any) -> bool:
-    """Whether it is a data frame: of pandas, polars or (scikit-learn 1.7 or later takes its rows) pyarrow."""
+    """Whether it is a data frame of pandas, polars or (with scikit-learn 1.7 or later) pyarrow."""
     return hasattr(type(values), "columns") and hasattr(type(values), "shape")
 
 
 def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
-    """Check names and number of a data frame's columns, not what they hold; return y, if there is one, as floats."""
+    """Check names and number of a data frame's columns, not their values; returns y, if given, as floats."""
     if 0 in X.shape:
         raise ValueError(f"X is empty: its shape is {X.shape}.")
     validate_data(estimator, X, *y, reset=reset, skip_check_array=True)
@@ -87,7 +87,7 @@ def validate_frame(estimator: Any, X: Any, *y: Any, reset: bool) -> np.ndarray:
 
 
 def validate_numbers(estimator: Any, X: Any, *y: Any, reset: bool, dtype: Any, ensure_min_samples: int = 1) -> Any:
-    """scikit-learn's `validate_data` of rows, and of targets of any width, which become floats; errors name which."""
+    """Validate rows, and targets of any width as floats, by scikit-learn's `validate_data`; errors name X or y."""
     given = dict(zip(("X", "y"), (X, *y), strict=False))
     for name, values in given.items():
         _check_kind(values, name)
@@ -107,13 +107,13 @@ def validate_numbers(estimator: Any, X: Any, *y: Any, reset: bool, dtype: Any, e
     if not y:
         return validated
     target = validated[1] if validated[1].dtype.kind == "f" else as_floats(validated[1], "y")
-    # Before it made floats of objects, None may have been among them.
+    # Objects may have held None, which became NaN.
     assert_all_finite(target, input_name="y", estimator_name=type(estimator).__name__)
     return validated[0], target
 
 
 def _check_kind(values: Any, name: str) -> None:
-    """Refuse what would be taken for other numbers than it is, and targets in a sparse matrix."""
+    """Raise an error for masked values, dates and times, and a sparse matrix of targets."""
     if name == "y" and issparse(values):
         raise TypeError(f"y must be a dense array; got a sparse matrix of the shape {values.shape}. Use y.toarray().")
     if isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values):
@@ -124,7 +124,7 @@ def _check_kind(values: Any, name: str) -> None:
 
 
 def words_of(frame: Any) -> list[Any]:
-    """The names of the columns of a data frame that are not numbers."""
+    """List the names of the columns of a data frame that are not numbers."""
     names = frame.column_names if hasattr(type(frame), "column_names") else frame.columns  # the first is pyarrow's
     columns = (safe_indexing(frame, index, axis=1) for index in range(frame.shape[1]))
     return [name for name, column in zip(names, columns, strict=True) if not _are_numbers(column)]
@@ -140,27 +140,27 @@ def _are_numbers(column: Any) -> bool:
 
 
 def check_magnitude(values: np.ndarray, name: str, limit: float = LARGEST) -> None:
-    """Refuse finite numbers whose squares would overflow."""
+    """Raise an error for numbers whose squares would overflow."""
     largest = max(float(values.max(initial=0.0)), -float(values.min(initial=0.0)))
     if largest > limit:
         raise ValueError(f"{name} must not exceed {limit:g} in size; its largest value is {largest:g}. Rescale it.")
 
 
 def check_not_vanishing(largest: np.ndarray, name: str, limit: float = SMALLEST) -> None:
-    """Refuse columns, other than of zeros, whose squares would vanish, by their largest absolute values."""
+    """Raise an error for columns, other than of zeros, whose squares would vanish, by their largest sizes."""
     if ((largest > 0.0) & (largest < limit)).any():
         smallest = np.min(largest[largest > 0.0])
         raise ValueError(f"{name} must be 0 or exceed {limit:g} in size; a column's largest value is {smallest:g}.")
 
 
 def check_size(values: np.ndarray, name: str) -> None:
-    """Refuse columns of numbers, (n, columns), whose squares would overflow or vanish."""
+    """Raise an error for columns of numbers (n, columns) whose squares would overflow or vanish."""
     check_magnitude(values, name)
     check_not_vanishing(np.abs(values).max(axis=0), name)
 
 
 def as_floats(values: Any, name: str) -> np.ndarray:
-    """Real numbers as an array of floats, or an error that names them."""
+    """Return real numbers as an array of floats, or raise an error that names them."""
     try:
         array = np.asarray(values)
         if array.dtype.kind not in "cSUMm":
@@ -171,7 +171,7 @@ def as_floats(values: Any, name: str) -> np.ndarray:
 
 
 def checked_groups(groups: Any, n_samples: int, name: str = "groups") -> np.ndarray | None:
-    """Numbers 0, 1, ... (n_samples,) in place of the labels of groups; None for None."""
+    """Return numbers 0, 1, ... (n_samples,) for the labels of groups, or None for None."""
     if groups is None:
         return None
     try:
@@ -183,14 +183,14 @@ def checked_groups(groups: Any, n_samples: int, name: str = "groups") -> np.ndar
     try:
         numbers: np.ndarray = np.unique(labels, return_inverse=True)[1]
     except TypeError:
-        # Words and numbers, say, have no order.
+        # Labels of several types, such as words and numbers, have no order.
         numbers = np.unique([repr(label) for label in labels.tolist()], return_inverse=True)[1]
     return numbers
 
 
 @contextmanager
 def unchanged_if_it_fails(estimator: Any) -> Iterator[None]:
-    """Give an estimator its attributes back if what is done to it fails."""
+    """Restore the attributes of an estimator if the code inside fails."""
     before = dict(vars(estimator))
     try:
         yield
