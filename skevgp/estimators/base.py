@@ -23,7 +23,7 @@ from ..fitting.fit import Fitted
 from ..fitting.prior import CoefPrior, coef_names
 from ..fitting.problem import Problem
 from ..kernels.parse import KernelSpec
-from ..noise import Gaussian, StudentT
+from ..noise.base import Noise
 from ..solvers import as_solver
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
@@ -72,7 +72,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     kernel: Kernel | Callable[..., Any] | None
     kernel_map: TransformerMixin | None
     coef_prior: CoefPrior | Literal["auto"]
-    noise: Literal["gaussian", "student-t"] | Gaussian | StudentT
+    noise: Literal["gaussian", "student-t"] | Noise
     normalize_y: bool
     max_iter: Any
     solver: Any

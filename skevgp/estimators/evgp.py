@@ -25,9 +25,11 @@ from ..fitting.messages import DEPENDENT_ROWS, interrupted
 from ..fitting.noisy_inputs import fit_to_noisy_inputs, look_at_slopes
 from ..fitting.prior import CoefPrior, as_coef_prior
 from ..fitting.problem import Problem, Sharing
-from ..noise import Gaussian, StudentT, as_noise
+from ..noise import as_noise
+from ..noise.base import Noise
 from ..noise.gaussian import input_covariance, relative_noise
-from ..solvers import LBFGS, Adam, as_solver
+from ..solvers import as_solver
+from ..solvers.base import Solver
 from ..utils.monitor import monitor_of
 from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import (
@@ -231,10 +233,10 @@ class EVGPRegressor(GaussianProcess):
         n_inducing: int | Literal["auto"] = 100,
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Sharing = "auto",
-        noise: Literal["gaussian", "student-t"] | Gaussian | StudentT = "gaussian",
+        noise: Literal["gaussian", "student-t"] | Noise = "gaussian",
         noise_cv: int | None = 5,
         normalize_y: bool = False,
-        solver: Literal["lbfgs", "adam"] | LBFGS | Adam = "lbfgs",
+        solver: Literal["lbfgs", "adam"] | Solver = "lbfgs",
         max_iter: int | None = None,
         warm_start: bool = False,
         n_jobs: int | None = None,
@@ -430,7 +432,7 @@ class EVGPRegressor(GaussianProcess):
     # If y is what was added to columns of X, which ones: `ResidualRegressor` says so, since their noise is in y too.
     _columns_changed: np.ndarray | None = None
 
-    def _check_together(self, solver: LBFGS | Adam, noise: Gaussian | StudentT, X: Any) -> None:
+    def _check_together(self, solver: Solver, noise: Noise, X: Any) -> None:
         """Refuse arguments that do not go together."""
         if not isinstance(self.n_inducing, str):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
@@ -443,7 +445,7 @@ class EVGPRegressor(GaussianProcess):
                 f"solver={self.solver!r} and X of type {type(X).__name__}."
             )
 
-    def _problem(self, data: Dataset, solver: LBFGS | Adam, noise: Gaussian | StudentT) -> Problem:
+    def _problem(self, data: Dataset, solver: Solver, noise: Noise) -> Problem:
         prior = as_coef_prior(self.coef_prior)
         problem = Problem.from_data(
             data, kernel=self.kernel, coef_prior=prior, noise=noise, normalize_y=self.normalize_y

@@ -14,8 +14,7 @@ from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.parameters import ParameterTable, Values
 from ..model.predictor import Predictor
 from ..solvers import LBFGS
-from ..solvers.base import Minimum
-from ..solvers.lbfgs import Tolerance
+from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import LARGEST, as_floats

@@ -19,8 +19,7 @@ from ..model.exact import ExactModel, LikelihoodObjective
 from ..model.model import SparseModel
 from ..model.objectives import BoundObjective, ElboObjective
 from ..model.parameters import ParameterTable, Values
-from ..solvers.base import Minimum
-from ..solvers.lbfgs import Tolerance
+from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more

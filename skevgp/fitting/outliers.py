@@ -11,7 +11,7 @@ import numpy as np
 from ..data.rows import LocalSource, Rows
 from ..model.parameters import Values
 from ..model.predictor import Predictor
-from ..noise.student_t import RowScales
+from ..noise.base import RowScales
 from .model import ENOUGH, LEAST_TOL, Model
 from .search import Fit, Start, better, search
 
@@ -65,11 +65,11 @@ class RowDoubts:
         noise, plain = fitted.values["noise"], replace(fitted, doubts=None)
         look = look_at(rows, of_residuals(fitted.predictor))
         predicted = look.latent + np.multiply.outer(look.variance, noise)
-        doubts = replace(self, scales=RowScales(len(noise), (look.errors**2 / predicted).sum(axis=1)))
+        doubts = replace(self, scales=self.scales.at((look.errors**2 / predicted).sum(axis=1)))
         for _ in range(_TURNS):
             new = plain.updated(doubts.weigh(rows))
             before, look = doubts, look_at(rows, of_residuals(new.predictor))
-            doubts = replace(self, scales=RowScales(len(noise), look.distances(noise)))
+            doubts = replace(self, scales=self.scales.at(look.distances(noise)))
             if not doubts.differ_from(before):
                 break
         return doubts.told(replace(plain.updated(doubts.weigh(rows)), doubts=doubts))
@@ -109,9 +109,9 @@ def _first_doubts(model: Model) -> RowDoubts:
     short = replace(model, rows=some, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
     look = look_at(rows, predictor_at(short, search(short).values))
     n_outputs = look.errors.shape[1]
-    scales = RowScales(n_outputs, look.distances(look.typical))
+    scales = model.problem.noise.row_scales(n_outputs, look.distances(look.typical))
     if np.mean(scales.outlier > 0.5) > _FEW:
-        scales = RowScales(n_outputs, np.zeros(len(rows)))
+        scales = scales.at(np.zeros(len(rows)))
     return RowDoubts(scales, np.ones(n_outputs))
 
 
@@ -125,7 +125,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     for _ in range(_TURNS):
         look = look_at(rows, predictor_at(model, fit.values))
         factor = np.where(model.table["noise"].free, look.clean_variance() / noise, 1.0)
-        before, doubts = doubts, RowDoubts(RowScales(len(noise), look.distances(noise)), factor)
+        before, doubts = doubts, RowDoubts(doubts.scales.at(look.distances(noise)), factor)
         model = replace(model, rows=doubts.weigh(rows))
         if not doubts.differ_from(before):
             break

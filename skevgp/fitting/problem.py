@@ -14,8 +14,10 @@ from ..data.rows import Moments, Source, moments_of_rows
 from ..kernels.parse import KernelSpec, parse_kernel
 from ..model.bounds import PosteriorFamily
 from ..model.predictor import CoefficientPrior
-from ..noise import Gaussian, StudentT
-from ..solvers import LBFGS, Adam
+from ..noise import Gaussian
+from ..noise.base import Noise
+from ..solvers import LBFGS
+from ..solvers.base import Solver
 from ..utils.validation import check_magnitude, check_not_vanishing
 from .calibration import CrossValidation
 from .inducing import Placement
@@ -52,7 +54,7 @@ class Problem:
     groups: np.ndarray | None = None
     # How inducing points are placed. The exact model does not use it.
     placement: Placement = field(default_factory=lambda: Placement("auto", 0))
-    solver: LBFGS | Adam = field(default_factory=LBFGS)
+    solver: Solver = field(default_factory=LBFGS)
     max_iter: int = 0
     # In nats. None: the fit chooses it.
     tol: float | None = None
@@ -62,7 +64,7 @@ class Problem:
     family: PosteriorFamily = "full"
     # The folds by which signal and noise are calibrated.
     noise_cv: CrossValidation | None = None
-    noise: Gaussian | StudentT = field(default_factory=Gaussian)
+    noise: Noise = field(default_factory=Gaussian)
     # (n, o): noise variances of the rows in units of σ², on top of those in the source. The outputs of a model share
     # their mean.
     row_variance: np.ndarray | None = None
@@ -76,7 +78,7 @@ class Problem:
         *,
         kernel: Any,
         coef_prior: CoefPrior,
-        noise: Gaussian | StudentT,
+        noise: Noise,
         normalize_y: bool,
         allow_vague: bool = False,
     ) -> Problem:
@@ -142,8 +144,8 @@ class Problem:
 
     def check(self) -> None:
         """Raise a ValueError if the solver or the diagonal posterior cannot fit this problem."""
-        solver, prior, is_adam = self.solver, self.units.prior, isinstance(self.solver, Adam)
-        if is_adam and self.per_output and isinstance(self.sharing, str) and self.sharing == "kernel":
+        solver, prior = self.solver, self.units.prior
+        if solver.stochastic and self.per_output and isinstance(self.sharing, str) and self.sharing == "kernel":
             raise ValueError(
                 'sharing="kernel" of outputs with rows of their own needs solver="lbfgs" or an LBFGS(...); got '
                 f"solver={solver!r}."
@@ -151,7 +153,7 @@ class Problem:
         told = "shared=True of CoefPrior" if prior.shared else "a covariance of the weights (cov of CoefPrior)"
         if prior.root is None and not prior.shared:
             return
-        if is_adam:
+        if solver.stochastic:
             raise ValueError(f'{told} needs solver="lbfgs" or an LBFGS(...); got solver={solver!r}.')
         if self.family == "diagonal":
             raise ValueError(f'{told} needs posterior="full"; got posterior={self.family!r}.')

@@ -14,7 +14,7 @@ from ..data.rows import LocalSource, Rows
 from ..data.threads import BlockMap, side_by_side
 from ..model.parameters import ParameterTable, Values
 from ..solvers import LBFGS
-from ..solvers.lbfgs import Tolerance
+from ..solvers.base import Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .inducing import Placement

@@ -2,16 +2,17 @@
 
 from typing import Any
 
+from .base import Noise
 from .gaussian import Gaussian
 from .student_t import StudentT
 
 __all__ = ["Gaussian", "StudentT"]
 
 # Noise models by their names for ``noise=``.
-NOISES: dict[str, type[Gaussian] | type[StudentT]] = {"gaussian": Gaussian, "student-t": StudentT}
+NOISES: dict[str, type[Noise]] = {"gaussian": Gaussian, "student-t": StudentT}
 
 
-def as_noise(noise: Any) -> Gaussian | StudentT:
+def as_noise(noise: Any) -> Noise:
     """Return the noise model for ``noise=``, with checked options; ValueError or TypeError if it is not valid."""
     if isinstance(noise, str) and noise in NOISES:
         return NOISES[noise]()

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 from scipy.optimize import minimize_scalar
 
-from ..utils.state import StatefulEstimator
-from ..utils.validation import LARGEST, as_floats, check_magnitude, check_real
+from ..utils.validation import LARGEST, as_floats, check_magnitude
+from .base import Noise
 
 # If x is measured as x + η, η ~ N(0, Σ), then y = g(x) + ε is about g(x + η) - ∂g η + ε. As a row at x + η its noise
 # variance is σ² + ∂g Σ ∂gᵀ. It depends on the slopes of the learned function, so that fits and slopes alternate.
@@ -20,7 +20,7 @@ _LEAST = 1e-4
 _SMALLEST = 1e-290
 
 
-class Gaussian(StatefulEstimator):
+class Gaussian(Noise):
     """Gaussian noise, for ``noise=`` of the regressors.
 
     Parameters
@@ -41,16 +41,9 @@ class Gaussian(StatefulEstimator):
     >>> model = EVGPRegressor(n_inducing=10, noise=Gaussian(inputs=0.05), random_state=0).fit(X, y)
     """
 
-    heavy_tails = False
-
     def __init__(self, variance: float | None = None, inputs: ArrayLike | None = None):
         self.variance = variance
         self.inputs = inputs
-
-    def check(self) -> None:
-        """Raise an error if an option is out of range."""
-        if self.variance is not None:
-            check_real(self.variance, "variance of Gaussian", minimum=0.0, strict=True)
 
 
 def input_covariance(inputs: ArrayLike, n_features: int) -> np.ndarray:

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.special import expit, gammaln
 
-from ..utils.state import StatefulEstimator
-from ..utils.validation import check_real
+from .base import Noise
 
 # The noise of a row's o outputs is N(0, diag(σ²) v / τ) given τ, so that a row is an outlier in all its outputs. A
 # Student-t with ν degrees of freedom has τ ~ Gamma(ν/2, ν/2) (Tipping & Lawrence 2005, "Variational inference for
@@ -36,7 +35,7 @@ from ..utils.validation import check_real
 _NU, _WIDTH, _SHARE = 4.0, 30.0, 1e-6
 
 
-class StudentT(StatefulEstimator):
+class StudentT(Noise):
     """Noise with outliers, for ``noise=`` of `EVGPRegressor`.
 
     Rows with an error of more than about six standard deviations are outliers. Their noise is a Student-t with 4
@@ -69,19 +68,30 @@ class StudentT(StatefulEstimator):
     """
 
     heavy_tails = True
-    inputs = None
 
     def __init__(self, variance: float | None = None):
         self.variance = variance
 
-    def check(self) -> None:
-        """Raise an error if an option is out of range."""
-        if self.variance is not None:
-            check_real(self.variance, "variance of StudentT", minimum=0.0, strict=True)
+    def row_scales(self, n_outputs: int, distances: np.ndarray) -> StudentTScales:
+        """Return the noise scales of rows, q(τ).
+
+        Parameters
+        ----------
+        n_outputs : int
+            Number of outputs o.
+        distances : ndarray of shape (n_rows,)
+            d = Σ_o E(y - g)² / (σ² v) of each row.
+
+        Returns
+        -------
+        scales : StudentTScales
+            With E[τ] and the probability of being an outlier.
+        """
+        return StudentTScales(n_outputs, distances)
 
 
 @dataclass(frozen=True)
-class RowScales:
+class StudentTScales:
     """q(τ) of n rows with o outputs."""
 
     n_outputs: int  # o
@@ -90,6 +100,10 @@ class RowScales:
     def __getstate__(self) -> dict[str, Any]:
         # Copies and pickles of a model hold no rows; new rows get their own distances.
         return {**vars(self), "distances": np.empty(0)}
+
+    def at(self, distances: np.ndarray) -> StudentTScales:
+        """Return q(τ) of rows with other d (n,)."""
+        return StudentTScales(self.n_outputs, distances)
 
     @property
     def mean(self) -> np.ndarray:

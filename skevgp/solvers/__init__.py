@@ -3,15 +3,16 @@
 from typing import Any
 
 from .adam import Adam
+from .base import Solver
 from .lbfgs import LBFGS
 
 __all__ = ["LBFGS", "Adam"]
 
 # Solvers by their names for ``solver=``.
-SOLVERS: dict[str, type[LBFGS] | type[Adam]] = {"lbfgs": LBFGS, "adam": Adam}
+SOLVERS: dict[str, type[Solver]] = {"lbfgs": LBFGS, "adam": Adam}
 
 
-def as_solver(solver: Any) -> LBFGS | Adam:
+def as_solver(solver: Any) -> Solver:
     """Return the solver for ``solver=``, with checked options; ValueError or TypeError if it is not valid."""
     if isinstance(solver, str) and solver in SOLVERS:
         return SOLVERS[solver]()

@@ -8,11 +8,14 @@ from typing import ClassVar, Literal
 
 import numpy as np
 
+from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.state import StatefulEstimator
 from ..utils.validation import check_integer, check_real
 
 # x -> (loss, gradient); may raise `NotPositiveDefiniteError` or return NaN away from the start.
 Objective = Callable[[np.ndarray], tuple[float, np.ndarray]]
+# A loss counts as far if it is this much above the best loss, in units of the size of the best loss plus one.
+_FAR = 10.0
 # Lower and upper limits, each of the shape of x.
 Limits = tuple[np.ndarray, np.ndarray]
 # callback(iteration, lower_bound, outputs)
@@ -33,6 +36,19 @@ class Minimum:
     def n_iter(self) -> int:
         """Number of iterations."""
         return len(self.loss_curve)
+
+
+@dataclass(frozen=True)
+class Tolerance:
+    """Gain that an iteration needs: ``least``, or a ``share`` of the gain so far over a loss ``origin``."""
+
+    least: float
+    share: float = 0.0
+    origin: float = 0.0
+
+    def at(self, loss: float) -> float:
+        """Return the tolerance at a loss, in its units."""
+        return max(self.least, self.share * (self.origin - loss)) if np.isfinite(loss) else self.least
 
 
 class Solver(StatefulEstimator):
@@ -59,3 +75,33 @@ class Solver(StatefulEstimator):
             check_real(self.max_time, f"max_time of {name}", minimum=0.0, strict=True)
         if not (isinstance(self.tol, str) and self.tol == "auto"):
             check_real(self.tol, f"tol of {name}", minimum=0.0)
+
+
+class Guarded:
+    """An objective of x / ``unit`` that never raises nor returns NaN, and keeps the best point so far."""
+
+    def __init__(self, objective: Objective, start: np.ndarray):
+        self._objective = objective
+        self.x, self.loss, self.unit = start.copy(), np.inf, np.ones(len(start))
+
+    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
+        # A line search that stepped too far interpolates back. From a loss of 1e10 it would take forever, or end within
+        # rounding errors of its start. So losses far above the best are returned on a logarithmic scale, with the
+        # gradient to match.
+        x = z * self.unit
+        try:
+            # Points that overflow are recognised by their loss below.
+            with np.errstate(over="ignore", invalid="ignore"):
+                loss, gradient = self._objective(x)
+                gradient = gradient * self.unit
+        except NotPositiveDefiniteError:
+            loss, gradient = np.nan, np.full_like(x, np.nan)
+        far = _FAR * (1.0 + abs(self.loss))
+        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
+            return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
+        if loss < self.loss:
+            self.x, self.loss = x.copy(), loss
+        ratio = (loss - self.loss) / far
+        if ratio > 1.0:
+            return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
+        return loss, gradient

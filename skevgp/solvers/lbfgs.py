@@ -11,10 +11,8 @@ from scipy.optimize import OptimizeResult, minimize
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import check_integer
-from .base import Callback, Limits, Minimum, Objective, Solver
+from .base import Callback, Guarded, Limits, Minimum, Objective, Solver, Tolerance
 
-# A loss counts as far if it is this much above the best loss, in units of the size of the best loss plus one.
-_FAR = 10.0
 # Relative size of a step that changes the loss by its rounding error only.
 _HAIR = 1e-10
 # Step between two gradients for the curvature, in the coordinates of a `ParameterTable`.
@@ -31,19 +29,6 @@ class Descent:
     gradient: float = 1e-9  # a start ends if no entry of the gradient is larger
     patience: int = 3  # number of iterations in a row with less gain than the tolerance that count as a stall
     probes: int = 8  # number of pairs of gradients for the units of the coordinates
-
-
-@dataclass(frozen=True)
-class Tolerance:
-    """Gain that an iteration needs: ``least``, or a ``share`` of the gain so far over a loss ``origin``."""
-
-    least: float
-    share: float = 0.0
-    origin: float = 0.0
-
-    def at(self, loss: float) -> float:
-        """Return the tolerance at a loss, in its units."""
-        return max(self.least, self.share * (self.origin - loss)) if np.isfinite(loss) else self.least
 
 
 class LBFGS(Solver):
@@ -159,7 +144,7 @@ class LBFGS(Solver):
         minimum : Minimum
             Best point, its loss and the loss of each iteration.
         """
-        guarded, minimum = _Guarded(objective, start), Minimum(start, np.inf)
+        guarded, minimum = Guarded(objective, start), Minimum(start, np.inf)
         stalled = 0
 
         def seen(intermediate_result: OptimizeResult) -> None:
@@ -212,36 +197,6 @@ class LBFGS(Solver):
                 x = np.clip(guarded.x + reach * rng.randn(len(x)), *limits)
         minimum.x, minimum.loss = guarded.x, guarded.loss
         return minimum
-
-
-class _Guarded:
-    """An objective of x / ``unit`` that never raises nor returns NaN, and keeps the best point so far."""
-
-    def __init__(self, objective: Objective, start: np.ndarray):
-        self._objective = objective
-        self.x, self.loss, self.unit = start.copy(), np.inf, np.ones(len(start))
-
-    def __call__(self, z: np.ndarray) -> tuple[float, np.ndarray]:
-        # A line search that stepped too far interpolates back. From a loss of 1e10 it would take forever, or end within
-        # rounding errors of its start. So losses far above the best are returned on a logarithmic scale, with the
-        # gradient to match.
-        x = z * self.unit
-        try:
-            # Points that overflow are recognised by their loss below.
-            with np.errstate(over="ignore", invalid="ignore"):
-                loss, gradient = self._objective(x)
-                gradient = gradient * self.unit
-        except NotPositiveDefiniteError:
-            loss, gradient = np.nan, np.full_like(x, np.nan)
-        far = _FAR * (1.0 + abs(self.loss))
-        if not (np.isfinite(loss) and np.isfinite(gradient).all()):
-            return (self.loss + far if np.isfinite(far) else 1e100), np.zeros_like(x)
-        if loss < self.loss:
-            self.x, self.loss = x.copy(), loss
-        ratio = (loss - self.loss) / far
-        if ratio > 1.0:
-            return self.loss + far * (1.0 + np.log(ratio)), gradient / ratio
-        return loss, gradient
 
 
 def curvature_units(objective: Objective, x: np.ndarray, alike: np.ndarray, n_probes: int) -> np.ndarray:

@@ -8,7 +8,7 @@ from skevgp.fitting.fit import finished
 from skevgp.fitting.outliers import Look, RowDoubts, fit_doubting, look_at, settle
 from skevgp.fitting.search import Start, better, search
 from skevgp.noise import StudentT
-from skevgp.noise.student_t import RowScales
+from skevgp.noise.student_t import StudentTScales
 
 from .cases import N, O, Y, data_of, model_of
 
@@ -26,7 +26,7 @@ def wrong_at_three(**changes):
 def test_no_turn_lowers_the_bound(changes):
     model = wrong_at_three(max_iter=10, **changes)
     rows = model.rows
-    doubts = RowDoubts(RowScales(O, np.random.RandomState(1).uniform(0.0, 60.0, N)), np.ones(O))
+    doubts = RowDoubts(StudentTScales(O, np.random.RandomState(1).uniform(0.0, 60.0, N)), np.ones(O))
     weighed = replace(model, rows=doubts.weigh(rows))
     fit = weighed.minimise(Start(model.table.values_at_start(), 10))
     for _ in range(4):
@@ -41,7 +41,7 @@ def test_a_turn_of_the_doubts_alone_does_not_lower_the_bound_either(monkeypatch)
     monkeypatch.setattr(outliers, "_TURNS", 1)
     model = wrong_at_three()
     rows, values = model.rows, model.table.values_at_start()
-    doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
+    doubts = RowDoubts(StudentTScales(O, np.zeros(N)), np.ones(O))
     weighed = replace(model, rows=doubts.weigh(rows))
     fit, bounds = weighed.minimise(Start(values, 0)), []
     for _ in range(6):
@@ -56,7 +56,7 @@ def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
     model = wrong_at_three()
     rows = model.rows
     fit = model.minimise(Start(model.table.values_at_start(), 0))
-    doubts = RowDoubts(RowScales(O, np.zeros(N)), np.ones(O))
+    doubts = RowDoubts(StudentTScales(O, np.zeros(N)), np.ones(O))
     for _ in range(20):
         model, fit, doubts = settle(model, fit, rows, doubts)
     scales, noise = doubts.scales, fit.values["noise"]

@@ -3,7 +3,8 @@ import pytest
 from scipy.optimize import rosen, rosen_der
 
 from skevgp.solvers import LBFGS
-from skevgp.solvers.lbfgs import Tolerance, curvature_units
+from skevgp.solvers.base import Tolerance
+from skevgp.solvers.lbfgs import curvature_units
 from skevgp.utils.linalg import NotPositiveDefiniteError
 from skevgp.utils.monitor import Monitor
 

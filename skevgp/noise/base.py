@@ -1,0 +1,64 @@
+"""The interface of noise models."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..utils.state import StatefulEstimator
+from ..utils.validation import check_real
+
+
+class Noise(StatefulEstimator):
+    """A noise model with its options."""
+
+    # Whether rows have scales that the fit estimates. A subclass then has `row_scales`.
+    heavy_tails: ClassVar[bool] = False
+
+    # Noise variance at the start of a fit. None: taken from the data.
+    variance: float | None
+    # Noise of X, as `Gaussian` takes it.
+    inputs: ArrayLike | None = None
+
+    def check(self) -> None:
+        """Raise an error if an option is out of range."""
+        if self.variance is not None:
+            check_real(self.variance, f"variance of {type(self).__name__}", minimum=0.0, strict=True)
+
+    def row_scales(self, n_outputs: int, distances: np.ndarray) -> RowScales:
+        """Return the noise scales of rows, q(τ).
+
+        Parameters
+        ----------
+        n_outputs : int
+            Number of outputs o.
+        distances : ndarray of shape (n_rows,)
+            d = Σ_o E(y - g)² / (σ² v) of each row.
+
+        Returns
+        -------
+        scales : RowScales
+            With E[τ] and the probability of being an outlier.
+        """
+        raise NotImplementedError
+
+
+class RowScales(Protocol):
+    """q(τ) of n rows, whose noise variance is σ² v / τ."""
+
+    @property
+    def mean(self) -> np.ndarray:
+        """E[τ], (n,)."""
+
+    @property
+    def outlier(self) -> np.ndarray:
+        """Probability (n,) of being an outlier."""
+
+    @property
+    def log_variance(self) -> np.ndarray:
+        """Addend to log v in the bound, (n,)."""
+
+    def at(self, distances: np.ndarray) -> RowScales:
+        """Return q(τ) of rows with other d (n,)."""
