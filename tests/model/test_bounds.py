@@ -50,7 +50,7 @@ def plain_loss(model, rows, table):
             anp.exp(c["hyperparameters"]),
             anp.exp(c["signal"]),
             anp.exp(c["noise"]),
-            table["inducing_points"].value(c["inducing_points"]),
+            c["inducing_points"] * table["inducing_points"].unit + table["inducing_points"].origin,
             rows,
             model.prior,
             model.family,
