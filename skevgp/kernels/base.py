@@ -134,7 +134,7 @@ class CentredSquares:
 
 
 class CovarianceAt(ABC):
-    """A covariance with its hyperparameters and inducing points put in; see `statistics.KernelAt`."""
+    """A covariance of unit signal variance with its hyperparameters and m inducing points put in."""
 
     @abstractmethod
     def matrix(self) -> np.ndarray:
