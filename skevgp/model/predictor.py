@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..data.rows import Columns, of_outputs, times_weights
-from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance, times_lower
+from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
 from .statistics import Kernel, Whitening
 
 # Of the deviations of all outputs at once.
@@ -393,44 +393,3 @@ class Predictor:
         for group, part in zip(self.groups, (first, *others), strict=True):
             found[group.outputs] = part
         return found
-
-
-# The best q of independent values (the paper's), for a precision B of the best of all.
-
-
-def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
-    m = len(L_inv)
-    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
-    # B is no less than I, whatever rounding says.
-    precision = np.maximum(precision, np.einsum("ji,ji->i", L_inv, L_inv))
-    return -np.log(precision), -np.log(np.maximum(np.diagonal(B)[m:], 1.0))
-
-
-def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
-    """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
-    m = len(L_inv)
-    root = np.zeros((m + len(log_w), m + len(log_w)))
-    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
-    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
-    return root
-
-
-def diagonal_gap(
-    B: np.ndarray, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (as Lᵀ L̄) in L; ``log_det_bar`` is -½ B⁻¹.
-
-    In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
-    """
-    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    BL = times_lower(B[:m, :m], L_inv)
-    f_diagonal = np.maximum(np.einsum("ji,ji->i", L_inv, BL), np.einsum("ji,ji->i", L_inv, L_inv))
-    coef_diagonal = np.maximum(np.diagonal(B)[m:], 1.0)
-    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
-    B_bar = log_det_bar.copy()
-    B_bar[:m, :m] += 0.5 * times_lower(L_inv / f_diagonal, L_inv, transposed=True)
-    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
-    factor_bar = -times_lower(BL / f_diagonal, L_inv, transposed=True)
-    diagonal_of(factor_bar)[...] += 1.0
-    return float(gap), B_bar, factor_bar
