@@ -220,15 +220,11 @@ def _error_pass(
     """eᵀe (o,), V e (m, o) and Hᵀe (p, o) of one block."""
     block, outputs = block.of(outputs)
     U, P = _projected(block, whitening, outputs)
-    e = _put_errors(block, P, outputs, weights)
-    m, PE = len(U), P[: len(weights)] @ e.T
+    m, k = len(U), len(weights)
+    # eᵀ (o, n) replaces rᵀ in [V; Hᵀ; rᵀ].
+    e = np.subtract(block.residuals[:, outputs].T, weights.T @ P[:k], out=P[k:])
+    PE = P[:k] @ e.T
     return np.einsum("on,on->o", e, e), PE[:m], PE[m:]
-
-
-def _put_errors(block: Block, P: np.ndarray, outputs: slice, weights: np.ndarray) -> np.ndarray:
-    """eᵀ (o, n), written over rᵀ in [V; Hᵀ; rᵀ]."""
-    e = P[len(weights) :]
-    return np.subtract(block.residuals[:, outputs].T, weights.T @ P[: len(weights)], out=e)
 
 
 def pull_back(
@@ -270,12 +266,14 @@ def _second_pass(
 ) -> tuple[Any, np.ndarray, np.ndarray]:
     """The term of one block in the kernel's gradient, eᵀe (o,) and V e (m, o)."""
     block, outputs = block.of(outputs)
-    # What was kept stays until the next first pass replaces it: freed memory would be given back to the system.
+    # Kept arrays stay until the next first pass replaces them: freed memory would be given back to the system.
     if block.kept is not None and block.kept[0] is whitening:
         _, U, P = block.kept
     else:
         U, P = _projected(block, whitening, outputs)
-    e = _put_errors(block, P, outputs, weights)
+    # eᵀ (o, n) replaces rᵀ in [V; Hᵀ; rᵀ].
+    k = len(weights)
+    e = np.subtract(block.residuals[:, outputs].T, weights.T @ P[:k], out=P[k:])
     # Ū = back [V; Hᵀ; eᵀ] Ω (m, n). The products of size m are in ``back``.
     U_bar, omega = back @ P, 1.0 if block.roots is None else block.roots**2
     if block.roots is not None:
