@@ -9,7 +9,7 @@ from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.model.bounds import LOG_2PI, bounds_at_optimum
-from skevgp.model.objectives import ElboObjective, _ElboTerms, evaluate
+from skevgp.model.objectives import ElboObjective, ElboTerms, evaluate
 from skevgp.solvers import LBFGS
 
 from .oracle import at_the_fit
@@ -183,7 +183,7 @@ class Uncollapsed(Collapsed):
 
     def found(self):
         fitted, values, units = self.fitted, self.values, self.model._fitted.units
-        terms_of = lambda groups: [_ElboTerms(self.elbo, values, group) for group in groups]  # noqa: E731
+        terms_of = lambda groups: [ElboTerms(self.elbo, values, group) for group in groups]  # noqa: E731
         loss, gradient = evaluate(fitted.sparse, values, self.blocks, terms_of)
         n, whitenings = len(self.problem.y), list(fitted.sparse.whitenings(values))
         # The loss leaves out what all outputs have in common; and residuals have a unit.

@@ -209,7 +209,7 @@ class _Waves:
     ) -> _Waves:
         """Draw k functions."""
         hyperparameters, (m, d) = np.log(group.hyperparameters), group.points.shape
-        waves = random_functions(group.kernel, hyperparameters, n_waves, d, rng)  # type: ignore[arg-type]
+        waves = random_functions(group.kernel, hyperparameters, n_waves, d, rng)
         at_points = waves.value(group.points)
         weights = drawn_weights(group, k, common, rng).transpose(1, 0, 2)
         by_waves = rng.standard_normal((len(group.signal), k, len(at_points)))

@@ -32,7 +32,7 @@ from scipy.stats import t as student_t
 
 from ..data.blocks import AnyBlock
 from ..data.rows import Rows
-from ..model.bounds import Group, PosteriorFamily, bounds_at_optimum, projected
+from ..model.bounds import Group, PosteriorFamily, bounds_at_optimum
 from ..model.model import SparseModel
 from ..model.parameters import Parameter, ParameterTable, Values
 from ..model.statistics import SufficientStatistics, Whitening, collect
@@ -166,7 +166,7 @@ def _dependent(
 def _left_over(model: SparseModel, values: Values, statistics: list[SufficientStatistics]) -> np.ndarray:
     """Squared error (o,) on the training rows, per degree of freedom."""
     found = np.empty(len(values["noise"]))
-    for bound in bounds_at_optimum(list(model.groups_of(values, statistics)), model.family):
+    for bound in bounds_at_optimum(model.groups_of(values, statistics), model.family):
         group = bound.group
         n_rows = group.statistics.n_rows
         # Rows less the trace of I - B⁻¹, the number of weights that they determine.
@@ -174,7 +174,7 @@ def _left_over(model: SparseModel, values: Values, statistics: list[SufficientSt
         if group.prior.shared:
             # Other outputs determine the weights too. What this output adds is the trace of σ⁻² PᵀP B⁻¹.
             for o, q in enumerate(bound.posteriors):
-                own = q.root_inv @ projected(group, o)[0] @ q.root_inv.T
+                own = q.root_inv @ group.products(o)[0] @ q.root_inv.T
                 freedom[o] = n_rows - own.trace() / group.noise[o]
         found[group.outputs] = bound.residuals().squares / np.maximum(freedom, 1e-6 * n_rows)
     return found

@@ -149,7 +149,7 @@ def models_of(
         )
         table = starting_table(problem, own_rows, start, variance, n_kernels, exact)
         if stay:
-            table = table.with_fixed("inducing_points")
+            table = table.changed("inducing_points", fixed=True)
         columns = range(part.outputs[0], part.outputs[-1] + 1)
         shown = part.outputs[0] if len(part.outputs) == 1 else part.outputs
         models.append(
@@ -364,10 +364,10 @@ class Model:
         n_inducing = min(map(len, sets))
         if n_inducing <= self.n_inducing:
             return None
-        table = self.table.with_start("inducing_points", np.array([own[:n_inducing] for own in sets]))
+        table = self.table.changed("inducing_points", start=np.array([own[:n_inducing] for own in sets]))
         if everything and self.sparse.family == "full":
             # The bound is then the likelihood, and no other points are better.
-            table = table.with_fixed("inducing_points")
+            table = table.changed("inducing_points", fixed=True)
             return replace(self, table=table, sparse=replace(self.sparse, complete=True))
         return replace(self, table=table)
 

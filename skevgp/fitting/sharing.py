@@ -199,7 +199,7 @@ class _ShortFits:
     def _planned(self, groups: list[list[int]]) -> list[Model]:
         """A model for each group."""
         models = models_of(replace(self.problem, sharing=groups), np.random.RandomState(0), self.monitor, BlockMap())
-        return [replace(model, table=model.table.with_fixed("inducing_points")) for model in models]
+        return [replace(model, table=model.table.changed("inducing_points", fixed=True)) for model in models]
 
 
 def _short_fit(model: Model, table: ParameterTable, n_iter: int, monitor: Monitor) -> list[Values]:

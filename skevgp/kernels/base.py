@@ -127,7 +127,7 @@ class CentredSquares:
 
 
 class CovarianceAt(ABC):
-    """A covariance at given hyperparameters and inducing points; see `statistics.KernelAt`."""
+    """A covariance of unit signal variance with its hyperparameters and m inducing points put in."""
 
     @abstractmethod
     def matrix(self) -> np.ndarray:

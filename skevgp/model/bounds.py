@@ -1,26 +1,18 @@
-"""The bounds as pure functions of the sufficient statistics.
+"""Bounds on the log marginal likelihood as pure functions of the sufficient statistics.
 
-Per output, in whitened coordinates: f_m = s L v with K = s² L Lᵀ, and β = μ_β + C (w₀ + w) with Σ_β = C Cᵀ, so
-that v ~ N(0, I), w ~ N(-w₀, I) a priori. Here r = y - H (μ_β + C w₀): the reference w₀ is any fixed vector; put
-near the solution it keeps rᵀr, and with it the rounding errors of the sums, small. With P = [s Vᵀ, H C] the
-model is r = P ω + ε, ω = (v, w), and all that follows is Bayesian linear regression (Rasmussen & Williams 2006,
-sections 2.1.1 and 2.7) plus the trace term of Titsias (2009), eq. 9:
+For each output, with m inducing points and p features, f_m = s L v with K = s² L Lᵀ, and β = μ_β + C (w₀ + w) with
+Σ_β = C Cᵀ. A priori, v ~ N(0, I) and w ~ N(-w₀, I). The residuals are r = y - H (μ_β + C w₀). The reference w₀ may be
+any fixed vector. If it is near the solution, rᵀr is small, and with it the rounding errors of the sums.
+
+With P = [s Vᵀ, H C] (n, m + p) and ω = (v, w), the model is r = P ω + ε. The rest is Bayesian linear regression
+(Rasmussen & Williams 2006, sections 2.1.1 and 2.7) and the trace term of Titsias (2009), eq. 9:
 
     B = I + σ⁻² PᵀP,   g = σ⁻² Pᵀr - (0, w₀),   posterior of ω: N(B⁻¹ g, B⁻¹).
-
-Outputs that share their weights have one w and a v each. B is then an arrowhead: with B_j = [D_j, E_j; E_jᵀ, F_j] the
-matrix of output j alone, its blocks are D_j on the diagonal, E_j in the columns of w, and I + Σ (F_j - I) in the
-corner. What is left of that, the Schur complement S = I + Σ (F_j - I - E_jᵀ D_j⁻¹ E_j), is the precision of w, so that
-
-    log|B| = Σ log|D_j| + log|S|,   precision of (v_j, w): [D_j, E_j; E_jᵀ, S + E_jᵀ D_j⁻¹ E_j],
-
-and all of B⁻¹ that predictions, the bound's gradient and the covariance between outputs need is in the inverses of
-these.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Literal
@@ -28,8 +20,8 @@ from typing import Literal
 import numpy as np
 
 from ..data.blocks import Blocks, LinearSums
-from ..utils.linalg import diagonal_of, jittered_cholesky, symmetric_inverse, triangular_inverse
-from .predictor import CoefficientPrior, diagonal_gap
+from ..utils.linalg import diagonal_of, jittered_cholesky, symmetric_inverse, times_lower, triangular_inverse
+from .predictor import CoefficientPrior
 from .statistics import Residuals, StatisticsGradient, SufficientStatistics, Whitening, errors
 
 PosteriorFamily = Literal["full", "diagonal"]
@@ -38,123 +30,118 @@ LOG_2PI = float(np.log(2.0 * np.pi))
 
 
 @dataclass(frozen=True)
-class WhitenedPosterior:
-    """The optimal q(ω) of one output: N(mean, B⁻¹).
-
-    Attributes
-    ----------
-    B, root, root_inv : ndarray of shape (m + p, m + p)
-        Precision, its lower Cholesky factor, and the inverse of that.
-    mean : ndarray of shape (m + p,)
-    n_own : int
-        How many of the first coordinates are counted here: m if w is shared and counted with another output.
-    """
-
-    B: np.ndarray
-    root: np.ndarray
-    root_inv: np.ndarray
-    mean: np.ndarray
-    n_own: int
-
-    @property
-    def log_det(self) -> float:
-        """log|B|; where w is counted elsewhere, that of v given w."""
-        return 2.0 * float(np.log(diagonal_of(self.root)[: self.n_own]).sum())
-
-
-@dataclass(frozen=True)
 class Group:
-    """One set of inducing points and the outputs that it serves, at one point of the parameters.
+    """A set of m inducing points and its o outputs, at one point of the parameters."""
 
-    Attributes
-    ----------
-    outputs : slice
-        Which of the model's outputs, o of them.
-    whitening : Whitening
-        Of the m inducing points.
-    statistics : SufficientStatistics
-        Of these outputs.
-    signal, noise : ndarray of shape (o,)
-        s² and σ².
-    prior : CoefficientPrior
-        Of these outputs, with p features.
-    complete : bool, default=False
-        Whether the inducing points are all rows, so that they leave nothing unexplained.
-    """
-
+    # The place of these outputs among all of the model.
     outputs: slice
     whitening: Whitening
+    # Sums of these outputs.
     statistics: SufficientStatistics
+    # (o,): s² and σ².
     signal: np.ndarray
     noise: np.ndarray
+    # The prior of these outputs, with p features.
     prior: CoefficientPrior
+    # Whether the inducing points are all rows, so that they explain the whole variance.
     complete: bool = False
 
     @cached_property
     def scales(self) -> np.ndarray:
-        """What makes Pᵀ of [V; Hᵀ] for each output, (o, m + p), where the weights are independent a priori."""
+        """(o, m + p): the diagonal of T of each output (see `times_T`), if the weights are independent a priori."""
         (o, p), m = self.prior.scale.shape, len(self.statistics.VV)
         scales = np.empty((o, m + p))
         scales[:, :m] = np.sqrt(self.signal)[:, np.newaxis]
         scales[:, m:] = self.prior.scale
         return scales
 
-    def weights_of(self, index: int, omega: np.ndarray) -> np.ndarray:
-        """T ω, (m + p) or (m + p, k), with P = [Vᵀ, H] T of an output: what [V; Hᵀ] is multiplied by."""
-        return self._times(index, omega, lambda root: root)
-
-    def pulled_back(self, index: int, sums: np.ndarray) -> np.ndarray:
-        """Tᵀ of sums over [V; Hᵀ], (m + p) or (m + p, k): those over Pᵀ."""
-        return self._times(index, sums, np.transpose)
-
-    def _times(self, index: int, given: np.ndarray, root_of: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
-        found = (self.scales[index] * given.T).T
+    def times_T(self, index: int, A: np.ndarray, transposed: bool = False) -> np.ndarray:
+        """T A, or Tᵀ A, of an output, for A (m + p,) or (m + p, k). T = blockdiag(s I, C), so that P = [Vᵀ, H] T."""
+        found = (self.scales[index] * A.T).T
         if self.prior.root is not None:
-            m = len(self.statistics.VV)
-            found[m:] = root_of(self.prior.root[index]) @ given[m:]
+            C, m = self.prior.root[index], len(self.statistics.VV)
+            found[m:] = (C.T if transposed else C) @ A[m:]
         return found
 
+    def products(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """PᵀP (m + p, m + p) and Pᵀr (m + p,) of an output."""
+        statistics, scales = self.statistics, self.scales[index]
+        sums = np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
+        if self.prior.root is not None:
+            # Tᵀ (Tᵀ J)ᵀ = Tᵀ J T, with J = [V; Hᵀ] [Vᵀ, H].
+            TJ = self.times_T(index, statistics.joint, transposed=True)
+            return self.times_T(index, TJ.T, transposed=True), self.times_T(index, sums, transposed=True)
+        PP = np.multiply.outer(scales, scales)
+        PP *= statistics.joint
+        return PP, scales * sums
 
-def projected(group: Group, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """PᵀP (m + p, m + p) and Pᵀr (m + p,) of a group's output."""
-    statistics, scales = group.statistics, group.scales[index]
-    sums = np.concatenate([statistics.VR[:, index], statistics.HR[:, index]])
-    if group.prior.root is not None:
-        return group.pulled_back(index, group.pulled_back(index, statistics.joint).T), group.pulled_back(index, sums)
-    PP = np.multiply.outer(scales, scales)
-    PP *= statistics.joint
-    return PP, scales * sums
+
+# --- the optimal posterior --------------------------------------------------------------------------------------------
 
 
-def optimal_posterior(group: Group, index: int) -> WhitenedPosterior:
-    """The posterior of ω of a group's output given the kernel (Titsias 2009, eq. 10, with explicit features).
+@dataclass(frozen=True)
+class WhitenedPosterior:
+    """The optimal q(ω) of one output: N(mean, B⁻¹)."""
 
-    Raises
-    ------
-    NotPositiveDefiniteError
-        If the sums are not finite.
-    """
-    m, noise = len(group.statistics.VV), group.noise[index]
-    B, g = projected(group, index)
-    B /= noise
-    diagonal_of(B)[...] += 1.0
-    g /= noise
-    g[m:] -= group.prior.reference[index]
-    root = jittered_cholesky(B)
-    root_inv = triangular_inverse(root)
-    return WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B))
+    # (m + p, m + p): the precision, its lower Cholesky factor, and the inverse of the factor.
+    B: np.ndarray
+    root: np.ndarray
+    root_inv: np.ndarray
+    # (m + p,).
+    mean: np.ndarray
+    # Number of leading coordinates that count for this output. It is m if w is shared and counts for another output.
+    n_own: int
+
+    @property
+    def log_det(self) -> float:
+        """log|B|, or the log determinant of the precision of v given w if w counts for another output."""
+        return 2.0 * float(np.log(diagonal_of(self.root)[: self.n_own]).sum())
 
 
 def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]:
-    """The posterior of each output, by group; of outputs that share their weights, from the data of all of them."""
-    if not groups[0].prior.shared:
-        return [[optimal_posterior(group, o) for o in range(len(group.noise))] for group in groups]
+    """The optimal posterior of each output, by group (Titsias 2009, eq. 10, with explicit features).
+
+    Raises `NotPositiveDefiniteError` if the sums are not finite.
+    """
+    if groups[0].prior.shared:
+        return _with_shared_weights(groups)
+    found = []
+    for group in groups:
+        m, own = len(group.statistics.VV), []
+        for o, noise in enumerate(group.noise):
+            # B = I + σ⁻² PᵀP (m + p, m + p) and g = σ⁻² Pᵀr - (0, w₀) (m + p,). With B = R Rᵀ, the mean is R⁻ᵀ R⁻¹ g.
+            B, g = group.products(o)
+            B /= noise
+            diagonal_of(B)[...] += 1.0
+            g /= noise
+            g[m:] -= group.prior.reference[o]
+            root = jittered_cholesky(B)
+            root_inv = triangular_inverse(root)
+            own.append(WhitenedPosterior(B, root, root_inv, root_inv.T @ (root_inv @ g), len(B)))
+        found.append(own)
+    return found
+
+
+def _with_shared_weights(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]:
+    """The optimal posterior of each output, given the data of all outputs, which share their weights."""
+    # There is one w for all outputs and a v for each. B is then an arrowhead matrix. Let
+    #
+    #     B_j = [D_j, E_j; E_jᵀ, F_j],   D_j: (m, m), E_j: (m, p), F_j: (p, p),
+    #
+    # be the matrix of output j alone. B has the blocks D_j on its diagonal, E_j in the columns of w, and
+    # I + Σ (F_j - I) in the corner. The precision of w is the Schur complement of the corner,
+    #
+    #     S = I + Σ (F_j - I - E_jᵀ D_j⁻¹ E_j),   (p, p),
+    #
+    # so that log|B| = Σ log|D_j| + log|S|, and the precision of (v_j, w) is [D_j, E_j; E_jᵀ, S + E_jᵀ D_j⁻¹ E_j]. The
+    # inverses of these contain all of B⁻¹ that predictions, the gradient of the bound and covariances of outputs need.
     p = groups[0].prior.scale.shape[1]
     each, S, sizes, g_w = [], np.eye(p), np.ones(p), -groups[0].prior.reference[0]
     for group in groups:
         m = len(group.statistics.VV)
         for o, noise in enumerate(group.noise):
-            PP, g = projected(group, o)
+            # B_j - blockdiag(0, I), and with D_j = R Rᵀ: A = R⁻¹ E_j (m, p) and z = R⁻¹ g_v (m,).
+            PP, g = group.products(o)
             PP /= noise
             g /= noise
             diagonal_of(PP)[:m] += 1.0
@@ -166,12 +153,13 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
             g_w += g[m:] - A.T @ z
             each.append((PP, D_root, D_root_inv, A, z))
     S_root = jittered_cholesky(S, sizes=sizes)
-    # With the jitter, if it needed one.
+    # S includes the jitter, if there is one.
     S = S_root @ S_root.T
     S_root_inv = triangular_inverse(S_root)
     w = S_root_inv.T @ (S_root_inv @ g_w)
     found = []
     for index, (B, D_root, D_root_inv, A, z) in enumerate(each):
+        # The Cholesky factor of the precision of (v_j, w) is [R, 0; Aᵀ, S_root].
         m = len(D_root)
         B[m:, m:] = S + A.T @ A
         root, root_inv = np.zeros(B.shape), np.zeros(B.shape)
@@ -179,68 +167,98 @@ def optimal_posteriors(groups: Sequence[Group]) -> list[list[WhitenedPosterior]]
         root_inv[:m, :m], root_inv[m:, m:] = D_root_inv, S_root_inv
         root_inv[m:, :m] = -S_root_inv @ (A.T @ D_root_inv)
         mean = np.concatenate([D_root_inv.T @ (z - A @ w), w])
+        # w counts for the first output.
         found.append(WhitenedPosterior(B, root, root_inv, mean, m if index else m + p))
     in_order = iter(found)
     return [[next(in_order) for _ in group.noise] for group in groups]
 
 
+# --- the paper's q: independent inducing values and weights -----------------------------------------------------------
+
+
+def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Log variances -log Λ_ii of the optimal diagonal q: of f_m in units of s² (m,), and of w (p,)."""
+    m = len(L_inv)
+    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
+    # B is at least I. Rounding may make it smaller.
+    precision = np.maximum(precision, np.einsum("ji,ji->i", L_inv, L_inv))
+    return -np.log(precision), -np.log(np.maximum(np.diagonal(B)[m:], 1.0))
+
+
+def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
+    """R (m + p, m + p) with Cov[ω] = RᵀR, for independent f_m and w with these log variances."""
+    m = len(L_inv)
+    root = np.zeros((m + len(log_w), m + len(log_w)))
+    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
+    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
+    return root
+
+
+def diagonal_gap(
+    B: np.ndarray, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
+) -> tuple[float, np.ndarray, np.ndarray]:
+    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (as Lᵀ L̄) in L. ``log_det_bar`` is -½ B⁻¹."""
+    # In the coordinates (f_m, β) = (s L v, c w), the precision is Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c), all
+    # (m + p, m + p). The factors s and c cancel.
+    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
+    BL = times_lower(B[:m, :m], L_inv)
+    f_diagonal = np.maximum(np.einsum("ji,ji->i", L_inv, BL), np.einsum("ji,ji->i", L_inv, L_inv))
+    coef_diagonal = np.maximum(np.diagonal(B)[m:], 1.0)
+    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
+    B_bar = log_det_bar.copy()
+    B_bar[:m, :m] += 0.5 * times_lower(L_inv / f_diagonal, L_inv, transposed=True)
+    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
+    factor_bar = -times_lower(BL / f_diagonal, L_inv, transposed=True)
+    diagonal_of(factor_bar)[...] += 1.0
+    return float(gap), B_bar, factor_bar
+
+
+# --- the evidence lower bound -----------------------------------------------------------------------------------------
+
+
 def bounds_at_optimum(groups: Sequence[Group], family: PosteriorFamily) -> list[BoundAtOptimum]:
-    """The bound of each group of a model's outputs, which perhaps share their weights."""
-    posteriors = optimal_posteriors(groups)
-    return [BoundAtOptimum(group, family, own) for group, own in zip(groups, posteriors, strict=True)]
+    """The lower bound of each group of a model. Groups may share their weights."""
+    return [
+        BoundAtOptimum(group, family, posteriors)
+        for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True)
+    ]
 
 
 class BoundAtOptimum:
-    """The evidence lower bound with q at its optimum, summed over outputs, and its gradient.
+    """The evidence lower bound of a group with q at its optimum, summed over outputs, and its gradient.
 
-    ``family="full"`` is the collapsed bound (Titsias 2009, eq. 9, with kernel k + hΣ_βhᵀ and mean hᵀμ_β):
-    log N(y | Hμ_β, UᵀK⁻¹U + HΣ_βHᵀ + σ²I) - Tr(k(X, X) - UᵀK⁻¹U) / 2σ². ``family="diagonal"``, the paper's
-    q(f_m) = N(a, diag A), q(β) = N(b, diag B), has the same means and variances 1/Λ_ii, where Λ is the precision in the
-    coordinates (f_m, β), so that its bound is lower by ½ (Σᵢ log Λ_ii - log|Λ|).
-
-    At the optimum the mean's own derivative vanishes, so that value and gradient can be written with what it leaves
-    over, e = r - P mean:
-
-        bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v|²)/σ²].
-
-    (Of rows with weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v, and the
-    constant Σ w log v stands beside N log 2πσ²: the rows of P and r are multiplied by √ω.)
-
-    With e summed row by row (`statistics.pull_back`) no digits cancel at any signal-to-noise ratio; `residuals` gives
-    the same sums as differences of the statistics.
-
-    Parameters
-    ----------
-    group : Group
-    family : {"full", "diagonal"}
-    posteriors : list of WhitenedPosterior, default=None
-        One per output, of `optimal_posteriors`; None where no other group shares the weights.
-
-    Attributes
-    ----------
-    posteriors : list of WhitenedPosterior
-    weights : ndarray of shape (m + p, o)
-        e = r - [V; Hᵀ]ᵀ weights.
-    gradient : StatisticsGradient
-        Of the bound.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        If the sums are not finite.
+    It is complete once the residuals e are known: from `residuals`, or from the second pass over the rows.
     """
 
-    def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior] | None = None):
-        posteriors = optimal_posteriors([group])[0] if posteriors is None else posteriors
+    # ``family="full"`` is the collapsed bound (Titsias 2009, eq. 9, with kernel k + h Σ_β hᵀ and mean hᵀμ_β),
+    #
+    #     log N(y | H μ_β, UᵀK⁻¹U + H Σ_β Hᵀ + σ² I) - Tr(k(X, X) - UᵀK⁻¹U) / 2σ².
+    #
+    # ``family="diagonal"`` is the paper's q(f_m) = N(a, diag A), q(β) = N(b, diag B). It has the same means, and the
+    # variances 1/Λ_ii, where Λ is the precision in the coordinates (f_m, β). Its bound is lower by the gap
+    # ½ (Σᵢ log Λ_ii - log|Λ|).
+    #
+    # At the optimum the derivative in the mean vanishes. Value and gradient can therefore be written with the residuals
+    # e = r - P mean, (n,):
+    #
+    #     bound = -½ [N log 2πσ² + log|B| + eᵀe/σ² + |v|² + |w + w₀|² + s² Σ(k̃ - |v(x)|²)/σ²].
+    #
+    # If rows have weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v since the rows
+    # of P and r are multiplied by √ω, and Σ w log v is added to N log 2πσ².
+    #
+    # If e is summed row by row, as in `statistics.pull_back`, no digits cancel at any signal-to-noise ratio.
+
+    def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior]):
         statistics, scales, noise = group.statistics, group.scales, group.noise
         joint, m = statistics.joint, len(statistics.VV)
         self.group, self.posteriors = group, posteriors
+        # (m + p, o): e = r - [V; Hᵀ]ᵀ weights.
         mean = np.array([q.mean for q in posteriors])
         self.weights = (scales * mean).T
         if group.prior.root is not None:
             self.weights[m:] = group.prior.times(mean[:, m:]).T
         joint_bar, factor_bar = np.zeros(joint.shape), np.zeros((m, m))
-        # Of each output: log|B| (and twice the gap), and derivatives of the bound in log s² and log 1/σ² by way of B.
+        # (o,) each: log|B| plus twice the gap, and the derivatives of the bound in log s² and log 1/σ² through B.
         log_det, from_signal, from_noise = np.empty((3, len(noise)))
         for o, q in enumerate(posteriors):
             log_det[o] = q.log_det
@@ -250,10 +268,11 @@ class BoundAtOptimum:
                 log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
                 factor_bar -= gap_factor_bar
+            # B = I + σ⁻² Tᵀ J T, so that J̄ = σ⁻² T B̄ Tᵀ, (m + p, m + p).
             if group.prior.root is None:
                 B_bar *= np.multiply.outer(scales[o] / noise[o], scales[o])
             else:
-                B_bar = group.weights_of(o, group.weights_of(o, B_bar).T) / noise[o]
+                B_bar = group.times_T(o, group.times_T(o, B_bar).T) / noise[o]
             joint_bar += B_bar
             from_signal[o], from_noise[o] = np.vdot(B_bar[:m], joint[:m]), np.vdot(B_bar, joint)
         unexplained_bar = -0.5 * group.signal / noise
@@ -265,30 +284,31 @@ class BoundAtOptimum:
             factor_bar,
         )
         unexplained = unexplained_bar * statistics.unexplained
+        # |v|² + |w + w₀|² of each output. Shared weights count once.
         mean[:, m:] += group.prior.reference
         if group.prior.shared:
             for own, q in zip(mean, posteriors, strict=True):
                 own[q.n_own :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
-        # What does not depend on e, and its derivatives in log s² and log σ².
+        # (o,) each: the bound without eᵀe, and its derivatives in log s² and log σ².
         log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
         self._value = unexplained - 0.5 * (log_noise + log_det + penalty)
         self._log_signal = from_signal + unexplained
         self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
 
-    def residuals(self) -> Residuals:
-        """eᵀe and V e from the statistics: good while the signal is not above about 1e4 times the noise."""
+    def residuals(self, blocks: Blocks | None = None) -> Residuals:
+        """Sums of e over the rows or, without rows, differences of the statistics.
+
+        The differences are accurate up to a signal of about 1e4 times the noise.
+        """
+        if blocks is not None:
+            return errors(blocks, self.group.whitening, self.group.outputs, self.weights)
         statistics, m = self.group.statistics, len(self.group.statistics.VV)
         f, b = self.weights[:m], self.weights[m:]
         VE = statistics.VR - statistics.VV @ f - statistics.VH @ b
         HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
         squares = statistics.RR - ((statistics.VR + VE) * f).sum(axis=0) - ((statistics.HR + HE) * b).sum(axis=0)
         return Residuals(np.maximum(squares, 0.0), VE, HE)
-
-    def left_over(self, blocks: Blocks | None) -> Residuals:
-        """The same from the rows, where no digits cancel; from the statistics if these are all there is."""
-        seen = self.group.whitening, self.group.outputs, self.weights
-        return self.residuals() if blocks is None else errors(blocks, *seen)
 
     def value(self, residuals: Residuals) -> float:
         """The bound, in nats."""
@@ -301,99 +321,80 @@ class BoundAtOptimum:
         return self.value(residuals), {"signal": signal, "noise": noise}
 
 
-def unsolved(group: Group, posteriors: Sequence[WhitenedPosterior], left: Residuals) -> list[np.ndarray]:
-    """What each mean, by the errors that it leaves, is short of as the solution of B mean = g: g - B mean (m + p,).
-
-    As σ⁻² Pᵀe - mean - (0, w₀) it keeps the digits that B, g and their solution have lost (Higham 2002, section 12.1).
-    """
-    PE, m, found = np.concatenate([left.VE, left.HE]), len(left.VE), []
+def equation_errors(group: Group, posteriors: Sequence[WhitenedPosterior], residuals: Residuals) -> list[np.ndarray]:
+    """The error ρ = g - B mean (m + p,) of each output, with the residuals under these means."""
+    # As ρ = σ⁻² Pᵀe - mean - (0, w₀) it keeps the digits that B, g and the mean have lost (Higham 2002, section 12.1).
+    PE, m, found = np.concatenate([residuals.VE, residuals.HE]), len(residuals.VE), []
     for o, q in enumerate(posteriors):
         prior = q.mean + np.concatenate([np.zeros(m), group.prior.reference[o]])
         prior[q.n_own :] = 0.0
-        found.append(group.pulled_back(o, PE[:, o]) / group.noise[o] - prior)
+        found.append(group.times_T(o, PE[:, o], transposed=True) / group.noise[o] - prior)
     return found
 
 
-def shortfall(bounds: Sequence[BoundAtOptimum], left: Sequence[Residuals]) -> float:
-    """By how much rounding keeps the bounds' means from their least squares, in nats: ½ ρᵀB⁻¹ρ, with ρ = g - B mean."""
+def lost_by_rounding(bounds: Sequence[BoundAtOptimum], residuals: Sequence[Residuals]) -> float:
+    """The nats ½ ρᵀB⁻¹ρ that bounds lose because rounding moves their means, with ρ of `equation_errors`."""
     halves = []
-    for bound, own in zip(bounds, left, strict=True):
-        for q, rest in zip(bound.posteriors, unsolved(bound.group, bound.posteriors, own), strict=True):
-            halves.append(np.split(q.root_inv @ rest, [len(own.VE)]))
+    for bound, own in zip(bounds, residuals, strict=True):
+        for q, error in zip(bound.posteriors, equation_errors(bound.group, bound.posteriors, own), strict=True):
+            halves.append(np.split(q.root_inv @ error, [len(own.VE)]))
     of_v, of_w = zip(*halves, strict=True)
-    # Weights that outputs share have the sum of what these say.
+    # If outputs share w, its error is the sum over outputs.
     of_w = (np.sum(of_w, axis=0),) if bounds[0].group.prior.shared else of_w
     return 0.5 * float(sum(half @ half for half in (*of_v, *of_w)))
 
 
+# --- other bounds -----------------------------------------------------------------------------------------------------
+
+
 def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
-    """No less than the log marginal likelihood at these parameters, summed over outputs, whatever q is.
+    """An upper bound on the log marginal likelihood of all outputs, in nats. It holds for any q.
 
-    With Q = UᵀK⁻¹U + HΣ_βHᵀ, r = y - Hμ_β and t = Σ(k(x, x) - q(x, x)), the trace of what the inducing points leave of
-    the covariance, which is no less than its largest eigenvalue,
-
-        -½ [N log 2π + log|Q + σ²I| + rᵀ (Q + (σ² + t) I)⁻¹ r]
-
-    (Titsias 2014, "Variational inference for Gaussian and determinantal point processes"; HΣ_βHᵀ is on both sides).
-    The last term is the least of |r - Pω|² / (σ² + t) + |ω|², so that it is that of the bound with a noise of σ² + t.
-    An ω that rounding keeps from there makes it lower: what that costs is added. (log|B| is good to what sums hold.)
-    Inducing points that are all rows leave only what a jitter j makes of K: K - K (K + jI)⁻¹ K has no eigenvalue above
-    j, and a row that comes or counts often makes that so many times larger. (Where outputs share their weights, y, σ²
-    and t are those of all outputs, one after the other.)
-
-    Parameters
-    ----------
-    groups : sequence of Group
-        Of all outputs of a model.
-    blocks : Blocks, default=None
-        The rows, for errors summed row by row (see `BoundAtOptimum`); None takes them from the statistics.
-
-    Returns
-    -------
-    bound : float
-        In nats.
+    The residuals are summed over the rows or, without rows, taken from the statistics (see `BoundAtOptimum`).
     """
+    # Let Q = UᵀK⁻¹U + H Σ_β Hᵀ (n, n) and r = y - H μ_β. Let t = Σ (k(x, x) - q(x, x)) be the trace of the covariance
+    # that the inducing points do not explain. It is at least the largest eigenvalue, and the upper bound is
+    #
+    #     -½ [N log 2π + log|Q + σ² I| + rᵀ (Q + (σ² + t) I)⁻¹ r]
+    #
+    # (Titsias 2014, "Variational inference for Gaussian and determinantal point processes", with H Σ_β Hᵀ on both
+    # sides). The last term is the minimum over ω of |r - P ω|² / (σ² + t) + |ω|². So it equals that of the lower bound
+    # with the noise variance σ² + t. An ω that rounding moves from the minimum makes this bound too low. That loss is
+    # added. (log|B| is as accurate as the sums.)
+    #
+    # If the inducing points are all rows, only a jitter j remains of K: K - K (K + j I)⁻¹ K has no eigenvalue above j.
+    # A row that appears or counts several times makes this as many times larger. If outputs share their weights, y, σ²
+    # and t are stacked over outputs.
     wide, log_ratio = [], 0.0
     for group in groups:
-        statistics, left_over = group.statistics, group.statistics.unexplained
+        statistics, trace = group.statistics, group.statistics.unexplained
         if group.complete:
-            n_left = statistics.n_rows + statistics.surplus - len(statistics.VV)
-            left_over = group.whitening.jitter() * max(n_left + 1, 1)
-        noise = group.noise + group.signal * left_over
+            n_repeated = statistics.n_rows + statistics.surplus - len(statistics.VV)
+            trace = group.whitening.jitter() * max(n_repeated + 1, 1)
+        noise = group.noise + group.signal * trace
         wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
-    # The likelihood with this noise and without a trace term, but for its determinant.
+    # The log likelihood with the noise variance σ² + t, with the determinant for σ².
     bounds = bounds_at_optimum(wide, "full")
-    left = [bound.left_over(blocks) for bound in bounds]
-    total = sum(bound.value(own) for bound, own in zip(bounds, left, strict=True)) + shortfall(bounds, left)
+    residuals = [bound.residuals(blocks) for bound in bounds]
+    total = sum(bound.value(own) for bound, own in zip(bounds, residuals, strict=True))
+    total += lost_by_rounding(bounds, residuals)
     log_det = log_ratio + sum(q.log_det for bound in bounds for q in bound.posteriors)
     log_det -= sum(q.log_det for own in optimal_posteriors(groups) for q in own)
     return total + 0.5 * log_det
 
 
 def bounds_alone(sums: LinearSums, prior: CoefficientPrior, noise: np.ndarray, trace: np.ndarray) -> np.ndarray:
-    """The bound (o,) of each output with q(f) at its prior, all that the features leave over being noise.
+    """The lower bound (o,) of each output, in nats, with q(f) at its prior: the features alone explain the rows.
 
-    Parameters
-    ----------
-    sums : LinearSums
-    prior : CoefficientPrior
-    noise : ndarray of shape (o,)
-        Its variance.
-    trace : ndarray of shape (o,)
-        Σ ω k(x, x).
-
-    Returns
-    -------
-    bounds : ndarray of shape (o,)
-        In nats; where outputs share their weights, these are counted with the first.
+    ``noise`` (o,) is σ², and ``trace`` (o,) is Σ ω k(x, x). If outputs share their weights, these count for the first.
     """
     p, groups = prior.scale.shape[1], []
     VV, VH, VR = np.zeros((0, 0)), np.zeros((0, p)), np.zeros((0, 1))
-    for index, (variance, left) in enumerate(zip(noise, trace, strict=True)):
+    for index, (variance, unexplained) in enumerate(zip(noise, trace, strict=True)):
         output = slice(index, index + 1)
         products = VV, VH, VR, *sums.of(output)
-        statistics = SufficientStatistics(sums.n_rows, *products, float(left), sums.log_variance, sums.surplus)
+        statistics = SufficientStatistics(sums.n_rows, *products, float(unexplained), sums.log_variance, sums.surplus)
         whitening = Whitening(None, VV, VV)
         groups.append(Group(output, whitening, statistics, np.ones(1), np.array([variance]), prior.outputs(output)))
     return np.array([bound.value(bound.residuals()) for bound in bounds_at_optimum(groups, "full")])

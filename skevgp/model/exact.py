@@ -1,21 +1,23 @@
 """The exact model with explicit features: likelihood, gradient and posterior (Rasmussen & Williams 2006, section 2.7).
 
-Per output, with ρ = σ²/s², L Lᵀ = K̃ + ρ I and Σ_β = C Cᵀ, the whitened rows are z = L⁻¹ r / s and
-W = L⁻¹ H C / s; β = μ_β + C (w₀ + w) and r = y - H (μ_β + C w₀) as in `bounds`. Integrating β out leaves
+For each output, let ρ = σ²/s², L Lᵀ = K̃ + ρ I (n, n) and Σ_β = C Cᵀ (p, p). As in `bounds`, β = μ_β + C (w₀ + w) and
+r = y - H (μ_β + C w₀). The whitened rows are z = L⁻¹ r / s (n,) and W = L⁻¹ H C / s (n, p). Integrating β out gives
 
-    -2 log p(y) = (n - k) log 2π + log |s² L Lᵀ| + log |B| + |z - W w|² + |D (w + w₀)|² - 2 Σ_vague log c,
-    B = D + WᵀW,   w = B⁻¹ (Wᵀz - D w₀),   posterior of the weights: N(w, B⁻¹),
+    -2 log p(y) = (n - k) log 2π + log|s² L Lᵀ| + log|B| + |z - W w|² + |D (w + w₀)|² - 2 Σ_vague log c,
+    B = D + WᵀW (p, p),   w = B⁻¹ (Wᵀz - D w₀) (p,),   posterior of the weights: N(w, B⁻¹).
 
-where D = I, but 0 for the k weights whose prior is vague, Σ_β → ∞: for them c is a unit, and the likelihood that of
-n - k contrasts (eq. 2.45 there; the infinite log |Σ_β| left out). A QR factorisation of [W; D] gives B without squaring
-its condition. Outputs that share their weights are stacked: W and z are then those of all of them, one below the other.
+D is I, with zeros for the k weights whose prior is vague, Σ_β → ∞. For these, c is a unit, and the likelihood is that
+of n - k contrasts (eq. 2.45 there, without the infinite log|Σ_β|). A QR factorisation of [W; D] gives B without
+squaring its condition number. If outputs share their weights, their W and z are stacked.
 
-Predictions are those of a sparse model whose inducing points are the rows and whose L is the one above (eq. 2.41 and
-2.42): g(x) has the mean Vᵀ(s (z - W w)) + h(x)ᵀβ and the variance s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|²,
-with V = L⁻¹ k̃(X, x) and B = RᵀR.
+Predictions are those of a sparse model whose inducing points are the rows and whose factor is the L above (eq. 2.41 and
+2.42). With V = L⁻¹ k̃(X, x) and B = RᵀR,
 
-A row with the noise variance σ² v has ρ v in place of ρ on its diagonal. One that counts w times is a row with the
-noise variance σ² v / w, but for what w copies of it have beside exp(-½ w e² / (σ² v)):
+    mean of g(x): Vᵀ (s (z - W w)) + h(x)ᵀβ,
+    variance of g(x): s² (k̃(x, x) - |V|²) + |R⁻ᵀ (Cᵀ h(x) - s Wᵀ V)|².
+
+A row with the noise variance σ² v has ρ v instead of ρ on the diagonal. A row that counts w times equals a row with the
+noise variance σ² v / w, times the constant factor by which w copies of it differ:
 
     N(y | g, σ² v)^w = N(y | g, σ² v / w) (2πσ² v)^(-(w - 1)/2) w^(-1/2).
 """
@@ -44,31 +46,20 @@ from .statistics import Kernel, Whitening
 
 
 class OutputGivenKernel:
-    """Likelihood and posterior of one output, given K̃.
+    """Likelihood and posterior of one output, given K̃ (n, n), H (n, p) and the residuals r (n,).
 
-    Parameters
-    ----------
-    K : ndarray of shape (n, n)
-        k̃(X, X).
-    H : ndarray of shape (n, p)
-    r : ndarray of shape (n,)
-        Residuals.
-    signal, noise : float
-        s² and σ².
-    prior : CoefficientPrior
-        Of this output.
-    vague : ndarray of shape (p,)
-        Weights with Σ_β → ∞; their prior scale is a unit.
-    relative : ndarray of shape (n,), optional
-        Noise variances v / w in units of σ²; None are ones.
+    ``vague`` (p,) marks weights with Σ_β → ∞. ``relative`` (n,) are noise variances v / w in units of σ². None: all 1.
+    `join` must be called before anything is asked.
     """
 
-    # Of `join`.
+    # Set by `join`. R (p, p) with B = RᵀR, its inverse, and w (p,).
     R: np.ndarray
     R_inv: np.ndarray
     w: np.ndarray
-    left_over: np.ndarray
+    # z - W w (n,) and D (w + w₀) (p,).
+    errors: np.ndarray
     from_prior: np.ndarray
+    # Whether terms of w count for this output. If outputs share w, they count for the first.
     is_first: bool
 
     def __init__(
@@ -94,25 +85,25 @@ class OutputGivenKernel:
 
     @staticmethod
     def join(outputs: Sequence[OutputGivenKernel]) -> None:
-        """Find w from all of some outputs, which share it; what belongs to it is counted with the first of them."""
+        """Compute the weights w that some outputs share, from all of their rows."""
         proper, reference = ~outputs[0].vague, outputs[0].reference
         # [W; D] w = [z; -D w₀] by least squares.
         Q, R = np.linalg.qr(np.vstack([*(own.W for own in outputs), np.diag(proper.astype(float))]))
         R_inv = lapack.dtrtri(R)[0] if len(R) else R
         wanted = Q.T @ np.concatenate([*(own.z for own in outputs), np.where(proper, -reference, 0.0)])
-        # Not by the inverse: what it loses, features of 1e16 times the noise would multiply.
+        # A solve instead of the inverse: features of 1e16 times the noise would multiply the errors of the inverse.
         w = lapack.dtrtrs(R, wanted)[0] if len(R) else wanted
         for own in outputs:
             own.R, own.R_inv, own.w, own.is_first = R, R_inv, w, own is outputs[0]
-            own.left_over = own.z - own.W @ w
+            own.errors = own.z - own.W @ w
             own.from_prior = proper * (w + reference)
 
     @property
     def log_likelihood(self) -> float:
-        """Of the residuals, in nats."""
+        """The log likelihood of the residuals, in nats."""
         n_contrasts = len(self.L)
         log_det = len(self.L) * np.log(self.signal) + 2.0 * np.log(np.diagonal(self.L)).sum()
-        squares = self.left_over @ self.left_over
+        squares = self.errors @ self.errors
         if self.is_first:
             n_contrasts -= self.vague.sum()
             log_det += 2.0 * (np.log(np.abs(np.diagonal(self.R))).sum() - np.log(self.scale[self.vague]).sum())
@@ -120,18 +111,16 @@ class OutputGivenKernel:
         return float(-0.5 * (n_contrasts * LOG_2PI + log_det + squares))
 
     def gradient(self) -> tuple[np.ndarray, float, float]:
-        """Of the log likelihood in K̃ (symmetric), log s² and log σ²: ½ (α αᵀ - P) pulled back to each.
-
-        (α = (s² L Lᵀ)⁻¹ (r - H C w); P is the inverse of y's covariance, of this output's rows, or for vague weights
-        its limit.)
-        """
-        # α and P in units of 1/s and 1/s²: in their own α² may overflow.
-        alpha, n = self.L_inv.T @ self.left_over, len(self.L)
+        """Gradients of the log likelihood in K̃ (n, n), which is symmetric, in log s² and in log σ²."""
+        # In y's covariance the gradient is ½ (α αᵀ - P), with α = (s² L Lᵀ)⁻¹ (r - H C w) (n,) and P (n, n) the inverse
+        # of the covariance of this output's rows, or its limit for vague weights. Here α and P are in units of 1/s and
+        # 1/s². In their own units, α² may overflow.
+        alpha, n = self.L_inv.T @ self.errors, len(self.L)
         WR = self.W @ self.R_inv
         from_weights = self.L_inv.T @ WR
         P = symmetric_inverse(self.L_inv) - from_weights @ from_weights.T
         in_noise = alpha**2 - diagonal_of(P)
-        squares = float(self.left_over @ self.left_over)
+        squares = float(self.errors @ self.errors)
         explained = float(np.vdot(WR, WR))
         noise_bar = 0.5 * self.ratio * float(in_noise.sum() if self.relative is None else in_noise @ self.relative)
         P *= -1.0
@@ -140,42 +129,32 @@ class OutputGivenKernel:
         return P, 0.5 * (squares - n + explained) - noise_bar, noise_bar
 
     def posterior(self) -> tuple[np.ndarray, np.ndarray]:
-        """Of ω = (v, w): its mean (n + p,) and a root (max(p, 1), n + p) of its covariance."""
+        """The mean (n + p,) of ω = (v, w), and a root (max(p, 1), n + p) of its covariance."""
         root = np.zeros((1, len(self.L)))
         if len(self.R):
             root = np.hstack([-(self.W @ self.R_inv).T, self.R_inv.T])
-        return np.concatenate([self.left_over, self.w]), root
+        return np.concatenate([self.errors, self.w]), root
 
 
 @dataclass(frozen=True)
 class ExactModel:
-    """Covariance, prior and rows: θ -> likelihood, gradient and posterior.
+    """Covariance, prior and rows of o outputs: likelihood, gradient and posterior at given parameters."""
 
-    Attributes
-    ----------
-    kernel : Kernel
-        k̃, common to all outputs.
-    prior : CoefficientPrior
-    vague : ndarray of shape (o, p)
-        Weights with an infinite prior scale; in ``prior`` theirs is a unit.
-    rows : RawRows
-        All of them, in internal units.
-    kernels : tuple of Kernel, optional
-        k̃ of each output, where outputs have inputs of their own.
-    """
-
+    # k̃, common to all outputs.
     kernel: Kernel
+    # If weights are vague, their prior scale is a unit.
     prior: CoefficientPrior
+    # (o, p): whether the prior of each weight is vague.
     vague: np.ndarray
+    # All rows, in internal units.
     rows: RawRows
+    # k̃ of each output, if outputs have inputs of their own.
     kernels: tuple[Kernel, ...] | None = None
 
     def with_fewer_features(self) -> ExactModel:
-        """The same likelihood with no more features than rows n, where there are more.
-
-        Of H C = Rᵀ Qᵀ rows see Qᵀ w ~ N(-Qᵀ w₀, I) alone, and no other direction of w has a likelihood: Rᵀ (n, n) takes
-        the place of H. Not where outputs share their weights, or some are vague.
-        """
+        """The model of the same likelihood with at most as many features as rows. Shared or vague weights stay."""
+        # With the QR factorisation H C = Rᵀ Qᵀ, Q (p, n) and R (n, n), the rows depend on Qᵀ w ~ N(-Qᵀ w₀, I) only. So
+        # Rᵀ replaces H, and Qᵀ w₀ replaces w₀.
         (o, p), n = self.prior.scale.shape, len(self.rows.inputs)
         if p <= n or self.prior.shared or self.vague.any():
             return self
@@ -183,7 +162,7 @@ class ExactModel:
         for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
             H = self.rows.of(slice(index, index + 1)).features
             A = (H * scale if self.prior.root is None else H @ self.prior.root[index]).T
-            # The large rows first: so each keeps its own digits (Higham 2002, section 19.4).
+            # With large rows first, each row keeps its digits (Higham 2002, section 19.4).
             order = np.argsort(-np.abs(A).max(axis=1))
             Q, R = np.linalg.qr(A[order])
             features[:, index], reference[index] = R.T, Q.T @ w0[order]
@@ -192,7 +171,7 @@ class ExactModel:
         return replace(self, prior=prior, vague=np.zeros((o, n), dtype=bool), rows=rows)
 
     def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
-        """The covariance of the rows, of all outputs or of each, and each output given it."""
+        """The kernel at the rows, for all outputs or for each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
         each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
         relative = None if self.rows.precision is None else 1.0 / self.rows.precision
@@ -219,9 +198,9 @@ class ExactModel:
         return covariances, outputs
 
     def log_likelihoods(self, values: Values) -> np.ndarray:
-        """Of each output, (o,), with what its rows' counts add; -inf where it cannot be computed.
+        """The log likelihood (o,) of each output, in nats, or -inf if it cannot be computed.
 
-        Shared weights are counted with the first.
+        Shared weights count for the first output.
         """
         try:
             return np.array([output.log_likelihood for output in self.outputs(values)[1]]) + self._of_copies(values)
@@ -229,7 +208,7 @@ class ExactModel:
             return np.full(len(self.vague), -np.inf)
 
     def log_likelihood(self, values: Values) -> tuple[float, Values]:
-        """Summed over outputs, and its gradient in the logarithms of the values."""
+        """The log likelihood of all outputs, in nats, and its gradient in the logarithms of the values."""
         covariances, outputs = self.outputs(values)
         total = float(self._of_copies(values).sum())
         gradient = {name: np.zeros_like(value) for name, value in values.items()}
@@ -238,26 +217,22 @@ class ExactModel:
             total += output.log_likelihood
             own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
             K_bars[index % len(K_bars)] += own
-        gradient["noise"] -= 0.5 * self.n_copies
+        # The factor for copies of rows has the power -Σ (w - 1) / 2 of σ².
+        gradient["noise"] -= 0.5 * (self.rows.total - len(self.rows.inputs))
         for at, K_bar in zip(covariances, K_bars, strict=True):
             gradient["hyperparameters"] += at.finish_pullback(at.start_pullback(), K_bar)[0]
         return total, gradient
 
-    @property
-    def n_copies(self) -> float:
-        """Σ (w - 1)."""
-        return self.rows.total - len(self.rows.inputs)
-
     def _of_copies(self, values: Values) -> np.ndarray:
-        """What rows that count w times add to the log likelihood of rows with the noise variance σ² v / w."""
+        """The log (o,) of the constant factor for rows that count w times (see the top of this file)."""
         w, noise = self.rows.counts, values["noise"]
         if w is None or self.rows.precision is None:
             return np.zeros(len(noise))
         constant = float((w - 1.0) @ (LOG_2PI + np.log(w / self.rows.precision)) + np.log(w).sum())
-        return -0.5 * (constant + self.n_copies * np.log(noise))
+        return -0.5 * (constant + (self.rows.total - len(self.rows.inputs)) * np.log(noise))
 
     def predictor(self, values: Values) -> Predictor:
-        """In internal units; the rows are its inducing points."""
+        """The predictor in internal units. Its inducing points are the rows."""
         covariances, outputs = self.outputs(values)
         groups = []
         for index, output in enumerate(outputs):
@@ -280,13 +255,7 @@ class ExactModel:
 
 
 class LikelihoodObjective:
-    """θ -> minus the log marginal likelihood, per row, and its gradient: what L-BFGS minimises.
-
-    Parameters
-    ----------
-    model : ExactModel
-    table : ParameterTable
-    """
+    """Minus the log marginal likelihood, per row, and its gradient, as a function of the flat vector."""
 
     def __init__(self, model: ExactModel, table: ParameterTable):
         self.model, self.table = model.with_fewer_features(), table

@@ -1,47 +1,36 @@
-"""The families of q(ω) that mini-batches move: what each adds to the paper's loss, with hand-written gradients.
+"""The families of q(ω) for mini-batches: their parameters, and their terms in the paper's loss with gradients.
 
-Per output q(ω) = N(mean, S), in the whitened coordinates of `bounds`. Its spread enters the loss (the paper's eq. elbo)
-through ½ [Tr((I + σ⁻² PᵀP) S) - log|S|], P = [s Vᵀ, H diag(c)]. The rows of a mini-batch count N/n times: the same as
-a noise variance of σ² n/N, which is what a group's ``noise`` is in this module.
+For each output q(ω) = N(mean, S), in the whitened coordinates of `bounds`. The covariance S (m + p, m + p) enters the
+loss (the paper's eq. elbo) through ½ [Tr((I + σ⁻² PᵀP) S) - log|S|], with P = [s Vᵀ, H diag(c)] (n, m + p). Each row of
+a mini-batch counts N/n times. This equals a noise variance of σ² n/N, which is a group's ``noise`` in this module.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from ..utils.linalg import diagonal_of, jittered_cholesky, symmetric_inverse, times_lower, triangular_inverse
-from .bounds import Group, WhitenedPosterior, projected
+from .bounds import Group, WhitenedPosterior, diagonal_root, log_variances
 from .parameters import Parameter, Values
-from .predictor import diagonal_root, log_variances
 
 
 @dataclass
 class SpreadTerms:
-    """What the spread of q adds to the loss of a group, and its gradients in what these names say.
+    """The terms of the covariances S in the loss of a group, and their gradients."""
 
-    Attributes
-    ----------
-    value : float
-        The sum over outputs of ½ [Tr((I + σ⁻² PᵀP) S) - log|S|].
-    VV : ndarray of shape (m, m)
-    VH : ndarray of shape (m, p)
-    factor : ndarray of shape (m, m)
-        As of `StatisticsGradient`.
-    log_signal, log_noise : ndarray of shape (o,)
-    spread : ndarray of shape (o, k)
-        In the coordinates of the parameter ``spread``; of width 0 if there is none.
-    """
-
+    # Σ over outputs of ½ [Tr((I + σ⁻² PᵀP) S) - log|S|].
     value: float
+    # Gradients in V Vᵀ (m, m), V H (m, p) and, as Lᵀ L̄, in L (m, m): see `StatisticsGradient`.
     VV: np.ndarray
     VH: np.ndarray
     factor: np.ndarray
+    # (o,): gradients in log s² and log σ².
     log_signal: np.ndarray
     log_noise: np.ndarray
+    # (o, k): gradients in the coordinates of the parameter ``spread``. k is 0 if there is none.
     spread: np.ndarray
 
     @classmethod
@@ -49,63 +38,61 @@ class SpreadTerms:
         VV, VH, factor = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
         return cls(0.0, VV, VH, factor, np.zeros(o), np.zeros(o), np.zeros((o, k)))
 
+    def add_output(self, o: int, group: Group, S_v: np.ndarray, rows: np.ndarray, penalty: float) -> None:
+        """Add the terms of output o: S_v (m, m + p) of S, the diagonal of σ⁻² PᵀP S (m + p,), and Tr(S) - log|S|."""
+        m, s = len(group.whitening.L), np.sqrt(group.signal[o])
+        # The trace of a product of two covariances is not negative. Rounding may make it so.
+        self.value += 0.5 * (max(float(rows.sum()), 0.0) + penalty)
+        self.VV += (0.5 * group.signal[o] / group.noise[o]) * S_v[:, :m]
+        self.VH += (s / group.noise[o]) * S_v[:, m:] * group.prior.scale[o]
+        self.log_signal[o] = 0.5 * rows[:m].sum()
+        self.log_noise[o] = -0.5 * rows.sum()
 
-class Family(Protocol):
-    """A family of q: its parameters, and what it does at a point of them."""
+
+class _GradientFamily:
+    """A family whose mean (o, m + p) and ``spread`` (o, k) are parameters of an optimiser."""
+
+    # Where they start: at the optimum.
+    _mean: np.ndarray
+    _spread: np.ndarray
 
     def parameters(self, mean_unit: np.ndarray) -> list[Parameter]:
-        """What an optimiser moves, started where q is best; the mean in units of ``mean_unit`` (o, m + p)."""
+        """The parameters, with the mean in units of ``mean_unit`` (o, m + p)."""
+        return [Parameter("mean", self._mean, unit=mean_unit), Parameter("spread", self._spread)]
 
     def mean(self, values: Values, group: Group) -> np.ndarray:
         """E[ω] (o, m + p) of a group's outputs."""
-
-    def terms(self, values: Values, group: Group) -> SpreadTerms:
-        """The part of the loss that belongs to the spread; called after `mean`, once for each group."""
-
-    def means(self, values: Values) -> list[np.ndarray]:
-        """E[ω] of each output, as `mean` last found it."""
-
-    def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:
-        """R of each output with S = Rᵀ R; ``L_inv`` one per output."""
-
-
-class DiagonalFamily:
-    """The paper's q: independent inducing values and weights.
-
-    S = blockdiag(L⁻¹ diag(d) L⁻ᵀ, diag(e)): d (in units of s²) and e are variances in the coordinates f_m and w. All
-    outputs of a group share the two products of m-sized matrices.
-
-    Parameters
-    ----------
-    optima : sequence of WhitenedPosterior
-        The best unrestricted q of each output: the diagonal one has its mean.
-    L_inv : sequence of ndarray of shape (m, m)
-        One per output.
-    """
-
-    def __init__(self, optima: Sequence[WhitenedPosterior], L_inv: Sequence[np.ndarray]):
-        self._mean = np.array([q.mean for q in optima])
-        self._log_variances = np.array(
-            [np.concatenate(log_variances(q.B, factor)) for q, factor in zip(optima, L_inv, strict=True)]
-        )
-
-    def parameters(self, mean_unit: np.ndarray) -> list[Parameter]:
-        return [Parameter("mean", self._mean, unit=mean_unit), Parameter("spread", self._log_variances)]
-
-    def mean(self, values: Values, group: Group) -> np.ndarray:
         return values["mean"][group.outputs]
 
     def means(self, values: Values) -> list[np.ndarray]:
+        """E[ω] (m + p,) of each output."""
         return list(values["mean"])
 
+
+class DiagonalFamily(_GradientFamily):
+    """The paper's q, with independent inducing values and weights.
+
+    It starts at ``optima``, the best full q of each output, which have its mean. ``L_inv`` is (m, m) for each output.
+    """
+
+    # S = blockdiag(L⁻¹ diag(d) L⁻ᵀ, diag(e)), where d (m,), in units of s², and e (p,) are variances of f_m and w.
+    # Their logarithms are the spread. The outputs of a group share both products of (m, m) matrices.
+
+    def __init__(self, optima: Sequence[WhitenedPosterior], L_inv: Sequence[np.ndarray]):
+        self._mean = np.array([q.mean for q in optima])
+        self._spread = np.array(
+            [np.concatenate(log_variances(q.B, factor)) for q, factor in zip(optima, L_inv, strict=True)]
+        )
+
     def terms(self, values: Values, group: Group) -> SpreadTerms:
+        """The terms of the covariances in the loss of a group."""
         statistics, L_inv, m = group.statistics, group.whitening.L_inv, len(group.whitening.L)
         log_variance = values["spread"][group.outputs]
         variance = np.exp(log_variance)
         d = variance[:, :m]
         ratio = (group.signal / group.noise)[:, np.newaxis]
         VVL = times_lower(statistics.VV, L_inv)
-        # Tr(PᵀP S) / σ² is the sum of these over the variances.
+        # (o, m + p): the terms of each variance in Tr(σ⁻² PᵀP S) and in Tr(S).
         from_data = np.empty_like(variance)
         from_data[:, :m] = np.einsum("ij,ij->j", L_inv, VVL) * ratio
         from_data[:, m:] = group.prior.scale**2 * np.diagonal(statistics.HH) / group.noise[:, np.newaxis]
@@ -129,6 +116,7 @@ class DiagonalFamily:
         )
 
     def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """R (m + p, m + p) of each output with S = Rᵀ R."""
         m = len(L_inv[0])
         return [
             diagonal_root(spread[:m], spread[m:], factor)
@@ -136,45 +124,12 @@ class DiagonalFamily:
         ]
 
 
-def _add_covariance(
-    terms: SpreadTerms, o: int, group: Group, S_v: np.ndarray, rows: np.ndarray, penalty: float
-) -> None:
-    """Add one output's ½ [Tr((I + σ⁻² PᵀP) S) - log|S|].
+class FullFamily(_GradientFamily):
+    """q as one joint Gaussian of inducing values and weights. It starts at ``optima``, the best q of each output."""
 
-    Parameters
-    ----------
-    terms : SpreadTerms
-        To be added to.
-    o : int
-        The output's place in the group.
-    group : Group
-    S_v : ndarray of shape (m, m + p)
-        The upper rows of S.
-    rows : ndarray of shape (m + p,)
-        The diagonal of σ⁻² PᵀP S.
-    penalty : float
-        Tr(S) - log|S|.
-    """
-    m, s = len(group.whitening.L), np.sqrt(group.signal[o])
-    # The trace of a product of two covariances, whatever rounding says.
-    terms.value += 0.5 * (max(float(rows.sum()), 0.0) + penalty)
-    terms.VV += (0.5 * group.signal[o] / group.noise[o]) * S_v[:, :m]
-    terms.VH += (s / group.noise[o]) * S_v[:, m:] * group.prior.scale[o]
-    terms.log_signal[o] = 0.5 * rows[:m].sum()
-    terms.log_noise[o] = -0.5 * rows.sum()
-
-
-class FullFamily:
-    """q as one joint Gaussian of inducing values and weights, moved by gradients.
-
-    S = R Rᵀ, R = R₀ T: R₀ R₀ᵀ is the best covariance at the start, T lower triangular, with the log of its diagonal.
-    So a step of one size means the same in directions that the data fix to 1e-4 and in those that they leave free.
-
-    Parameters
-    ----------
-    optima : sequence of WhitenedPosterior
-        The best q of each output.
-    """
+    # S = R Rᵀ with R = R₀ T, all (m + p, m + p), where R₀ R₀ᵀ is the best covariance at the start. T is lower
+    # triangular. The spread contains the log of its diagonal, then the entries below. A step of one size therefore
+    # means the same in directions that the data fix to 1e-4 and in those that they do not fix.
 
     def __init__(self, optima: Sequence[WhitenedPosterior]):
         self._mean = np.array([q.mean for q in optima])
@@ -182,18 +137,10 @@ class FullFamily:
         self._start_log_det = [2.0 * np.log(np.abs(np.diagonal(root))).sum() for root in self._start]
         self._size = len(self._start[0])
         self._below = np.tril_indices(self._size, -1)
-
-    def parameters(self, mean_unit: np.ndarray) -> list[Parameter]:
-        spread = np.zeros((len(self._mean), self._size * (self._size + 1) // 2))
-        return [Parameter("mean", self._mean, unit=mean_unit), Parameter("spread", spread)]
-
-    def mean(self, values: Values, group: Group) -> np.ndarray:
-        return values["mean"][group.outputs]
-
-    def means(self, values: Values) -> list[np.ndarray]:
-        return list(values["mean"])
+        self._spread = np.zeros((len(self._mean), self._size * (self._size + 1) // 2))
 
     def terms(self, values: Values, group: Group) -> SpreadTerms:
+        """The terms of the covariances in the loss of a group."""
         (m, p), size = group.statistics.VH.shape, self._size
         spread = values["spread"][group.outputs]
         terms = SpreadTerms.zeros(m, p, *spread.shape)
@@ -201,12 +148,12 @@ class FullFamily:
             output = group.outputs.start + o
             T = self._triangular(coordinates)
             R = self._start[output] @ T
-            PP, _ = projected(group, o)
+            PP, _ = group.products(o)
             PPR = PP @ R
             PPR /= group.noise[o]
             log_det = self._start_log_det[output] + 2.0 * coordinates[:size].sum()
             rows = np.einsum("ij,ij->i", PPR, R)
-            _add_covariance(terms, o, group, R[:m] @ R.T, rows, float(np.vdot(R, R)) - log_det)
+            terms.add_output(o, group, R[:m] @ R.T, rows, float(np.vdot(R, R)) - log_det)
             PPR += R
             T_bar = self._start[output].T @ PPR
             terms.spread[o, :size] = np.diagonal(T_bar) * np.diagonal(T) - 1.0
@@ -214,11 +161,13 @@ class FullFamily:
         return terms
 
     def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """Rᵀ of each output."""
         return [
             (start @ self._triangular(spread)).T for start, spread in zip(self._start, values["spread"], strict=True)
         ]
 
     def _triangular(self, coordinates: np.ndarray) -> np.ndarray:
+        """T, from the spread of one output."""
         T = np.zeros((self._size, self._size))
         diagonal_of(T)[...] = np.exp(coordinates[: self._size])
         T[self._below] = coordinates[self._size :]
@@ -226,19 +175,17 @@ class FullFamily:
 
 
 class NaturalFamily:
-    """q as one joint Gaussian, moved by natural gradients: no parameters for an optimiser, but a state of its own.
+    """q as one joint Gaussian with natural gradient steps. It has a state and no parameters for an optimiser.
 
-    The state is q's natural parameters Λ = S⁻¹ and Λ mean. A natural gradient of length ρ goes that share of the way
-    to the optimum for the rows at hand (Hensman et al. 2013, section 3, the updates of the canonical parameters):
-    Λ <- (1 - ρ) Λ + ρ B, Λ mean <- (1 - ρ) Λ mean + ρ g, with B and g of `bounds`.
-
-    Parameters
-    ----------
-    optima : sequence of WhitenedPosterior
-        The best q of each output: where the state starts.
-    rate, least_rate : float
-        ρ, above 0 and at most 1: the first one, and what it never falls below.
+    The state starts at ``optima``, the best q of each output. Steps have the length ``rate`` at first, and at least
+    ``least_rate``, both in (0, 1].
     """
+
+    # The state of each output is its natural parameters Λ = S⁻¹ (m + p, m + p) and Λ mean (m + p,). A natural gradient
+    # step of length ρ moves them by the share ρ to the optimum for the rows at hand (Hensman et al. 2013, section 3,
+    # the updates of the canonical parameters), with B and g of `bounds`:
+    #
+    #     Λ <- (1 - ρ) Λ + ρ B,   Λ mean <- (1 - ρ) Λ mean + ρ g.
 
     def __init__(self, optima: Sequence[WhitenedPosterior], rate: float, least_rate: float):
         self.rate, self._first_rate, self._least_rate = rate, rate, least_rate
@@ -248,23 +195,24 @@ class NaturalFamily:
         self._root_inv = [q.root_inv for q in optima]
 
     def pace(self, share: float) -> None:
-        """Make the steps this share of the first: as the parameters slow down, q may average over more rows."""
+        """Set the step length to this share of the first. If other parameters slow down, q averages over more rows."""
         self.rate = max(share * self._first_rate, self._least_rate)
 
     def forget(self) -> None:
-        """From now on go all the way at each step, wherever q was."""
+        """Forget the state. From now on each step leads to the optimum for its rows."""
         self.rate = 1.0
         for state in (*self.precision, *self.shift):
             state[...] = 0.0
 
     def parameters(self, mean_unit: np.ndarray) -> list[Parameter]:
+        """No parameters."""
         return []
 
     def mean(self, values: Values, group: Group) -> np.ndarray:
-        """Move the state of a group's outputs by a step, and return their means."""
+        """Move the state of a group's outputs by one step, and return their E[ω] (o, m + p)."""
         m = len(group.whitening.L)
         for o, output in enumerate(range(group.outputs.start, group.outputs.stop)):
-            PP, Pr = projected(group, o)
+            PP, Pr = group.products(o)
             precision, shift = self.precision[output], self.shift[output]
             PP *= self.rate / group.noise[o]
             diagonal_of(PP)[...] += self.rate
@@ -280,19 +228,25 @@ class NaturalFamily:
         return np.array(self._mean[group.outputs])
 
     def means(self, values: Values) -> list[np.ndarray]:
+        """E[ω] (m + p,) of each output after the last step."""
         return list(self._mean)
 
     def terms(self, values: Values, group: Group) -> SpreadTerms:
+        """The terms of the covariances in the loss of a group, after the step of `mean`."""
         m, p = group.statistics.VH.shape
         terms = SpreadTerms.zeros(m, p, len(group.signal), 0)
         for o, output in enumerate(range(group.outputs.start, group.outputs.stop)):
             root_inv = self._root_inv[output]
             S = symmetric_inverse(root_inv)
-            PP, _ = projected(group, o)
+            PP, _ = group.products(o)
             rows = np.einsum("ij,ij->i", PP, S) / group.noise[o]
             log_det = 2.0 * np.log(np.diagonal(root_inv)).sum()
-            _add_covariance(terms, o, group, S[:m], rows, float(np.trace(S)) - log_det)
+            terms.add_output(o, group, S[:m], rows, float(np.trace(S)) - log_det)
         return terms
 
     def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:
+        """R (m + p, m + p) of each output with S = Rᵀ R."""
         return list(self._root_inv)
+
+
+Family = DiagonalFamily | FullFamily | NaturalFamily

@@ -1,4 +1,4 @@
-"""The sparse model of some outputs on some rows: parameters -> groups of outputs, bound, predictor."""
+"""The sparse model of some outputs: from parameters and rows to groups of outputs, bounds and predictor."""
 
 from __future__ import annotations
 
@@ -15,49 +15,40 @@ from .bounds import (
     PosteriorFamily,
     WhitenedPosterior,
     bounds_at_optimum,
+    diagonal_root,
+    equation_errors,
+    log_variances,
     optimal_posteriors,
-    unsolved,
     upper_bound,
 )
 from .parameters import Parameter, Values
-from .predictor import CoefficientPrior, Predictor, PredictorGroup, diagonal_root, log_variances
+from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect, errors
 
-# An error of the precision of q where that is 1.
+# Means are refined if the precision of q has rounding errors below this, where the prior's precision is 1.
 _REFINABLE = 0.1
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """Covariance, prior and family of q: all that a bound needs but the rows and the parameters.
+    """Covariance, prior of the weights and family of q for o outputs.
 
-    Its parameters are ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``.
-
-    Attributes
-    ----------
-    kernel : Kernel
-        k̃, of unit signal variance.
-    prior : CoefficientPrior
-        Of o outputs.
-    family : {"full", "diagonal"}
-    groups : tuple of slice
-        The outputs that each set of inducing points serves.
-    jitter : Jitter, default=Jitter()
-        Of k(X_m, X_m).
-    complete : bool, default=False
-        Whether the inducing points are all rows: the bound is then the likelihood, and what is left of k(x, x) - |v|²
-        is rounding.
-    kernels : tuple of Kernel, optional
-        If rows are split by groups, which then have inputs of their own or are joined by their weights: that of each
-        group. All have the same hyperparameters, or, where these are of shape (g, n_hyper), each its own.
+    The parameters (`Values`) are ``hyperparameters``, ``signal``, ``noise`` and ``inducing_points``. Each method that
+    takes ``whitenings`` computes them if they are None.
     """
 
+    # k̃, of unit signal variance.
     kernel: Kernel
     prior: CoefficientPrior
     family: PosteriorFamily
+    # The outputs of each set of inducing points.
     groups: tuple[slice, ...]
+    # Jitter of k(X_m, X_m).
     jitter: Jitter = JITTER
+    # Whether the inducing points are all rows. The bound is then the likelihood, and k(x, x) - |v|² is rounding error.
     complete: bool = False
+    # The kernel of each group, if groups have inputs of their own or are joined by their weights only. All have the
+    # same hyperparameters (n_hyper,), or each its own row of (g, n_hyper).
     kernels: tuple[Kernel, ...] | None = None
 
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
@@ -67,60 +58,62 @@ class SparseModel:
         return self.kernel if self.kernels is None else self.kernels[group], own
 
     def set_of(self, output: int, parameter: Parameter) -> int:
-        """Which row of a parameter, of all groups or of each, belongs to an output."""
+        """Index of the row of a parameter that belongs to an output: that of its group, or 0 if all share one."""
         if parameter.start.ndim == 1:
             return 0
         return next(i for i, group in enumerate(self.groups) if group.start <= output < group.stop)
 
     def blocks(self, rows: Rows, n_inducing: int) -> Blocks:
-        """The rows of its outputs as blocks."""
+        """Rows as blocks for this model's kernels."""
         if self.kernels is None:
             return rows.blocks(self.kernel, n_inducing)
         return rows.blocks(self.kernels, n_inducing, self.groups)
 
     def whitenings(self, values: Values) -> Iterator[Whitening]:
-        """Of each set of inducing points."""
+        """The whitening of each set of inducing points."""
         for index, points in enumerate(values["inducing_points"]):
             yield Whitening.of(*self.kernel_of(values, index), points, self.jitter)
 
-    def groups_on(
+    def statistics(
         self, values: Values, blocks: Blocks, whitenings: Iterable[Whitening] | None = None
-    ) -> Iterator[Group]:
-        """Each group with the statistics of some rows: a pass over them for each, when it is asked for."""
-        for outputs, whitening in zip(self.groups, whitenings or self.whitenings(values), strict=True):
-            yield self.group(values, outputs, whitening, collect(blocks, whitening, outputs))
+    ) -> list[SufficientStatistics]:
+        """The statistics of each group: a pass over the rows for each."""
+        # Unlike in `group`, the unexplained variance stays if the points are all rows: `partial_fit` adds rows.
+        sets = zip(self.groups, whitenings or self.whitenings(values), strict=True)
+        return [collect(blocks, whitening, outputs) for outputs, whitening in sets]
+
+    def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
+        """The group of one set of inducing points."""
+        signal, noise = values["signal"][outputs], values["noise"][outputs]
+        if self.complete:
+            statistics = replace(statistics, unexplained=0.0)
+        return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs), self.complete)
 
     def groups_of(
         self,
         values: Values,
         statistics: Sequence[SufficientStatistics],
         whitenings: Iterable[Whitening] | None = None,
-    ) -> Iterator[Group]:
-        """Each group with its statistics, which were collected for the same hyperparameters and inducing points."""
-        for outputs, whitening, own in zip(self.groups, whitenings or self.whitenings(values), statistics, strict=True):
-            yield self.group(values, outputs, whitening, own)
+    ) -> list[Group]:
+        """All groups, with statistics for the same hyperparameters and inducing points."""
+        sets = zip(self.groups, whitenings or self.whitenings(values), statistics, strict=True)
+        return [self.group(values, *own) for own in sets]
 
-    def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
-        """What belongs to one set of inducing points."""
-        signal, noise = values["signal"][outputs], values["noise"][outputs]
-        if self.complete:
-            statistics = replace(statistics, unexplained=0.0)
-        return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs), self.complete)
-
-    def statistics(
-        self, values: Values, blocks: Blocks, whitenings: Iterable[Whitening] | None = None
-    ) -> list[SufficientStatistics]:
-        """The statistics of each group.
-
-        As they are, also where the points are all rows: after `partial_fit` they no longer will be.
-        """
-        sets = zip(self.groups, whitenings or self.whitenings(values), strict=True)
-        return [collect(blocks, whitening, outputs) for outputs, whitening in sets]
+    def groups_on(self, values: Values, blocks: Blocks) -> Iterator[Group]:
+        """Each group, with the statistics of some rows. The pass over the rows is made when the group is asked for."""
+        for outputs, whitening in zip(self.groups, self.whitenings(values), strict=True):
+            yield self.group(values, outputs, whitening, collect(blocks, whitening, outputs))
 
     def bound(self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None) -> float:
-        """The bound with q at its optimum; arguments as of `upper_bound`."""
-        bounds = bounds_at_optimum(list(self.groups_of(values, statistics)), self.family)
-        return sum(bound.value(bound.left_over(blocks)) for bound in bounds)
+        """The lower bound with q at its optimum. Without ``blocks``, digits cancel if there is little noise."""
+        bounds = bounds_at_optimum(self.groups_of(values, statistics), self.family)
+        return sum(bound.value(bound.residuals(blocks)) for bound in bounds)
+
+    def upper_bound(
+        self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None
+    ) -> float:
+        """An upper bound on the log marginal likelihood. Without ``blocks``, digits cancel if there is little noise."""
+        return upper_bound(self.groups_of(values, statistics), blocks)
 
     def at_optimum(
         self,
@@ -131,38 +124,15 @@ class SparseModel:
     ) -> Predictor:
         """The predictor with q at its optimum.
 
-        Parameters
-        ----------
-        values : dict
-        statistics : sequence of SufficientStatistics
-            What `statistics` returns for these values.
-        whitenings : iterable of Whitening, default=None
-            What `whitenings` yields for these values, if it is there already.
-        blocks : Blocks, default=None
-            All rows, for means that keep their digits in directions of which the rows say little; not for weights that
-            outputs share.
+        If ``blocks`` of all rows are given, means are refined, unless outputs share their weights.
         """
-        groups, mean, root = list(self.groups_of(values, statistics, whitenings)), [], []
+        groups, mean, root = self.groups_of(values, statistics, whitenings), [], []
         for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
             L_inv = group.whitening.L_inv
             for q in posteriors if blocks is None or self.prior.shared else _refined(group, posteriors, blocks):
                 mean.append(q.mean)
                 root.append(q.root_inv if self.family == "full" else diagonal_root(*log_variances(q.B, L_inv), L_inv))
         return self.predictor(values, [group.whitening for group in groups], mean, root)
-
-    def upper_bound(
-        self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None
-    ) -> float:
-        """No less than the log marginal likelihood: a pass over the rows for each group, if they are still there.
-
-        Parameters
-        ----------
-        values, statistics
-            As of `at_optimum`.
-        blocks : Blocks, default=None
-            All rows; without them digits cancel at high signal-to-noise ratios.
-        """
-        return upper_bound(list(self.groups_of(values, statistics)), blocks)
 
     def predictor(
         self,
@@ -171,49 +141,35 @@ class SparseModel:
         mean: Sequence[np.ndarray],
         root: Sequence[np.ndarray],
     ) -> Predictor:
-        """Put q(ω) of each output, with its mean (m + p,) and covariance rootᵀ root, together with the parameters.
-
-        Parameters
-        ----------
-        values : dict
-        whitenings : sequence of Whitening
-            What `whitenings` yields for these values.
-        mean, root : sequence of ndarray
-            One per output.
-        """
-        sets = zip(self.groups, values["inducing_points"], whitenings, strict=True)
-        return Predictor(
-            tuple(
-                PredictorGroup.of(
-                    outputs,
-                    *self.kernel_of(values, index),
-                    points,
-                    whitening,
-                    values["signal"][outputs],
-                    self.prior.outputs(outputs),
-                    mean[outputs],
-                    root[outputs],
-                )
-                for index, (outputs, points, whitening) in enumerate(sets)
-            ),
-            values["noise"],
-            self.prior.offset,
-            np.zeros(len(values["noise"])),
-            self.prior.shared,
-        )
+        """The predictor for q(ω) of each output with the given mean (m + p,) and covariance rootᵀ root."""
+        groups = [
+            PredictorGroup.of(
+                outputs,
+                *self.kernel_of(values, index),
+                points,
+                whitening,
+                values["signal"][outputs],
+                self.prior.outputs(outputs),
+                mean[outputs],
+                root[outputs],
+            )
+            for index, (outputs, points, whitening) in enumerate(
+                zip(self.groups, values["inducing_points"], whitenings, strict=True)
+            )
+        ]
+        noise = values["noise"]
+        return Predictor(tuple(groups), noise, self.prior.offset, np.zeros(len(noise)), self.prior.shared)
 
 
 def _refined(group: Group, posteriors: list[WhitenedPosterior], blocks: Blocks) -> list[WhitenedPosterior]:
-    """One step of iterative refinement of the means, by errors summed row by row: a pass.
-
-    B mean = g loses digits in directions of which the rows say little: there B is about 1, and its rounding errors are
-    a share of its trace. What is `unsolved` does not. Where errors of B are above `_REFINABLE` a step need not lead
-    nearer, and is not taken.
-    """
-    weights = np.column_stack([group.weights_of(o, q.mean) for o, q in enumerate(posteriors)])
-    left, found = errors(blocks, group.whitening, group.outputs, weights), []
-    for q, rest in zip(posteriors, unsolved(group, posteriors, left), strict=True):
-        step = q.root_inv.T @ (q.root_inv @ rest)
+    """Posteriors with means after one step of iterative refinement: a pass over the rows."""
+    # Where the data say little about ω, B is about 1, and its rounding errors are a share of its trace. There the
+    # solution of B mean = g loses digits. ρ = g - B mean, from residuals summed row by row, does not. If errors of B
+    # are above `_REFINABLE`, a step need not lead closer.
+    weights = np.column_stack([group.times_T(o, q.mean) for o, q in enumerate(posteriors)])
+    residuals, found = errors(blocks, group.whitening, group.outputs, weights), []
+    for q, error in zip(posteriors, equation_errors(group, posteriors, residuals), strict=True):
+        step = q.root_inv.T @ (q.root_inv @ error)
         refinable = np.finfo(float).eps * np.trace(q.B) < _REFINABLE
         found.append(replace(q, mean=q.mean + step) if refinable else q)
     return found

@@ -1,15 +1,14 @@
-"""The two functions that are minimised: minus the bound at the optimum of q, and the paper's loss of mini-batches."""
+"""The functions that are minimised: minus the bound with q at its optimum, and the paper's loss of mini-batches."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 
 from ..data.blocks import Blocks
-from .bounds import LOG_2PI, BoundAtOptimum, Group, bounds_at_optimum
+from .bounds import LOG_2PI, BoundAtOptimum, Group, bounds_at_optimum, optimal_posteriors
 from .families import DiagonalFamily, Family, FullFamily, NaturalFamily
 from .model import SparseModel
 from .parameters import ParameterTable, Values
@@ -17,61 +16,30 @@ from .predictor import Predictor
 from .statistics import Residuals, StatisticsGradient, pull_back
 
 
-class Terms(Protocol):
-    """A scalar of a group of outputs, as far as the statistics of the rows decide it."""
-
-    @property
-    def weights(self) -> np.ndarray:
-        """(m + p, o): the mean of q leaves e = r - [V; Hᵀ]ᵀ weights of each row."""
-
-    @property
-    def gradient(self) -> StatisticsGradient:
-        """Of the scalar."""
-
-    def finish(self, residuals: Residuals) -> tuple[float, Values]:
-        """The scalar, and its gradients in what belongs to the group's outputs: (o, ...) each, by parameter."""
-
-
 def evaluate(
     model: SparseModel,
     values: Values,
     blocks: Blocks,
-    terms_of: Callable[[Sequence[Group]], Sequence[Terms]],
+    terms_of: Callable[[Sequence[Group]], Sequence[BoundAtOptimum | ElboTerms]],
 ) -> tuple[float, Values]:
-    """A scalar of the model and some rows, summed over outputs, and its gradient: two passes for each set of points.
+    """A scalar summed over outputs, and its gradient in the values, or the logarithms of all but inducing points.
 
-    Parameters
-    ----------
-    model : SparseModel
-    values : dict
-    blocks : Blocks
-    terms_of : callable
-        What the scalar is, given groups with their statistics: one after the other or, if outputs share their weights,
-        all at once.
-
-    Returns
-    -------
-    total : float
-    gradient : dict
-        In the values; in the logarithms of hyperparameters, signal and noise.
-
-    Raises
-    ------
-    NotPositiveDefiniteError
-        If a matrix is not finite.
+    It takes two passes over the rows for each set of inducing points. ``terms_of`` returns the term of each group. If
+    outputs share their weights it gets all groups at once, else one at a time. Raises `NotPositiveDefiniteError` if a
+    matrix is not finite.
     """
     total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
+    separate = values["hyperparameters"].ndim == 2
     groups = model.groups_on(values, blocks)
-    jointly: Iterable[Sequence[Group]] = [list(groups)] if model.prior.shared else ([group] for group in groups)
+    together: Iterable[Sequence[Group]] = [list(groups)] if model.prior.shared else ([group] for group in groups)
     index = 0
-    for together in jointly:
-        for group, terms in zip(together, terms_of(together), strict=True):
+    for some in together:
+        for group, terms in zip(some, terms_of(some), strict=True):
             (hyper_bar, Z_bar), residuals = pull_back(
                 blocks, group.whitening, group.outputs, group.statistics, terms.gradient, terms.weights
             )
             value, own = terms.finish(residuals)
             total += value
-            separate = gradient["hyperparameters"].ndim == 2
             gradient["hyperparameters"][index if separate else slice(None)] += hyper_bar
             gradient["inducing_points"][index] += Z_bar
             for name, bar in own.items():
@@ -81,14 +49,7 @@ def evaluate(
 
 
 class BoundObjective:
-    """θ -> minus the bound at the optimum of q, per row, and its gradient: what L-BFGS minimises.
-
-    Parameters
-    ----------
-    model : SparseModel
-    table : ParameterTable
-    blocks : Blocks
-    """
+    """Minus the bound with q at its optimum, per row, and its gradient, as a function of the flat vector."""
 
     def __init__(self, model: SparseModel, table: ParameterTable, blocks: Blocks):
         self.model, self.table, self.blocks = model, table, blocks
@@ -101,23 +62,10 @@ class BoundObjective:
 
 
 class ElboObjective:
-    """(θ, q) -> the paper's loss (its eq. elbo) of a mini-batch (its appendix C), per row, and its gradient.
+    """The paper's loss (eq. elbo) of mini-batches (its appendix C), per row, as a function of all parameters and q.
 
-    Parameters
-    ----------
-    model : SparseModel
-    table : ParameterTable
-        Of the parameters without q.
-    blocks : Blocks
-        All rows.
-    natural_rates : (float, float), default=None
-        If given, q (of the full family) moves by natural gradients of these lengths, the first and the least, and is no
-        part of θ.
-
-    Attributes
-    ----------
-    table : ParameterTable
-        Of all that an optimiser moves.
+    ``table`` is given without the parameters of q, and ``blocks`` are all rows. If ``natural_rates`` are given, q is of
+    the full family and moves by natural gradients, of these first and least lengths.
     """
 
     def __init__(
@@ -131,77 +79,79 @@ class ElboObjective:
         start = table.values_at_start()
         optima, factors = [], []
         for group in model.groups_on(start, blocks):
-            of_group = BoundAtOptimum(group, model.family).posteriors
-            optima += of_group
-            factors += [group.whitening.L_inv] * len(of_group)
+            (posteriors,) = optimal_posteriors([group])
+            optima += posteriors
+            factors += [group.whitening.L_inv] * len(posteriors)
         self.natural = None if natural_rates is None else NaturalFamily(optima, *natural_rates)
         self.family: Family
         if self.natural is not None:
             self.family = self.natural
         else:
             self.family = FullFamily(optima) if model.family == "full" else DiagonalFamily(optima, factors)
-        # A step of w should move the prediction as much as a step of v does.
+        # A step of w should change predictions as much as a step of v.
         reach = model.prior.scale * np.sqrt(np.diagonal(blocks.linear.HH[0]) / self.n_rows)
         m = start["inducing_points"].shape[1]
         unit = np.hstack([np.ones((len(reach), m)), 1.0 / np.where(reach > 0.0, reach, 1.0)])
+        # The parameters of the model and of q.
         self.table = ParameterTable([*table.parameters, *self.family.parameters(unit)])
 
     def minibatch(self, batches: Iterator[Blocks]) -> Callable[[np.ndarray], tuple[float, np.ndarray]]:
-        """X -> (loss, gradient) of the next batch, per row of the whole data."""
+        """The function x -> (loss, gradient) of the next batch."""
         return lambda x: self.evaluate(x, next(batches))
 
     def pace(self, share: float) -> None:
-        """Told the size of Adam's next step as a share of its first, shorten the natural gradients as much."""
+        """Shorten natural gradients to this share of the first, which is that of Adam's steps."""
         if self.natural is not None:
             self.natural.pace(share)
 
     def evaluate(self, x: np.ndarray, blocks: Blocks) -> tuple[float, np.ndarray]:
-        """The loss of some rows that stand for all, per row, and its gradient (size,); x is of the same size."""
+        """The loss per row and its gradient (size,) at x (size,), from rows that represent all."""
         values = self.table.values(x)
-        # Rows that count N/n times (whatever their weights: all are drawn alike): a noise variance of σ² n/N.
+        # Each row counts N/n times, as with a noise variance of σ² n/N. N and n ignore weights: rows are drawn equally.
         counted = values | {"noise": values["noise"] * (blocks.linear.length / self.blocks.linear.length)}
         loss, gradient = evaluate(
-            self.model, counted, blocks, lambda groups: [_ElboTerms(self, values, group) for group in groups]
+            self.model, counted, blocks, lambda groups: [ElboTerms(self, values, group) for group in groups]
         )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         loss += 0.5 * len(values["noise"]) * self.blocks.linear.log_variance
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 
     def solution(self, x: np.ndarray) -> tuple[float, Predictor]:
-        """The bound on all rows and the predictor at a point.
+        """The bound on all rows and the predictor at x.
 
-        A q that moves by natural gradients takes a last one, of length 1, on all rows: to its optimum.
+        If q moves by natural gradients, it first takes a step of length 1 on all rows, to its optimum.
         """
         values = self.table.values(x)
         if self.natural is not None:
             self.natural.forget()
         bound = -self.evaluate(x, self.blocks)[0] * self.n_rows
-        whitenings = list(self.model.whitenings(values))
-        L_inv = [
-            whitening.L_inv
-            for outputs, whitening in zip(self.model.groups, whitenings, strict=True)
-            for _ in range(outputs.start, outputs.stop)
-        ]
+        whitenings, L_inv = list(self.model.whitenings(values)), []
+        for outputs, whitening in zip(self.model.groups, whitenings, strict=True):
+            L_inv += [whitening.L_inv] * (outputs.stop - outputs.start)
         roots = self.family.roots(values, L_inv)
         return bound, self.model.predictor(values, whitenings, self.family.means(values), roots)
 
 
-class _ElboTerms:
-    """The paper's loss of a group of outputs.
+class ElboTerms:
+    """The paper's loss of a group of outputs, without ½ N log 2πσ², and its gradient.
 
-    q's mean is whitened (a = s L v); its spread is as its family says. With e = r - P mean, summed row by row, and with
-    the rows of a batch counted N/n times (in the group's noise), the loss of each output is
-
-        ½ [N log 2πσ² + (eᵀe + s² Σ(k̃ - |v|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`;
-
-    the first term, with the noise as it is, is added for all outputs at once.
+    ``group`` has the noise variance σ² n/N, because each row of a batch counts N/n times. The loss is complete once the
+    residuals e are known from the second pass over the rows.
     """
+
+    # q has a whitened mean (a = s L v) and a covariance of its family. With e = r - P mean (n,), summed row by row, the
+    # loss of each output is
+    #
+    #     ½ [N log 2πσ² + (eᵀe + s² Σ (k̃ - |v(x)|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`.
+    #
+    # The first term, with σ² itself, is added in `ElboObjective.evaluate`.
 
     def __init__(self, elbo: ElboObjective, values: Values, group: Group):
         self._group, self._n_rows, m = group, elbo.n_rows, len(group.whitening.L)
         self._mean = elbo.family.mean(values, group)
         self._spread = elbo.family.terms(values, group)
         self._has_parameters = "mean" in values
+        # (m + p, o): e = r - [V; Hᵀ]ᵀ weights.
         f, b = np.sqrt(group.signal) * self._mean[:, :m].T, (group.prior.scale * self._mean[:, m:]).T
         self.weights = np.vstack([f, b])
         self._ratio = group.signal / group.noise

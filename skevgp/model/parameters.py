@@ -1,61 +1,49 @@
-"""Named parameters <-> one flat vector of coordinates, with transforms and limits."""
+"""Named parameters, their transforms and limits, and the flat vector that an optimiser moves."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any, Literal
 
 import autograd.numpy as anp
 import numpy as np
 
-# A value so much below its limit, as a share, is there but for rounding.
+# A value within this share of its upper limit is at the limit, up to rounding.
 _AT_LIMIT = 1e-6
 
-# Of parameters, by name.
+# Values of parameters by name.
 Values = dict[str, np.ndarray]
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """A row of the table.
-
-    Attributes
-    ----------
-    name : str
-    start : ndarray
-        First value, in the parameter's own units; its shape is the parameter's.
-    transform : {"identity", "log"}
-        The optimiser moves ``(value - origin) / unit`` or ``log(value)``.
-    lower, upper : ndarray or float
-        Limits of the value, broadcast to its shape.
-    widest : ndarray or float, optional
-        The upper limit of a fit that starts at ``upper`` or above; None leaves that.
-    unit : ndarray or float
-        Size of a typical change, for ``"identity"``.
-    origin : ndarray or float
-        A typical value, for ``"identity"``.
-    fixed : bool or ndarray of bool
-        Whether it stays where it starts; an array of its shape says so of each entry.
-    """
+    """A parameter with its start, transform and limits."""
 
     name: str
+    # First value, in the parameter's own units. It has the parameter's shape.
     start: np.ndarray
+    # The optimiser moves the coordinate (value - origin) / unit, or log(value).
     transform: Literal["identity", "log"] = "identity"
+    # Limits of the value, broadcast to its shape.
     lower: np.ndarray | float = -np.inf
     upper: np.ndarray | float = np.inf
+    # For "identity": the size of a typical change, and a typical value.
     unit: np.ndarray | float = 1.0
     origin: np.ndarray | float = 0.0
+    # Whether the value stays where it starts, for all entries or for each.
     fixed: bool | np.ndarray = False
+    # Upper limit of a fit that starts at ``upper`` or above. None: ``upper``.
     widest: np.ndarray | float | None = None
 
-    @property
+    @cached_property
     def free(self) -> np.ndarray:
-        """Which of its entries move, flat."""
+        """Whether each entry moves, (size,)."""
         return ~np.broadcast_to(self.fixed, self.start.shape).ravel()
 
     def coordinate(self, value: np.ndarray | float) -> np.ndarray:
-        """The optimiser's coordinates of a value, flat."""
+        """The optimiser's coordinates (size,) of a value."""
         value = np.broadcast_to(value, self.start.shape)
         if self.transform == "log":
             with np.errstate(divide="ignore"):
@@ -63,96 +51,75 @@ class Parameter:
         return ((value - self.origin) / self.unit).ravel()
 
     def value_limits(self) -> np.ndarray:
-        """Limits of each entry, (size, 2), in the parameter's own units: the widest."""
-        limits = self.lower, self.upper if self.widest is None else self.widest
-        return np.column_stack([np.ravel(np.broadcast_to(limit, self.start.shape)) for limit in limits])
-
-    def value(self, coordinate: np.ndarray) -> np.ndarray:
-        """The value at a coordinate of the parameter's shape."""
-        return np.exp(coordinate) if self.transform == "log" else self.origin + coordinate * self.unit
-
-
-def _shape(values: Values, name: str) -> tuple[int, ...] | None:
-    return values[name].shape if name in values else None
+        """The widest limits (size, 2) of each entry, in the parameter's own units."""
+        limits = np.empty((self.start.size, 2))
+        for column, limit in enumerate((self.lower, self.upper if self.widest is None else self.widest)):
+            limits[:, column] = np.ravel(np.broadcast_to(limit, self.start.shape))
+        return limits
 
 
 class ParameterTable:
-    """Parameters in a fixed order; the free ones make up the flat vector that an optimiser moves.
-
-    Parameters
-    ----------
-    parameters : sequence of Parameter
-        With distinct names.
-    """
+    """Parameters with distinct names, in a fixed order. Their free entries make up the flat vector (size,)."""
 
     def __init__(self, parameters: Sequence[Parameter]):
         self.parameters = tuple(parameters)
+        # The place of each parameter's free entries in the flat vector, and the coordinates where it starts.
         self._slices: dict[str, slice] = {}
-        end = 0
-        # For parameters of which only some entries move.
-        self._free: dict[str, np.ndarray] = {}
-        for parameter in self.parameters:
-            free = parameter.free
-            if free.any():
-                self._slices[parameter.name] = slice(end, end + int(free.sum()))
-                end += int(free.sum())
-                if not free.all():
-                    self._free[parameter.name] = free
-        self.size = end
+        self._starts: dict[str, np.ndarray] = {}
+        self.size = 0
+        for own in self.parameters:
+            end = self.size + int(own.free.sum())
+            self._slices[own.name], self.size = slice(self.size, end), end
+            self._starts[own.name] = own.coordinate(own.start)
 
     def __getitem__(self, name: str) -> Parameter:
         return next(parameter for parameter in self.parameters if parameter.name == name)
 
-    def started_at(self, values: Values) -> ParameterTable:
-        """The same table with other starts, for what is free of the parameters whose shapes agree.
+    # --- other tables with the same parameters ------------------------------------------------------------------------
 
-        Upper limits where these start become the widest.
+    def changed(self, name: str, **fields: Any) -> ParameterTable:
+        """The same table with other fields of one parameter, such as its start, perhaps of another shape."""
+        return ParameterTable([replace(own, **fields) if own.name == name else own for own in self.parameters])
+
+    def without(self, name: str) -> ParameterTable:
+        """The same table without one parameter."""
+        return ParameterTable([own for own in self.parameters if own.name != name])
+
+    def started_at(self, values: Values) -> ParameterTable:
+        """The same table with the free entries at other starts, for each parameter whose shape agrees.
+
+        Where these starts are at an upper limit or above, the widest limit replaces it.
         """
-        table = self.widened(self.held(values))
-        return ParameterTable(
-            [
-                replace(parameter, start=np.where(parameter.fixed, parameter.start, values[parameter.name]))
-                if _shape(values, parameter.name) == parameter.start.shape
-                else parameter
-                for parameter in table.parameters
-            ]
-        )
+        parameters = []
+        for own in self.widened(self.held(values)).parameters:
+            if own.name in values and values[own.name].shape == own.start.shape:
+                own = replace(own, start=np.where(own.fixed, own.start, values[own.name]))
+            parameters.append(own)
+        return ParameterTable(parameters)
 
     def held(self, values: Values) -> tuple[str, ...]:
-        """Parameters of which free values are at an upper limit that is not the widest, or above."""
-        return tuple(
-            own.name
-            for own in self.parameters
-            if own.widest is not None
-            and _shape(values, own.name) == own.start.shape
-            and (np.ravel(values[own.name] >= (1.0 - _AT_LIMIT) * own.upper) & own.free).any()
-        )
+        """Names of parameters with free values at or above an upper limit that is not the widest."""
+        names = []
+        for own in self.parameters:
+            if own.widest is not None and own.name in values and values[own.name].shape == own.start.shape:
+                at_limit = values[own.name] >= (1.0 - _AT_LIMIT) * own.upper
+                if (at_limit.ravel() & own.free).any():
+                    names.append(own.name)
+        return tuple(names)
 
     def widened(self, names: Iterable[str]) -> ParameterTable:
         """The same table with the widest limits of some parameters."""
-        return ParameterTable(
-            [
-                replace(own, upper=own.widest, widest=None) if own.widest is not None and own.name in names else own
-                for own in self.parameters
-            ]
-        )
+        table = self
+        for name in names:
+            if (widest := self[name].widest) is not None:
+                table = table.changed(name, upper=widest, widest=None)
+        return table
 
-    def with_start(self, name: str, start: np.ndarray) -> ParameterTable:
-        """The same table with another start of a parameter, perhaps of another shape."""
-        return ParameterTable([replace(own, start=start) if own.name == name else own for own in self.parameters])
-
-    def without(self, name: str) -> ParameterTable:
-        """The same table without a parameter."""
-        return ParameterTable([own for own in self.parameters if own.name != name])
-
-    def with_fixed(self, name: str) -> ParameterTable:
-        """The same table with a parameter that stays where it starts."""
-        return ParameterTable([replace(own, fixed=True if own.name == name else own.fixed) for own in self.parameters])
+    # --- values and the flat vector -----------------------------------------------------------------------------------
 
     def start(self) -> np.ndarray:
-        """The flat vector (size,) of the starts, put inside their limits."""
-        flat = self.flat({parameter.name: parameter.coordinate(parameter.start) for parameter in self.parameters})
-        return np.clip(flat, *self.limits())
+        """The flat vector (size,) of the starts, clipped to their limits."""
+        return np.clip(self.flat(self._starts), *self.limits())
 
     def values_at_start(self) -> Values:
         """The values by name where the optimiser starts."""
@@ -160,55 +127,45 @@ class ParameterTable:
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper limits (size,) of the flat vector."""
-        lower = self.flat({parameter.name: parameter.coordinate(parameter.lower) for parameter in self.parameters})
-        upper = self.flat({parameter.name: parameter.coordinate(parameter.upper) for parameter in self.parameters})
-        return lower, upper
+        lower = self.flat({own.name: own.coordinate(own.lower) for own in self.parameters})
+        return lower, self.flat({own.name: own.coordinate(own.upper) for own in self.parameters})
 
     def alike(self) -> np.ndarray:
-        """An integer (size,) for each coordinate, the same for those of one column of a parameter of three axes."""
+        """An integer (size,) for each coordinate. Coordinates of one column of a parameter of three axes share it."""
         kinds, n_kinds = {}, 0
-        for parameter in self.parameters:
-            shape = parameter.start.shape
-            n_own = shape[2] if len(shape) == 3 else parameter.start.size
-            kinds[parameter.name] = n_kinds + np.arange(parameter.start.size) % max(n_own, 1)
+        for own in self.parameters:
+            shape = own.start.shape
+            n_own = shape[2] if len(shape) == 3 else own.start.size
+            kinds[own.name] = n_kinds + np.arange(own.start.size) % max(n_own, 1)
             n_kinds += n_own
         return self.flat(kinds).astype(int)
 
     def coordinates(self, flat: Any) -> dict[str, Any]:
-        """The coordinates by name, each in its parameter's shape; can be traced by autograd."""
+        """The coordinates by name, each in its parameter's shape. Autograd can trace this."""
         found = {}
-        for parameter in self.parameters:
-            name = parameter.name
-            if name in self._free:
-                free, first = self._free[name], self._slices[name].start
-                # What a fixed entry takes from the vector is thrown away.
-                source = first + np.maximum(np.cumsum(free) - 1, 0)
-                part = anp.where(free, flat[source], parameter.coordinate(parameter.start))
-            elif name in self._slices:
-                part = flat[self._slices[name]]
-            else:
-                part = parameter.coordinate(parameter.start)
-            found[name] = part.reshape(parameter.start.shape)
+        for own in self.parameters:
+            part = flat[self._slices[own.name]]
+            if not own.free.any():
+                part = self._starts[own.name]
+            elif not own.free.all():
+                # The k-th free entry is part[k].
+                part = anp.where(own.free, part[np.cumsum(own.free) - 1], self._starts[own.name])
+            found[own.name] = part.reshape(own.start.shape)
         return found
 
     def values(self, flat: np.ndarray) -> Values:
         """The values by name, in the parameters' own units."""
-        coordinates = self.coordinates(flat)
-        return {parameter.name: parameter.value(coordinates[parameter.name]) for parameter in self.parameters}
+        values = self.coordinates(flat)
+        for own in self.parameters:
+            at = values[own.name]
+            values[own.name] = np.exp(at) if own.transform == "log" else own.origin + at * own.unit
+        return values
 
-    def gradient(self, bars: dict[str, np.ndarray]) -> np.ndarray:
-        """The flat gradient (size,), from those in the values, or in their logarithms where these are what moves."""
-        return self.flat(
-            {own.name: bars[own.name] * (own.unit if own.transform == "identity" else 1.0) for own in self.parameters}
-        )
+    def gradient(self, bars: Values) -> np.ndarray:
+        """The gradient (size,) in the flat vector, from gradients in values or, for "log", in their logarithms."""
+        units = {own.name: own.unit if own.transform == "identity" else 1.0 for own in self.parameters}
+        return self.flat({name: bars[name] * unit for name, unit in units.items()})
 
-    def flat(self, parts: dict[str, np.ndarray]) -> np.ndarray:
-        """Join the free parameters' parts (coordinates or gradients in them) into a vector (size,)."""
-        if not self._slices:
-            return np.empty(0)
-        return np.concatenate(
-            [
-                np.ravel(parts[name])[self._free[name]] if name in self._free else np.ravel(parts[name])
-                for name in self._slices
-            ]
-        )
+    def flat(self, parts: Values) -> np.ndarray:
+        """The flat vector (size,) of coordinates by name, or of gradients in them."""
+        return np.concatenate([np.empty(0), *(np.ravel(parts[own.name])[own.free] for own in self.parameters)])

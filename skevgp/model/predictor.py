@@ -1,4 +1,4 @@
-"""The prior of the weights, and the fitted model, frozen: all that predictions need, and nothing else."""
+"""The prior of the weights, and the fitted model with all that predictions need."""
 
 from __future__ import annotations
 
@@ -9,39 +9,31 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..data.rows import Columns, of_outputs, times_weights
-from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance, times_lower
+from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
 from .statistics import Kernel, Whitening
 
-# Of the deviations of all outputs at once.
+# Predictions of several rows at once take arrays of about this many numbers.
 _PREDICTED_NUMBERS = 2**20
 
 
 @dataclass(frozen=True)
 class CoefficientPrior:
-    """β ~ N(mean, C Cᵀ) for each output, and the reference that residuals are taken from.
+    """β ~ N(mean, C Cᵀ) of each of o outputs with p features, where β = mean + C (w₀ + w)."""
 
-    Attributes
-    ----------
-    mean, scale : ndarray of shape (o, p)
-        With ``scale`` the standard deviations.
-    reference : ndarray of shape (o, p)
-        w₀: residuals are y - H (mean + C w₀).
-    root : ndarray of shape (o, p, p), optional
-        C; None means diag(scale), independent weights.
-    shared : bool, default=False
-        Whether all outputs have the same w, and with it the same β in the user's units: rows of the arrays then differ
-        by the outputs' units only.
-    """
-
+    # (o, p): the means and standard deviations of β.
     mean: np.ndarray
     scale: np.ndarray
+    # (o, p): w₀. Residuals are y - H (mean + C w₀).
     reference: np.ndarray
+    # (o, p, p): C. None: diag(scale), for independent weights.
     root: np.ndarray | None = None
+    # Whether all outputs have the same w, and so the same β in the user's units. Rows of the arrays then differ by the
+    # units of the outputs only.
     shared: bool = False
 
     @property
     def offset(self) -> np.ndarray:
-        """The coefficients (o, p) that the residuals are taken from."""
+        """The coefficients mean + C w₀ (o, p) at which the residuals are taken."""
         return self.mean + self.times(self.reference)
 
     def times(self, w: np.ndarray) -> np.ndarray:
@@ -63,7 +55,7 @@ class CoefficientPrior:
         )
 
     def scaled(self, factor: np.ndarray) -> CoefficientPrior:
-        """The prior of β times ``factor`` (o,), with the same w."""
+        """The prior of ``factor`` (o,) times β, with the same w."""
         by = factor[:, np.newaxis]
         root = None if self.root is None else self.root * by[:, np.newaxis]
         return replace(self, mean=self.mean * by, scale=self.scale * by, root=root)
@@ -71,34 +63,24 @@ class CoefficientPrior:
 
 @dataclass(frozen=True)
 class PredictorGroup:
-    """Outputs that share inducing points: with P = [V; Hᵀ], g(x) has mean ``mean @ P`` and deviation ``root @ P``.
+    """Outputs that share m inducing points. With P = [V; Hᵀ] (m + p, n), g(x) has the mean ``mean @ P``.
 
-    Attributes
-    ----------
-    outputs : slice or list of int
-        o of them.
-    kernel : Kernel
-        k̃.
-    hyperparameters : ndarray of shape (n_hyper,)
-        Of k̃.
-    points : ndarray of shape (m, d)
-    whitening : Whitening
-        Of k̃ at the points.
-    signal : ndarray of shape (o,)
-        s².
-    mean : ndarray of shape (o, m + p)
-    root : ndarray of shape (o, k, m + p)
-        The variance of g(x) is |root @ P|² and what the points leave of s² k̃(x, x); k is m + p, or less in the exact
-        model. The last p entries of root @ P are what comes from the weights.
+    The variance of g(x) is |root @ P|² + s² (k̃(x, x) - |v|²).
     """
 
+    # o of the outputs.
     outputs: Columns
+    # k̃ and its hyperparameters (n_hyper,).
     kernel: Kernel
     hyperparameters: np.ndarray
+    # (m, d), and their whitening.
     points: np.ndarray
     whitening: Whitening
+    # (o,): s².
     signal: np.ndarray
+    # (o, m + p).
     mean: np.ndarray
+    # (o, k, m + p), where k is m + p, or less in the exact model. The last p of the k rows belong to the weights.
     root: np.ndarray
 
     @classmethod
@@ -114,9 +96,9 @@ class PredictorGroup:
         mean: Sequence[np.ndarray],
         root: Sequence[np.ndarray],
     ) -> PredictorGroup:
-        """From q(ω) of each output, ω = (v, w) whitened as in `bounds`, with these outputs' prior."""
+        """The group for q(ω) of each output, with ω = (v, w) as in `bounds`: mean (m + p,) and root (k, m + p)."""
         m, s = len(points), np.sqrt(signal)[:, np.newaxis]
-        # T turns [V; Hᵀ] into Pᵀ of each output.
+        # mean Tᵀ and root Tᵀ, with T = blockdiag(s I, C) of each output (see `bounds.Group.times_T`).
         own_mean, own_root = np.array(mean), np.array(root)
         own_mean[:, :m] *= s
         own_mean[:, m:] = prior.times(own_mean[:, m:])
@@ -124,62 +106,32 @@ class PredictorGroup:
         own_root[:, :, m:] = own_root[:, :, m:] @ prior.roots().transpose(0, 2, 1)
         return cls(outputs, kernel, hyperparameters, points, whitening, signal, own_mean, own_root)
 
-    def scaled(self, factor: np.ndarray) -> PredictorGroup:
-        """The same group for outputs in other units: y times ``factor`` (o,)."""
-        by = factor[:, np.newaxis]
-        return replace(self, signal=self.signal * factor**2, mean=self.mean * by, root=self.root * by[:, np.newaxis])
-
-    def project(self, prepared: object, features: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """P = [V; Hᵀ] of shape (m + p, n), and k̃(x, x) - |v|² of each row, not below its rounding error."""
-        m = len(self.points)
-        P = np.empty((m + features.shape[1], len(features)))
-        V = self.whitening.solve(prepared, out=P[:m])
-        P[m:] = features.T
-        return P, self.whitening.remaining(prepared, V)
-
 
 class Projected(NamedTuple):
-    """Rows as a group of outputs sees them.
+    """Rows as a group of outputs sees them."""
 
-    Attributes
-    ----------
-    inputs : ndarray of shape (n, d)
-    prepared : object
-        What the kernel makes of them.
-    P : ndarray of shape (m + p, n)
-        [V; Hᵀ].
-    unexplained : ndarray of shape (n,)
-        k̃(x, x) - |v|², not below its rounding error.
-    """
-
+    # (n, d), and the result of the kernel's ``prepare``.
     inputs: np.ndarray
     prepared: Any
+    # (m + p, n): [V; Hᵀ].
     P: np.ndarray
+    # (n,): k̃(x, x) - |v|², clipped at its rounding error.
     unexplained: np.ndarray
 
 
 @dataclass(frozen=True)
 class Predictor:
-    """Mean, variance and covariance of the noise-free g(x), and the weights (the paper's eq. prediction, with C free).
+    """Mean, variance and covariance of the noise-free g(x), and the weights (the paper's eq. prediction, for any C)."""
 
-    Attributes
-    ----------
-    groups : tuple of PredictorGroup
-        Of all outputs, each in one of them.
-    noise : ndarray of shape (o,)
-        σ².
-    offset : ndarray of shape (o, p)
-        What the groups' weights of features are added to.
-    intercept : ndarray of shape (o,)
-        What is added to the mean.
-    shared : bool
-        Whether outputs have the same weights, and so depend on each other.
-    """
-
+    # Each output is in one of them.
     groups: tuple[PredictorGroup, ...]
+    # (o,): σ².
     noise: np.ndarray
+    # (o, p): added to the weights of the groups.
     offset: np.ndarray
+    # (o,): added to the mean.
     intercept: np.ndarray
+    # Whether outputs share their weights and are therefore correlated.
     shared: bool
 
     @classmethod
@@ -191,18 +143,23 @@ class Predictor:
         offset: np.ndarray,
         intercept: np.ndarray,
     ) -> Predictor:
-        """Predictors of some ``outputs`` each as one: each output times ``unit``, with another offset and intercept."""
+        """One predictor from several, where ``outputs`` are those of each part.
+
+        Each output is multiplied by ``unit`` (o,). Offset and intercept replace those of the parts.
+        """
         groups, noise = [], np.empty(len(unit))
         for part, columns in zip(parts, outputs, strict=True):
             noise[columns] = part.noise * unit[columns] ** 2
             for group in part.groups:
                 own = np.array(columns)[group.outputs].tolist()
-                groups.append(replace(group.scaled(unit[own]), outputs=own))
+                by = unit[own][:, np.newaxis]
+                signal, mean, root = group.signal * unit[own] ** 2, group.mean * by, group.root * by[:, np.newaxis]
+                groups.append(replace(group, outputs=own, signal=signal, mean=mean, root=root))
         return cls(tuple(groups), noise, offset, intercept, parts[0].shared)
 
     @property
     def rows_at_once(self) -> int:
-        """How many rows to predict at once, so that memory stays small and products are large."""
+        """Number of rows to predict at once, so that arrays are small and matrix products large."""
         stacked = sum(group.mean.size for group in self.groups)
         return int(np.clip(_PREDICTED_NUMBERS // max(stacked, 1), 256, 4096))
 
@@ -220,29 +177,12 @@ class Predictor:
     def predict(
         self, inputs: np.ndarray, features: np.ndarray, return_variance: bool = False
     ) -> tuple[np.ndarray, np.ndarray | None]:
-        """Mean and variance of the noise-free g(x).
+        """Mean (n, o) of the noise-free g(x) and, if asked for, its variance (n, o).
 
-        Parameters
-        ----------
-        inputs : ndarray of shape (n, d) or (n, o, d)
-            The kernel's.
-        features : ndarray of shape (n, p) or (n, o, p)
-            h(x).
-        return_variance : bool, default=False
-
-        Returns
-        -------
-        mean : ndarray of shape (n, o)
-        variance : ndarray of shape (n, o), or None
+        ``inputs`` of the kernel are (n, d) or (n, o, d). ``features`` h(x) are (n, p) or (n, o, p).
         """
-        return self.moments(self.projected(inputs, features), features, return_variance)
-
-    def moments(
-        self, projected: Iterable[Projected], features: np.ndarray, return_variance: bool
-    ) -> tuple[np.ndarray, np.ndarray | None]:
-        """What `predict` returns, of rows as each group sees them."""
         means, variances = [], []
-        for group, own in zip(self.groups, projected, strict=True):
+        for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
             means.append(group.mean @ own.P)
             if return_variance:
                 o, k, size = group.root.shape
@@ -258,21 +198,10 @@ class Predictor:
     def covariance(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Mean (n, o) of g(x), and its covariance between rows (n, n, o), of each output.
+        """Mean (n, o) of g(x), and its covariance (n, n, o) between rows, for each output.
 
-        The diagonal is what `predict` says of the variance, and nothing is indefinite by more than rounding.
-
-        Parameters
-        ----------
-        inputs, features : ndarray
-            As of `predict`.
-        noise : ndarray of shape (o,) or float, default=0.0
-            A variance of each row by itself: with σ² it is the covariance of y.
-
-        Returns
-        -------
-        mean : ndarray of shape (n, o)
-        covariance : ndarray of shape (n, n, o)
+        The diagonal is the variance from `predict`. The matrices are positive semi-definite up to rounding. ``noise``
+        (o,) is added to the diagonal: with σ² it is the covariance of y.
         """
         mean, own, common = self._own_covariances(inputs, features, noise)
         covariance = np.empty((len(mean), *mean.shape))
@@ -288,14 +217,9 @@ class Predictor:
         n_samples: int,
         rng: np.random.RandomState,
     ) -> np.ndarray:
-        """Draw from the distribution that `covariance` describes; arguments as there.
-
-        Returns
-        -------
-        samples : ndarray of shape (n, o, n_samples)
-        """
+        """Draws (n, o, n_samples) from the distribution with the moments of `covariance`."""
         mean, own, common = self._own_covariances(inputs, features, noise)
-        # Of outputs that share their weights, what comes from these is one draw; all else is independent.
+        # Outputs that share their weights share one draw of them. Their other parts are independent.
         of_weights = rng.standard_normal((common.shape[1], n_samples))
         samples = [
             own_mean[:, np.newaxis] + covariance_root(matrix) @ rng.standard_normal((len(mean), n_samples))
@@ -306,9 +230,9 @@ class Predictor:
     def _own_covariances(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Mean (n, o), covariances (o, n, n) but for what outputs have in common, and the root (o, k, n) of that."""
+        """Mean (n, o), covariance (o, n, n) without the part of shared weights, and the root (o, k, n) of that part."""
         size, n = self.rows_at_once, len(inputs)
-        # In the blocks of `predict`: rounding depends on how many rows there are.
+        # In parts as in `predict`, because rounding depends on the number of rows.
         parts = [self.predict(inputs[i : i + size], features[i : i + size], True) for i in range(0, n, size)]
         mean, variance = (np.concatenate(each) for each in zip(*parts, strict=True))
         projected = list(self.projected(inputs, features))
@@ -329,33 +253,32 @@ class Predictor:
         return mean, covariances, common
 
     def novelty(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Var[f(x) | data] / Var[f(x)] of each output, (n, o)."""
+        """Var[f(x) | data] / Var[f(x)] (n, o)."""
         parts = []
         for group, own in zip(self.groups, self.projected(inputs, features), strict=True):
             V = own.P[: len(group.points)]
             left = np.outer(group.signal, own.unexplained)
             left += np.square(group.root[:, :, : len(V)] @ V).sum(axis=1)
             prior = np.outer(group.signal, group.whitening.covariance.diagonal(own.prepared) * np.ones(len(features)))
-            # Of a linear kernel at the origin there is nothing to know.
+            # A linear kernel has no variance at the origin.
             parts.append(np.minimum(left / np.where(prior > 0.0, prior, np.inf), 1.0))
         return self.in_order(parts).T
 
     def common(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """What outputs with the same weights have in common: M (k, n, o) with the covariance M_iᵀ M_j of two of them.
-
-        (Of B⁻¹ = R Rᵀ with R⁻¹ as in `bounds`, the rows of w; all else of an output is independent of the others.)
-        """
+        """M (k, n, o), where M_iᵀ M_j is the covariance of outputs i and j. Without shared weights, k is 0."""
         return self._common(self.projected(inputs, features)).transpose(1, 2, 0)
 
     def _common(self, projected: Iterable[Projected]) -> np.ndarray:
-        """The same of rows as each group sees them, (o, k, n)."""
+        """M of `common` as (o, k, n), for rows as each group sees them."""
+        # With B⁻¹ = RᵀR and R = root_inv of `bounds`, M consists of the rows of w. The other parts of outputs are
+        # independent.
         p = self.offset.shape[1] if self.shared else 0
         return self.in_order(
             group.root[:, group.root.shape[1] - p :] @ own.P for group, own in zip(self.groups, projected, strict=True)
         )
 
     def jointly(self, covariance: np.ndarray, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
-        """Covariances (n, n, o) of each output as one (n o, n o) of all, outputs of a row next to each other."""
+        """The covariance (n o, n o) of all outputs, from those of each (n, n, o). Outputs of a row are consecutive."""
         n, _, o = covariance.shape
         common = self.common(inputs, features)
         between = np.einsum("kni,kmj->nimj", common, common, optimize=True)
@@ -371,7 +294,11 @@ class Predictor:
             if inputs.ndim == 3 or group.kernel is not kernel:
                 kernel = group.kernel
                 prepared = kernel.prepare(own)
-            yield Projected(own, prepared, *group.project(prepared, of_outputs(features, group.outputs)))
+            H, m = of_outputs(features, group.outputs), len(group.points)
+            P = np.empty((m + H.shape[1], len(H)))
+            V = group.whitening.solve(prepared, out=P[:m])
+            P[m:] = H.T
+            yield Projected(own, prepared, P, group.whitening.remaining(prepared, V))
 
     def coefficients(self) -> tuple[np.ndarray, np.ndarray]:
         """Mean (o, p) and covariance (o, p, p) of β."""
@@ -385,7 +312,7 @@ class Predictor:
         return mean, covariance
 
     def in_order(self, parts: Iterable[np.ndarray]) -> np.ndarray:
-        """What each group has of its outputs, (o, ...) each, as one array of all outputs."""
+        """One array of all outputs (o, ...) from those of each group, in the order of the outputs."""
         first, *others = parts
         if not others:
             return first
@@ -393,44 +320,3 @@ class Predictor:
         for group, part in zip(self.groups, (first, *others), strict=True):
             found[group.outputs] = part
         return found
-
-
-# The best q of independent values (the paper's), for a precision B of the best of all.
-
-
-def log_variances(B: np.ndarray, L_inv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Log variances 1/Λ_ii of the optimal diagonal q: of f_m (in units of s²) and of w."""
-    m = len(L_inv)
-    precision = np.einsum("ji,jk,ki->i", L_inv, B[:m, :m], L_inv, optimize=True)
-    # B is no less than I, whatever rounding says.
-    precision = np.maximum(precision, np.einsum("ji,ji->i", L_inv, L_inv))
-    return -np.log(precision), -np.log(np.maximum(np.diagonal(B)[m:], 1.0))
-
-
-def diagonal_root(log_f: np.ndarray, log_w: np.ndarray, L_inv: np.ndarray) -> np.ndarray:
-    """R with Cov[ω] = Rᵀ R for diagonal covariances of f_m and β."""
-    m = len(L_inv)
-    root = np.zeros((m + len(log_w), m + len(log_w)))
-    root[:m, :m] = (L_inv * np.exp(0.5 * log_f)).T
-    root[m:, m:] = np.diag(np.exp(0.5 * log_w))
-    return root
-
-
-def diagonal_gap(
-    B: np.ndarray, log_det: float, log_det_bar: np.ndarray, whitening: Whitening
-) -> tuple[float, np.ndarray, np.ndarray]:
-    """½ (Σᵢ log Λ_ii - log|Λ|), and its gradients in B and (as Lᵀ L̄) in L; ``log_det_bar`` is -½ B⁻¹.
-
-    In the coordinates (f_m, β) = (s L v, c w), Λ = T⁻ᵀ B T⁻¹ with T = blockdiag(s L, diag c); s and c cancel.
-    """
-    L, L_inv, m = whitening.L, whitening.L_inv, len(whitening.L)
-    BL = times_lower(B[:m, :m], L_inv)
-    f_diagonal = np.maximum(np.einsum("ji,ji->i", L_inv, BL), np.einsum("ji,ji->i", L_inv, L_inv))
-    coef_diagonal = np.maximum(np.diagonal(B)[m:], 1.0)
-    gap = 0.5 * (np.log(f_diagonal).sum() + np.log(coef_diagonal).sum() - log_det) + np.log(np.diagonal(L)).sum()
-    B_bar = log_det_bar.copy()
-    B_bar[:m, :m] += 0.5 * times_lower(L_inv / f_diagonal, L_inv, transposed=True)
-    diagonal_of(B_bar)[m:] += 0.5 / coef_diagonal
-    factor_bar = -times_lower(BL / f_diagonal, L_inv, transposed=True)
-    diagonal_of(factor_bar)[...] += 1.0
-    return float(gap), B_bar, factor_bar

@@ -390,7 +390,7 @@ def test_nowhere_near_is_better(family, shared):
 @pytest.mark.parametrize("which", ["signal", "noise"])
 def test_what_is_fixed_is_left_and_the_other_is_best_for_it(which):
     model, rows, table, values = small()
-    search = search_of(0, model, rows, table.with_fixed(which), values)
+    search = search_of(0, model, rows, table.changed(which, fixed=True), values)
     found = assert_best(search, **{f"{which}s": (1.0,)})
     assert found[which == "noise"] == values[which][0]
 
@@ -406,7 +406,7 @@ def test_at_a_limit_of_the_signal_the_noise_is_best():
 @pytest.mark.parametrize(("first", "lowest"), [(None, 0.5), (1e-7, 0.1)])
 def test_the_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):
     model, rows, table, values = small()
-    table = table.with_fixed("signal") if fixed else table
+    table = table.changed("signal", fixed=True) if fixed else table
     values = values if first is None else values | {"noise": np.full(2, first)}
     search = search_of(0, model, rows, table, values)
     search = replace(search, noise=search.noise._replace(low=lowest))
@@ -457,5 +457,5 @@ def test_bits_do_not_depend_on_the_number_of_threads(groups, monkeypatch):
 def test_few_rows_and_what_is_fixed_are_left():
     assert calibrated_rows(*small(49), CrossValidation(5)) is None
     model, rows, table, values = small()
-    fixed = table.with_fixed("signal").with_fixed("noise")
+    fixed = table.changed("signal", fixed=True).changed("noise", fixed=True)
     assert calibrated_rows(model, rows, fixed, values, CrossValidation(5)) is None

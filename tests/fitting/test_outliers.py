@@ -81,7 +81,7 @@ def test_outliers_are_found():
 
 def test_what_is_fixed_stays():
     model = wrong_at_three(max_iter=5)
-    model = replace(model, table=model.table.with_fixed("noise"))
+    model = replace(model, table=model.table.changed("noise", fixed=True))
     done = finished(*fit_doubting(model, lambda own: (own, search(own))))
     np.testing.assert_array_equal(done.predictor.noise, model.table.values_at_start()["noise"])
 

@@ -14,14 +14,17 @@ from skevgp.model.bounds import (
     BoundAtOptimum,
     bounds_alone,
     bounds_at_optimum,
+    diagonal_gap,
+    equation_errors,
+    log_variances,
+    lost_by_rounding,
     optimal_posteriors,
-    shortfall,
-    unsolved,
     upper_bound,
 )
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective
 from skevgp.model.predictor import CoefficientPrior
+from skevgp.model.statistics import Whitening
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
@@ -50,7 +53,7 @@ def plain_loss(model, rows, table):
             anp.exp(c["hyperparameters"]),
             anp.exp(c["signal"]),
             anp.exp(c["noise"]),
-            table["inducing_points"].value(c["inducing_points"]),
+            c["inducing_points"] * table["inducing_points"].unit + table["inducing_points"].origin,
             rows,
             model.prior,
             model.family,
@@ -114,7 +117,7 @@ def test_residuals_from_statistics_agree_with_those_from_rows():
     model, rows, table = problem()
     values = table.values(table.start())
     blocks = rows.blocks(model.kernel, 17)
-    bound = BoundAtOptimum(next(model.groups_on(values, blocks)), "full")
+    (bound,) = bounds_at_optimum(list(model.groups_on(values, blocks)), "full")
     _, V = whitened(values["hyperparameters"], values["inducing_points"][0], rows.inputs)
     e = rows.residuals - V.T @ bound.weights[:6] - rows.features @ bound.weights[6:]
     np.testing.assert_allclose(bound.residuals().squares, (e**2).sum(axis=0), rtol=1e-8)
@@ -128,8 +131,8 @@ def test_squares_from_statistics_are_never_negative_whatever_rounding_says():
         model, rows, table = problem(seed=seed)
         rows.residuals[:] = rows.features @ np.full((3, 2), 30.0)
         values = table.values_at_start() | {"noise": np.full(2, 1e-10)}
-        (group,) = model.groups_on(values, rows.blocks(model.kernel, 17))
-        found.append(BoundAtOptimum(group, "full").residuals().squares)
+        (bound,) = bounds_at_optimum(list(model.groups_on(values, rows.blocks(model.kernel, 17))), "full")
+        found.append(bound.residuals().squares)
     assert np.min(found) >= 0.0
     assert np.max(found) < 1e-6
 
@@ -230,6 +233,20 @@ def test_a_noise_far_below_the_signal_costs_no_digits(family):
     loss = plain_loss(model, rows, small)
     np.testing.assert_allclose(value, loss(small.start()), rtol=1e-6)
     assert relative_error(gradient, grad(loss)(small.start())) < 1e-5
+
+
+def test_a_precision_that_rounding_made_negative_counts_as_that_of_the_prior():
+    """q of independent values: B is no less than I."""
+    own = Whitening.of(SquaredExponential(1), np.ones(1), np.linspace(0, 1e-4, 4)[:, np.newaxis])
+    B = np.diag([1.0, -3e30, 2.0, 1.0, -5.0])
+    log_f, log_w = log_variances(B, own.L_inv)
+    assert (-log_f >= np.log((own.L_inv**2).sum(axis=0)) - 1e-9).all()
+    np.testing.assert_array_equal(log_w, [0.0])
+    gap, B_bar, factor_bar = diagonal_gap(B, 0.0, np.zeros((5, 5)), own)
+    assert gap == pytest.approx(-0.5 * (log_f.sum() + log_w.sum()) + np.log(np.diagonal(own.L)).sum(), rel=1e-9)
+    assert np.isfinite(gap)
+    assert np.isfinite(B_bar).all()
+    assert np.isfinite(factor_bar).all()
 
 
 # --- the upper bound -----------------------------------------------------------------------------------------------
@@ -384,8 +401,8 @@ def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(
     alike = {name: getattr(model.prior, name)[:1].repeat(2, axis=0) for name in ("mean", "scale", "reference")}
     model = replace(model, prior=replace(model.prior, shared=weights_are_shared, **alike))
     values, blocks = table.values_at_start(), rows.blocks(model.kernel, 17)
-    groups = list(model.groups_of(values, model.statistics(values, blocks)))
-    best = sum(bound.value(bound.left_over(blocks)) for bound in bounds_at_optimum(groups, "full"))
+    groups = model.groups_of(values, model.statistics(values, blocks))
+    best = sum(bound.value(bound.residuals(blocks)) for bound in bounds_at_optimum(groups, "full"))
     rng, bounds = np.random.RandomState(0), []
     off_w = 0.1 * rng.randn(model.prior.scale.shape[1])
     for group, posteriors in zip(groups, optimal_posteriors(groups), strict=True):
@@ -393,13 +410,13 @@ def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(
         moved = [replace(q, mean=q.mean + off) for q, off in zip(posteriors, offs, strict=True)]
         bounds.append(BoundAtOptimum(group, "full", moved))
         if not weights_are_shared:
-            rest = unsolved(group, moved, bounds[-1].left_over(blocks))
+            rest = equation_errors(group, moved, bounds[-1].residuals(blocks))
             for q, off, found in zip(moved, offs, rest, strict=True):
                 np.testing.assert_allclose(found, -q.B @ off, rtol=1e-8, atol=1e-8)
-    left = [bound.left_over(blocks if from_rows else None) for bound in bounds]
+    left = [bound.residuals(blocks if from_rows else None) for bound in bounds]
     value = sum(bound.value(own) for bound, own in zip(bounds, left, strict=True))
     assert value < best - 0.1
-    assert value + shortfall(bounds, left) == pytest.approx(best, rel=1e-9)
+    assert value + lost_by_rounding(bounds, left) == pytest.approx(best, rel=1e-9)
 
 
 def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
@@ -407,7 +424,7 @@ def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
     model, rows, table = problem()
     values = table.values_at_start()
     blocks = rows.blocks(model.kernel, 17)
-    groups = list(model.groups_of(values, model.statistics(values, blocks)))
+    groups = model.groups_of(values, model.statistics(values, blocks))
     expected = upper_bound(groups, blocks)
 
     def moved(groups, family):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.blocks import Batch
-from skevgp.model.bounds import optimal_posterior, projected
+from skevgp.model.bounds import optimal_posteriors
 from skevgp.model.families import DiagonalFamily, FullFamily, NaturalFamily
 from skevgp.model.objectives import BoundObjective, ElboObjective
 from skevgp.model.parameters import ParameterTable
@@ -27,7 +27,7 @@ def started(kind, shared=True):
     """A family that starts at the optimum, the groups of all rows, and the best q of each output."""
     model, rows, table = problem("diagonal" if kind is DiagonalFamily else "full", shared)
     groups = list(model.groups_on(table.values_at_start(), rows.blocks(model.kernel, 60)))
-    optima = [optimal_posterior(group, o) for group in groups for o in range(len(group.signal))]
+    optima = [q for own in optimal_posteriors(groups) for q in own]
     L_inv = [group.whitening.L_inv for group in groups for _ in group.signal]
     family = DiagonalFamily(optima, L_inv) if kind is DiagonalFamily else kind(optima)
     return family, groups, optima, L_inv
@@ -100,7 +100,7 @@ def test_the_spreads_terms_are_traces_and_a_determinant(kind, shared):
     for group in groups:
         expected = 0.0
         for o, output in enumerate(range(group.outputs.start, group.outputs.stop)):
-            precision = np.eye(SIZE) + projected(group, o)[0] / group.noise[o]
+            precision = np.eye(SIZE) + group.products(o)[0] / group.noise[o]
             expected += 0.5 * (np.vdot(precision, S[output]) - np.linalg.slogdet(S[output])[1])
         assert family.terms(values, group).value == pytest.approx(expected, rel=1e-9)
 
@@ -227,7 +227,7 @@ def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
     np.testing.assert_allclose(loss, expected, rtol=1e-8)
     assert relative_error(gradient, expected_gradient) < 1e-8
     values = table.values(x)
-    optima = [optimal_posterior(g, o) for g in model.groups_on(values, blocks) for o in range(len(g.signal))]
+    optima = [q for own in optimal_posteriors(list(model.groups_on(values, blocks))) for q in own]
     for mean, best in zip(elbo.family.means(values), optima, strict=True):
         np.testing.assert_allclose(mean, best.mean, rtol=1e-8, atol=1e-8 * np.abs(best.mean).max())
     for root, best in zip(elbo.family.roots(values, []), optima, strict=True):

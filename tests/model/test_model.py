@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from skevgp.model.bounds import BoundAtOptimum
+from skevgp.model.bounds import bounds_at_optimum
 from skevgp.model.objectives import BoundObjective
 from skevgp.model.statistics import Whitening
 from skevgp.utils.linalg import Jitter
@@ -140,5 +140,5 @@ def test_the_jitter_is_the_models():
     ]
     np.testing.assert_allclose(np.diag(factors[1])[1::2] ** 2, 2e-6, rtol=1e-3)
     assert (np.diag(factors[0])[1::2] ** 2 < 1e-10).all()
-    group = next(model.groups_on(values, blocks))
-    assert np.isfinite(BoundAtOptimum(group, "full").residuals().squares).all()
+    (bound,) = bounds_at_optimum(list(model.groups_on(values, blocks)), "full")
+    assert np.isfinite(bound.residuals().squares).all()

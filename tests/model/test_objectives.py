@@ -49,13 +49,14 @@ def traced_loss(elbo, family, block, linear):
     """The loss per row by `negative_elbo`, on statistics in plain autograd.numpy."""
     model, table, n_rows = elbo.model, elbo.table, elbo.n_rows
     X = block.prepared[: model.kernel.n_columns].T
-    m, o = table["inducing_points"].start.shape[1], len(model.prior.scale)
+    points = table["inducing_points"]
+    m, o = points.start.shape[1], len(model.prior.scale)
 
     def loss(x):
         c = table.coordinates(x)
         parts, roots, log_dets = [], [], []
         for i in range(o):
-            Z = table["inducing_points"].value(c["inducing_points"][i % len(c["inducing_points"])])
+            Z = c["inducing_points"][i % len(c["inducing_points"])] * points.unit + points.origin
             L, V = whitened(anp.exp(c["hyperparameters"]), Z, X)
             parts.append((V @ V.T, V @ block.features, V @ block.residuals, anp.sum(1.0 - anp.sum(V**2, axis=0))))
             root, log_det = traced_root(elbo, family, c["spread"][i], L, i)
@@ -145,13 +146,13 @@ def test_elbo_agrees_with_the_papers_formula_in_plain_autograd(family, shared):
     model, rows, table = problem(family, shared, n=30, m=4, p=2)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 30))
     size, m = 6, 4
-    mean_unit = elbo.table["mean"].unit
+    mean_unit, points = elbo.table["mean"].unit, elbo.table["inducing_points"]
 
     def loss(x):
         c = elbo.table.coordinates(x)
         total = 0.0
         for i in range(len(model.prior.scale)):
-            Z = table["inducing_points"].value(c["inducing_points"][i % len(c["inducing_points"])])
+            Z = c["inducing_points"][i % len(c["inducing_points"])] * points.unit + points.origin
             L, V = whitened(anp.exp(c["hyperparameters"]), Z, rows.inputs)
             s2, noise = anp.exp(c["signal"][i]), anp.exp(c["noise"][i])
             mean = c["mean"][i] * mean_unit[i]
