@@ -171,7 +171,7 @@ class DaskBlocks:
 
     def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], AnyBlock], n_inducing: int):
         shared = _dask().delayed(make, traverse=False)
-        # A worker may run the second pass over blocks of which another ran the first. Hence keep=False.
+        # The two passes over a block may run on different workers. Hence nothing is kept between them.
         self._partitions = _held([part.blocks(shared, n_inducing, keep=False) for part in partitions])
 
     @cached_property
@@ -225,7 +225,7 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
     return (mean, both[:, n_outputs:][:, columns]) if return_std else mean
 
 
-# --- what runs on the workers ------------------------------------------------------------------------------------
+# --- functions that run on the workers --------------------------------------------------------------------------------
 
 
 def _partition(

@@ -226,7 +226,7 @@ class Preparer(Protocol):
     """The part of a kernel that `Rows` needs."""
 
     def prepare(self, inputs: np.ndarray) -> Any:
-        """Compute what the kernel needs of rows (n, d) once."""
+        """Compute all that depends on the rows (n, d) only, once for all parameters."""
 
 
 def block_of(
