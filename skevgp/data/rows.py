@@ -253,9 +253,9 @@ def block_of(
             log_v = np.log(own.counts / own.precision) if own.log_variance is None else own.log_variance
             block.log_variance = float(own.counts @ log_v)
         blocks.append(block)
-    return (
-        blocks[0] if groups is None else SplitBlock(dict(zip((group.start for group in groups), blocks, strict=True)))
-    )
+    if groups is None:
+        return blocks[0]
+    return SplitBlock({group.start: block for group, block in zip(groups, blocks, strict=True)})
 
 
 def _internal_moments(to_internal: ToInternal, raw: RawRows) -> tuple[Moments, Moments]:
@@ -306,7 +306,7 @@ class Rows:
 
     @property
     def mean_precision(self) -> float:
-        """Σ ω / Σ w, the weighted mean of 1 / v: the noise variances σ² v are σ² divided by it, on average."""
+        """Σ ω / Σ w, the weighted mean of 1 / v. A typical noise variance of a row is σ² divided by it."""
         return self._moments[1].n / self._moments[0].n
 
     def is_constant(self) -> np.ndarray:
