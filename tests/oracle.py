@@ -1,5 +1,6 @@
 """The bounds written down from the data in plain autograd.numpy: no statistics, no blocks, no hand-written gradient."""
 
+from functools import partial
 from types import SimpleNamespace
 
 import autograd.numpy as anp
@@ -7,7 +8,7 @@ import numpy as np
 
 from skevgp.data.blocks import LocalBlocks
 from skevgp.data.dataset import Dataset
-from skevgp.data.rows import LocalSource, MakeBlock, Moments, RawRows, Rows
+from skevgp.data.rows import LocalSource, Moments, RawRows, Rows, block_of
 from skevgp.fitting.search import Rules
 from skevgp.fitting.start import starting_table
 from skevgp.kernels.parse import Start, Starts
@@ -98,7 +99,10 @@ class ArrayRows:
         return len(self.inputs)
 
     def blocks(self, kernel, size, **options):
-        raw, make = RawRows(self.inputs, self.features, self.residuals), MakeBlock((kernel,), lambda raw: raw)
+        raw, make = (
+            RawRows(self.inputs, self.features, self.residuals),
+            partial(block_of, kernels=(kernel,), to_internal=lambda raw: raw),
+        )
         return LocalBlocks(lambda rows: make(raw[rows]), len(self), 6, size=size, **options)
 
 

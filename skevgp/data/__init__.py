@@ -1,1 +1,1 @@
-"""The rows: blocks, threads, memory maps, Dask."""
+"""Rows of data: blocks, threads, memory maps, Dask arrays."""

@@ -1,11 +1,11 @@
-"""Dask arrays as data: chunks stay where they are, sums travel; predictions are lazy."""
+"""Dask arrays as data: workers keep the chunks and return sums over them, and predictions are lazy."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from copy import copy, deepcopy
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -13,15 +13,15 @@ from sklearn.utils import check_array
 
 from ..utils.optional import require
 from ..utils.validation import as_floats, check_magnitude, is_dask
-from .blocks import AnyBlock, Blocks, LinearSums, LocalBlocks
-from .maps import EXAMPLE_ROWS, MappedRows, RowShapes, fit_map, fresh_map, spread
-from .rows import LocalSource, RawRows, made
+from .blocks import AnyBlock, Blocks, LinearSums
+from .maps import EXAMPLE_ROWS, MappedRows, Maps, evenly_spaced, fit_map, fresh_map
+from .rows import LocalSource, RawRows
 from .threads import BlockMap, ordered_sum, single_threaded_libraries
 from .weights import Chosen, check_variances, check_weights
 
-# Sums of so many partitions are added up on a worker at a time.
+# A worker adds the sums of this many partitions at a time.
 _SUMMED_AT_ONCE = 8
-# A map without partial_fit is fitted to so many rows, evenly spread.
+# A map without partial_fit is fitted to this many evenly spaced rows.
 _MAP_SAMPLE = 10_000
 
 
@@ -34,7 +34,7 @@ def _dask_array() -> Any:
 
 
 def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,), known: bool = True) -> Any:
-    """A Dask array whose chunks are whole rows, at least one and of known number if so asked, or an error."""
+    """Validate a Dask array and make its chunks whole rows. If ``known``, count the rows, at least one."""
     da = _dask_array()
     if not isinstance(values, da.Array):
         raise TypeError(
@@ -52,7 +52,7 @@ def as_rows(values: Any, name: str, ndims: tuple[int, ...] = (2,), known: bool =
 
 
 def aligned(X: Any, y: Any) -> tuple[Any, Any]:
-    """X and y as Dask arrays of the same chunks of rows, none of them empty."""
+    """Validate X and y, and give them the same chunks of rows without empty ones."""
     da = _dask_array()
     X = as_rows(X, "X")
     y = as_rows(y if is_dask(y) else da.from_array(as_floats(y, "y"), chunks="auto"), "y", (1, 2))
@@ -63,13 +63,13 @@ def aligned(X: Any, y: Any) -> tuple[Any, Any]:
 
 
 def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
-    """A fitted clone of a transformer, or None: chunk by chunk if it has ``partial_fit``, else to a sample of rows."""
+    """Fit a clone of a transformer, or return None for None. Without ``partial_fit``, it sees a sample of rows."""
     if feature_map is None:
         return None
     delayed = _dask().delayed
     fitted = fresh_map(feature_map, name)
     if not hasattr(fitted, "partial_fit"):
-        chosen = spread(len(X), _MAP_SAMPLE)
+        chosen = evenly_spaced(len(X), _MAP_SAMPLE)
         sample_X, sample_y = _dask().compute(X[chosen], y[chosen])
         return fit_map(feature_map, sample_X, sample_y, name)
     fitted = delayed(fitted, traverse=False)
@@ -79,29 +79,23 @@ def fit_map_to_chunks(feature_map: Any, X: Any, y: Any, name: str) -> Any:
 
 
 def dask_example(X: Any) -> np.ndarray:
-    """A few of the rows, evenly spread."""
-    return np.asarray(X[spread(len(X), EXAMPLE_ROWS)].compute(), dtype=np.float64)
+    """A few evenly spaced rows."""
+    return np.asarray(X[evenly_spaced(len(X), EXAMPLE_ROWS)].compute(), dtype=np.float64)
 
 
 @dataclass(frozen=True)
 class RowWeights:
-    """How often the rows of Dask arrays count, and how noisy they are.
+    """Weights and relative noise variances of the rows of Dask arrays."""
 
-    Attributes
-    ----------
-    counts, variance : list of Delayed, optional
-        w and v of each chunk.
-    kept : ndarray of shape (n_chunks,), optional
-        Rows of each chunk that count at all; None: all.
-    """
-
+    # w and v of each chunk, as Delayed. None: 1.
     counts: list[Any] | None = None
     variance: list[Any] | None = None
+    # (n_chunks,): number of rows of positive weight in each chunk. None: all rows.
     kept: np.ndarray | None = None
 
     @classmethod
     def of(cls, X: Any, counts: Any, variance: Any) -> RowWeights:
-        """From arrays (n,), Dask arrays or None; checked by their lowest and highest entries."""
+        """Validate weights and variances (n,): arrays, Dask arrays or None."""
         counts, variance = _chunks_like(X, counts, "sample_weight"), _chunks_like(X, variance, "relative_variance")
         kept = None
         for chunks, check in ((counts, check_weights), (variance, check_variances)):
@@ -112,14 +106,14 @@ class RowWeights:
         return cls(counts, variance, kept)
 
     def labels_of(self, labels: np.ndarray) -> np.ndarray:
-        """Of labels (n,) of all rows those of the rows that count."""
+        """The labels of the rows of positive weight, from those of all rows (n,)."""
         if self.counts is None:
             return labels
         return labels[np.concatenate(_dask().compute(*self.counts)) != 0.0]
 
 
 def _chunks_like(X: Any, values: Any, name: str) -> list[Any] | None:
-    """Numbers of the rows, in the chunks of X."""
+    """Numbers (n,) as Delayed, in the chunks of X."""
     if values is None:
         return None
     values = values if is_dask(values) else _dask_array().from_array(as_floats(values, name), chunks="auto")
@@ -130,41 +124,20 @@ def _chunks_like(X: Any, values: Any, name: str) -> list[Any] | None:
 
 
 class DaskSource:
-    """Rows that Dask's workers hold.
-
-    Parameters
-    ----------
-    X : dask.array.Array of shape (n, n_columns)
-    y : dask.array.Array of shape (n,) or (n, o)
-        In the same chunks.
-    feature_map, kernel_map : transformer or None
-        Fitted.
-    weights : RowWeights, optional
-        Of the chunks; rows of weight 0 are left out.
-    shapes : (tuple, tuple), optional
-        As of `MappedRows`.
-    """
+    """Rows of Dask arrays X (n, n_columns) and y (n,) or (n, o) with the same chunks. Weights of 0 are left out."""
 
     positions: np.ndarray | None = None
 
-    def __init__(
-        self,
-        X: Any,
-        y: Any,
-        feature_map: Any,
-        kernel_map: Any,
-        weights: RowWeights | None = None,
-        shapes: RowShapes | None = None,
-    ):
-        dask, weights = _dask(), RowWeights() if weights is None else weights
-        maps = dask.delayed((feature_map, kernel_map), traverse=False)
+    def __init__(self, X: Any, y: Any, maps: Maps, weights: RowWeights):
+        dask = _dask()
+        shared_maps, partition = dask.delayed(maps, traverse=False), dask.delayed(_partition)
         lengths = np.array(X.chunks[0]) if weights.kept is None else weights.kept
         none = [None] * len(lengths)
         given = X.to_delayed().ravel(), y.to_delayed().ravel()
         chunks = zip(*given, weights.counts or none, weights.variance or none, strict=True)
-        partition = dask.delayed(_partition)
+        # Each partition is a `LocalSource` on a worker.
         self._partitions: Sequence[Any] = _held(
-            [partition(*chunk, maps, shapes) for chunk, n in zip(chunks, lengths, strict=True) if n > 0]
+            [partition(*chunk, shared_maps) for chunk, n in zip(chunks, lengths, strict=True) if n > 0]
         )
         self._ends: np.ndarray = np.cumsum(lengths[lengths > 0])
         self.n_rows = int(lengths.sum())
@@ -172,49 +145,34 @@ class DaskSource:
     def sum(self, function: Callable[[RawRows], Any]) -> Any:
         return _sum_over(self._partitions, function)
 
-    def take(self, rows: np.ndarray) -> RawRows:
-        dask = _dask()
-        owners = np.searchsorted(self._ends, rows, side="right")
-        order = np.argsort(owners, kind="stable")
-        parts = []
-        for owner in np.unique(owners):
-            first = self._ends[owner - 1] if owner else 0
-            own = rows[order][owners[order] == owner] - first
-            parts.append(dask.delayed(_taken)(self._partitions[owner], own))
-        found = dask.compute(*parts)
-        back = np.argsort(order)
-        return RawRows(*_joined(found))[back]
-
-    def part(self, first: int, end: int) -> DaskSource:
-        delayed, part = _dask().delayed, copy(self)
-        starts = np.append(0, self._ends[:-1])
-        cuts = np.column_stack([np.maximum(first - starts, 0), np.minimum(end, self._ends) - starts]).tolist()
-        owners = [owner for owner, (begin, stop) in enumerate(cuts) if begin < stop]
-        part._partitions = [delayed(_cut)(self._partitions[owner], *cuts[owner]) for owner in owners]
-        part._ends = np.cumsum([cuts[owner][1] - cuts[owner][0] for owner in owners])
-        part.n_rows = end - first
-        return part
+    def take(self, rows: np.ndarray, /) -> RawRows:
+        owners, parts = self._by_partition(rows)
+        found = _dask().compute(*(partition.take(own) for partition, own in parts))
+        return _joined(found)[np.argsort(np.argsort(owners, kind="stable"))]
 
     def some(self, rows: np.ndarray) -> DaskSource:
-        delayed, some = _dask().delayed, copy(self)
-        starts, owners = np.append(0, self._ends[:-1]), np.searchsorted(self._ends, rows, side="right")
-        own = [(owner, rows[owners == owner] - starts[owner]) for owner in np.unique(owners)]
-        some._partitions = [delayed(_some)(self._partitions[owner], chosen) for owner, chosen in own]
-        some._ends = np.cumsum([len(chosen) for _, chosen in own])
+        some, (_, parts) = copy(self), self._by_partition(rows)
+        some._partitions = [partition.some(own) for partition, own in parts]
+        some._ends = np.cumsum([len(own) for _, own in parts])
         some.n_rows = len(rows)
         return some
+
+    def _by_partition(self, rows: np.ndarray) -> tuple[np.ndarray, list[tuple[Any, np.ndarray]]]:
+        """The index of the partition of each row, and the rows of each partition by their index in it."""
+        starts, owners = np.append(0, self._ends[:-1]), np.searchsorted(self._ends, rows, side="right")
+        return owners, [(self._partitions[owner], rows[owners == owner] - starts[owner]) for owner in np.unique(owners)]
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
         return DaskBlocks(self._partitions, make, n_inducing)
 
 
 class DaskBlocks:
-    """Blocks that Dask's workers make of their partitions and keep."""
+    """Blocks that Dask's workers make from their partitions and keep."""
 
     def __init__(self, partitions: Sequence[Any], make: Callable[[RawRows], AnyBlock], n_inducing: int):
-        dask = _dask()
-        shared = dask.delayed(make, traverse=False)
-        self._partitions = _held([dask.delayed(_blocks)(part, shared, n_inducing) for part in partitions])
+        shared = _dask().delayed(make, traverse=False)
+        # The two passes over a block may run on different workers. Hence nothing is kept between them.
+        self._partitions = _held([part.blocks(shared, n_inducing, keep=False) for part in partitions])
 
     @cached_property
     def linear(self) -> LinearSums:
@@ -225,7 +183,7 @@ class DaskBlocks:
 
 
 def _held(parts: list[Any]) -> Sequence[Any]:
-    """Kept by the workers of a cluster; without one made anew at each pass, since they might not all fit here."""
+    """Let the workers of a cluster keep the parts. Without a cluster, each pass makes them again to save memory."""
     try:
         require("distributed", "Fitting on a cluster").get_client()
     except (ImportError, ValueError):
@@ -234,31 +192,21 @@ def _held(parts: list[Any]) -> Sequence[Any]:
 
 
 def _sum_over(partitions: Sequence[Any], function: Callable[..., Any]) -> Any:
-    """One map-reduce round; the order of summation depends on nothing but the number of partitions."""
+    """One map-reduce round. The order of summation depends on the number of partitions only."""
     delayed = _dask().delayed
     shared = delayed(function, traverse=False)
     sums = [delayed(_partition_sum)(partition, shared) for partition in partitions]
     while len(sums) > 1:
         groups = (sums[first : first + _SUMMED_AT_ONCE] for first in range(0, len(sums), _SUMMED_AT_ONCE))
         sums = [delayed(ordered_sum)(group) for group in groups]
-    # Numbers from a worker may lie at odd addresses, where np.vdot crashes with the BLAS of some processors.
+    # Numbers from a worker may have unaligned addresses, where np.vdot crashes with the BLAS of some processors.
     return deepcopy(sums[0].compute())
 
 
 def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, shape: tuple[int, ...]) -> Any:
-    """Mean, or mean and standard deviation, as lazy Dask arrays.
-
-    Parameters
-    ----------
-    model : estimator
-        With ``predict``.
-    X : dask.array.Array of shape (n, n_columns)
-    return_std, include_noise : bool
-    shape : tuple
-        () or (o,): of one prediction.
-    """
+    """Mean, or mean and standard deviation, as lazy Dask arrays. A prediction has the shape () or (o,)."""
     delayed = _dask().delayed
-    # As it is now, whatever is folded into it before the result is computed.
+    # Predictions are those of the model as it is now, even if it is updated before they are computed.
     model = copy(model)
     n_outputs = shape[0] if shape else 1
     width = n_outputs * (1 + return_std)
@@ -277,25 +225,20 @@ def predict_chunks(model: Any, X: Any, return_std: bool, include_noise: bool, sh
     return (mean, both[:, n_outputs:][:, columns]) if return_std else mean
 
 
-# --- what runs on the workers ------------------------------------------------------------------------------------
+# --- functions that run on the workers --------------------------------------------------------------------------------
 
 
 def _partition(
-    X: np.ndarray,
-    y: np.ndarray,
-    counts: np.ndarray | None,
-    variance: np.ndarray | None,
-    maps: tuple[Any, Any],
-    shapes: RowShapes | None,
+    X: np.ndarray, y: np.ndarray, counts: np.ndarray | None, variance: np.ndarray | None, maps: Maps
 ) -> LocalSource:
-    # Partitions are worked on at the same time, and transformers need not be safe for that.
+    # Partitions are processed at the same time, and transformers need not be safe for that.
     maps = deepcopy(maps)
     X = check_array(X, dtype=[np.float64, np.float32], input_name="X")
     y = check_array(y, dtype=np.float64, ensure_2d=False, input_name="y").reshape(len(X), -1)
     check_magnitude(X, "X")
     check_magnitude(y, "y")
-    chosen = Chosen.in_order(len(X), *(None if each is None else as_floats(each, "") for each in (counts, variance)))
-    return LocalSource(MappedRows(X, X, y, *maps, chosen, shapes), chosen.n_rows)
+    chosen = Chosen.of(X, y, counts, variance, ordered=False)
+    return LocalSource(MappedRows(X, X, y, maps, chosen), chosen.n_rows)
 
 
 def _range(values: np.ndarray) -> tuple[float, float, int]:
@@ -303,34 +246,22 @@ def _range(values: np.ndarray) -> tuple[float, float, int]:
     return float(values.min()), float(values.max()), int(np.count_nonzero(values))
 
 
-def _cut(partition: LocalSource, first: int, end: int) -> LocalSource:
-    return partition.part(first, end)
-
-
-def _some(partition: LocalSource, rows: np.ndarray) -> LocalSource:
-    return partition.some(rows)
-
-
-def _blocks(partition: LocalSource, make: Callable[[RawRows], AnyBlock], n_inducing: int) -> Blocks:
-    return LocalBlocks(partial(made, partition.take, make), partition.n_rows, n_inducing, keep=False)
-
-
 def _partition_sum(partition: Any, function: Callable[..., Any]) -> Any:
     with single_threaded_libraries():
         return partition.sum(function)
 
 
-def _taken(partition: LocalSource, rows: np.ndarray) -> tuple[Any, ...]:
-    return partition.take(rows).parts
-
-
-def _joined(found: Sequence[tuple[Any, ...]]) -> list[Any]:
-    """Rows of several partitions, part by part; a partition whose rows all count once has no weights."""
-    if any(parts[3] is not None for parts in found):
-        found = [
-            (*parts[:3], *(np.ones(len(parts[0])) if part is None else part for part in parts[3:5])) for parts in found
+def _joined(parts: Sequence[RawRows]) -> RawRows:
+    """Rows of several partitions. A partition in which all weights are 1 has none."""
+    if any(part.counts is not None for part in parts):
+        ones = [np.ones(len(part.inputs)) for part in parts]
+        parts = [
+            replace(part, counts=one, precision=one) if part.counts is None else part
+            for part, one in zip(parts, ones, strict=True)
         ]
-    return [None if columns[0] is None else np.concatenate(columns) for columns in zip(*found, strict=True)]
+    columns = zip(*(vars(part).values() for part in parts), strict=True)
+    joined: list[Any] = [None if each[0] is None else np.concatenate(each) for each in columns]
+    return RawRows(*joined)
 
 
 def _partly_fitted(fitted: Any, X: np.ndarray, y: np.ndarray) -> Any:

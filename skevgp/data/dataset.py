@@ -1,4 +1,4 @@
-"""A data set as the user gives it: X and y are validated, the rows that count are chosen, and the maps are fitted."""
+"""The user's data set: X and y are validated, rows of positive weight are chosen, and the maps are fitted."""
 
 from __future__ import annotations
 
@@ -22,36 +22,25 @@ from ..utils.validation import (
 from .dask import DaskSource, RowWeights, aligned, dask_example, fit_map_to_chunks
 from .maps import MappedRows, Maps, example_of, fit_map
 from .rows import LocalSource, Source
-from .weights import chosen_rows
+from .weights import Chosen
 
 
 @dataclass(frozen=True)
 class Dataset:
-    """The rows of a fit.
+    """The rows of a fit."""
 
-    Attributes
-    ----------
-    given : array or data frame of shape (n_samples, n_columns)
-        X as the maps see it: a data frame stays one.
-    X : array, or data frame if only maps see it
-        X as the kernel sees it if there is no kernel map.
-    y : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-    chosen : Chosen or RowWeights
-        Which rows count, how often, and how noisy they are.
-    maps : Maps
-        The fitted maps.
-    source : Source
-        The rows that count, through the maps.
-    groups : ndarray of shape (n_rows,), optional
-        The group of each row of the source.
-    """
-
+    # (n_samples, n_columns): X for the maps, for which a data frame stays one, and X for a kernel without a map.
     given: Any
     X: Any
+    # (n_samples,) or (n_samples, n_outputs).
     y: np.ndarray
+    # The rows that the fit uses: `Chosen`, or `RowWeights` of Dask arrays.
     chosen: Any
+    # The fitted maps.
     maps: Maps
+    # The used rows, through the maps.
     source: Source
+    # (n_rows,): the group of each row of the source.
     groups: np.ndarray | None = None
 
     @classmethod
@@ -64,7 +53,7 @@ class Dataset:
         relative_variance: Any = None,
         groups: Any = None,
     ) -> Dataset:
-        """Validate X and y as a scikit-learn estimator does, and fit clones of its maps."""
+        """Validate X and y as scikit-learn does, and fit clones of the estimator's maps."""
         given, X, y = checked_rows(estimator, X, y, reset=True)
         groups = checked_groups(groups, len(y))
         chosen = _chosen(X, y, sample_weight, relative_variance, groups)
@@ -82,7 +71,7 @@ class Dataset:
     def further(
         cls, estimator: Any, maps: Maps, X: Any, y: Any, sample_weight: Any = None, relative_variance: Any = None
     ) -> Dataset:
-        """Further rows for a fitted estimator, through the maps that it has."""
+        """Further rows for a fitted estimator with these maps."""
         given, X, y = checked_rows(estimator, X, y)
         chosen = _chosen(X, y, sample_weight, relative_variance, ordered=False)
         return cls(given, X, y, chosen, maps, _source(given, X, y, maps, chosen))
@@ -93,21 +82,19 @@ def _chosen(
 ) -> Any:
     if is_dask(X):
         return RowWeights.of(X, sample_weight, relative_variance)
-    return chosen_rows(X, y, sample_weight, relative_variance, groups, ordered)
+    return Chosen.of(X, y, sample_weight, relative_variance, groups, ordered)
 
 
 def _source(given: Any, X: Any, y: np.ndarray, maps: Maps, chosen: Any) -> Source:
     if is_dask(X):
-        return DaskSource(X, y, maps.feature_map, maps.kernel_map, chosen, maps.shapes)
-    rows = MappedRows(given, X, y.reshape(len(y), -1), maps.feature_map, maps.kernel_map, chosen, maps.shapes)
-    return LocalSource(rows, chosen.n_rows, chosen.positions)
+        return DaskSource(X, y, maps, chosen)
+    return LocalSource(MappedRows(given, X, y.reshape(len(y), -1), maps, chosen), chosen.n_rows, chosen.positions)
 
 
 def checked_rows(estimator: Any, X: Any, *y: Any, reset: bool = False) -> tuple[Any, Any, np.ndarray]:
-    """X as the maps see it, X as the kernel sees it without a map, and y as an array.
+    """Validate X and y. Return X for the maps, X for a kernel without a map, and y as an array. y may be left out.
 
-    A data frame may hold what is no number if there is a ``kernel_map``: then only the maps see it, and what they
-    return is checked. To predict, y is left out.
+    A data frame may have columns that are not numbers if there is a ``kernel_map``, since only the maps see it then.
     """
     given = X
     if is_dask(X):
@@ -123,7 +110,7 @@ def checked_rows(estimator: Any, X: Any, *y: Any, reset: bool = False) -> tuple[
 
 
 def checked_numbers(estimator: Any, X: Any, *y: Any, reset: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """X and y as arrays of numbers: what the kernel sees without a map, and what derivatives are in."""
+    """Validate X and y as arrays of numbers, for a kernel without a map or for derivatives in X."""
     try:
         validated = validate_numbers(estimator, X, *y, reset=reset, dtype=FLOATS)
     except (ValueError, np.exceptions.DTypePromotionError) as error:

@@ -1,8 +1,8 @@
-"""The user's maps: fitted to the rows, applied to them in pieces, and what comes back is checked."""
+"""The user's maps. They are fitted to the rows and applied to pieces of them, and the result is checked."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from threading import Lock
 from typing import Any
 
@@ -19,45 +19,26 @@ from ..utils.validation import LARGEST, as_floats, check_magnitude, is_frame
 from .rows import RawRows
 from .weights import Chosen, rows_of
 
-# Rows that a map sees at once.
+# A map is applied to this many rows at once.
 MAP_ROWS = 16_384
-# Rows that show what those of a fit are like.
+# A model keeps this many rows as an example.
 EXAMPLE_ROWS = 64
 
 
 def fit_map(feature_map: Any, X: Any, y: np.ndarray, name: str, chosen: Chosen | None = None) -> Any:
-    """A fitted clone of a transformer, or None.
-
-    Parameters
-    ----------
-    feature_map : transformer or None
-    X : array-like of shape (n, d)
-        As the user gave it.
-    y : ndarray of shape (n,) or (n, o)
-    name : str
-        The argument's name, for errors.
-    chosen : Chosen, optional
-        The rows to fit it to; how often they count it is told if it takes a ``sample_weight``. None are all.
-
-    Raises
-    ------
-    TypeError
-        If it is not a transformer.
-    """
+    """Fit a clone of a transformer, or return None for None. ``name`` is the argument's name for errors."""
     if feature_map is None:
         return None
-    fitted = fresh_map(feature_map, name)
-    if chosen is None:
-        return fitted.fit(X, y)
+    fitted, chosen = fresh_map(feature_map, name), Chosen(len(y)) if chosen is None else chosen
     if chosen.counts is not None and has_fit_parameter(fitted, "sample_weight"):
-        rows = chosen.positions
-        return fitted.fit(rows_of(X, rows), rows_of(y, rows), sample_weight=chosen.counts)
-    rows = chosen.positions if chosen.repeated is None else chosen.repeated
-    return fitted.fit(rows_of(X, rows), rows_of(y, rows))
+        rows, options = chosen.positions, {"sample_weight": chosen.counts}
+    else:
+        rows, options = chosen.positions if chosen.unmerged is None else chosen.unmerged, {}
+    return fitted.fit(rows_of(X, rows), rows_of(y, rows), **options)
 
 
 def fresh_map(feature_map: Any, name: str) -> Any:
-    """A clone of a transformer, or a TypeError that names it."""
+    """Clone a transformer. Raise TypeError if it is not one."""
     if isinstance(feature_map, Kernel):
         raise TypeError(f"{name}={feature_map!r} is a kernel: give it as kernel=.")
     if isinstance(feature_map, type) or not (hasattr(feature_map, "fit") and hasattr(feature_map, "transform")):
@@ -69,7 +50,7 @@ def fresh_map(feature_map: Any, name: str) -> Any:
 
 
 def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
-    """Some rows as the maps see them: of a data frame as one, of an array in float64."""
+    """Some rows for a map: a data frame stays one, and an array becomes float64."""
     if not is_frame(X):
         return np.asarray(X[rows], dtype=np.float64)
     # A slice of a pyarrow table must end within it.
@@ -77,57 +58,36 @@ def take_rows(X: Any, rows: slice | np.ndarray) -> Any:
 
 
 def example_of(X: Any, chosen: Chosen) -> Any:
-    """A few of the rows that count, evenly spread, as the maps see them."""
-    rows = spread(chosen.n_rows, EXAMPLE_ROWS)
+    """A few evenly spaced rows of those that a fit uses."""
+    rows = evenly_spaced(chosen.n_rows, EXAMPLE_ROWS)
     return take_rows(X, rows if chosen.positions is None else chosen.positions[rows])
 
 
-def spread(n_rows: int, n_some: int) -> np.ndarray:
-    """Positions of some rows, evenly spread; of all if they are not more."""
+def evenly_spaced(n_rows: int, n_some: int) -> np.ndarray:
+    """Indices of at most ``n_some`` evenly spaced rows."""
     return np.unique(np.linspace(0, n_rows - 1, min(n_rows, n_some)).astype(int))
 
 
 def apply_map(fitted_map: Any, X: Any, name: str) -> np.ndarray:
-    """What a fitted map makes of rows, block by block.
-
-    Parameters
-    ----------
-    fitted_map : transformer
-    X : array-like of shape (n, d)
-        As the user gave it.
-    name : str
-        The argument's name, for errors.
-
-    Returns
-    -------
-    values : ndarray of shape (n, width) or, of a map with a row per output, (n, n_outputs, width)
-
-    Raises
-    ------
-    ValueError
-        If it returns the wrong number of rows or of dimensions, or values that are not finite.
-    """
+    """Apply a fitted map block by block: (n, width), or (n, n_outputs, width) if it returns a row for each output."""
     n_rows = X.shape[0]
     blocks: list[np.ndarray] = []
     for first in range(0, n_rows, MAP_ROWS):
         rows = X if n_rows <= MAP_ROWS else take_rows(X, slice(first, first + MAP_ROWS))
-        values = transformed(fitted_map, rows)
-        if not _is_good(values, rows.shape[0]):
-            values = _checked(values, rows.shape[0], f"{name}={fitted_map!r}")
+        values = _checked(transformed(fitted_map, rows), rows.shape[0], fitted_map, name)
         if blocks and values.shape[1:] != blocks[0].shape[1:]:
             raise ValueError(
                 f"{name}={fitted_map!r} must return the same number of columns for all rows; it returned "
-                f"{shape_text(blocks[0].shape[1:])} and {shape_text(values.shape[1:])}."
+                f"{_shape_text(blocks[0].shape[1:])} and {_shape_text(values.shape[1:])}."
             )
         blocks.append(values)
     return blocks[0] if len(blocks) == 1 else np.concatenate(blocks)
 
 
 def transformed(fitted_map: Any, rows: Any) -> Any:
-    """What a fitted map returns of rows.
+    """Transform rows by a fitted map. Unions, alone or at the end of a pipeline, are evaluated here.
 
-    Unions, by themselves or last in a pipeline, are put together here: scikit-learn's take no rows for each output, and
-    for a row their bookkeeping takes longer than all parts.
+    scikit-learn's unions do not accept a row for each output. For a single row, they are slower than all their parts.
     """
     if type(fitted_map) is Pipeline:
         steps = [step for _, step in fitted_map.steps if step not in (None, "passthrough")]
@@ -137,22 +97,19 @@ def transformed(fitted_map: Any, rows: Any) -> Any:
             return transformed(steps[-1], rows)
     if type(fitted_map) is FeatureUnion:
         parts = [(name, part) for name, part in fitted_map.transformer_list if not isinstance(part, str)]
-        values = [_dense(transformed(part, rows)) for _, part in parts]
+        found = [transformed(part, rows) for _, part in parts]
+        values = [np.asarray(value.toarray() if issparse(value) else value) for value in found]
         if values and all(part.shape[:1] == rows.shape[:1] for part in values):
             if weights := fitted_map.transformer_weights:
                 names = [name for name, _ in parts]
                 each = [1.0 if weights.get(name) is None else weights[name] for name in names]
                 values = [part * weight for part, weight in zip(values, each, strict=True)]
-            return _side_by_side(values)
+            return _concatenated(values)
     return fitted_map.transform(rows)
 
 
-def _dense(values: Any) -> np.ndarray:
-    return np.asarray(values.toarray() if issparse(values) else values)
-
-
-def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:
-    """Columns of all parts; of parts with a row per output, and others with one for all, those of each output."""
+def _concatenated(parts: list[np.ndarray]) -> np.ndarray:
+    """The columns of all parts. If some have a row for each output, the others are repeated for each output."""
     n_outputs = {part.shape[1] for part in parts if part.ndim == 3}
     if not n_outputs:
         return np.hstack(parts)
@@ -163,20 +120,19 @@ def _side_by_side(parts: list[np.ndarray]) -> np.ndarray:
     return np.concatenate(each, axis=2)
 
 
-def _is_good(values: Any, n_rows: int) -> bool:
-    """Whether it needs no other check: what nearly every map returns, and a message takes longer than the features."""
-    return (
+def _checked(values: Any, n_rows: int, fitted_map: Any, name: str) -> np.ndarray:
+    """What a map returned, as an array of finite floats. Errors name the map."""
+    # Nearly every map returns such an array. It needs no name, which takes longer than the features to write.
+    if (
         type(values) is np.ndarray
         and values.dtype == np.float64
         and values.ndim in (2, 3)
         and len(values) == n_rows
         and values.size > 0
-        and bool(np.abs(values).max() <= LARGEST)  # False if there is a NaN
-    )
-
-
-def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
-    """What a map returned as an array of floats, or an error that names the map."""
+        and np.abs(values).max() <= LARGEST  # False if there is a NaN
+    ):
+        return values
+    called = f"{name}={fitted_map!r}"
     values = as_floats(values.toarray() if issparse(values) else values, f"What {called} returns")
     if values.ndim not in (2, 3) or len(values) != n_rows:
         raise ValueError(
@@ -190,119 +146,35 @@ def _checked(values: Any, n_rows: int, called: str) -> np.ndarray:
     return values
 
 
-def shape_text(shape: tuple[int, ...]) -> str:
-    """What a row has, for errors: its columns, or outputs x columns."""
+def _shape_text(shape: tuple[int, ...]) -> str:
+    """The number of columns, or outputs x columns, for errors."""
     return " x ".join(map(str, shape))
 
 
-# --- X and y through both maps ----------------------------------------------------------------------------------------
+# --- X through both maps ----------------------------------------------------------------------------------------------
 
-# What the maps make of all rows is kept if it fits in so many bytes; else they are applied anew at each pass.
+# Inputs and features of all rows are kept if they fit in this many bytes. Otherwise each pass applies the maps again.
 MAPPED_BYTES = 32 * 2**20
 
-
-# Of a row's kernel inputs, and of its features.
+# Shapes of a row's kernel inputs and features.
 RowShapes = tuple[tuple[int, ...], tuple[int, ...]]
-
-
-def check_shapes(mapped: tuple[np.ndarray, np.ndarray], shapes: RowShapes) -> None:
-    """Refuse inputs and features of rows that have other columns than those before."""
-    found = mapped[0].shape[1:], mapped[1].shape[1:]
-    if found != shapes:
-        raise ValueError(
-            "kernel_map and feature_map must return the same number of columns for all rows; they returned "
-            f"({', '.join(map(shape_text, shapes))}) and ({', '.join(map(shape_text, found))})."
-        )
-
-
-class MappedRows:
-    """Loads rows: a slice or indices -> kernel inputs, features and targets.
-
-    Parameters
-    ----------
-    given : array-like of shape (n, n_columns)
-        What the maps see: X as the user gave it if it is a data frame, else X.
-    X : ndarray of shape (n, n_columns)
-        What the kernel sees; where it has a map, the data frame itself will do.
-    y : ndarray of shape (n, o)
-    feature_map, kernel_map : transformer or None
-        Fitted.
-    chosen : Chosen, optional
-        Which rows of these count; None are all.
-    shapes : (tuple, tuple), optional
-        Of a row's inputs and features; None are those of the first row.
-    """
-
-    def __init__(
-        self,
-        given: Any,
-        X: Any,
-        y: np.ndarray,
-        feature_map: Any,
-        kernel_map: Any,
-        chosen: Chosen | None = None,
-        shapes: RowShapes | None = None,
-    ):
-        self.given, self.X, self.y = given, X, y
-        self.chosen = Chosen(len(X)) if chosen is None else chosen
-        self.feature_map, self.kernel_map = feature_map, kernel_map
-        self._mapped: tuple[np.ndarray, np.ndarray] | None = None
-        self._lock = Lock()
-        self._shapes = shapes
-        first = self._through_maps(slice(0, MAP_ROWS))
-        made = (first[0][0].size if kernel_map is not None else 0) + first[1][0].size
-        n_rows = self.chosen.n_rows
-        if made and 8 * made * n_rows <= MAPPED_BYTES:
-            self._mapped = first if n_rows <= MAP_ROWS else self._through_maps(slice(0, n_rows))
-
-    def __call__(self, rows: slice | np.ndarray) -> RawRows:
-        if self._mapped is not None:
-            inputs, features = (values[rows] for values in self._mapped)
-        else:
-            # Transformers need not be safe to call from several threads.
-            with self._lock:
-                inputs, features = self._through_maps(rows)
-        weights = (None if each is None else each[rows] for each in (self.chosen.counts, self.chosen.precision))
-        return RawRows(inputs, features, np.asarray(self.y[self._given(rows)], dtype=np.float64), *weights)
-
-    def _given(self, rows: slice | np.ndarray) -> slice | np.ndarray:
-        """Where rows are among those that were given."""
-        return rows if self.chosen.positions is None else self.chosen.positions[rows]
-
-    def _through_maps(self, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's inputs and the features of rows."""
-        rows = self._given(rows)
-        X = take_rows(self.X, rows)
-        given = X if self.given is self.X else take_rows(self.given, rows)
-        mapped = map_rows(given, X, self.feature_map, self.kernel_map)
-        if self._shapes is None:
-            self._shapes = mapped[0].shape[1:], mapped[1].shape[1:]
-        check_shapes(mapped, self._shapes)
-        return mapped
-
-    def __getstate__(self) -> dict[str, Any]:
-        return {**vars(self), "_lock": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        vars(self).update(state, _lock=Lock())
 
 
 @dataclass(frozen=True)
 class Maps:
-    """The fitted maps of a model, an example of the rows that they were fitted to, and number and names of X's columns.
-
-    ``shapes`` are those of a row's kernel inputs and features, once they are known.
-    """
+    """The fitted maps of a model."""
 
     feature_map: Any
     kernel_map: Any
+    # A few of the rows that they were fitted to, and number and names of the columns of X.
     example: Any = None
     n_columns: int = 0
     columns: np.ndarray | None = None
+    # None: not known yet.
     shapes: RowShapes | None = None
 
     def __getstate__(self) -> dict[str, Any]:
-        # A data frame as arrays: whoever reads it need not have its package.
+        # A data frame is saved as arrays, because its package need not be installed when the file is read.
         return {**vars(self), "example": FrameColumns.of(self.example) or self.example}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -310,17 +182,64 @@ class Maps:
         vars(self).update(state, example=example.frame() if isinstance(example, FrameColumns) else example)
 
     def rows(self, given: Any, X: Any, rows: slice | np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The kernel's inputs and the features of some rows, given as the maps see them and as the kernel does."""
+        """Kernel inputs and features of some rows. The maps see ``given``, and without a map the kernel sees X."""
         array = take_rows(X, rows)
         given = array if given is X else take_rows(given, rows)
-        found = map_rows(given, array, self.feature_map, self.kernel_map)
-        if self.shapes is not None:
-            check_shapes(found, self.shapes)
-        return found
+        inputs = array if self.kernel_map is None else apply_map(self.kernel_map, given, "kernel_map")
+        features = np.empty((len(array), 0))
+        if self.feature_map is not None:
+            features = apply_map(self.feature_map, given, "feature_map")
+        shapes = inputs.shape[1:], features.shape[1:]
+        if self.shapes is not None and shapes != self.shapes:
+            raise ValueError(
+                "kernel_map and feature_map must return the same number of columns for all rows; they returned "
+                f"({', '.join(map(_shape_text, self.shapes))}) and ({', '.join(map(_shape_text, shapes))})."
+            )
+        return inputs, features
 
 
-def map_rows(given: Any, X: Any, feature_map: Any, kernel_map: Any) -> tuple[np.ndarray, np.ndarray]:
-    """The kernel's inputs and the features of rows X; the maps see ``given``."""
-    inputs = X if kernel_map is None else apply_map(kernel_map, given, "kernel_map")
-    features = np.empty((len(X), 0)) if feature_map is None else apply_map(feature_map, given, "feature_map")
-    return inputs, features
+class MappedRows:
+    """A function that loads rows: a slice or indices -> kernel inputs, features and targets y (n, o).
+
+    ``given`` and X are as of `Maps.rows`. X may be a data frame if the kernel has a map.
+    """
+
+    def __init__(self, given: Any, X: Any, y: np.ndarray, maps: Maps, chosen: Chosen | None = None):
+        self.given, self.X, self.y = given, X, y
+        self.chosen = Chosen(len(X)) if chosen is None else chosen
+        self._lock = Lock()
+        self._kept: tuple[np.ndarray, np.ndarray] | None = None
+        first = maps.rows(given, X, self._positions(slice(0, MAP_ROWS)))
+        self.maps = replace(maps, shapes=(first[0].shape[1:], first[1].shape[1:]))
+        n_numbers = (first[0][0].size if maps.kernel_map is not None else 0) + first[1][0].size
+        n_rows = self.chosen.n_rows
+        if n_numbers and 8 * n_numbers * n_rows <= MAPPED_BYTES:
+            everything = self._positions(slice(0, n_rows))
+            self._kept = first if n_rows <= MAP_ROWS else self.maps.rows(given, X, everything)
+
+    def __call__(self, rows: slice | np.ndarray) -> RawRows:
+        positions = self._positions(rows)
+        if self._kept is not None:
+            inputs, features = self._kept[0][rows], self._kept[1][rows]
+        else:
+            # Transformers need not be safe to call from several threads.
+            with self._lock:
+                inputs, features = self.maps.rows(self.given, self.X, positions)
+        counts, precision = self.chosen.counts, self.chosen.precision
+        return RawRows(
+            inputs,
+            features,
+            np.asarray(self.y[positions], dtype=np.float64),
+            None if counts is None else counts[rows],
+            None if precision is None else precision[rows],
+        )
+
+    def _positions(self, rows: slice | np.ndarray) -> slice | np.ndarray:
+        """Indices of rows in the user's X."""
+        return rows if self.chosen.positions is None else self.chosen.positions[rows]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "_lock": None}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state, _lock=Lock())

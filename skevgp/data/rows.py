@@ -1,4 +1,4 @@
-"""The rows of a data set: in the user's units wherever they are, and in internal units as the inference sees them."""
+"""The rows of a data set: in the user's units wherever they are stored, and in internal units for the inference."""
 
 from __future__ import annotations
 
@@ -15,46 +15,32 @@ from .blocks import AnyBlock, Batch, Block, Blocks, LocalBlocks, SplitBlock
 from .threads import BlockMap, ordered_sum
 
 Total = TypeVar("Total")
-# Of targets: which outputs.
+# Indices of outputs.
 Columns = slice | list[int]
 
-# Rows that a pass over raw rows sees at once.
+# A sum over rows loads this many rows at once.
 PASS_ROWS = 16_384
 
 
 @dataclass(frozen=True)
 class RawRows:
-    """Some rows in the user's units.
+    """Some rows, in the user's units or in internal ones."""
 
-    Attributes
-    ----------
-    inputs : ndarray of shape (n, d) or (n, o, d)
-        The kernel's, of all outputs or of each.
-    features : ndarray of shape (n, p) or (n, o, p)
-        h(x), of all outputs or of each.
-    targets : ndarray of shape (n, o)
-    counts, precision : ndarray of shape (n,), optional
-        w, how often a row counts, and ω = w / v, where its noise variance is σ² v. None: 1; both or neither.
-    log_variance : ndarray of shape (n,), optional
-        What the bound has for log v, where v is not known but for a q.
-    """
-
+    # (n, d), or (n, o, d) if each output has its own: the kernel's inputs.
     inputs: np.ndarray
+    # (n, p), or (n, o, p) if each output has its own: h(x).
     features: np.ndarray
+    # (n, o): y, or residuals in internal units.
     targets: np.ndarray
+    # (n,): the weight w of each row, and ω = w / v, where the row's noise variance is σ² v. Both are None if all are 1.
     counts: np.ndarray | None = None
     precision: np.ndarray | None = None
+    # (n,): E[log v], if v has a distribution q(v). None: log v.
     log_variance: np.ndarray | None = None
 
     def __getitem__(self, rows: slice | np.ndarray) -> RawRows:
-        """Some of them."""
-        some: list[Any] = [None if part is None else part[rows] for part in self.parts]
+        some: list[Any] = [None if values is None else values[rows] for values in vars(self).values()]
         return RawRows(*some)
-
-    @property
-    def parts(self) -> tuple[Any, ...]:
-        """Their arrays, or None, in the order of the attributes."""
-        return self.inputs, self.features, self.targets, self.counts, self.precision, self.log_variance
 
     @property
     def total(self) -> float:
@@ -62,13 +48,13 @@ class RawRows:
         return len(self.inputs) if self.counts is None else float(self.counts.sum())
 
     def of(self, columns: Columns) -> RawRows:
-        """Some of the outputs; of a single one inputs and features have no axis of outputs."""
-        inputs, features = (of_outputs(values, columns) for values in (self.inputs, self.features))
+        """Some outputs of these rows."""
+        inputs, features = of_outputs(self.inputs, columns), of_outputs(self.features, columns)
         return replace(self, inputs=inputs, features=features, targets=self.targets[:, columns])
 
 
 def of_outputs(values: np.ndarray, columns: Columns) -> np.ndarray:
-    """Rows (n, k), or what is there for some outputs of rows for each output (n, o, k)."""
+    """Inputs or features of some outputs: (n, k) for all outputs stay, (n, o, k) become (n, k) for a single output."""
     if values.ndim == 2:
         return values
     values = values[:, columns]
@@ -76,7 +62,7 @@ def of_outputs(values: np.ndarray, columns: Columns) -> np.ndarray:
 
 
 def times_weights(features: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """h(x)ᵀ weights (n, o), of features (n, p) or (n, o, p) and the weights (o, p) of each output."""
+    """h(x)ᵀ β of each output, (n, o), for features (n, p) or (n, o, p) and weights β (o, p)."""
     return features @ weights.T if features.ndim == 2 else np.einsum("nop,op->no", features, weights)
 
 
@@ -84,38 +70,29 @@ class Source(Protocol):
     """All rows of a data set: in memory, in a file, or on other machines. Their order never changes."""
 
     n_rows: int
-    # Of each row among the user's; None if they are in his order.
+    # (n_rows,): index of each row in the user's X. None: the rows are in the user's order.
     positions: np.ndarray | None
 
     def sum(self, function: Callable[[RawRows], Total]) -> Total:
-        """The sum of function(piece) over pieces of the rows, by ``+``; ``function`` can be pickled."""
+        """The sum of function(piece) over pieces of the rows, by ``+``. It must be possible to pickle ``function``."""
 
-    def take(self, rows: np.ndarray) -> RawRows:
-        """Some rows, by index."""
-
-    def part(self, first: int, end: int) -> Source:
-        """Consecutive rows, at least one."""
+    def take(self, rows: np.ndarray, /) -> RawRows:
+        """Load rows by index."""
 
     def some(self, rows: np.ndarray) -> Source:
-        """Rows by index, at least one; in ascending order if they are Dask's, whose chunks stay in theirs."""
+        """A data set of one or more rows by index. Dask needs ascending order, because chunks keep theirs."""
 
     def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
-        """The rows as blocks for so many inducing points, each made by ``make``, with a share of the memory."""
+        """Blocks for a number of inducing points. ``make`` makes each, and ``share`` is their share of the memory."""
 
 
 @dataclass(frozen=True)
 class Moments:
-    """Count, mean, scatter and range of columns; sums of them are exact (Chan, Golub & LeVeque 1983, eq. 2.1).
+    """Count, mean, scatter and range of columns. They can be added (Chan, Golub & LeVeque 1983, equation 2.1)."""
 
-    Attributes
-    ----------
-    n : float
-        The sum of the weights, if rows have some.
-    mean, squares, lowest, highest : ndarray of shape (columns,), or (o, columns) of columns for each output
-        ``squares`` is the sum of squared deviations from the mean.
-    """
-
+    # Σ w, or the number of rows.
     n: float
+    # Each (columns,), or (o, columns) if each output has its own. ``squares`` is Σ w (x - mean)².
     mean: np.ndarray
     squares: np.ndarray
     lowest: np.ndarray
@@ -123,14 +100,14 @@ class Moments:
 
     @classmethod
     def of(cls, values: np.ndarray, weights: np.ndarray | None = None) -> Self:
-        """Of an array (n, columns) with at least one row, and its rows' weights (n,), above 0; None are ones."""
+        """The moments of at least one row (n, columns) with positive weights (n,)."""
         lowest, highest = values.min(axis=0), values.max(axis=0)
         n = len(values) if weights is None else float(weights.sum())
         # The mean of equal numbers may round.
         average = values.mean(axis=0) if weights is None else np.tensordot(weights, values, 1) / n
         mean = np.where(lowest == highest, lowest, average)
         squares = (values - mean) ** 2
-        # What is too large for it is refused by its size.
+        # Numbers whose squares overflow raise an error elsewhere.
         with np.errstate(over="ignore"):
             total = np.sum(squares, axis=0) if weights is None else np.tensordot(weights, squares, 1)
         return cls(n, mean, total, lowest, highest)
@@ -146,7 +123,7 @@ class Moments:
         )
 
     def at(self, columns: Columns) -> Self:
-        """Of some outputs, of columns (k,) or (o, k); of a single one without an axis of outputs."""
+        """The moments of some outputs, as `of_outputs` selects them."""
         each = (self.mean, self.squares, self.lowest, self.highest)
         return type(self)(self.n, *(of_outputs(values[np.newaxis], columns)[0] for values in each))
 
@@ -166,7 +143,7 @@ class Moments:
 
 
 def moments_of_rows(raw: RawRows) -> tuple[Moments, Moments, Moments]:
-    """Of inputs, features and targets, whose weights are ω: the noisier a row, the less it says of them."""
+    """Moments of inputs and features, weighted by w, and of targets, weighted by ω."""
     return (
         Moments.of(raw.inputs, raw.counts),
         Moments.of(raw.features, raw.counts),
@@ -174,181 +151,135 @@ def moments_of_rows(raw: RawRows) -> tuple[Moments, Moments, Moments]:
     )
 
 
+@dataclass(eq=False)
 class LocalSource:
-    """Rows that this process can load.
+    """Rows that this process can load."""
 
-    Parameters
-    ----------
-    load : callable
-        Slice or indices -> RawRows.
-    n_rows : int
-    positions : ndarray of shape (n_rows,), optional
-        Of each row among the user's; None if they are in the user's order.
-    chosen : slice or ndarray of shape (n_rows,), optional
-        Which of the rows that ``load`` knows these are; None are all.
-    factors, log_variance : ndarray of shape (n_rows,), optional
-        ω is multiplied by the first, and the second is added to log v.
-    """
-
-    def __init__(
-        self,
-        load: Callable[[slice | np.ndarray], RawRows],
-        n_rows: int,
-        positions: np.ndarray | None = None,
-        chosen: slice | np.ndarray | None = None,
-        factors: np.ndarray | None = None,
-        log_variance: np.ndarray | None = None,
-    ):
-        self.load, self.n_rows, self.positions = load, n_rows, positions
-        self._chosen, self._factors, self._log_variance = chosen, factors, log_variance
+    # Loads a slice or indices. A slice may end after the last row.
+    take: Callable[[slice | np.ndarray], RawRows]
+    n_rows: int
+    # As of `Source`.
+    positions: np.ndarray | None = None
 
     @classmethod
     def holding(cls, rows: RawRows) -> Self:
-        """Of rows in memory."""
+        """Rows in memory."""
         return cls(rows.__getitem__, len(rows.inputs))
-
-    def take(self, rows: slice | np.ndarray) -> RawRows:
-        """Load some rows."""
-        if isinstance(self._chosen, slice):
-            first, end = self._chosen.start, self._chosen.stop
-            known: Any = (
-                slice(first + rows.start, min(first + rows.stop, end)) if isinstance(rows, slice) else first + rows
-            )
-        else:
-            known = rows if self._chosen is None else self._chosen[rows]
-        raw = self.load(known)
-        if self._factors is None or self._log_variance is None:
-            return raw
-        factors, log_variance = self._factors[rows], self._log_variance[rows]
-        if raw.counts is None or raw.precision is None:
-            return replace(raw, counts=np.ones(len(factors)), precision=factors, log_variance=log_variance)
-        log_v = np.log(raw.counts / raw.precision)
-        return replace(raw, precision=raw.precision * factors, log_variance=log_variance + log_v)
 
     def sum(self, function: Callable[[RawRows], Total]) -> Total:
         pieces = (self.take(slice(first, first + PASS_ROWS)) for first in range(0, self.n_rows, PASS_ROWS))
         return ordered_sum(map(function, pieces))
 
-    def part(self, first: int, end: int) -> LocalSource:
-        return LocalSource(self.take, end - first, chosen=slice(first, end))
-
     def some(self, rows: np.ndarray) -> LocalSource:
-        """Rows by index, as a data set of their own."""
-        return LocalSource(self.take, len(rows), chosen=rows)
+        return LocalSource(partial(_some, self.take, rows), len(rows))
 
-    def weighed(self, factors: np.ndarray, log_variance: np.ndarray) -> LocalSource:
-        """The same rows with ω times ``factors`` (n_rows,), and with so much added to their log v."""
-        return LocalSource(self.take, self.n_rows, self.positions, None, factors, log_variance)
+    def reweighted(self, factors: np.ndarray, log_variance: np.ndarray) -> LocalSource:
+        """The same rows, with ω multiplied by factors (n_rows,), and with log_variance (n_rows,) added to log v."""
+        return LocalSource(partial(_reweighted, self.take, factors, log_variance), self.n_rows, self.positions)
 
-    def blocks(self, make: Callable[[RawRows], AnyBlock], n_inducing: int, threads: BlockMap, share: float) -> Blocks:
-        return LocalBlocks(partial(made, self.take, make), self.n_rows, n_inducing, threads, share)
+    def blocks(
+        self,
+        make: Callable[[RawRows], AnyBlock],
+        n_inducing: int,
+        threads: BlockMap | None = None,
+        share: float = 1.0,
+        keep: bool = True,
+    ) -> Blocks:
+        return LocalBlocks(partial(self._block, make), self.n_rows, n_inducing, threads, share, keep)
+
+    def _block(self, make: Callable[[RawRows], AnyBlock], rows: slice) -> AnyBlock:
+        return make(self.take(rows))
 
 
-def made(take: Callable[[slice], RawRows], make: Callable[[RawRows], AnyBlock], rows: slice) -> AnyBlock:
-    """A block of rows: take them, then make it."""
-    return make(take(rows))
+# Workers of Dask receive sources. Therefore they hold partial functions, which can be pickled, and no closures.
 
 
-# --- in internal units: residuals in place of targets, of order one ---------------------------------------------------
+def _some(take: Callable[[np.ndarray], RawRows], chosen: np.ndarray, rows: slice | np.ndarray) -> RawRows:
+    return take(chosen[rows])
 
-# Residuals that scatter by no more than so many times the variance of the targets' rounding do not vary.
+
+def _reweighted(
+    take: Callable[[slice | np.ndarray], RawRows],
+    factors: np.ndarray,
+    log_variance: np.ndarray,
+    rows: slice | np.ndarray,
+) -> RawRows:
+    raw, factors, log_variance = take(rows), factors[rows], log_variance[rows]
+    if raw.counts is None or raw.precision is None:
+        return replace(raw, counts=np.ones(len(factors)), precision=factors, log_variance=log_variance)
+    log_v = np.log(raw.counts / raw.precision)
+    return replace(raw, precision=raw.precision * factors, log_variance=log_variance + log_v)
+
+
+# --- in internal units: residuals of order one instead of targets -----------------------------------------------------
+
+# Residuals are constant if their variance is at most this many times the variance of the targets' rounding.
 _ROUNDED = 16.0
-# Mini-batches are drawn from so many rows at a time: shuffling needs memory.
+# Mini-batches are drawn from this many rows at a time, because a permutation needs memory.
 _SHUFFLED_ROWS = 2**18
 
-
-class Preparer(Protocol):
-    """What `Rows` needs of a kernel."""
-
-    def prepare(self, inputs: np.ndarray) -> Any:
-        """What the kernel computes once of rows (n, d)."""
-
-
-# From the user's units to the internal ones: (inputs, features, residuals) as `RawRows`.
+# From the user's units to internal ones: targets become residuals.
 ToInternal = Callable[[RawRows], RawRows]
 
 
-@dataclass(frozen=True)
-class MakeBlock:
-    """Rows in the user's units -> `Block` of some outputs, or `SplitBlock` of groups of them.
+class Preparer(Protocol):
+    """The part of a kernel that `Rows` needs."""
 
-    Attributes
-    ----------
-    kernels : tuple of Preparer
-        One, or that of each group.
-    to_internal : callable
-    outputs : slice or list of int
-    groups : tuple of slice, optional
-        Of these outputs.
+    def prepare(self, inputs: np.ndarray) -> Any:
+        """Compute all that depends on the rows (n, d) only, once for all parameters."""
+
+
+def block_of(
+    raw: RawRows,
+    kernels: Sequence[Preparer],
+    to_internal: ToInternal,
+    columns: Columns = slice(None),
+    groups: Sequence[slice] | None = None,
+) -> AnyBlock:
+    """The block of some outputs of rows in the user's units.
+
+    With groups of these outputs, it is a `SplitBlock`. ``kernels`` are those of the groups, or one.
     """
-
-    kernels: tuple[Preparer, ...]
-    to_internal: ToInternal
-    outputs: Columns = field(default_factory=lambda: slice(None))
-    groups: tuple[slice, ...] | None = None
-
-    def __call__(self, raw: RawRows) -> AnyBlock:
-        rows = self.to_internal(raw).of(self.outputs)
-        if self.groups is None:
-            return _block(rows, self.kernels[0].prepare(rows.inputs))
-        each = [rows.of(outputs) for outputs in self.groups]
-        prepared = [kernel.prepare(own.inputs) for kernel, own in zip(self.kernels, each, strict=True)]
-        return SplitBlock(
-            {group.start: _block(own, made) for group, own, made in zip(self.groups, each, prepared, strict=True)}
-        )
-
-
-def _block(rows: RawRows, prepared: Any) -> Block:
-    # A column's numbers side by side: products and errors take the columns, not the rows.
-    linear = np.asfortranarray(np.hstack([rows.features, rows.targets]))
-    block = Block(prepared, linear, rows.features.shape[1])
-    if rows.counts is not None and rows.precision is not None:
-        block.counts, block.roots = rows.counts, np.sqrt(rows.precision)
-        linear *= block.roots[:, np.newaxis]
-        log_v = np.log(rows.counts / rows.precision) if rows.log_variance is None else rows.log_variance
-        block.log_variance = float(rows.counts @ log_v)
-    return block
+    rows = to_internal(raw).of(columns)
+    blocks = []
+    for kernel, own in zip(kernels, [rows] if groups is None else map(rows.of, groups), strict=True):
+        prepared = kernel.prepare(own.inputs)
+        # Products read columns, so each column is contiguous.
+        linear = np.asfortranarray(np.hstack([own.features, own.targets]))
+        block = Block(prepared, linear, own.features.shape[1])
+        if own.counts is not None and own.precision is not None:
+            block.counts, block.roots = own.counts, np.sqrt(own.precision)
+            linear *= block.roots[:, np.newaxis]
+            log_v = np.log(own.counts / own.precision) if own.log_variance is None else own.log_variance
+            block.log_variance = float(own.counts @ log_v)
+        blocks.append(block)
+    if groups is None:
+        return blocks[0]
+    return SplitBlock({group.start: block for group, block in zip(groups, blocks, strict=True)})
 
 
-@dataclass(frozen=True)
-class _InternalMoments:
-    """Rows in the user's units -> moments of the inputs and the residuals in internal units."""
-
-    to_internal: ToInternal
-
-    def __call__(self, raw: RawRows) -> tuple[Moments, Moments]:
-        rows = self.to_internal(raw)
-        return Moments.of(rows.inputs, rows.counts), Moments.of(rows.targets, rows.precision)
+def _internal_moments(to_internal: ToInternal, raw: RawRows) -> tuple[Moments, Moments]:
+    """Moments of the inputs, weighted by w, and of the residuals, weighted by ω."""
+    rows = to_internal(raw)
+    return Moments.of(rows.inputs, rows.counts), Moments.of(rows.targets, rows.precision)
 
 
 @dataclass(frozen=True)
 class Rows:
-    """All rows of a data set, as an estimator hands them to the inference.
+    """All rows of a data set in internal units."""
 
-    Attributes
-    ----------
-    source : Source
-        In the user's units.
-    to_internal : callable
-        From there to residuals in place of targets: y minus the reference linear part, in units of its own size.
-    columns : slice or list of int
-        The outputs that count.
-    share : float
-        Of the memory for blocks, for one of several fits at once.
-    threads : BlockMap
-        What blocks are worked on by.
-    constant : ndarray of bool, optional
-        Which of all outputs do not vary, so that what scatters of them is rounding.
-    rounding : ndarray, optional
-        The variance of the rounding of each output.
-    """
-
+    # Rows in the user's units, and the function that converts them.
     source: Source
     to_internal: ToInternal
+    # The outputs that are used. `residuals`, `constant` and `rounding` are those of all outputs.
     columns: Columns = field(default_factory=lambda: slice(None))
+    # Share of the memory for blocks, for one of several fits at once.
     share: float = 1.0
+    # The threads that work on blocks.
     threads: BlockMap = field(default_factory=BlockMap)
+    # (outputs,): whether residuals are constant except for rounding. None: False.
     constant: np.ndarray | None = None
+    # (outputs,): the variance of the residuals' rounding. None: 0.
     rounding: np.ndarray | None = None
 
     def __len__(self) -> int:
@@ -356,72 +287,95 @@ class Rows:
 
     @cached_property
     def _moments(self) -> tuple[Moments, Moments]:
-        return self.source.sum(_InternalMoments(self.to_internal))
+        return self.source.sum(partial(_internal_moments, self.to_internal))
 
     @property
     def inputs(self) -> Moments:
-        """Of the inputs' columns (d,), or (o, d) where outputs have inputs of their own."""
+        """Moments of the inputs' columns (d,), or (o, d) if each output has its own."""
         return self._moments[0].at(self.columns)
 
     @property
     def residuals(self) -> Moments:
-        """Of the residuals of all outputs."""
+        """Moments of the residuals of all outputs."""
         return self._moments[1]
-
-    def noisier(self, variance: np.ndarray | None) -> Rows:
-        """With noise variances (n, n_outputs) of all outputs in units of σ², of which these share the mean."""
-        if variance is None:
-            return self
-        if not isinstance(self.source, LocalSource):
-            raise TypeError("Rows of Dask arrays have no noise of their own.")
-        own = variance[:, self.columns].mean(axis=1)
-        return replace(self, source=self.source.weighed(1.0 / own, np.log(own)))
 
     @property
     def total(self) -> float:
-        """Σ w: rows, each as often as it counts."""
-        return self.inputs.n
+        """Σ w."""
+        return self._moments[0].n
 
     @property
     def mean_precision(self) -> float:
-        """The mean of 1 / v, Σ ω / Σ w: a noise variance σ² is one of σ² / this, on average."""
-        return self.residuals.n / self.inputs.n
+        """Σ ω / Σ w, the weighted mean of 1 / v. A typical noise variance of a row is σ² divided by it."""
+        return self._moments[1].n / self._moments[0].n
+
+    def is_constant(self) -> np.ndarray:
+        """Whether each output (o,) is constant."""
+        n_outputs = len(self.residuals.mean)
+        return (np.zeros(n_outputs, dtype=bool) if self.constant is None else self.constant)[self.columns]
 
     def scatter(self) -> np.ndarray:
-        """The noise variance σ² (o,) that would explain how residuals vary; the mean of 1 / v where they do not."""
+        """The noise variance σ² (o,) that explains the variance of the residuals, `mean_precision` if constant."""
         scatter, rounding = self.residuals.variance, 0.0 if self.rounding is None else self.rounding
-        varies = (scatter > _ROUNDED * rounding)[self.columns] & ~self.still()
+        varies = (scatter > _ROUNDED * rounding)[self.columns] & ~self.is_constant()
         return np.where(varies, scatter[self.columns], 1.0) * self.mean_precision
 
-    def still(self) -> np.ndarray:
-        """Which outputs (o,) do not vary."""
-        n_outputs = len(self.residuals.mean)
-        constant = np.zeros(n_outputs, dtype=bool) if self.constant is None else self.constant
-        return constant[self.columns]
+    # --- some rows or outputs -----------------------------------------------------------------------------------------
 
     def some(self, chosen: np.ndarray) -> RawRows:
-        """Rows by index, in internal units."""
+        """Load rows by index, in internal units."""
         return self.to_internal(self.source.take(chosen)).of(self.columns)
 
     def sample(self, size: int, rng: np.random.RandomState) -> RawRows:
-        """All rows, or ``size`` of them drawn at random, in their order."""
+        """Load all rows, or ``size`` random rows in their order."""
         chosen = np.arange(len(self))
         if len(self) > size:
             chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
         return self.some(chosen)
 
+    def random_subset(self, size: int, rng: np.random.RandomState) -> Rows:
+        """``size`` random rows in random order, held in memory."""
+        chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
+        raw, order = self.source.take(chosen), rng.permutation(size)
+        return replace(self, source=LocalSource.holding(raw[order]))
+
+    def subset(self, chosen: np.ndarray, share: float = 1.0) -> Rows:
+        """Rows by index, with a share of the memory. Dask needs ascending order."""
+        return replace(self, source=self.source.some(chosen), share=self.share * share)
+
+    def outputs(self, columns: Columns, share: float = 1.0) -> Rows:
+        """The same rows with some of these outputs, and a share of the memory."""
+        if self.columns != slice(None):
+            columns = np.arange(len(self.residuals.mean))[self.columns][columns].tolist()
+        return replace(self, columns=columns, share=self.share * share)
+
+    def noisier(self, variance: np.ndarray | None) -> Rows:
+        """The same rows with noise variances (n, outputs) in units of σ². These outputs share their mean."""
+        if variance is None:
+            return self
+        if not isinstance(self.source, LocalSource):
+            raise TypeError("Rows of Dask arrays have no noise of their own.")
+        own = variance[:, self.columns].mean(axis=1)
+        return replace(self, source=self.source.reweighted(1.0 / own, np.log(own)))
+
+    def user_order(self) -> np.ndarray:
+        """Indices of the rows, in the order in which the user gave them."""
+        positions = self.source.positions
+        return np.arange(len(self)) if positions is None else np.argsort(positions)
+
+    # --- blocks and mini-batches --------------------------------------------------------------------------------------
+
     def blocks(
         self, kernel: Preparer | Sequence[Preparer], n_inducing: int, groups: tuple[slice, ...] | None = None
     ) -> Blocks:
-        """The rows as blocks for a kernel with so many inducing points, perhaps split by groups with one each."""
+        """Blocks for a kernel and a number of inducing points, or for groups of these outputs with a kernel each."""
         kernels = tuple(kernel) if isinstance(kernel, Sequence) else (kernel,)
-        make = MakeBlock(kernels, self.to_internal, self.columns, groups)
+        make = partial(block_of, kernels=kernels, to_internal=self.to_internal, columns=self.columns, groups=groups)
         return self.source.blocks(make, n_inducing, self.threads, self.share)
 
     def batches(self, kernel: Preparer, size: int, rng: np.random.RandomState) -> Iterator[Batch]:
-        """Mini-batches without end: each epoch shuffles the rows anew and leaves out what does not fill a batch."""
+        """Mini-batches without end. Each epoch shuffles the rows and leaves out those that do not fill a batch."""
         size = min(size, len(self))
-        make = MakeBlock((kernel,), self.to_internal, self.columns)
         # Parts of nearly equal length, none of them shorter than a batch.
         ends = np.linspace(0, len(self), max(len(self) // max(_SHUFFLED_ROWS, size), 1) + 1).astype(int)
         parts = list(pairwise(ends))
@@ -430,32 +384,5 @@ class Rows:
                 first, last = parts[part]
                 order = first + rng.permutation(last - first)
                 for begin in range(0, len(order) - size + 1, size):
-                    yield Batch(make(self.source.take(order[begin : begin + size])))
-
-    def sampled(self, size: int, rng: np.random.RandomState) -> Rows:
-        """``size`` of the rows, drawn at random and held in memory, in random order."""
-        chosen = np.sort(sample_without_replacement(len(self), size, random_state=rng))
-        raw, order = self.source.take(chosen), rng.permutation(size)
-        return replace(self, source=LocalSource.holding(raw[order]))
-
-    def as_given(self) -> np.ndarray:
-        """The rows, by index, in the order in which the user gave them."""
-        positions = self.source.positions
-        return np.arange(len(self)) if positions is None else np.argsort(positions)
-
-    def some_of(self, chosen: np.ndarray, share: float) -> Rows:
-        """Rows by index, in ascending order where the source is Dask's, with a share of the memory."""
-        return replace(self, source=self.source.some(chosen), share=self.share * share)
-
-    def part(self, first: int, end: int, share: float) -> Rows:
-        """Consecutive rows, with a share of the memory."""
-        return replace(self, source=self.source.part(first, end), share=self.share * share)
-
-    def within(self, group: slice) -> Rows:
-        """The same rows with some of these outputs."""
-        columns = np.arange(len(self.residuals.mean))[self.columns][group].tolist()
-        return replace(self, columns=columns)
-
-    def outputs(self, columns: Columns, share: float = 1.0) -> Rows:
-        """The same rows with some of the outputs."""
-        return replace(self, columns=columns, share=share)
+                    raw = self.source.take(order[begin : begin + size])
+                    yield Batch(block_of(raw, (kernel,), self.to_internal, self.columns))

@@ -1,4 +1,4 @@
-"""Sums in a fixed order and jobs side by side, in threads that hold BLAS and OpenMP to one thread each."""
+"""Sums in a fixed order, and threads in which BLAS and OpenMP use one thread each."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
-from functools import lru_cache
+from functools import lru_cache, reduce
 from itertools import islice
 from sys import modules
 from threading import Lock
@@ -24,11 +24,9 @@ _lock, _users, _limits = Lock(), 0, list[Any]()
 
 @contextmanager
 def single_threaded_libraries() -> Iterator[None]:
-    """Hold BLAS and OpenMP to one thread: results then do not depend on how many there could be.
-
-    The limit on BLAS is the process's: of several fits at once the first sets it and the last lifts it. That on OpenMP
-    is each thread's own.
-    """
+    """Limit BLAS and OpenMP to one thread, so that results do not depend on the number of cores."""
+    # The limit on BLAS holds for the process: the first of several fits sets it, and the last one removes it. The limit
+    # on OpenMP holds for this thread.
     global _users
     with _one_thread("openmp"):
         with _lock:
@@ -47,33 +45,32 @@ def single_threaded_libraries() -> Iterator[None]:
 
 
 def _one_thread(user_api: str) -> Any:
-    """A limit on these libraries only: one of `threadpool_limits`, when lifted, also sets the others back."""
+    """Limit the libraries of one API."""
+    # `threadpool_limits` would also reset the others when the limit is removed.
     return _controller(len(modules)).select(user_api=user_api).limit(limits=1)
 
 
 @lru_cache(maxsize=1)
 def _controller(n_modules: int) -> ThreadpoolController:
-    """What controls the libraries that are loaded: to look for them takes milliseconds, and imports load more."""
+    """The controller of the loaded libraries. A search takes milliseconds, and is repeated after further imports."""
     return ThreadpoolController()
 
 
 def _take_control() -> None:
-    """Let this thread limit OpenBLAS, whichever did before it.
-
-    From threadpoolctl 3.6 on the first thread that sets a limit is the only one that can, while it lives; a fit may run
-    in any thread, and the lock above keeps several from fighting.
-    """
+    """Let this thread limit OpenBLAS."""
+    # From threadpoolctl 3.6 on, only the first thread that sets a limit can change it, as long as that thread lives. A
+    # fit may run in any thread, and the lock above orders several fits.
     if hasattr(OpenBLASController, "clear_controlling_thread"):
         OpenBLASController.clear_controlling_thread(force=True)
 
 
 def thread_pool(n_threads: int) -> ThreadPoolExecutor:
-    """Threads in which BLAS and OpenMP are held to one thread."""
+    """Threads in which BLAS and OpenMP use one thread."""
     return ThreadPoolExecutor(n_threads, initializer=threadpool_limits, initargs=(1,))
 
 
 def add(first: Any, second: Any) -> Any:
-    """First + second; of tuples, entry by entry."""
+    """Return first + second. Tuples are added entry by entry."""
     if isinstance(first, tuple):
         return tuple(a + b for a, b in zip(first, second, strict=True))
     return first + second
@@ -81,18 +78,13 @@ def add(first: Any, second: Any) -> Any:
 
 def ordered_sum(parts: Iterable[Any]) -> Any:
     """The sum of at least one part, from the first to the last."""
-    iterator = iter(parts)
-    total = next(iterator)
-    for part in iterator:
-        total = add(total, part)
-    return total
+    return reduce(add, parts)
 
 
 class BlockMap:
-    """Apply a function to parts of the data, in threads if there are several, and yield results in the parts' order.
+    """Apply a function to parts of the data, in threads if there are several, and yield results in order.
 
-    Few parts are under way at once, so that memory does not grow with their number, and the order of summation never
-    depends on the number of threads, so neither do the bits of a sum.
+    The bits of a sum over parts do not depend on the number of threads, because its order does not.
     """
 
     def __init__(self, n_threads: int = 1):
@@ -103,6 +95,7 @@ class BlockMap:
         if self._pool is None:
             yield from map(function, parts)
             return
+        # Only a few parts are submitted at once. Memory then does not grow with their number.
         waiting = iter(parts)
         running: deque[Future[Total]] = deque()
         try:
@@ -123,12 +116,9 @@ class BlockMap:
 
 
 def side_by_side(one: Callable[[Part], Total], jobs: Sequence[Part], n_threads: int, monitor: Monitor) -> list[Total]:
-    """Each job's result; Ctrl-C stops the monitor, upon which jobs end with what they have."""
-    results: list[Total] = []
+    """Run jobs in threads, and return their results in order. Ctrl-C stops the monitor, and jobs return their best."""
     if n_threads < 2:
-        for job in jobs:
-            results.append(one(job))
-        return results
+        return [one(job) for job in jobs]
     futures: list[Future[Total]] = []
     with thread_pool(n_threads) as pool:
         with monitor.keeping_the_best():
@@ -136,7 +126,7 @@ def side_by_side(one: Callable[[Part], Total], jobs: Sequence[Part], n_threads: 
                 futures.append(pool.submit(one, job))
             done, _ = wait(futures, return_when=FIRST_EXCEPTION)
             if any(future.exception() for future in done):
-                # The error is the result: nobody waits for the others.
+                # The error is raised without waiting for the other jobs.
                 monitor.stop()
                 pool.shutdown(wait=False, cancel_futures=True)
                 next(future for future in futures if future in done and future.exception()).result()

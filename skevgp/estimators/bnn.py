@@ -16,7 +16,7 @@ from sklearn.utils import check_random_state
 from sklearn.utils.validation import check_is_fitted
 
 from ..data.threads import single_threaded_libraries
-from ..data.weights import Chosen, chosen_rows, rows_of
+from ..data.weights import Chosen, rows_of
 from ..exceptions import warn_user
 from ..solvers.adam import adam, is_flat
 from ..utils.monitor import Monitor, monitor_of
@@ -239,7 +239,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             inputs, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64)
             targets = np.asarray(targets, dtype=np.float64).reshape(len(inputs), -1)
             # Rows of weight 0 are left out. counts (n,) are the weights of the others, or None if all are 1.
-            chosen: Chosen = chosen_rows(inputs, targets, sample_weight)
+            chosen = Chosen.of(inputs, targets, sample_weight)
             inputs, targets = rows_of(inputs, chosen.positions), rows_of(targets, chosen.positions)
             check_size(inputs, "X")
             check_size(targets, "y")

@@ -86,8 +86,8 @@ def calibrated(
     rng = np.random.RandomState(seed)
     if by.groups is None and len(rows) > _MOST_ROWS:
         # More rows tell no more, and the memory for folds would grow with them.
-        rows = rows.some_of(np.unique(np.linspace(0, len(rows) - 1, _MOST_ROWS).astype(int)), 1.0)
-    folds = by.folds(rows.as_given(), rng)
+        rows = rows.subset(np.unique(np.linspace(0, len(rows) - 1, _MOST_ROWS).astype(int)))
+    folds = by.folds(rows.user_order(), rng)
     if len(folds) < 2 or not any(table[name].free.any() for name in ("signal", "noise")):
         return None
     try:
@@ -121,7 +121,7 @@ def _by_folds(
         signals = variances(table["signal"], at_bound, np.clip(at_bound, s_low, s_high), s_high)
     searches = _searches(model, values, folds, rows, signals, noises)
     found = list(rows.threads(VarianceSearch.best, searches))
-    gone, dependent, still = 0, False, rows.still()
+    gone, dependent, still = 0, False, rows.is_constant()
     if by.groups is not None:
         explained = (values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()) & ~still
         groups = [by.groups[fold.predicted] for fold in folds]
@@ -136,7 +136,7 @@ def _by_folds(
     elif table["noise"].free.any() and len(rows) >= _FEWEST_DEPENDENT:
         fixed = [Variance(value, value, value) for value in at_bound.tolist()]
         others = variances(table["noise"], values["noise"], np.maximum(low, np.minimum(left_over, high)), high)
-        in_blocks = folds_in_order(rows.as_given(), by.n_folds, rng)
+        in_blocks = folds_in_order(rows.user_order(), by.n_folds, rng)
         blocks = _searches(model, values, in_blocks, rows, fixed, others)
         random = [replace(own, signal=s2, noise=n2) for own, s2, n2 in zip(searches, fixed, others, strict=True)]
         dependent = _dependent(rows, searches, found, blocks, random)
@@ -155,7 +155,7 @@ def _dependent(
 ) -> bool:
     """Whether blocks of consecutive rows are predicted worse than random folds: neighbouring rows are then alike."""
     worse = [block.loss(*best) - own.loss(*best) for block, own, best in zip(blocks, searches, found, strict=True)]
-    if max(worse) > _WORSE and follow_a_path(rows.as_given(), lambda some: rows.some(some).inputs):
+    if max(worse) > _WORSE and follow_a_path(rows.user_order(), lambda some: rows.some(some).inputs):
         return True
     by_blocks, by_chance = (
         np.array([noise for _, noise in rows.threads(VarianceSearch.best, own)]) for own in (blocks, random)
@@ -190,8 +190,8 @@ def _searches(
 ) -> list[VarianceSearch]:
     """A search for each output, in order. It takes one pass over the rows for each group of outputs."""
     m, share = values["inducing_points"].shape[1], 1.0 / len(folds)
-    all_of = [model.blocks(rows.some_of(fold.rows, share), m) for fold in folds]
-    predicted = [model.blocks(rows.some_of(fold.predicted, share), m) for fold in folds]
+    all_of = [model.blocks(rows.subset(fold.rows, share), m) for fold in folds]
+    predicted = [model.blocks(rows.subset(fold.predicted, share), m) for fold in folds]
     each = []
     for outputs, whitening in zip(model.groups, model.whitenings(values), strict=True):
         of_others = sums_of_others([collect(fold, whitening, outputs) for fold in all_of])

@@ -299,7 +299,7 @@ def fit_exact(
     if problem.max_iter > 0:
         each = [(rows, best.values["noise"])]
         if others:
-            each = [(rows.within(slice(o, o + 1)), best.values["noise"][[o]]) for o in range(len(kernels))]
+            each = [(rows.outputs(slice(o, o + 1)), best.values["noise"][[o]]) for o in range(len(kernels))]
         told = [
             learned_too_little(own, best.values | {"noise": noise}, table, own_rows, sparse=False)
             for own, (own_rows, noise) in zip(kernels, each, strict=True)

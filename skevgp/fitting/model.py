@@ -235,7 +235,7 @@ class Model:
 
     @cached_property
     def _sample(self) -> Rows:
-        return self.rows.sampled(self.samples[-1], self.rng)
+        return self.rows.random_subset(self.samples[-1], self.rng)
 
     @cached_property
     def blocks(self) -> Blocks:
@@ -258,7 +258,7 @@ class Model:
         """Minus the bound per row and its gradient, of a sample of ``n_rows`` rows or of all."""
         if n_rows is not None:
             # A smaller sample is the first part of the larger one.
-            blocks = self.sparse.blocks(self._sample.part(0, n_rows, 1.0), self.n_inducing)
+            blocks = self.sparse.blocks(self._sample.subset(np.arange(n_rows)), self.n_inducing)
             return BoundObjective(self.sparse, table, blocks)
         if self.exact is not None:
             return LikelihoodObjective(self.exact, table)
@@ -458,5 +458,5 @@ class Model:
         for group, outputs in enumerate(self.sparse.groups):
             kernel, hyperparameters = self.sparse.kernel_of(values, group)
             own = {"hyperparameters": hyperparameters, "noise": values["noise"][outputs]}
-            told.append(learned_too_little(kernel, own, self.table, self.rows.within(outputs)))
+            told.append(learned_too_little(kernel, own, self.table, self.rows.outputs(outputs)))
         return max(told)

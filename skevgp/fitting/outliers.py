@@ -50,7 +50,7 @@ class RowDoubts:
         source = rows.source
         if not isinstance(source, LocalSource):
             raise TypeError("Rows of Dask arrays cannot be doubted.")
-        return replace(rows, source=source.weighed(self.scales.mean, self.scales.log_variance))
+        return replace(rows, source=source.reweighted(self.scales.mean, self.scales.log_variance))
 
     def told(self, fitted: FittedModel) -> FittedModel:
         """A fitted model with the noise variance of rows that are not outliers. No upper bound is known."""
@@ -105,7 +105,7 @@ def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tup
 def _first_doubts(model: Model) -> RowDoubts:
     """Noise scales from a short fit to some rows. The median of its errors gives the variance."""
     rows, size = model.rows, max(_LOOK_ROWS, _LOOK_ROWS_PER_POINT * model.n_inducing)
-    some = rows.sampled(size, model.rng) if size < len(rows) else rows
+    some = rows.random_subset(size, model.rng) if size < len(rows) else rows
     short = replace(model, rows=some, max_iter=min(_LOOK_ITERATIONS, model.max_iter), monitor=model.monitor.silent())
     look = look_at(rows, predictor_at(short, search(short).values))
     n_outputs = look.errors.shape[1]

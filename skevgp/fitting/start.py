@@ -178,7 +178,7 @@ def with_signal_of_constants(
 
     During the fit they have almost no signal, so that they do not dominate the kernel that they share.
     """
-    still, start = rows.still(), table["signal"].start
+    still, start = rows.is_constant(), table["signal"].start
     if problem.spec.starts.signal.value is not None or not still.any() or still.all():
         return values, False
     alone = start / problem.rules.signal_limits[0]

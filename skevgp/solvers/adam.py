@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import numpy as np
@@ -209,18 +208,11 @@ def adam(
     return minimum
 
 
-@dataclass(frozen=True)
-class _Typical:
-    """The median of losses, which single steps that went too far do not change, and its variance."""
-
-    value: float
-    variance: float
-
-    @classmethod
-    def of(cls, losses: np.ndarray) -> _Typical:
-        low, median, high = np.percentile(losses, [25.0, 50.0, 75.0])
-        # Quartiles of a normal distribution are 1.35 standard deviations apart.
-        return cls(float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses))
+def _median(losses: np.ndarray) -> tuple[float, float]:
+    """The median of losses (a few steps that went too far do not move it), and the variance of that median."""
+    low, median, high = np.percentile(losses, [25.0, 50.0, 75.0])
+    # As for a normal distribution, whose quartiles are 1.35 standard deviations apart.
+    return float(median), 0.5 * np.pi * ((high - low) / 1.35) ** 2 / len(losses)
 
 
 def is_flat(losses: np.ndarray, tol: float) -> bool:
@@ -228,8 +220,8 @@ def is_flat(losses: np.ndarray, tol: float) -> bool:
     n = len(losses) // 3
     if n == 0:
         return False
-    before, after = _Typical.of(losses[-2 * n : -n]), _Typical.of(losses[-n:])
-    return abs(before.value - after.value) < max(tol, 2.0 * np.sqrt(before.variance + after.variance))
+    (before, before_variance), (after, after_variance) = _median(losses[-2 * n : -n]), _median(losses[-n:])
+    return abs(before - after) < max(tol, 2.0 * np.sqrt(before_variance + after_variance))
 
 
 class _BestSoFar:

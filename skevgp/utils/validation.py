@@ -175,7 +175,7 @@ def checked_groups(groups: Any, n_samples: int, name: str = "groups") -> np.ndar
     if groups is None:
         return None
     try:
-        labels = np.asarray(groups.compute() if hasattr(groups, "__dask_graph__") else groups)
+        labels = np.asarray(groups.compute() if is_dask(groups) else groups)
     except ValueError as error:
         raise ValueError(f"{name} must be one label for each row: {error}") from error
     if labels.shape != (n_samples,):

@@ -9,7 +9,7 @@ import pytest
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor
-from skevgp.data.maps import MappedRows, map_rows
+from skevgp.data.maps import MappedRows, Maps
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (400, 2))
@@ -33,7 +33,7 @@ class Counting(FunctionTransformer):
 
 
 def mapped(feature_map=None, kernel_map=None, X=X, y=Y):
-    return MappedRows(X, X, y, feature_map, kernel_map)
+    return MappedRows(X, X, y, Maps(feature_map, kernel_map))
 
 
 def test_without_maps_the_kernel_sees_X_and_there_are_no_features():
@@ -80,8 +80,8 @@ def test_mapped_rows_can_be_sent_to_workers():
 
 def test_a_frame_is_for_the_maps():
     frame = pd.DataFrame(X, columns=["a", "b"])
-    inputs, features = map_rows(frame, X, FunctionTransformer(lambda given: given[["b"]]), None)
-    assert inputs is X
+    inputs, features = Maps(FunctionTransformer(lambda given: given[["b"]]), None).rows(frame, X, slice(0, 400))
+    np.testing.assert_array_equal(inputs, X)
     np.testing.assert_array_equal(features, X[:, 1:])
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.blocks import Block
-from skevgp.data.rows import LocalSource, MakeBlock, Moments, RawRows, Rows, moments_of_rows
+from skevgp.data.rows import LocalSource, Moments, RawRows, Rows, block_of, moments_of_rows
 from skevgp.data.threads import BlockMap
 
 RNG = np.random.RandomState(0)
@@ -58,12 +58,12 @@ def test_sums_are_over_pieces_in_order(source):
         np.testing.assert_allclose(found.variance, values.var(axis=0), rtol=1e-12)
 
 
-def test_a_part_is_some_rows_and_has_parts_itself(source):
-    part = source.part(100, 131)
+def test_some_rows_are_a_source_of_which_some_can_be_chosen(source):
+    part = source.some(np.arange(100, 131))
     assert part.n_rows == 31
     assert part.sum(lambda raw: raw.targets[:, 0].tolist()) == Y[100:131, 0].tolist()
     np.testing.assert_array_equal(part.take(np.array([0, 30])).inputs, X[[100, 130]])
-    np.testing.assert_array_equal(part.part(30, 31).take(np.array([0])).inputs, X[[130]])
+    np.testing.assert_array_equal(part.some(np.array([30])).take(np.array([0])).inputs, X[[130]])
     # The rows that follow are not its own.
     np.testing.assert_array_equal(part.take(slice(28, 50)).inputs, X[128:131])
 
@@ -73,7 +73,7 @@ def test_blocks_are_made_of_the_loaded_rows(source):
         assert isinstance(raw, RawRows)
         return Block(raw.inputs, np.hstack([raw.features, raw.targets]), raw.features.shape[1])
 
-    for own, expected in [(source, H), (source.part(3, 90), H[3:90])]:
+    for own, expected in [(source, H), (source.some(np.arange(3, 90)), H[3:90])]:
         sums = own.blocks(make, 10, BlockMap(), 1.0).linear
         assert sums.n_rows == len(expected)
         np.testing.assert_allclose(sums.HH[0], expected.T @ expected, rtol=1e-12)
@@ -85,7 +85,7 @@ class Loads:
 
 
 def test_what_is_sent_to_workers_can_be_pickled():
-    part = pickle.loads(pickle.dumps(LocalSource(Loads(), 400).part(10, 20)))
+    part = pickle.loads(pickle.dumps(LocalSource(Loads(), 400).some(np.arange(10, 20))))
     np.testing.assert_array_equal(part.take(np.arange(10)).inputs, X[10:20])
 
 
@@ -110,11 +110,11 @@ def rows(targets=Y, **options):
 
 def test_a_block_is_of_prepared_inputs_features_and_some_residuals():
     raw = LocalSource.holding(RawRows(X, H, Y)).take(np.arange(4))
-    block = MakeBlock((Identity(),), halved, slice(1, 2))(raw)
+    block = block_of(raw, (Identity(),), halved, slice(1, 2))
     np.testing.assert_array_equal(block.prepared, X[:4])
     np.testing.assert_array_equal(block.features, H[:4])
     np.testing.assert_array_equal(block.residuals, 0.5 * Y[:4, 1:])
-    np.testing.assert_array_equal(MakeBlock((Identity(),), halved)(raw).residuals, 0.5 * Y[:4])
+    np.testing.assert_array_equal(block_of(raw, (Identity(),), halved).residuals, 0.5 * Y[:4])
 
 
 def test_moments_are_of_inputs_and_residuals_in_internal_units():
@@ -139,8 +139,8 @@ def test_some_outputs():
     assert own.residuals.mean.shape == (2,)
 
 
-def test_a_part_is_of_consecutive_rows_and_has_a_share_of_the_share():
-    part = rows(share=0.5).part(20, 30, 0.1)
+def test_a_subset_has_a_share_of_the_share():
+    part = rows(share=0.5).subset(np.arange(20, 30), 0.1)
     assert (len(part), part.share) == (10, 0.05)
     np.testing.assert_allclose(part.blocks(Identity(), 6).linear.HH[0], H[20:30].T @ H[20:30], rtol=1e-12)
 
@@ -195,7 +195,7 @@ def test_batches_follow_the_generator():
 
 
 def test_a_sample_is_some_of_the_rows_once_each_in_random_order():
-    sample = rows().sampled(60, np.random.RandomState(3))
+    sample = rows().random_subset(60, np.random.RandomState(3))
     got = sample.some(np.arange(60))
     found = [int(np.flatnonzero((one == X).all(axis=1))[0]) for one in got.inputs]
     assert len(set(found)) == 60
@@ -203,4 +203,4 @@ def test_a_sample_is_some_of_the_rows_once_each_in_random_order():
     np.testing.assert_array_equal(got.features, H[found])
     np.testing.assert_array_equal(got.targets, 0.5 * Y[found])
     # Its beginning is a sample, too.
-    np.testing.assert_array_equal(sample.part(0, 20, 1.0).some(np.arange(20)).inputs, got.inputs[:20])
+    np.testing.assert_array_equal(sample.subset(np.arange(20)).some(np.arange(20)).inputs, got.inputs[:20])

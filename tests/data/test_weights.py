@@ -33,7 +33,7 @@ def test_the_first_of_rows_that_were_joined_is_named_and_each_finds_its_own():
         same = np.flatnonzero((np.hstack([X, Y]) == np.hstack([X, Y])[position]).all(axis=1))
         assert position == same[0]
         np.testing.assert_array_equal(np.flatnonzero(once.as_given(np.arange(once.n_rows)) == index), same)
-    np.testing.assert_array_equal(np.sort(once.repeated), np.arange(60))
+    np.testing.assert_array_equal(np.sort(once.unmerged), np.arange(60))
 
 
 def test_rows_of_weight_0_are_left_out_and_have_nothing():
@@ -48,9 +48,9 @@ def test_rows_of_weight_0_are_left_out_and_have_nothing():
 
 def test_rows_of_other_labels_or_noise_are_others():
     labels = RNG.randint(0, 2, 60)
-    apart = Chosen.of(X, Y, labels=labels)
+    apart = Chosen.of(X, Y, groups=labels)
     assert apart.n_rows == len(np.unique(np.column_stack([X, Y, labels]), axis=0))
-    for position, row in zip(apart.repeated, apart.alike[apart.repeated], strict=True):
+    for position, row in zip(apart.unmerged, apart.merged_into[apart.unmerged], strict=True):
         assert labels[position] == labels[apart.positions[row]]
     variance = 1.0 + labels
     noisy = Chosen.of(X, Y, None, variance)
@@ -68,13 +68,13 @@ def test_what_is_not_used_costs_nothing():
     assert backwards.counts is None is backwards.precision
 
 
-@pytest.mark.parametrize("way", [Chosen.of, Chosen.in_order])
-def test_many_rows_and_new_ones_stay_in_their_order(way, monkeypatch):
-    monkeypatch.setattr(module, "ORDERED_ROWS", 10)
-    data = (X, Y) if way == Chosen.of else (60,)
-    assert way(*data, None, None) == Chosen(60)
+@pytest.mark.parametrize("ordered", [True, False])
+def test_many_rows_and_new_ones_stay_in_their_order(ordered, monkeypatch):
+    if ordered:
+        monkeypatch.setattr(module, "ORDERED_ROWS", 10)
+    assert Chosen.of(X, Y, ordered=ordered) == Chosen(60)
     counts = np.tile([0.0, 2.0, 1.0], 20)
-    chosen = way(*data, counts, 0.5 * np.ones(60))
+    chosen = Chosen.of(X, Y, counts, 0.5 * np.ones(60), ordered=ordered)
     np.testing.assert_array_equal(chosen.positions, np.flatnonzero(counts))
     np.testing.assert_array_equal(chosen.counts, counts[counts > 0])
     np.testing.assert_array_equal(chosen.precision, 2.0 * counts[counts > 0])

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from skevgp.data.blocks import Batch, LocalBlocks
-from skevgp.data.rows import MakeBlock, RawRows
+from skevgp.data.rows import RawRows, block_of
 from skevgp.model.bounds import bounds_alone, bounds_at_optimum, upper_bound
 from skevgp.model.exact import ExactModel
 from skevgp.model.model import SparseModel
@@ -30,7 +30,7 @@ def weighted(rows, counts=None, variance=None):
 
 
 def blocks_of(raw, kernel, size=17):
-    make = MakeBlock((kernel,), lambda rows: rows)
+    make = partial(block_of, kernels=(kernel,), to_internal=lambda rows: rows)
     return LocalBlocks(lambda rows: make(raw[rows]), len(raw.inputs), 6, size=size)
 
 
@@ -139,7 +139,7 @@ def test_what_a_jitter_leaves_of_rows_that_have_been_forgotten_in_part():
     """The sums of rows that count once, a tenth of them."""
     model, raw, values = far_apart(np.ones(20))
     statistics = model.statistics(values, blocks_of(raw, model.kernel))[0].scaled(0.1)
-    rows = RawRows(*raw.parts[:3], np.full(20, 0.1), np.full(20, 0.1))
+    rows = replace(raw, counts=np.full(20, 0.1), precision=np.full(20, 0.1))
     likelihood = dense(values, rows, model.prior)[1]
     assert likelihood < model.upper_bound(values, [statistics])
 
@@ -158,7 +158,7 @@ def test_the_gradient_of_the_papers_loss_agrees_with_finite_differences(name):
     model, rows, table = model_with(KERNELS[name], n=30, m=4, p=2)
     raw = weighted(rows, *drawn(30))
     elbo = ElboObjective(model, table, blocks_of(raw, model.kernel, 30))
-    batch = Batch(MakeBlock((model.kernel,), lambda rows: rows)(raw[:11]))
+    batch = Batch(block_of(raw[:11], (model.kernel,), lambda rows: rows))
     x = elbo.table.start() + 0.1 * np.random.RandomState(1).randn(elbo.table.size)
     _, gradient = elbo.evaluate(x, batch)
     differences = central_differences(lambda x: elbo.evaluate(x, batch)[0], x, 1e-5)
@@ -170,8 +170,8 @@ def test_mini_batches_are_right_on_average_whatever_the_rows_weigh():
     raw = weighted(rows, *drawn(60))
     elbo = ElboObjective(model, table, blocks_of(raw, model.kernel, 60))
     x = elbo.table.start() + 0.1 * np.random.RandomState(1).randn(elbo.table.size)
-    make = MakeBlock((model.kernel,), lambda rows: rows)
-    parts = [elbo.evaluate(x, Batch(make(raw[first : first + 20]))) for first in range(0, 60, 20)]
+    blocks = [block_of(raw[first : first + 20], (model.kernel,), lambda rows: rows) for first in range(0, 60, 20)]
+    parts = [elbo.evaluate(x, Batch(block)) for block in blocks]
     loss, gradient = elbo.evaluate(x, elbo.blocks)
     assert np.mean([part[0] for part in parts]) == pytest.approx(loss, rel=1e-10)
     np.testing.assert_allclose(np.mean([part[1] for part in parts], axis=0), gradient, rtol=1e-7, atol=1e-10)
@@ -190,8 +190,8 @@ def test_the_exact_likelihood_of_rows_that_count_twice_and_of_known_noise(vague)
     counts = np.random.RandomState(1).randint(1, 4, test_exact.N)
     _, variance = drawn(test_exact.N)
     again = np.repeat(np.arange(test_exact.N), counts)
-    rows = RawRows(*model.rows.parts[:3], counts.astype(float), counts / variance)
-    repeated = RawRows(*model.rows.parts[:3], np.ones(test_exact.N), 1.0 / variance)[again]
+    rows = replace(model.rows, counts=counts.astype(float), precision=counts / variance)
+    repeated = replace(model.rows, counts=np.ones(test_exact.N), precision=1.0 / variance)[again]
     once, twice = (ExactModel(model.kernel, model.prior, vague, raw) for raw in (rows, repeated))
     value, gradient = once.log_likelihood(test_exact.VALUES)
     expected, expected_gradient = twice.log_likelihood(test_exact.VALUES)
@@ -206,7 +206,7 @@ def test_the_exact_likelihood_of_rows_that_count_twice_and_of_known_noise(vague)
 def test_the_exact_likelihood_is_the_dense_one_and_so_is_its_gradient():
     model, _ = test_exact.problem(test_exact.VAGUE["proper"])
     counts, variance = drawn(test_exact.N)
-    raw = RawRows(*model.rows.parts[:3], counts, counts / variance)
+    raw = replace(model.rows, counts=counts, precision=counts / variance)
     model = ExactModel(model.kernel, model.prior, model.vague, raw)
     values = test_exact.VALUES
     value, gradient = model.log_likelihood(values)
