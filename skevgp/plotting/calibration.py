@@ -130,8 +130,6 @@ class CalibrationDisplay:
         ------
         ValueError, TypeError
             As for `from_predictions`, and if the estimator has no standard deviation.
-        ImportError
-            If matplotlib is not installed.
         """
         return cls.from_predictions(
             y,
@@ -187,8 +185,6 @@ class CalibrationDisplay:
         ValueError, TypeError
             If shapes differ, a value is not finite, a standard deviation is negative, the number of names is not that
             of the outputs, or ``n_levels`` is not an integer of at least 2.
-        ImportError
-            If matplotlib is not installed.
         """
         check_integer(n_levels, "n_levels", minimum=2)
         levels = interval_levels(y_true, y_pred, std)
@@ -225,11 +221,6 @@ class CalibrationDisplay:
         -------
         self : CalibrationDisplay
             The display itself, with ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed.
         """
         ax = axes_of(ax)
         self._plot_band(ax)

@@ -84,8 +84,6 @@ class CoefficientDisplay:
         ------
         ValueError
             If the regressor has no explicit features, or there is no such output.
-        ImportError
-            If matplotlib is not installed.
         """
         check_fitted(estimator)
         if not hasattr(estimator, "coef_"):
@@ -118,11 +116,6 @@ class CoefficientDisplay:
         -------
         self : CoefficientDisplay
             The display itself, with ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed.
         """
         ax = axes_of(ax)
         places = np.arange(len(self.names))[::-1]

@@ -128,8 +128,6 @@ class LearningCurveDisplay:
             If a size is not a possible number of groups, sizes do not ascend, or X, y and groups differ in length.
         TypeError
             If a size or n_runs is not an integer.
-        ImportError
-            If matplotlib is not installed.
         """
         require("matplotlib.pyplot", "Plotting")  # raises the error before the fits
         check_consistent_length(X, y, groups)
@@ -179,8 +177,6 @@ class LearningCurveDisplay:
         ------
         ValueError
             If ``log_scale=True`` and a score is not positive.
-        ImportError
-            If matplotlib is not installed.
         """
         positive = bool(np.nanmin(self.scores) > 0)
         if log_scale and not positive:

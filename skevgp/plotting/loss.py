@@ -74,8 +74,6 @@ class LossDisplay:
         ------
         ValueError
             If there are no iterations, for example after ``max_iter=0``.
-        ImportError
-            If matplotlib is not installed.
         """
         check_fitted(estimator)
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
@@ -110,11 +108,6 @@ class LossDisplay:
         -------
         self : LossDisplay
             The display itself, with ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed.
         """
         ax = axes_of(ax)
         others = [ax.get_ylim()] if ax.lines else []

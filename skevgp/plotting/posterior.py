@@ -121,8 +121,6 @@ class PosteriorDisplay:
         ValueError
             If y or x does not have a value per row of X, only one of x_train and y_train is given, their lengths
             differ, or there is no such output.
-        ImportError
-            If matplotlib is not installed.
         """
         check_is_fitted(estimator)
         mean, std = (part.reshape(len(part), -1) for part in estimator.predict(X, return_std=True))
@@ -164,11 +162,6 @@ class PosteriorDisplay:
         -------
         self : PosteriorDisplay
             The display itself, with ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed.
         """
         ax = axes_of(ax)
         order = np.argsort(self.x, kind="stable")

@@ -125,8 +125,6 @@ class RolloutDisplay:
         ValueError, TypeError
             If there is no such state or initial state, truth or names do not fit the rollout, or the number of axes is
             not that of the states.
-        ImportError
-            If matplotlib is not installed.
         """
         own = _of_one(ahead, index)
         n_steps, n_states = own.mean.shape
@@ -174,8 +172,6 @@ class RolloutDisplay:
         ------
         ValueError
             If the number of axes is not that of the panels.
-        ImportError
-            If matplotlib is not installed.
         """
         check_integer(n_samples, "n_samples", minimum=0)
         panels = _panels(axes, self.mean.shape[1])

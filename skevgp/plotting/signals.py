@@ -109,8 +109,6 @@ class SignalsDisplay:
         ------
         ValueError
             If there is no such file or joint, or axes are of another shape.
-        ImportError
-            If matplotlib is not installed.
         """
         n_files = len(log.recordings)
         if file not in range(-n_files, n_files):
@@ -143,8 +141,6 @@ class SignalsDisplay:
         ------
         ValueError
             If axes are of another shape.
-        ImportError
-            If matplotlib is not installed.
         """
         panels = _axes(axes, len(self.joint_names))
         for row, (name, label) in enumerate(_PANELS.items()):
