@@ -34,7 +34,7 @@ P = ParamSpec("P")
 _OF_WEIGHTS = ("coef_", "coef_std_", "coef_cov_", "coef_names_", "coef_prior_mean_", "coef_prior_scale_")
 # Attributes that are computed when they are read.
 _AFTER_FIT = ("lower_bound_", "upper_bound_")
-# Arguments of version 0.1, and where they are now.
+# Arguments of version 0.1, and their new places.
 _MOVED = {
     "coef_mean": "coef_prior=skevgp.CoefPrior(mean=...)",
     "coef_scale": "coef_prior=skevgp.CoefPrior(scale=...)",
@@ -197,7 +197,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
-        # scikit-learn has it only if its option ``display`` is "diagram".
+        # The attribute exists only if scikit-learn's option ``display`` is "diagram".
         diagram: Callable[[], str] = super()._repr_html_
         return lambda: diagram() + html_of(self)
 

@@ -38,11 +38,11 @@ from ..utils.validation import (
 _EPOCHS, _STEPS = 100, 5000
 # Rows per step if batch_size is "auto".
 _BATCH_SIZE = 200
-# Numbers that a layer of a prediction holds at once.
+# Maximum number of floats in a layer of a prediction.
 _NUMBERS_AT_ONCE = 2**21
 # A column is constant if its entries differ by no more than this many rounding errors.
 _ROUNDING = 8.0 * np.finfo(float).eps
-# Added to the variance of a pre-activation: a row of zeros has none, and its square root needs a slope there.
+# Added to the variance of a pre-activation, whose square root needs a slope even if all inputs are 0.
 _TINY = 1e-32
 # Bounds of the standard deviations, in units of the prior's, and of the noise variances of standardised targets.
 _STD, _NOISE_VARIANCE = (1e-9, 1e3), (1e-12, 1e6)

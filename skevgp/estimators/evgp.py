@@ -386,7 +386,7 @@ class EVGPRegressor(GaussianProcess):
             raise ValueError(f"forgetting_factor must be at most 1; got {forgetting_factor!r}.")
         if not self.__sklearn_is_fitted__():
             return self.fit(X, y, sample_weight, relative_variance=relative_variance)
-        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        self._validate_params()  # scikit-learn validates only models that are not fitted
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(

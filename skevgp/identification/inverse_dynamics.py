@@ -419,7 +419,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
-        # scikit-learn has it only if its option ``display`` is "diagram".
+        # The attribute exists only if scikit-learn's option ``display`` is "diagram".
         diagram: Callable[[], str] = super()._repr_html_
         return lambda: diagram() + html_of(self)
 

@@ -20,7 +20,7 @@ _WORDS = {
     "edge": "cut: filter's edge",
     "too short": "cut: too short",
 }
-_MARGIN = 0.25  # of a panel's height, beyond what was processed
+_MARGIN = 0.25  # above and below the processed signals, as a share of a panel's height
 
 
 class SignalsDisplay:

@@ -103,7 +103,7 @@ def physical_consistency(parameters: np.ndarray) -> np.ndarray:
         lever = np.divide(first, mass[..., None], out=np.zeros_like(first), where=mass[..., None] != 0.0)
         spread = pseudo[..., :3, :3] - first[..., :, None] * lever[..., None, :]
     possible = np.isfinite(spread).all(axis=(-2, -1)) & ((mass != 0.0) | (first == 0.0).all(axis=-1))
-    spread = np.where(possible[..., None, None], spread, -np.eye(3))  # a first moment without a mass
+    spread = np.where(possible[..., None, None], spread, -np.eye(3))  # not physical: a first moment without a mass
     moments = np.linalg.eigvalsh(0.5 * (spread + spread.swapaxes(-2, -1)))
     size = np.abs(moments).mean(axis=-1)
     smallest = np.divide(moments[..., 0], size, out=np.zeros_like(size), where=size > 0.0)
