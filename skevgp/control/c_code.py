@@ -14,10 +14,10 @@ import numpy as np
 from ..utils.casadi import casadi
 from ..utils.files import replacing
 
-# CasADi explains each instruction, matrices and all.
+# Comments of CasADi on each instruction, including whole matrices.
 _EXPLANATION = re.compile(r"^ *\/\* #\d+:.*?\*\/\n", re.MULTILINE | re.DOTALL)
 
-# Names that are taken where the generated C is compiled: words of the language and variables that it uses, ...
+# Names with a meaning in the generated C: words of the language and variables, ...
 _WORDS = """
 auto break case char const continue default do double else enum extern float for goto if inline int long register
 restrict return short signed sizeof static struct switch typedef union unsigned void volatile while asm typeof alignas
@@ -26,7 +26,7 @@ x mean variance arg res iw w abort abs calloc exit free labs malloc memcpy memse
 fpclassify isfinite isnormal signbit isgreater isgreaterequal isless islessequal islessgreater isunordered signgam
 HUGE_VAL HUGE_VALF HUGE_VALL INFINITY NAN math_errhandling
 """
-# ... functions of <math.h>, of which there are three each, ...
+# ... functions of <math.h> for three types each, ...
 _FUNCTIONS = """
 acos asin atan atan2 cos sin tan acosh asinh atanh cosh sinh tanh exp exp2 exp10 expm1 frexp ilogb ldexp log log10 log1p
 log2 logb modf scalb scalbn scalbln cbrt fabs hypot pow sqrt erf erfc lgamma tgamma gamma ceil floor nearbyint rint
@@ -34,7 +34,7 @@ lrint llrint round lround llround trunc fmod remainder drem remquo copysign nan 
 isinf isnan finite significand j0 j1 jn y0 y1 yn sincos
 """
 _TAKEN = {*_WORDS.split(), *(f"{name}{kind}" for name in _FUNCTIONS.split() for kind in ("", "f", "l"))}
-# ... and what begins like this.
+# ... and names that begin with one of these.
 _TAKEN_STARTS = ("casadi_", "FP_", "MATH_")
 
 _HEADER = """\
@@ -156,7 +156,7 @@ def _parts_of(function: Any, jacobian: bool) -> dict[str, tuple[Any, list[str]]]
     mean, variance = function(x)
     found = {"predict": (name, {"mean": mean, "variance": variance})}
     if jacobian:
-        # A column of CasADi is a row of C.
+        # CasADi stores columns, so that the transpose has the rows of C.
         slopes = {
             "mean_jacobian": ca.densify(ca.jacobian(mean, x)).T,
             "variance_jacobian": ca.densify(ca.jacobian(variance, x)).T,

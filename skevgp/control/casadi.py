@@ -78,7 +78,7 @@ class Exported:
         ca = casadi()
         parts = self._parts()
         ends = np.cumsum([0, *(part.size for part in parts)]).tolist()
-        # CasADi has columns where NumPy has rows.
+        # CasADi stores matrices by columns, NumPy by rows.
         open_ = [
             ca.reshape(values, part.shape[-1], int(np.prod(part.shape[:-1])))
             for values, part in zip(ca.vertsplit(given, ends), parts, strict=True)
@@ -134,7 +134,7 @@ def _expression(own: Map, x: Any, argument: str) -> Mapped:
 
 def _at(group: PredictorGroup, inputs: Mapped, features: Mapped) -> tuple[Any, Any, Any]:
     """Return k̃(X_m, x), k̃(x, x) and the features of a group."""
-    kernel: Any = group.kernel  # the mathematics names no class
+    kernel: Any = group.kernel  # the type in `model` has no expressions
     own = kernel.expression(np.log(group.hyperparameters), group.points, _of(inputs, group.outputs))
     return *own, _of(features, group.outputs)
 

@@ -1,4 +1,4 @@
-"""Data sets: robots' own logs, simulated robots (with Pinocchio) and toys."""
+"""Data sets: logs of robots, simulated robots (with Pinocchio) and toy data."""
 
 from ..robots import list_robots, load_robot, perturb_robot
 from .control import ComputedTorqueController, quintic_reference

@@ -13,28 +13,28 @@ from .plant import Plant
 def quintic_reference(
     q0: ArrayLike, q1: ArrayLike, duration: float, times: ArrayLike
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The minimum-jerk motion between two positions at rest.
+    """Return the minimum-jerk motion between two positions at rest.
 
-    With s = t / duration: q0 + (q1 - q0) (10 s³ - 15 s⁴ + 6 s⁵), then q1, held.
+    With s = t / duration, it is q0 + (q1 - q0) (10 s³ - 15 s⁴ + 6 s⁵), and q1 afterwards.
 
     Parameters
     ----------
     q0, q1 : array-like of shape (n_joints,) or (n_trajectories, n_joints)
         First and last positions, rad or m.
     duration : float
-        How long the motion takes, s; above 0.
+        Duration of the motion, s; above 0.
     times : float or array-like of shape (n_times,)
-        When to look at it, s, from its start.
+        Times after the start, s.
 
     Returns
     -------
     positions, velocities, accelerations : ndarray of shape (n_joints,) or (n_trajectories, n_joints)
-        In rad or m, and per s and s²; for several times of shape (..., n_times, n_joints).
+        The motion in rad or m, and its derivatives per s and s². For several times, of shape (..., n_times, n_joints).
 
     Raises
     ------
     ValueError, TypeError
-        If a value is not a finite real number, the shapes do not go together, or ``duration`` is not positive.
+        If a value is not a finite real number, shapes do not fit each other, or ``duration`` is not positive.
 
     Examples
     --------
@@ -64,47 +64,47 @@ def quintic_reference(
 
 
 class ComputedTorqueController:
-    """Moves a robot along a smooth reference by feedback linearisation, for many trajectories at once.
+    """Move a robot along a smooth reference by feedback linearisation, for many trajectories at once.
 
-    Each call gives the torques
+    Each call returns the torques
 
         τ = M(q) (q̈_d + k_p (q_d - q) + k_d (q̇_d - q̇) + k_i ∫(q_d - q) dt) + C(q, q̇) q̇ + g(q) + D q̇_d
 
-    of the recursive Newton-Euler algorithm, with the reference (q_d, q̇_d, q̈_d) of `quintic_reference` at the start
-    of the step and the model's viscous damping D. The gains act on accelerations. It is a controller of `simulate`:
-    torque and reference are held over a step; effort limits are the simulator's.
+    by the recursive Newton-Euler algorithm, with the reference (q_d, q̇_d, q̈_d) of `quintic_reference` at the start
+    of the step and the model's viscous damping D. Use it as a controller of `simulate`, which holds torques over a step
+    and applies effort limits.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        What `load_robot` takes; all its joints must be driven.
+        Robot as in `load_robot`. All its joints must be driven.
     q0, q1 : array-like of shape (n_joints,) or (n_trajectories, n_joints)
-        Where the reference starts and ends, rad or m.
+        Start and end of the reference, rad or m.
     duration : float
-        How long the reference moves, s; then it rests at ``q1``.
+        Duration of the reference motion, s. Then it stays at ``q1``.
     dt : float, default=0.03
         Length of a step, s.
     kp, kd, ki : float or array-like of shape (n_joints,), default=100.0, 20.0 and 1.0
-        Gains of position, velocity and integral, in 1/s², 1/s and 1/s³, not negative; ``kd`` below 2 / dt, above
-        which the held loop is unstable.
+        Gains of position, velocity and integral, in 1/s², 1/s and 1/s³, at least 0. ``kd`` must be below 2 / dt, above
+        which the loop is unstable.
 
     Attributes
     ----------
     dt : float
-        As given.
+        Length of a step, s.
     integral : ndarray of shape (n_trajectories, n_joints)
-        The integral of q_d - q up to the last call, rad s or m s; 0 in step 0.
+        Integral of q_d - q up to the last call, rad s or m s.
 
     Raises
     ------
     ImportError
-        If Pinocchio is not installed; the message gives the pip command.
+        If Pinocchio is not installed.
     ValueError, TypeError
         If a joint has no motor, a value is out of its range, or a shape does not fit the robot.
 
     See Also
     --------
-    simulate : Closes the loop.
+    simulate : Simulate the robot with the controller.
 
     Examples
     --------
@@ -148,7 +148,7 @@ class ComputedTorqueController:
         self._next = 0
 
     def __call__(self, step: int, Z: ArrayLike) -> np.ndarray:
-        """The torques of a step, of shape (n_trajectories, n_joints); steps follow one another from 0."""
+        """Return the torques of a step, (n_trajectories, n_joints); steps must follow each other from 0."""
         if check_integer(step, "step", minimum=0) not in (0, self._next):
             raise ValueError(f"Steps must follow one another from 0; got {step}, expected 0 or {self._next}.")
         states = np.array(_finite(Z, "Z"))
@@ -160,17 +160,15 @@ class ComputedTorqueController:
         self.integral = self.integral + self._change(q, v) if step else np.zeros_like(q)
         q_d, v_d, a_d = quintic_reference(self._q0, self._q1, self._duration, step * self.dt)
         a = a_d + self._kp * (q_d - q) + self._kd * (v_d - v) + self._ki * self.integral
-        # Damping at the desired velocity: at the measured one, held, it would stop a strongly damped joint's motion.
+        # Damping at the desired velocity. At the measured one, held over a step, it would stop a strongly damped joint.
         torque = self._plant.body.forces(q, v, a) + np.array(self._plant.model.damping) * v_d
         self._before, self._next = (q, v, q_d, torque), step + 1
         return torque
 
     def _change(self, q1: np.ndarray, v1: np.ndarray) -> np.ndarray:
-        """The integral of q_d - q over the last step, from the states at both ends and in the middle.
-
-        The cubic through the ends leaves h³/180 of the second difference of the accelerations; the model's serves,
-        and what torque acted hardly matters in it.
-        """
+        """Return the integral of q_d - q over the last step, from the states at both ends and in the middle."""
+        # The error of the cubic through the ends is h³/180 times the second difference of the accelerations. Those of
+        # the model suffice, and they hardly depend on the torque.
         h = self.dt
         q0, v0, q_d, torque = self._before
         middle = (q0 + q1) / 2.0 + h / 8.0 * (v0 - v1), 1.5 * (q1 - q0) / h - (v0 + v1) / 4.0

@@ -1,4 +1,4 @@
-"""Data sets for learning dynamics: x = (state, input) now, y = state one step later."""
+"""Data sets for learning dynamics: x = (state, input), y = state one step later."""
 
 from __future__ import annotations
 
@@ -60,83 +60,85 @@ def make_dynamics(
     random_state: RandomState = None,
     return_X_y: bool = False,
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Simulate a robot: the data sets of section IV-B of the paper, and the like of any robot.
+    """Simulate data sets of a robot, such as those of section IV-B of the paper.
 
-    The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs
-    ``eta * N(0, 1)``, held over each step, with the paper's scales (its Table 1). There are two cartpoles, since the
-    paper does not say which it has: ``"cartpole"`` is that of Drake's own example, without friction;
-    ``"cartpole_damped"`` has damping of 0.1 N s/m and 0.1 N m s/rad on its joints, as that of MIT's course
-    Underactuated Robotics had until May 2022.
+    The pendulum, the cartpole and the acrobot start at ``alpha * U(-1, 1)`` and are driven by inputs ``eta * N(0, 1)``,
+    held over each step, with the scales of the paper (its Table 1). ``"cartpole"`` is Drake's own example, without
+    friction. ``"cartpole_damped"`` has a damping of 0.1 N s/m and 0.1 N m s/rad on its joints, as in MIT's course
+    Underactuated Robotics until May 2022. The paper does not say which one it has.
 
-    The arm iiwa14 starts at rest, its joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each, along a
-    quintic reference and by computed-torque control (gains 100, 20 and 1, held over each step), with noise of standard
-    deviation 0.1 * (3, 15, 3, 2, 2, 2, 0.05) N m on the torques.
-
-    Any other robot whose joints are all driven moves like this arm within its position limits, with noise of a tenth
-    of the torques that it takes to hold it and to give each joint 1 rad/s² (less where that would shake a light link by
-    more than 2 rad/s²). A robot with a joint without motor starts
-    in a random state within its limits and is driven by random inputs of that size, like the acrobot. A robot with the
-    name and the size of one of these is taken for it. `simulate` says which forces act, and which robots are slow.
+    The arm iiwa14 starts at rest with joints at U(-1.5, 1.5) rad, and moves to a target within 0.8 rad of each joint.
+    It follows a quintic reference by computed-torque control (gains 100, 20 and 1, held over each step), with noise of
+    standard deviation 0.1 * (3, 15, 3, 2, 2, 2, 0.05) N m on the torques. See Notes on other robots.
 
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        What `load_robot` takes: ``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``, ``"acrobot"``,
-        ``"iiwa14"``, another name of `list_robots`, the path of a URDF file, or a model.
+        Robot as in `load_robot`: ``"pendulum"``, ``"cartpole"``, ``"cartpole_damped"``, ``"acrobot"``, ``"iiwa14"``,
+        another name of `list_robots`, the path of a URDF file, or a model.
     n_trajectories : int, default=None
-        At least 1; None takes the paper's (48, of the acrobot 93 and of iiwa14 465), and 100 for another robot.
+        Number of trajectories, at least 1. If None, that of the paper (48, 93 for the acrobot, 465 for iiwa14), and 100
+        for other robots.
     n_steps : int, default=None
-        Steps per trajectory, at least 1; None takes the paper's (100, and 50 for iiwa14), and 50 for another robot.
+        Number of steps per trajectory, at least 1. If None, that of the paper (100, 50 for iiwa14), and 50 for other
+        robots.
     dt : float, default=0.03
-        Length of a step, s. Above 0.03 the controller's gains become softer. Robots with light links need a short step
-        all the same: where a held controller makes them run away, there is an error.
+        Length of a step, s. Above 0.03 the gains of the controller are lower. Robots with light links need a short
+        step.
     duration : float, default=None
-        How long a controlled move takes, s; the target is held afterwards. None moves until the end. Only for robots
-        that are controlled.
+        Duration of a controlled move, s. Then the target is held. If None, the move takes the whole trajectory. Only
+        for robots that are controlled.
     noise : float, default=0.0
-        Standard deviation of the Gaussian noise on each target, as a fraction of that target's standard deviation.
+        Standard deviation of the Gaussian noise on each target, as a fraction of the standard deviation of that target.
     input_noise : float, default=0.0
-        The same for the states in ``data``, as a fraction of each state's standard deviation. Inputs stay exact.
+        Standard deviation of the noise on the states in ``data``, as a fraction of that of each state. Inputs are
+        exact.
     wrap_angles : bool, default=False
-        Whether revolute positions in ``data`` lie in [-pi, pi). The row of ``target`` moves by the same multiple of
-        2 pi, so that their difference stays small; it may leave the interval. Noise is added before.
+        Whether to wrap revolute positions in ``data`` to [-pi, pi), after noise was added. ``target`` is shifted by the
+        same multiple of 2 pi, so that the difference stays small.
     n_jobs : int, default=None
-        Processes for the simulation, as in `simulate`; it does not change a bit.
+        Number of processes for the simulation, as in `simulate`. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Draws the initial states, the inputs (or the targets, then the noise on the torques) and the noise on states
-        and targets, in this order.
+        Seed of the initial states, of the inputs (or the targets, then the noise on the torques), and of the noise on
+        states and targets, in this order.
     return_X_y : bool, default=False
-        Whether to return ``(data, target)`` in place of a Bunch.
+        Whether to return ``(data, target)`` instead of a Bunch.
 
     Returns
     -------
     dynamics : :class:`~sklearn.utils.Bunch`
-        With
+        The data set, with n_rows = n_trajectories * n_steps, one trajectory after the other:
 
         - ``data`` : ndarray of shape (n_rows, 2 * n_joints + n_inputs): positions (rad or m), velocities (rad/s or
-          m/s) and the inputs that acted, within the motors' limits (N m or N), where n_rows = n_trajectories *
-          n_steps, one trajectory after the other;
+          m/s) and inputs within the motors' limits (N m or N);
         - ``target`` : ndarray of shape (n_rows, 2 * n_joints): positions and velocities after ``dt``;
         - ``groups`` : ndarray of shape (n_rows,): the trajectory of each row, for `GroupKFold`;
-        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): the true states, not
-          wrapped;
-        - ``dt`` : float, and ``robot``, as given: what a feature map must be told (``InertiaForce(robot, dt=dt)``);
+        - ``trajectories`` : ndarray of shape (n_trajectories, n_steps + 1, 2 * n_joints): true states, not wrapped;
+        - ``dt`` : float, and ``robot``, as given, for feature maps (``InertiaForce(robot, dt=dt)``);
         - ``feature_names``, ``target_names``, ``DESCR``.
     (data, target) : tuple of ndarray
-        If ``return_X_y``.
+        Only if ``return_X_y``.
 
     Raises
     ------
     ImportError
-        If Pinocchio is not installed; the message gives the pip command.
+        If Pinocchio is not installed.
     ValueError, TypeError
         If an argument is out of its range or of the wrong type, the robot is unknown, it cannot be simulated (see
-        `simulate`), or controlled moves run away because ``dt`` is too long or ``duration`` too short.
+        `simulate`), or controlled moves are unstable because ``dt`` is too long or ``duration`` too short.
 
     Warns
     -----
     RobotModelWarning
-        As `load_robot`.
+        If the model of the robot is unphysical, as in `load_robot`.
+
+    Notes
+    -----
+    Any other robot whose joints are all driven moves like iiwa14 within its position limits. The noise on its torques
+    is a tenth of the torques that hold it and accelerate each joint by 1 rad/s², or less if that would accelerate a
+    light link by more than 2 rad/s². A robot with a joint without motor starts in a random state within its limits, and
+    is driven by random inputs of that size, like the acrobot. A robot with the name and the size of a named system is
+    sampled like it. See `simulate` on forces and computing times.
 
     Examples
     --------

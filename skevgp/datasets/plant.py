@@ -1,4 +1,4 @@
-"""A robot as the simulator sees it: motors with limits on the driven joints, viscous damping on all."""
+"""A robot in the simulator: motors with limits on the driven joints, and viscous damping on all joints."""
 
 from __future__ import annotations
 
@@ -11,48 +11,34 @@ from scipy.sparse import eye_array, kron
 from ..robots import RigidBody, layout_of, load_robot
 from ..robots.loading import Robot, effort_limits
 
-# Measured against the stored reference: one-step errors of 1e-11 and below on the four systems.
+# One-step errors are at most 1e-11 on the four systems, compared with the stored reference.
 _EXPLICIT: dict[str, Any] = {"rtol": 1e-11, "atol": 1e-13}
-# Where damping would bring a joint to rest within 1/200 of a step, explicit steps would be about as short, and the
-# implicit method was measured to be faster, for 5 joints as for 29.
+# If damping brings a joint to rest within 1/200 of a step, explicit steps would be about as short, and the implicit
+# method was measured to be faster, for 5 joints as for 29.
 _STIFF = 200.0
 _IMPLICIT: dict[str, Any] = {"rtol": 1e-6, "atol": 1e-8}
-# Of the integrator's own steps: s on average, but as many in any case, and no more than these.
+# Maximum number of the integrator's own steps: average length in s, and limits of the maximum.
 _SHORTEST, _FEWEST_ALLOWED, _MOST_ALLOWED = 5e-5, 600, 20_000
 _SINGULAR = 1e-13
 
 
 class Plant:
-    """Forward dynamics of a robot under inputs, for many states at once.
-
-    Parameters
-    ----------
-    robot : str, path-like, System or pinocchio.Model
-        As in `load_robot`.
-
-    Attributes
-    ----------
-    model : pinocchio.Model
-    layout : Layout
-        What the columns of states and inputs are.
-    body : RigidBody
-    limits : ndarray of shape (2, n_inputs)
-        The least and the largest torque or force of each motor; infinite if the model knows none.
-    """
+    """Forward dynamics of a robot under inputs, for many states at once."""
 
     def __init__(self, robot: Robot):
         self.model = load_robot(robot)
         self.layout = layout_of(self.model)
         self.body = RigidBody(self.model)
         self._damping = np.array(self.model.damping)
+        # Least and largest torque or force of each motor (2, n_inputs), infinite if the model has no limits.
         self.limits = effort_limits(self.model)[:, list(self.layout.driven)]
 
     def accelerations(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Joint accelerations under inputs u, of shape (n, n_inputs)."""
+        """Return joint accelerations under inputs u, (n, n_inputs)."""
         return self.body.accelerations_under(q, v, u)
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """M(q) of one configuration, of shape (n_joints, n_joints), or an error if it is singular."""
+        """Return M(q) (n_joints, n_joints) of one configuration, or raise an error if it is singular."""
         M = self.body.mass_matrix(q)
         eigenvalues, eigenvectors = np.linalg.eigh(M)
         null = eigenvectors[:, eigenvalues <= _SINGULAR * eigenvalues[-1]]
@@ -66,30 +52,17 @@ class Plant:
         return M
 
     def is_stiff(self, q: np.ndarray, dt: float) -> bool:
-        """Whether damping acts far faster than dt in one of these configurations, of shape (n, n_joints)."""
+        """Whether damping acts far faster than dt in one of these configurations (n, n_joints)."""
         M = np.array([self.mass_matrix(row) for row in q])
         rates = np.linalg.eigvals(np.linalg.inv(M) * self._damping)
         return bool(rates.real.max() * dt > _STIFF)
 
     def advance(self, z: np.ndarray, u: np.ndarray, dt: float, stiff: bool) -> np.ndarray:
-        """The states after dt of inputs u, held.
-
-        Parameters
-        ----------
-        z : ndarray of shape (n, 2 * n_joints)
-        u : ndarray of shape (n, n_inputs)
-        dt : float
-        stiff : bool
-            Whether to take the implicit method.
-
-        Returns
-        -------
-        z : ndarray of shape (n, 2 * n_joints)
-        """
+        """Return the states (n, 2 * n_joints) after dt of constant inputs u (n, n_inputs)."""
         n, half = len(z), z.size // 2
 
         def derivative(_t: float, y: np.ndarray) -> np.ndarray:
-            # All positions, then all velocities; the implicit method brings several such columns.
+            # All positions, then all velocities. The implicit method passes several such columns.
             columns = y.reshape(2 * half, -1).T
             q, v = columns[:, :half], columns[:, half:]
             rows = (len(columns) * n, -1)

@@ -1,4 +1,4 @@
-"""How trajectories of a robot are drawn: random inputs, or controlled moves with noise on the torque."""
+"""Random trajectories of a robot: random inputs, or controlled moves with noise on the torque."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from .control import ComputedTorqueController
 from .plant import Plant
 from .simulation import Controller
 
-_LARGEST_MOVE = 1.5  # half the width of the first positions, rad or m, where limits allow it
-_TRAVEL = 0.8 / 1.5  # how far a target may be from there, as a fraction of that half-width
-_NOISE = 0.1  # of the torques' scale
-_LARGEST_SHAKE = 2.0  # acceleration by noise on one torque, rad/s² or m/s²
-_LOST = 5.0  # a joint faster than so many of its largest moves per step is no longer controlled
-_UNLIMITED = 1e6  # a position limit beyond it is none
+_LARGEST_MOVE = 1.5  # half width of the initial positions, rad or m, if limits allow it
+_TRAVEL = 0.8 / 1.5  # largest distance of a target, as a fraction of that half width
+_NOISE = 0.1  # noise as a fraction of the scale of torques
+_LARGEST_SHAKE = 2.0  # largest acceleration by noise on one torque, rad/s² or m/s²
+_LOST = 5.0  # a joint that is faster than this many largest moves per step is out of control
+_UNLIMITED = 1e6  # larger position limits are ignored
 
 
 @dataclass(frozen=True)
 class RandomInputs:
-    """The first state is center + scale * U(-1, 1), each input eta * N(0, 1)."""
+    """Initial states center + scale * U(-1, 1), and inputs eta * N(0, 1)."""
 
     center: np.ndarray  # (2 * n_joints,)
     scale: np.ndarray  # (2 * n_joints,), alpha in the paper
@@ -48,9 +48,9 @@ class RandomInputs:
 
 @dataclass(frozen=True)
 class ControlledMoves:
-    """From rest in center + width * U(-1, 1) to a target nearby within the limits, with noise on the torques."""
+    """Moves from rest in center + width * U(-1, 1) to a target nearby within the limits, with noise on the torques."""
 
-    center: np.ndarray  # (n_joints,), as all that follow
+    center: np.ndarray  # (n_joints,), as the following arrays
     width: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -67,12 +67,12 @@ class ControlledMoves:
         q0 = self.center + self.width * rng.uniform(-1.0, 1.0, (shape[0], n))
         q1 = np.clip(q0 + _TRAVEL * self.width * rng.uniform(-1.0, 1.0, (shape[0], n)), self.lower, self.upper)
         noise = self.noise * rng.standard_normal((*shape, n))
-        kd = min(20.0, 0.6 / dt)  # the paper's gains, softer where a long step would make them unstable
+        kd = min(20.0, 0.6 / dt)  # the gains of the paper, or lower ones if dt is long
         kp = kd**2 / 4.0
         controller = ComputedTorqueController(
             plant, q0, q1, duration=shape[1] * dt if duration is None else duration, dt=dt, kp=kp, kd=kd
         )
-        # Positions tell less: a motor that is too weak lets its joint fall as far.
+        # Speeds detect instability better than positions: a joint with a weak motor falls as far.
         fastest = _LOST * (_TRAVEL * self.width + _LARGEST_SHAKE / kp) / dt
 
         def noisy(step: int, Z: np.ndarray) -> np.ndarray:
@@ -115,18 +115,9 @@ _PAPER: Mapping[str, RandomInputs | ControlledMoves] = MappingProxyType(
 
 
 def sampling_of(plant: Plant) -> RandomInputs | ControlledMoves:
-    """How a robot's trajectories are drawn.
-
-    Parameters
-    ----------
-    plant : Plant
-
-    Returns
-    -------
-    sampling : RandomInputs or ControlledMoves
-        The paper's for a robot with the name and the size of a named system. Else moves if all joints are driven, and
-        random inputs if not, with scales from the model.
-    """
+    """Return the sampling of a robot: that of the paper for named systems, else with scales from the model."""
+    # A robot with the name and the size of a named system counts as it. Others make controlled moves if all joints are
+    # driven, and get random inputs otherwise.
     layout = plant.layout
     if layout.name in _PAPER and SYSTEMS[layout.name].layout.driven == layout.driven:
         return _PAPER[layout.name]
@@ -150,7 +141,7 @@ def sampling_of(plant: Plant) -> RandomInputs | ControlledMoves:
 
 
 def _position_limits(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
-    """Limits of the positions, infinite where the model has none (an empty range is none)."""
+    """Return limits of the positions, infinite if the model has none; an empty range counts as none."""
     lower, upper = np.array(plant.model.lowerPositionLimit), np.array(plant.model.upperPositionLimit)
     known = lower < upper
     return (
@@ -160,10 +151,8 @@ def _position_limits(plant: Plant) -> tuple[np.ndarray, np.ndarray]:
 
 
 def _noise_scale(plant: Plant, center: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """A tenth of what it takes to hold a joint and to give it 1 rad/s²; not more than gives any joint 2 rad/s².
-
-    Root mean squares over configurations; m/s² for prismatic joints.
-    """
+    """Return a tenth of the torque that holds a joint and gives it 1 rad/s², at most that for 2 rad/s² of any joint."""
+    # Root mean squares over configurations; m/s² for prismatic joints.
     q = center + width * np.random.RandomState(0).uniform(-1.0, 1.0, (50, len(center)))
     M = np.array([plant.mass_matrix(row) for row in q])
     work = np.abs(plant.body.gravity(q)) + np.diagonal(M, axis1=1, axis2=2)

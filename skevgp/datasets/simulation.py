@@ -18,7 +18,8 @@ from .plant import Plant
 
 Controller = Callable[[int, np.ndarray], ArrayLike]
 
-# Integrated together, whatever n_jobs, so that it does not change a bit; large enough that C++ does the work.
+# Number of trajectories that are integrated together for any n_jobs, so that the result does not depend on it. It is
+# large enough that most of the time is spent in C++.
 _GROUP = 64
 
 
@@ -59,63 +60,66 @@ def simulate(
 ) -> np.ndarray | tuple[np.ndarray, np.ndarray]:
     """Integrate a robot's equations of motion with the input held over each step.
 
-    Accelerations come from Pinocchio's articulated-body algorithm. Motors give at most the effort limits of the model
-    (a model whose limits are all 0 has unknown ones), and its viscous damping acts on the joints; dry friction,
-    contacts and the limits of positions and velocities are not simulated. The integrator is SciPy's DOP853 with a
-    relative tolerance of 1e-11, started anew at each step, for 64 trajectories together. Where damping acts more than
-    200 times faster than ``dt`` in one of their initial states, it is the implicit Radau with 1e-6 for them. Light
-    links with strong damping (``"xarm7"``) take several times as long as others.
+    Accelerations are those of Pinocchio's articulated-body algorithm, with the model's effort limits and viscous
+    damping. A model whose effort limits are all 0 has no limits. Dry friction, contacts, and limits of positions and
+    velocities are not simulated.
 
     Parameters
     ----------
     system : str, path-like, System or pinocchio.Model
-        What `load_robot` takes: a name of `list_robots`, the path of a URDF file, or a model.
+        Robot as in `load_robot`: a name of `list_robots`, the path of a URDF file, or a model.
     z0 : array-like of shape (2 * n_joints,) or (n_trajectories, 2 * n_joints)
         Initial states: joint positions (rad or m), then velocities (rad/s or m/s).
     U : array-like of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs), or callable
-        Inputs: torques (N m) or forces (N) on the driven joints, each held for ``dt``. Or a controller
-        ``controller(step, Z) -> U``: called once per step, with the states now, of shape (n_trajectories,
-        2 * n_joints), it returns the inputs (n_trajectories, n_inputs). The ``dt`` of a `ComputedTorqueController`
-        must be this one.
+        Torques (N m) or forces (N) on the driven joints, each held for ``dt``. Or a function ``controller(step, Z)``
+        that is called once per step with the states (n_trajectories, 2 * n_joints), and returns the inputs
+        (n_trajectories, n_inputs).
     dt : float, default=0.03
-        Length of a step, s.
+        Length of a step, s. A `ComputedTorqueController` must have the same.
     n_steps : int, default=None
-        How many steps a controller controls; only with a controller.
+        Number of steps. Only with a controller.
     wrap_angles : bool, default=False
-        Whether to return revolute positions in [-pi, pi). A controller always sees them unwrapped.
+        Whether to return revolute positions in [-pi, pi). A controller always gets them unwrapped.
     return_inputs : bool, default=False
-        Whether to return the inputs that acted, too.
+        Whether to return the inputs within the motors' limits too.
     n_jobs : int, default=None
-        Processes that groups of 64 trajectories are spread over (None: 1, -1: all cores). It does not change a bit of
-        the result. For the paper's data sets one process is faster: states travel between processes at each step.
+        Number of processes for groups of 64 trajectories (None: 1, -1: all cores). The result does not depend on it.
+        For the data sets of the paper one process is faster.
 
     Returns
     -------
     Z : ndarray of shape (n_steps + 1, 2 * n_joints) or (n_trajectories, n_steps + 1, 2 * n_joints)
-        The states at the times 0, dt, 2 dt, ...; the first is ``z0``.
+        States at the times 0, dt, 2 dt, ...; the first is ``z0``.
     inputs : ndarray of shape (n_steps, n_inputs) or (n_trajectories, n_steps, n_inputs)
-        If ``return_inputs``: ``U`` within the motors' limits.
+        ``U`` within the motors' limits. Only if ``return_inputs``.
 
     Raises
     ------
     ImportError
-        If Pinocchio is not installed; the message gives the pip command.
+        If Pinocchio is not installed.
     ValueError, TypeError
         If a shape does not fit the robot, a value is not a finite real number, ``dt`` is not positive, the robot is
-        unknown, its mass matrix is singular (links without inertia), or the integrator gives up.
+        unknown, its mass matrix is singular (links without inertia), or the integrator fails.
 
     Warns
     -----
     RobotModelWarning
-        As `load_robot`.
+        If the model of the robot is unphysical, as in `load_robot`.
 
     See Also
     --------
-    ComputedTorqueController : Moves robots whose joints are all driven.
+    ComputedTorqueController : Controller for robots whose joints are all driven.
+
+    Notes
+    -----
+    The integrator is SciPy's DOP853 with a relative tolerance of 1e-11, started again at each step, for 64 trajectories
+    together. If damping acts more than 200 times faster than ``dt`` in one of their initial states, it is the implicit
+    Radau with a tolerance of 1e-6. Robots with light links and strong damping, such as ``"xarm7"``, take several times
+    as long as others.
 
     Examples
     --------
-    A pendulum let go at 0.1 rad, without torque, for three steps:
+    Release a pendulum at 0.1 rad, without torque, for three steps:
 
     >>> import numpy as np
     >>> from skevgp.datasets import simulate
@@ -125,7 +129,7 @@ def simulate(
            [ 0.0965, -0.1148],
            [ 0.0923, -0.1686]])
 
-    The same with a torque that brakes it:
+    Do the same with a torque that brakes it:
 
     >>> simulate("pendulum", [0.1, 0.0], lambda step, Z: -2.0 * Z[:, 1:], n_steps=3).round(4)
     array([[ 0.1   ,  0.    ],
@@ -182,22 +186,12 @@ def simulate(
 
 
 def _advance(plant: Plant, dt: float, groups: list[tuple[np.ndarray, np.ndarray, bool]]) -> np.ndarray:
-    """The next states of some groups of trajectories."""
+    """Return the next states of some groups of trajectories."""
     return np.concatenate([plant.advance(z, u, dt, stiff) for z, u, stiff in groups])
 
 
 def turns(Z: np.ndarray, revolute: tuple[bool, ...]) -> np.ndarray:
-    """What to subtract from states so that revolute positions lie in [-pi, pi): a multiple of 2 pi, elsewhere 0.
-
-    Parameters
-    ----------
-    Z : ndarray of shape (..., 2 * n_joints)
-    revolute : tuple of n_joints bool
-
-    Returns
-    -------
-    away : ndarray of the shape of Z
-    """
+    """Return multiples of 2 pi to subtract from states (..., 2 * n_joints) for revolute positions in [-pi, pi)."""
     away = np.zeros_like(Z)
     columns = np.flatnonzero(revolute)
     angles = Z[..., columns]
@@ -210,7 +204,7 @@ def turns(Z: np.ndarray, revolute: tuple[bool, ...]) -> np.ndarray:
 
 
 def _held(U: np.ndarray, n_trajectories: int, n_inputs: int, single: bool, name: str) -> tuple[int, Controller]:
-    """The number of steps of given inputs, and the controller that plays them back."""
+    """Return the number of steps of given inputs, and a controller that returns them."""
     inputs = U[np.newaxis] if single else U
     if inputs.ndim != 3 or len(inputs) != n_trajectories or inputs.shape[2] != n_inputs:
         wanted = f"(n_steps, {n_inputs})" if single else f"({n_trajectories}, n_steps, {n_inputs})"

@@ -1,4 +1,4 @@
-"""Snelson's one-dimensional data: from a folder, or from where he published them."""
+"""Snelson's one-dimensional data, from a folder or from where he published them."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from ..utils.files import replacing
 from ..utils.validation import check_integer, check_real
 
 _ADDRESS = "http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz"
-# The folder in the archive, and of the copy that is kept.
+# Name of the folder in the archive, and of that with the copy.
 _FOLDER = "SPGP_dist"
-# SHA-256 of each file's numbers as little-endian doubles: spaces, line ends and the archive around them do not count.
+# SHA-256 of the numbers of each file as little-endian doubles, so that white space and the archive do not count.
 _CHECKSUMS = {
     "train_inputs": "8b1ccec300735c351479d24671c60dbbef4ddb2e0a1fb74eb98ce9419f8f9c7d",
     "train_outputs": "b4f62516c01db0d2b3c1d558d8db71766cd385cc81bc411fe4cd744eba314837",
     "test_inputs": "2b52ebe713c8f1d316c60689e8a1e2529c88ef17afe5a8507095fc49a00d0a49",
 }
-# In bytes, far above the true sizes: no server can fill the memory.
+# Largest size in bytes, far above the true sizes, so that a server cannot fill the memory.
 _LARGEST = 10_000_000
 _SECONDS = 30.0
 
 
 def _numbers(content: bytes, name: str, where: str) -> np.ndarray:
-    """Those of one file, if they are Snelson's."""
+    """Return the numbers of one file, or raise an error if they are not Snelson's."""
     try:
         values = np.array(content.split(), dtype="<f8")
     except ValueError:
@@ -48,7 +48,7 @@ def _numbers(content: bytes, name: str, where: str) -> np.ndarray:
 
 
 def _load(folder: Path) -> dict[str, np.ndarray] | None:
-    """The numbers of the files in a folder; None if one is missing."""
+    """Return the numbers of the files in a folder, or None if one is missing."""
     numbers = {}
     for name in _CHECKSUMS:
         path = next((path for path in (folder / name, folder / f"{name}.dat") if path.is_file()), None)
@@ -70,7 +70,7 @@ def _download(n_retries: int, delay: float) -> bytes:
 
 
 def _unpack(archive: bytes) -> dict[str, bytes]:
-    """The files by name. They are read, not extracted: no path in the archive reaches the disk."""
+    """Return the files by name. They are read, not extracted, so that no path in the archive is used on the disk."""
     with tarfile.open(fileobj=io.BytesIO(archive), mode="r:gz") as members:
         found = {PurePosixPath(member.name): member for member in members if member.isfile()}
         contents = {}
@@ -85,7 +85,7 @@ def _unpack(archive: bytes) -> dict[str, bytes]:
 
 
 def _fetch(folder: Path, n_retries: int, delay: float) -> dict[str, np.ndarray]:
-    """Download the files, check them and keep them in a folder."""
+    """Download the files, check them and store them in a folder."""
     try:
         contents = _unpack(_download(n_retries, delay))
         numbers = {name: _numbers(content, name, f"{_FOLDER}/{name}") for name, content in contents.items()}
@@ -131,48 +131,47 @@ def fetch_snelson(
     n_retries: int = 3,
     delay: float = 1.0,
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Load Snelson's one-dimensional data, as the paper's toy figure shows them.
+    """Load Snelson's one-dimensional data, as in the toy figure of the paper.
 
-    200 noisy observations of a wave at x between 0.06 and 5.97, of Snelson & Ghahramani (2006), which the paper puts on
-    a line: (y, x) <- (6 y + 3 x, x). They are downloaded once, from
-    http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz, and kept.
+    They are 200 noisy observations of a wave at x between 0.06 and 5.97 (Snelson & Ghahramani 2006). The paper adds a
+    line: (y, x) <- (6 y + 3 x, x). The files are downloaded once from
+    http://www.gatsby.ucl.ac.uk/~snelson/SPGP_dist.tgz.
 
     Parameters
     ----------
     data_home : str or path-like, default=None
-        A folder that holds the files ``train_inputs``, ``train_outputs`` and ``test_inputs`` (with or without
-        ``.dat``), or has a folder ``SPGP_dist`` that does. If neither is so, the files are downloaded into that
-        ``SPGP_dist``. By default scikit-learn's folder of data sets, see :func:`sklearn.datasets.get_data_home`.
+        Folder with the files ``train_inputs``, ``train_outputs`` and ``test_inputs`` (with or without ``.dat``), or
+        with a folder ``SPGP_dist`` that has them. Otherwise they are downloaded into ``SPGP_dist``. If None,
+        scikit-learn's folder of data sets, see :func:`sklearn.datasets.get_data_home`.
     download_if_missing : bool, default=True
-        Whether to download what is not there.
+        Whether to download missing files.
     trend : bool, default=True
-        Whether the target is the paper's, 6 y + 3 x, or Snelson's y.
+        Whether the target is 6 y + 3 x, as in the paper, or Snelson's y.
     return_X_y : bool, default=False
-        Whether to return ``(data, target)`` in place of a Bunch.
+        Whether to return ``(data, target)`` instead of a Bunch.
     n_retries : int, default=3
-        How often to try again if the server does not answer, at least 0.
+        Number of retries if the server does not answer, at least 0.
     delay : float, default=1.0
-        Seconds between tries, not negative.
+        Number of seconds between tries, at least 0.
 
     Returns
     -------
     snelson : :class:`~sklearn.utils.Bunch`
-        With ``data`` of shape (200, 1), in the order of the file; ``target`` (200,); ``test_data`` (301, 1), evenly
-        spaced from -3 to 10, for which there is no target; ``feature_names``, ``target_names`` and ``DESCR``.
+        The data set: ``data`` of shape (200, 1), in the order of the file; ``target`` (200,); ``test_data`` (301, 1),
+        evenly spaced from -3 to 10, without targets; ``feature_names``, ``target_names`` and ``DESCR``.
     (data, target) : tuple of ndarray
-        If ``return_X_y``.
+        Only if ``return_X_y``.
 
     Raises
     ------
     OSError
-        If the files are not there and cannot be downloaded, or must not be; if a file's numbers do not have the right
-        SHA-256 checksum.
+        If files are missing and cannot or must not be downloaded, or their numbers have another SHA-256 checksum.
     ValueError, TypeError
         If an argument is out of its range or of the wrong type.
 
     See Also
     --------
-    make_toy : Points of the same shape, drawn at random.
+    make_toy : Random points of the same shape.
 
     References
     ----------
@@ -181,7 +180,7 @@ def fetch_snelson(
 
     Examples
     --------
-    Where there is neither a copy nor a network, `make_toy` has the same shape:
+    Use `make_toy` if there is neither a copy nor a network:
 
     >>> from skevgp.datasets import fetch_snelson, make_toy
     >>> try:
@@ -193,7 +192,7 @@ def fetch_snelson(
     """
     check_integer(n_retries, "n_retries", minimum=0)
     check_real(delay, "delay", minimum=0.0)
-    from sklearn.datasets import get_data_home  # here, since it loads all of scikit-learn's data sets
+    from sklearn.datasets import get_data_home  # here, because it loads all data sets of scikit-learn
 
     home = Path(get_data_home(data_home))
     folder = home / _FOLDER

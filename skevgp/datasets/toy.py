@@ -12,12 +12,12 @@ from ..utils.validation import check_integer, check_real
 RandomState = int | np.random.RandomState | None
 
 
-# Height, centre and width of the waves: a broad dip and then faster ups and downs, where Snelson's data have them.
+# Height, centre and width of the waves: a broad dip and then faster waves, similar to Snelson's data.
 _WAVES = ((-1.8, 1.45, 0.9), (0.8, 2.6, 0.45), (0.9, 4.4, 0.4), (-0.85, 5.3, 0.45))
 
 
 def _toy_mean(x: np.ndarray) -> np.ndarray:
-    """The noise-free target: waves on a line of slope 3, as in the paper's toy figure."""
+    """Return the noise-free target: waves on a line of slope 3, as in the toy figure of the paper."""
     waves = sum(height * np.exp(-(((x - centre) / width) ** 2)) for height, centre, width in _WAVES)
     return 6.0 * waves + 3.0 * x
 
@@ -33,30 +33,29 @@ def make_toy(
 def make_toy(
     n_samples: int = 200, noise: float = 1.7, random_state: RandomState = None, *, return_X_y: bool = False
 ) -> Bunch | tuple[np.ndarray, np.ndarray]:
-    """Generate a wave on a linear trend, the shape of the paper's toy data.
+    """Generate a noisy wave on a linear trend, similar to the toy data of the paper.
 
-    The paper's figure uses Snelson's 200 points, x in (0, 6), with (y, x) <- (6 y + 3 x, x): see `fetch_snelson`. These
-    are points of the same shape drawn afresh: dips and humps of like places, heights and noise, which a kernel must
-    learn, on a trend that ``h(x) = (1, x)`` explains.
+    The paper uses Snelson's 200 points, x in (0, 6), with (y, x) <- (6 y + 3 x, x): see `fetch_snelson`. These points
+    are random, with waves of similar places, heights and noise. Features ``h(x) = (1, x)`` explain the trend.
 
     Parameters
     ----------
     n_samples : int, default=200
-        How many points, at least 1.
+        Number of points, at least 1.
     noise : float, default=1.7
-        Standard deviation of the Gaussian noise on the target, not negative.
+        Standard deviation of the Gaussian noise on the target, at least 0.
     random_state : int, RandomState instance or None, default=None
-        Draws the inputs and the noise.
+        Seed of the inputs and the noise.
     return_X_y : bool, default=False
-        Whether to return ``(data, target)`` in place of a Bunch.
+        Whether to return ``(data, target)`` instead of a Bunch.
 
     Returns
     -------
     toy : :class:`~sklearn.utils.Bunch`
-        With ``data`` of shape (n_samples, 1), sorted and in (0, 6); ``target`` (n_samples,); ``mean`` (n_samples,),
-        the target without noise; ``feature_names``, ``target_names`` and ``DESCR``.
+        The data set: ``data`` of shape (n_samples, 1), sorted and in (0, 6); ``target`` (n_samples,); ``mean``
+        (n_samples,), the target without noise; ``feature_names``, ``target_names`` and ``DESCR``.
     (data, target) : tuple of ndarray
-        If ``return_X_y``.
+        Only if ``return_X_y``.
 
     Raises
     ------
@@ -65,7 +64,7 @@ def make_toy(
 
     See Also
     --------
-    fetch_snelson : The points of the paper's figure.
+    fetch_snelson : Load the points of the figure in the paper.
 
     Examples
     --------

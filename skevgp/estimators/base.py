@@ -1,4 +1,4 @@
-"""What the sparse and the exact model share: prediction, samples, and the attributes that a fit sets."""
+"""Common part of the sparse and the exact model: prediction, samples, and the attributes that a fit sets."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from ..utils.validation import check_fitted, check_integer, is_dask, is_plain
 from .summary import ModelSummary, html_of, of_gaussian_process
 
 P = ParamSpec("P")
-# Attributes that there are only if there are weights.
+# Attributes of models with weights only.
 _OF_WEIGHTS = ("coef_", "coef_std_", "coef_cov_", "coef_names_", "coef_prior_mean_", "coef_prior_scale_")
-# Attributes that are found when somebody asks.
+# Attributes that are computed when they are read.
 _AFTER_FIT = ("lower_bound_", "upper_bound_")
-# Arguments of version 0.1, and where they are now.
+# Arguments of version 0.1, and their new places.
 _MOVED = {
     "coef_mean": "coef_prior=skevgp.CoefPrior(mean=...)",
     "coef_scale": "coef_prior=skevgp.CoefPrior(scale=...)",
@@ -51,7 +51,7 @@ _MOVED = {
 
 
 def names_moved_arguments(init: Callable[P, None]) -> Callable[P, None]:
-    """An ``__init__`` that says of arguments of version 0.1 where they are now."""
+    """Decorate an ``__init__`` so that errors on arguments of version 0.1 name their new place."""
     known = signature(init).parameters
 
     @wraps(init)
@@ -66,7 +66,7 @@ def names_moved_arguments(init: Callable[P, None]) -> Callable[P, None]:
 
 
 class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
-    """A Gaussian process with explicit features: a shell around the `Posterior` that a fit leaves."""
+    """A Gaussian process with explicit features: a shell around the `Posterior` of a fit."""
 
     feature_map: TransformerMixin | None
     kernel: Kernel | Callable[..., Any] | None
@@ -92,12 +92,12 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            For a Dask array, the results are lazy Dask arrays of the same chunks.
+            Rows with the columns of `fit`. For a Dask array, the results are lazy Dask arrays of the same chunks.
         return_std : bool, default=False
             Whether to return the standard deviation too.
         return_cov : bool or "joint", default=False
-            Whether to return the covariance between rows too, for each output. ``"joint"`` also returns that between
-            outputs, which depend on each other if they share their weights.
+            Whether to return the covariance between rows too, for each output. ``"joint"`` includes the covariance
+            between outputs, which depend on each other if they share their weights.
         include_noise : bool, default=True
             Whether standard deviation and covariance include the learned noise of y, or are those of the noise-free
             g(x).
@@ -115,13 +115,13 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Raises
         ------
         ValueError
-            If X does not fit the training data or is not finite, if both standard deviation and covariance are asked
-            for, or if the covariance of the rows of a Dask array is.
+            If X does not fit the training data or is not finite, if both ``return_std`` and ``return_cov`` are set, or
+            if ``return_cov`` is set for a Dask array.
 
         Notes
         -----
-        The diagonal of the covariance is the square of ``std``. Neither is below the rounding error of the variance,
-        about 1e-15 of the signal's: smaller variances cannot be told from 0.
+        The diagonal of the covariance is the square of ``std``. Variances are not below their rounding error, about
+        1e-15 of the signal variance.
         """
         if np.ndim(return_cov) > 0 or return_cov not in (False, True, "joint"):
             raise ValueError(f"return_cov must be False, True or 'joint'; got {return_cov!r}.")
@@ -154,9 +154,9 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         n_samples : int, default=1
             Number of functions.
         random_state : int, RandomState instance or None, default=0
-            Source of chance. An integer gives the same functions at each call.
+            Seed of the functions. An integer gives the same functions at each call.
         include_noise : bool, default=True
-            Whether samples are of y, with the learned noise, or of the noise-free g(x).
+            Whether samples are those of y, with the learned noise, or those of the noise-free g(x).
 
         Returns
         -------
@@ -185,19 +185,19 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     to_c = delegate("to_c")
 
     def summary(self) -> ModelSummary:
-        """Summarise what was learned: kernel, noise, bounds on the likelihood, and weights next to their prior.
+        """Summarise the fit: kernel, noise, bounds on the likelihood, and weights with their prior.
 
         Returns
         -------
         summary : ModelSummary
-            It prints as text, shows as tables in notebooks, and has ``to_frame()``.
+            Object that prints as text, shows as tables in notebooks, and has ``to_frame()``.
         """
         check_fitted(self)
         return of_gaussian_process(self)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
-        # scikit-learn has it only if its option ``display`` is "diagram".
+        # The attribute exists only if scikit-learn's option ``display`` is "diagram".
         diagram: Callable[[], str] = super()._repr_html_
         return lambda: diagram() + html_of(self)
 
@@ -208,12 +208,12 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return bundle
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters; by ``solver__...`` a solver that is a string becomes the solver that it names.
+        """Set parameters. A parameter ``solver__...`` turns a solver that is a string into an object.
 
         Parameters
         ----------
         **params : dict
-            Parameters of the estimator, and of what it is made of.
+            Parameters of the estimator and of its nested objects.
 
         Returns
         -------
@@ -237,15 +237,15 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             raise AttributeError(f"{kind} has {name} only after fit.")
         raise AttributeError(f"{kind!r} object has no attribute {name!r}")
 
-    # --- what fits and predictions begin and end with -----------------------------------------------------------------
+    # --- validation before, and attributes after a fit ----------------------------------------------------------------
 
     def _before_fit(self, X: Any) -> Self:
-        """What predicts as long as there was no fit: nothing, except a model with a prior of its own."""
+        """Return a model that predicts from the prior, or raise NotFittedError if there is none."""
         check_fitted(self)
         raise AssertionError
 
     def _checked(self, X: Any, asked: str = "predict") -> Rows:
-        """X for a prediction: as the maps see it, and as the kernel sees it without a map."""
+        """Validate X for a prediction, for the maps and for a kernel without a map."""
         if is_plain(self, X):
             return Rows(X, X)
         if is_dask(X):
@@ -253,7 +253,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return Rows(*checked_rows(self, X)[:2])
 
     def _checked_numbers(self, X: Any, asked: str) -> np.ndarray:
-        """X as numbers, in which derivatives are."""
+        """Validate X as numbers, for derivatives."""
         if is_plain(self, X):
             return X
         if is_dask(X):
@@ -262,11 +262,11 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
 
     @property
     def _n_outputs(self) -> int:
-        # A y of one column is one output without an axis, as in scikit-learn's GPR.
+        # A y of one column has no axis of outputs, as in scikit-learn's GPR.
         return len(self._posterior.predictor.noise)
 
     def _set_posterior(self, data: Dataset, problem: Problem, spec: KernelSpec, fitted: Fitted | ExactFit) -> None:
-        """Keep a fit: its posterior, and the attributes that describe it."""
+        """Store the posterior of a fit, and the attributes that describe it."""
         for name in _OF_WEIGHTS:
             self.__dict__.pop(name, None)
         maps = replace(data.maps, shapes=problem.shapes)
@@ -290,7 +290,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self.kernel_ = kernels[0] if self._n_outputs == 1 else kernels
 
     def _set_weights_and_noise(self) -> None:
-        """The attributes that new rows change."""
+        """Set the attributes that new rows change."""
         predictor = self._posterior.predictor
         if self.feature_map_ is not None:
             mean, covariance = predictor.coefficients()
@@ -300,7 +300,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self.noise_variance_: Any = float(predictor.noise[0]) if self._n_outputs == 1 else predictor.noise.copy()
 
     def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
-        """Tell the user how the fit ended, and which parameters of the given kernel ended at their bounds."""
+        """Warn about the end of the fit, and about parameters of the given kernel that ended at their bounds."""
         predictor = self._posterior.predictor
         at_bounds = (
             []
@@ -313,6 +313,6 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
                 )
             ]
         )
-        # What outputs share is said once.
+        # Messages on parameters that outputs share are given once.
         for message in (*messages, *dict.fromkeys(at_bounds)):
             warn_user(message, ConvergenceWarning)

@@ -38,11 +38,11 @@ from ..utils.validation import (
 _EPOCHS, _STEPS = 100, 5000
 # Rows per step if batch_size is "auto".
 _BATCH_SIZE = 200
-# Numbers that a layer of a prediction holds at once.
+# Maximum number of floats in a layer of a prediction.
 _NUMBERS_AT_ONCE = 2**21
 # A column is constant if its entries differ by no more than this many rounding errors.
 _ROUNDING = 8.0 * np.finfo(float).eps
-# Added to the variance of a pre-activation: a row of zeros has none, and its square root needs a slope there.
+# Added to the variance of a pre-activation, whose square root needs a slope even if all inputs are 0.
 _TINY = 1e-32
 # Bounds of the standard deviations, in units of the prior's, and of the noise variances of standardised targets.
 _STD, _NOISE_VARIANCE = (1e-9, 1e3), (1e-12, 1e6)
@@ -74,13 +74,13 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Slope of LeakyReLU for negative inputs, in [0, 1].
     prior_scale : float or array-like of shape (n_layers,), default=None
         Prior standard deviation of the weights of all layers, or of each layer, for standardised inputs and targets.
-        If None, it is 1 / sqrt(fan in): the outputs of a layer then are of the size of its inputs, whatever its width.
+        If None, it is 1 / sqrt(fan in), so that the outputs of a layer have the size of its inputs.
     batch_size : int or "auto", default="auto"
         Number of rows per step. ``"auto"`` is 200, or all rows if there are fewer.
     learning_rate_init : float, default=0.01
         First step size of Adam. It falls to zero along half a cosine: over ``max_iter`` epochs, or over the last steps.
     max_iter : int, default=None
-        Largest number of epochs, which are passes over the rows. If None, it is 100, or more where 100 epochs are fewer
+        Maximum number of epochs, which are passes over the rows. If None, it is 100, or more if 100 epochs are fewer
         than 5000 steps.
     tol : float, default=0.01
         Tolerance of the loss, in nats per row. When the loss stays flat, Adam begins its last steps, which are as many
@@ -100,7 +100,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     warm_start : bool, default=False
         Whether to start from the parameters of the last fit, if it had the same layers.
     random_state : int, RandomState instance or None, default=None
-        Draws the first weights, mini-batches, pre-activations, held-out rows and the weights for predictions.
+        Seed of the first weights, mini-batches, pre-activations, held-out rows and the weights for predictions.
     verbose : int, default=0
         Progress messages, as in `EVGPRegressor`. An iteration is a step, and the bound is per row.
 
@@ -223,12 +223,12 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Returns
         -------
         self : BayesianMLPRegressor
-            Fitted.
+            The estimator itself, fitted.
 
         Raises
         ------
         ValueError, TypeError
-            If an argument, the data or their shapes are out of range; the message says what is allowed.
+            If an argument, the data or their shapes are out of range.
 
         Warns
         -----
@@ -300,7 +300,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         Raises
         ------
         ValueError
-            If X does not fit the training data, is not finite, or both std and covariance are asked for.
+            If X does not fit the training data, is not finite, or both ``return_std`` and ``return_cov`` are set.
         """
         if return_std and return_cov:
             raise ValueError("At most one of return_std and return_cov can be asked for.")
@@ -335,7 +335,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         n_samples : int, default=1
             Number of functions.
         random_state : int, RandomState instance or None, default=0
-            Draws weights and noise.
+            Seed of weights and noise.
         include_noise : bool, default=True
             Whether to add the learned noise.
 
@@ -382,7 +382,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         rng: np.random.Generator,
         monitor: Monitor,
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, str]:
-        """Adam on mini-batches: parameters, loss and score of each epoch, and a message if it ended badly."""
+        """Run Adam on mini-batches; return parameters, loss and score of each epoch, and a message or ""."""
         n_held_back = max(1, round(self.validation_fraction * len(X))) if self.early_stopping else 0
         if n_held_back == len(X):
             raise ValueError(
@@ -401,7 +401,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         order = np.empty(0, dtype=int)
 
         def objective(theta: np.ndarray) -> tuple[float, np.ndarray]:
-            """Minus the bound per row, on the next mini-batch. Rows are shuffled at the beginning of each epoch."""
+            """Return minus the bound per row on the next mini-batch; rows are shuffled at the start of each epoch."""
             nonlocal order
             if len(order) == 0:
                 order = rng.permutation(len(X))
@@ -445,7 +445,7 @@ class BayesianMLPRegressor(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return X
 
     def _blocks_of_outputs(self, X: np.ndarray, weights: list[np.ndarray]) -> Iterator[np.ndarray]:
-        """Standardised outputs (n_draws, rows, o) without noise, for one block of rows after the other."""
+        """Yield standardised outputs (n_draws, rows, o) without noise, one block of rows at a time."""
         size = max(1, _NUMBERS_AT_ONCE // (len(weights[0]) * max(drawn.shape[2] for drawn in weights)))
         for first in range(0, len(X), size):
             yield self._network.functions(self._theta, weights, self._scaling.inputs(X[first : first + size]))
@@ -484,7 +484,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class Scaling:
-    """Means and scales of the columns of X and y: between the user's units and standardised ones."""
+    """Means and scales of the columns of X and y, between the user's units and standardised ones."""
 
     x_mean: np.ndarray  # (d,)
     x_scale: np.ndarray
@@ -493,22 +493,22 @@ class Scaling:
 
     @classmethod
     def of(cls, X: np.ndarray, Y: np.ndarray, counts: np.ndarray | None = None) -> Scaling:
-        """The scaling of a training set, whose rows count ``counts`` times, or once."""
+        """Return the scaling of a training set, whose rows count ``counts`` times, or once."""
         return cls(*_mean_and_scale(X, counts), *_mean_and_scale(Y, counts))
 
     def inputs(self, X: np.ndarray) -> np.ndarray:
-        """Standardised inputs, clipped where their squares would overflow."""
+        """Standardise inputs, and clip those whose squares would overflow."""
         return np.clip((X - self.x_mean) / self.x_scale, -LARGEST, LARGEST)
 
     def targets(self, Y: np.ndarray) -> np.ndarray:
-        """Standardised targets."""
+        """Standardise targets."""
         return (Y - self.y_mean) / self.y_scale
 
     # With D = diag(x_scale), S = diag(y_scale) and standardised inputs (x - x_mean) D⁻¹, the first layer's weights are
     # D⁻¹ W as weights of x - x_mean. The last layer's weights are W S, and its biases b S + y_mean, as those of y.
 
     def to_users(self, network: VariationalNetwork, theta: np.ndarray) -> np.ndarray:
-        """Parameters of the same network as a function of ``X - x_mean``, in units of X and y."""
+        """Return the parameters of the same network as a function of ``X - x_mean``, in units of X and y."""
         theta = theta.copy()
         layers, log_noise = network.split(theta)
         first, last, columns = layers[0], layers[-1], self.x_scale[:, np.newaxis]
@@ -521,7 +521,7 @@ class Scaling:
         return theta
 
     def from_users(self, network: VariationalNetwork, theta: np.ndarray, x_mean: np.ndarray) -> np.ndarray:
-        """The inverse, of a network that is a function of ``X - x_mean`` for another ``x_mean``."""
+        """Invert `to_users`, for a network that is a function of ``X - x_mean`` with another ``x_mean``."""
         theta = theta.copy()
         layers, log_noise = network.split(theta)
         first, last, columns = layers[0], layers[-1], self.x_scale[:, np.newaxis]
@@ -537,7 +537,7 @@ class Scaling:
 
 
 def _mean_and_scale(values: np.ndarray, counts: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and standard deviation of each column. A constant column has its size as its scale, or 1."""
+    """Return mean and standard deviation of each column; the scale of a constant column is its size, or 1."""
     largest = np.abs(values).max(axis=0)
     constant = np.ptp(values, axis=0) <= _ROUNDING * largest
     mean = values.mean(axis=0) if counts is None else counts @ values / counts.sum()
@@ -549,14 +549,12 @@ def _mean_and_scale(values: np.ndarray, counts: np.ndarray | None) -> tuple[np.n
 
 
 class VariationalNetwork:
-    """LeakyReLU layers with independent weights w ~ N(mean, std²) and biases that are numbers.
-
-    The parameters θ are one flat vector: the means of all layers, their log standard deviations, their biases, and a
-    log noise variance for each output. ``sizes`` are the units of each layer, inputs first and outputs last. The prior
-    of a layer's weights is N(0, prior_scale²).
-    """
+    """LeakyReLU layers with independent weights w ~ N(mean, std²) and biases that are numbers."""
 
     def __init__(self, sizes: Sequence[int], prior_scales: Sequence[float] | np.ndarray, negative_slope: float):
+        # The parameters θ are one flat vector: the means of all layers, their log standard deviations, their biases,
+        # and a log noise variance for each output. sizes are the units of each layer, inputs first and outputs last.
+        # The prior of the weights of a layer is N(0, prior_scale²).
         self.sizes, self.slope, self.prior_log_stds = tuple(sizes), negative_slope, np.log(prior_scales)
         matrices, vectors = list(pairwise(self.sizes)), [(size,) for size in self.sizes[1:]]
         self.n_hidden = sum(self.sizes[1:-1])
@@ -567,14 +565,14 @@ class VariationalNetwork:
             self._parts.append((slice(first, self.n_parameters), shape))
 
     def split(self, vector: np.ndarray) -> tuple[list[Layer], np.ndarray]:
-        """Views of a flat vector: the layers, and the log noise variances (o,)."""
+        """Return views of a flat vector: the layers, and the log noise variances (o,)."""
         parts = [vector[part].reshape(shape) for part, shape in self._parts]
         n_layers = len(self.sizes) - 1
-        # Means, then log standard deviations, then biases: each third has one part a layer.
+        # Means, then log standard deviations, then biases: each third has one part per layer.
         return [Layer(*parts[k : 3 * n_layers : n_layers]) for k in range(n_layers)], parts[-1]
 
     def limits(self) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper bounds of θ, far from anything sensible."""
+        """Return wide lower and upper bounds of θ."""
         lower, upper = np.full(self.n_parameters, -np.inf), np.full(self.n_parameters, np.inf)
         for bound, std, noise in zip((lower, upper), _STD, _NOISE_VARIANCE, strict=True):
             layers, log_noise = self.split(bound)
@@ -584,7 +582,7 @@ class VariationalNetwork:
         return lower, upper
 
     def start(self, rng: np.random.Generator) -> np.ndarray:
-        """First θ: means as in He et al. (2015), near 0 for the outputs, small deviations, biases 0, noise 1."""
+        """Return the first θ: means as in He et al. (2015), small for the outputs, small deviations, biases 0."""
         theta = np.zeros(self.n_parameters)
         layers, _ = self.split(theta)
         gain = np.sqrt(2.0 / (1.0 + self.slope**2))
@@ -604,10 +602,8 @@ class VariationalNetwork:
         n_rows: float,
         weights: np.ndarray | None = None,
     ) -> tuple[float, np.ndarray]:
-        """Minus the evidence lower bound per row, in nats, as b rows of a training set of ``n_rows`` rows estimate it.
-
-        ``draws`` (b, n_hidden) are standard normal. ``weights`` (b,) are how often rows count; None means once.
-        """
+        """Return minus the evidence lower bound per row in nats, estimated by b of n_rows rows, and its gradient."""
+        # draws (b, n_hidden) are standard normal. weights (b,) are how often rows count; None means once.
         # loss = ½ Σ_o [log 2π + log σ_o² + e_o / σ_o²] + KL[q(w) | p(w)] / n_rows,
         # e_o = mean over rows of (y - m)² + v: the expected squared error, with moments m and v of the outputs.
         layers, log_noise = self.split(theta)
@@ -649,7 +645,7 @@ class VariationalNetwork:
     def expected_log_likelihood(
         self, theta: np.ndarray, X: np.ndarray, Y: np.ndarray, draws: np.ndarray, weights: np.ndarray | None = None
     ) -> float:
-        """Expected log likelihood per row, in nats; arguments as of `loss_and_gradient`."""
+        """Return the expected log likelihood per row in nats, with the arguments of `loss_and_gradient`."""
         layers, log_noise = self.split(theta)
         *_, mean, variance = self._forward(layers, X, draws)
         return -_log_loss(_mean((Y - mean) ** 2 + variance, weights), log_noise)
@@ -657,20 +653,17 @@ class VariationalNetwork:
     def draw(
         self, theta: np.ndarray, n_draws: int, rng: np.random.Generator, mirrored: bool = False
     ) -> list[np.ndarray]:
-        """Weights (n_draws, fan in, fan out) of each layer, if ``mirrored`` in pairs M ± s ε.
-
-        In the mean over pairs, what is odd in the deviations cancels: a few draws have a good mean.
-        """
+        """Draw weights (n_draws, fan in, fan out) of each layer, if mirrored in pairs M ± s ε."""
         weights = []
         for layer in self.split(theta)[0]:
             deviations = rng.standard_normal(((n_draws + 1) // 2 if mirrored else n_draws, *layer.mean.shape))
-            if mirrored:
+            if mirrored:  # odd terms of the deviations cancel, so that a few draws have a good mean
                 deviations = np.concatenate([deviations, -deviations])[:n_draws]
             weights.append(layer.mean + np.exp(layer.log_std) * deviations)
         return weights
 
     def functions(self, theta: np.ndarray, weights: list[np.ndarray], X: np.ndarray) -> np.ndarray:
-        """Outputs (n_draws, b, o) at rows X (b, d), without noise, of each draw of the weights."""
+        """Return outputs (n_draws, b, o) without noise at rows X (b, d), for each draw of the weights."""
         layers, _ = self.split(theta)
         outputs = X[np.newaxis]
         for k, (layer, drawn) in enumerate(zip(layers, weights, strict=True)):
@@ -680,10 +673,10 @@ class VariationalNetwork:
         return outputs
 
     def _forward(self, layers: list[Layer], X: np.ndarray, draws: np.ndarray) -> tuple[Any, ...]:
-        """Inputs and variances of weights of each layer, √v of the hidden ones, and moments m and v of the outputs."""
+        """Return inputs and weight variances of the layers, √v of hidden layers, and moments m and v of the outputs."""
         # A pre-activation is a sum of normal weights times inputs, so it is normal: z ~ N(X M + b, X² V). It is drawn
-        # row by row in place of the weights (Kingma, Salimans & Welling 2015, section 2.2). The outputs' are not drawn:
-        # the normal likelihood is integrated over them in closed form.
+        # row by row instead of the weights (Kingma, Salimans & Welling 2015, section 2.2). Those of the outputs are not
+        # drawn, because the normal likelihood is integrated over them in closed form.
         inputs, variances, spreads, first = [X], [np.exp(2.0 * layer.log_std) for layer in layers], [], 0
         for layer, variance in zip(layers[:-1], variances, strict=False):
             noise = draws[:, first : first + len(layer.bias)]
@@ -696,10 +689,10 @@ class VariationalNetwork:
 
 
 def _mean(values: np.ndarray, weights: np.ndarray | None) -> np.ndarray:
-    """Mean over rows, with weights of mean 1."""
+    """Return the mean over rows, with weights of mean 1."""
     return values.mean(axis=0) if weights is None else weights @ values / len(values)
 
 
 def _log_loss(misfit: np.ndarray, log_noise: np.ndarray) -> float:
-    """Minus the expected log density of a row: ½ Σ_o [log 2π + log σ_o² + e_o / σ_o²]."""
+    """Return minus the expected log density of a row: ½ Σ_o [log 2π + log σ_o² + e_o / σ_o²]."""
     return 0.5 * float((np.log(2.0 * np.pi) + log_noise + misfit * np.exp(-log_noise)).sum())

@@ -28,7 +28,7 @@ from ..utils.sklearn import Interval, StrOptions, fit_context
 from ..utils.validation import check_fitted, is_dask, unchanged_if_it_fails
 from .base import GaussianProcess, names_moved_arguments
 
-# Of so many, an iteration takes a few milliseconds at most.
+# Number of rows up to which an iteration takes a few milliseconds at most.
 _FEW_ROWS = 100
 
 
@@ -40,93 +40,95 @@ class EGPRegressor(GaussianProcess):
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
               f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
 
-    but nothing is approximated: kernel and noise maximise the log marginal likelihood with the weights integrated out.
-    Time is cubic in the number of rows and memory quadratic: for a few thousand rows, and as the reference.
+    without approximation. Kernel and noise maximise the log marginal likelihood with the weights integrated out. Time
+    is cubic and memory quadratic in the number of rows. Use it for up to a few thousand rows, and as a reference.
 
     Parameters
     ----------
     feature_map : transformer, default=None
-        x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given: do not scale columns in front of
-        it. None has no explicit features. It may return a row for each output, (n, n_outputs, n_h).
+        Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It gets X as given, so do not scale the
+        columns of X. It may return a row for each output, (n, n_outputs, n_h).
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f, as of `EVGPRegressor`; outputs share its shape, and have signal variances of their own. Of
-        outputs that vary along different columns, or at different scales, it can learn one at the cost of the others:
-        ``MultiOutputRegressor(EGPRegressor(...))`` of scikit-learn fits each by itself (its predictions have no std).
+        Covariance of f, as in `EVGPRegressor`. Outputs have the same kernel shape, and their own signal variances.
     kernel_map : transformer, default=None
-        x -> the kernel's inputs, for example a `StandardScaler`. Only the kernel sees it: scaling belongs here.
-        It may return a row for each output, (n, n_outputs, d).
+        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel gets its result, so scale
+        columns here. It may return a row for each output, (n, n_outputs, d).
     coef_prior : skevgp.CoefPrior or "auto", default="auto"
-        Prior of the weights β. ``"auto"`` asks the feature map. ``CoefPrior(scale=np.inf)`` says that nothing is known
-        of the weights before.
+        Prior of the weights β. If ``"auto"``, it is that of the feature map. ``CoefPrior(scale=np.inf)`` is a vague
+        prior.
     noise : "gaussian" or `skevgp.noise.Gaussian`, default="gaussian"
-        Model of the noise. ``Gaussian(variance=...)`` is where its variance starts.
+        Noise model. ``Gaussian(variance=...)`` sets the start of its variance.
     alpha : float, default=None
-        A noise variance that is known, in place of one that is learned; ``std`` has it. If each row has its own, give
-        their mean here, and to `fit` what they are in units of it, ``relative_variance``.
+        Known noise variance, which is not learned. If rows differ, pass their mean here, and their variances in units
+        of it as ``relative_variance`` of `fit`. ``std`` includes it.
     normalize_y : bool, default=False
-        Whether the prior mean is the training mean of y, in place of 0. Of a y that is then constant nothing is known
-        but the constant: its signal stays at a standard deviation of 1.
+        Whether the prior mean is the training mean of y instead of 0. If y is constant, the signal has a standard
+        deviation of 1.
     optimizer : "fmin_l_bfgs_b", callable or None, default="fmin_l_bfgs_b"
-        What finds kernel and noise. None takes the kernel as it is given: a signal variance that is added to one that
-        has none is 1, as all numbers of the default kernel are. A callable is one as `GaussianProcessRegressor` takes,
-        ``optimizer(objective, theta, bounds=bounds) -> (theta, value)``, called from each start: the objective is minus
-        the log marginal likelihood, ``objective(theta, eval_gradient=True) -> (value, gradient)``; theta (n_free,) are
-        the logarithms of k̃'s free hyperparameters, then of each output's signal variance, then of each one's noise
-        variance; bounds (n_free, 2) are those of its entries.
+        Optimiser of kernel and noise. If None, the kernel is used as given, and missing numbers are 1. A callable has
+        the interface of `GaussianProcessRegressor` (see Notes).
     max_iter : int, default=1000
-        The most iterations of L-BFGS from each start. With 0 kernel and noise stay where they start.
+        Maximum number of iterations of L-BFGS from each start. With 0, kernel and noise stay at their start.
     max_time : float, default=None
-        Seconds that the iterations may take; when they are over, the best so far is kept, with a ConvergenceWarning.
+        Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning.
     n_restarts : int, default=0
-        Further fits with kernel and noise drawn log-uniformly around the first start, within their bounds; the
-        likeliest is kept.
+        Number of further fits, with kernel and noise drawn log-uniformly around the first start within their bounds.
+        The likeliest fit is kept.
     tol : float or "auto", default="auto"
-        In nats. L-BFGS starts anew from its best point when each of three iterations in a row raises the log marginal
-        likelihood by less than this, and stops when a fresh start gains no more. ``"auto"`` is 0.01, and 1e-9 for 100
-        rows or fewer, where iterations cost next to nothing: a function without noise is then met to rounding.
+        Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
+        and stops when such a start gains no more. ``"auto"`` is 0.01, and 1e-9 for 100 rows or fewer.
     n_targets : int, default=None
-        How many outputs y has. It is needed before a fit only, when `predict` and `sample_y` are of the prior; None is
-        one there.
+        Number of outputs of y, for `predict` and `sample_y` before a fit. If None, 1.
     random_state : int, RandomState instance or None, default=None
-        Draws the restarts.
+        Seed of the restarts.
     verbose : int, default=0
         Progress messages, as in `EVGPRegressor`. The bound is the log marginal likelihood.
 
     Attributes
     ----------
-    coef_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior mean of the weights. Only with a ``feature_map``. It is per feature of the map, not per column of X:
-        where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example ``importance_getter=lambda
-        model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and columns of like scale. A y
-        of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis of outputs then.
-    coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Their posterior standard deviations. Only with a ``feature_map``.
+    coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
+        Posterior means and standard deviations of the weights, per feature. Only with a ``feature_map``, as the other
+        attributes ``coef_...``. The axis of outputs is left out if y has one column or outputs share their weights.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances. Only with a ``feature_map``.
+        Posterior covariances of the weights.
     coef_names_ : ndarray of str of shape (n_h,)
-        What the feature map calls them, by its ``get_feature_names_out``; h0, h1, ... if it does not say. Only with a
-        ``feature_map``.
+        Names of the features by ``get_feature_names_out`` of the feature map, or h0, h1, ...
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used. Only with a ``feature_map``.
+        Prior means and standard deviations of the weights.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     kernel_ : Kernel, or list of Kernel for several outputs
-        Fitted, without the noise.
+        Fitted kernel without noise.
     noise_variance_ : float or ndarray of shape (n_outputs,)
-        σ², in squared units of y.
+        Noise variance σ² in squared units of y.
     log_marginal_likelihood_value_ : float
-        In nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts (eq. 2.45 there).
+        Log marginal likelihood in nats, summed over outputs. With k vague weights it is that of n_samples - k contrasts
+        (Rasmussen & Williams 2006, eq. 2.45).
     loss_curve_ : ndarray of shape (n_iter,)
         Minus the log marginal likelihood per iteration.
     n_iter_ : int
-        Iterations of the start that was kept; of a callable ``optimizer`` its evaluations.
+        Number of iterations of the best start, or of evaluations of a callable ``optimizer``.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it had any.
 
     See Also
     --------
     EVGPRegressor : The same model with inducing points, for any number of rows.
+
+    Notes
+    -----
+    Outputs that vary along different columns, or at different scales, fit better with kernels of their own:
+    ``MultiOutputRegressor(EGPRegressor(...))`` of scikit-learn, whose predictions have no std.
+
+    A callable ``optimizer(objective, theta, bounds=bounds) -> (theta, value)`` is called from each start. It minimises
+    minus the log marginal likelihood, ``objective(theta, eval_gradient=True) -> (value, gradient)``. The vector theta
+    (n_free,) has the logarithms of the free hyperparameters, then those of the signal variances and of the noise
+    variances of the outputs. The bounds (n_free, 2) are those of its entries.
+
+    `SelectFromModel` and `RFE` of scikit-learn rank columns of X, not features. For one output, the default kernel and
+    columns of similar scale, use ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``.
 
     References
     ----------
@@ -134,7 +136,7 @@ class EGPRegressor(GaussianProcess):
 
     Examples
     --------
-    A wave on a linear trend of which nothing is known; the explicit features are x and 1:
+    Learn a wave on an unknown linear trend, with the explicit features x and 1:
 
     >>> import numpy as np
     >>> from sklearn.preprocessing import PolynomialFeatures
@@ -146,8 +148,8 @@ class EGPRegressor(GaussianProcess):
     >>> round(model.score(X, y), 2)
     0.96
 
-    Before a fit predictions are of the prior, where y counts as of size one (maps are fitted to the rows that are asked
-    for: with scalers among them, rows are relative to each other):
+    Before a fit, predictions are those of the prior for a y of size one. Maps are then fitted to the rows of the
+    prediction:
 
     >>> prior = EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(scale=[0.0, 2.0]))
     >>> mean, std = prior.predict([[0.0], [3.0]], return_std=True)
@@ -225,12 +227,12 @@ class EGPRegressor(GaussianProcess):
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
-            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode.
+            Rows, with numbers up to 1e100. The maps get X as given: a data frame (pandas, polars, pyarrow) stays one,
+            and with a ``kernel_map`` it may hold words that the maps encode.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+            Targets, up to 1e100. The largest of a column must be 0 or above 1e-140.
         sample_weight, relative_variance : array-like of shape (n_samples,), default=None
-            As of `EVGPRegressor.fit`.
+            Weights and relative noise variances of the rows, as in `EVGPRegressor.fit`.
 
         Returns
         -------
@@ -241,14 +243,14 @@ class EGPRegressor(GaussianProcess):
         ------
         ValueError, TypeError
             If an argument is out of its range, the data are not finite, shapes do not fit, or features with vague
-            weights depend on each other; the message names the argument, the value and what is allowed.
+            weights are linearly dependent.
 
         Warns
         -----
         ConvergenceWarning
-            If iterations or time were used up, rounding errors ended them, or Ctrl-C did (the best parameters so far
-            are kept); if the Gaussian process learned nothing; if y is far from its prior mean; if a parameter of the
-            given kernel ended at one of its bounds. It says what to change.
+            If iterations or time were used up, or rounding errors or Ctrl-C ended them; the best parameters so far are
+            kept. If the Gaussian process learned nothing, y is far from its prior mean, or a parameter of the given
+            kernel is at a bound. The message gives advice.
         """
         if is_dask(X):
             raise TypeError("X is a Dask array, but the exact model needs all rows at once: use EVGPRegressor.")
@@ -275,7 +277,7 @@ class EGPRegressor(GaussianProcess):
         return self
 
     def _problem(self, data: Dataset) -> Problem:
-        """What a fit to a data set starts from."""
+        """Return the problem of a fit to a data set."""
         noise = as_noise(self.noise)
         if noise.heavy_tails or noise.inputs is not None:
             raise ValueError(f"The exact model has Gaussian noise of y only; got noise={self.noise!r}.")
@@ -308,10 +310,10 @@ class EGPRegressor(GaussianProcess):
         return self.tol
 
     def _before_fit(self, X: Any) -> Self:
-        """A copy that predicts what is known without data. Its maps are fitted to X."""
+        """Return a copy that predicts from the prior, with maps that are fitted to X."""
         model = clone(self)
         model._validate_params()
-        # What is no table has one row, until it is refused in scikit-learn's words.
+        # An X that is not a table counts as one row here; scikit-learn's validation raises the error.
         n_rows = len(X) if isinstance(X, list | tuple) else np.shape(X)[0] if np.ndim(X) else 1
         data = Dataset.from_user(model, X, np.zeros((n_rows, self.n_targets or 1)))
         problem = model._problem(data)
@@ -333,33 +335,33 @@ class EGPRegressor(GaussianProcess):
     def log_marginal_likelihood(
         self, theta: ArrayLike | None = None, eval_gradient: bool = False, clone_kernel: bool = True
     ) -> Any:
-        """Log marginal likelihood of the training data under another kernel, with the fitted noise.
+        """Return the log marginal likelihood of the training data under another kernel, with the fitted noise.
 
-        As of `GaussianProcessRegressor`, but always in the units of y, and with ``normalize_y`` too.
+        It corresponds to that of `GaussianProcessRegressor`, in units of y also with ``normalize_y``.
 
         Parameters
         ----------
         theta : array-like of shape (n_theta,) or (n_outputs, n_theta), default=None
-            Logarithms of the free hyperparameters, in the order of ``kernel_.theta``; for several outputs those of each
-            one's kernel, which need not agree in what the fitted ones share. None means the fitted ones. Where it is of
-            another length, ``kernel.theta`` will do, of the kernel as it was given: a signal variance that it does not
-            have is then 1, and noise that it has is its own.
+            Logarithms of the free hyperparameters of each output, in the order of ``kernel_.theta``. A vector of the
+            length of ``kernel.theta``, of the kernel as given, is accepted too: a missing signal variance is then 1,
+            and its own noise is used. If None, the fitted hyperparameters.
         eval_gradient : bool, default=False
-            Whether to return the gradient too; only with a ``theta``.
+            Whether to return the gradient too. It needs a ``theta``.
         clone_kernel : bool, default=True
-            Whether ``kernel_`` is left as it is; if not, ``theta`` stays in it, and predictions do not change.
+            Whether to keep ``kernel_``. If False, ``theta`` is stored in it, and predictions do not change.
 
         Returns
         -------
         log_likelihood : float
-            In nats, summed over outputs; with vague weights, of contrasts, as ``log_marginal_likelihood_value_``.
+            Log marginal likelihood in nats, as ``log_marginal_likelihood_value_``.
         gradient : ndarray of the shape of ``theta``
-            If ``eval_gradient``. For what outputs share add up its rows.
+            Gradient with respect to ``theta``. Only if ``eval_gradient``. Add up its rows for parameters that outputs
+            share.
 
         Raises
         ------
         ValueError
-            If ``theta`` has another shape or is out of range, or a gradient is asked for without it.
+            If ``theta`` has another shape or is out of range, or ``eval_gradient`` is set without it.
         """
         check_fitted(self)
         if theta is None and eval_gradient:
@@ -370,7 +372,7 @@ class EGPRegressor(GaussianProcess):
         if predictor.shared:
             raise ValueError("log_marginal_likelihood(theta) needs outputs with weights of their own: not shared ones.")
         order, given, width = self._spec.order, self._spec.given_order, np.shape(theta)[-1:]
-        # Of each output k̃'s hyperparameters, s² and σ², as fitted, in the user's units.
+        # Fitted hyperparameters of k̃, s² and σ² of each output, in the user's units.
         fitted = [
             np.append(group.hyperparameters, [predictor.signal[o], predictor.noise[o]])
             for o, group in enumerate(predictor.by_output)

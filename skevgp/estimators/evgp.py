@@ -52,115 +52,111 @@ class EVGPRegressor(GaussianProcess):
     .. math:: y = h(x)^\top \beta + f(x) + \varepsilon, \quad \beta \sim N(\mu_\beta, \Sigma_\beta), \quad
               f \sim GP(0, k), \quad \varepsilon \sim N(0, \sigma^2),
 
-    where the features h are known (rough physics, a trend) and f, a Gaussian process with ``n_inducing`` inducing
+    where the features h are known (approximate physics, a trend) and f, a Gaussian process with ``n_inducing`` inducing
     points, learns the residual. Time is linear in the number of rows. Without a feature map it is the sparse Gaussian
-    process of Titsias (2009) and Hensman et al. (2013).
+    process of Titsias (2009) and Hensman et al. (2013). See the user guide, :doc:`/guide/model`.
 
     Parameters
     ----------
     feature_map : transformer, default=None
-        Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It sees X as given, so do not scale the
-        columns of X. It may return a row for each output, (n, n_outputs, n_h). If None, there are no explicit features.
+        Transformer x -> h(x), for example `InertiaForceGravity("pendulum")`. It gets X as given, so do not scale the
+        columns of X. It may return a row for each output, (n, n_outputs, n_h).
     kernel : sklearn.gaussian_process.kernels.Kernel or callable, default=None
-        Covariance of f: one of the kernels that `skevgp.kernels` lists, or sums and products of them. Starts, bounds
-        and ``"fixed"`` are respected. The outermost constant factor is the signal variance, one for each output; if
-        there is none, one is added. A WhiteKernel as a term of the outermost sum sets the noise. A callable is a
-        covariance function in autograd.numpy (`FunctionKernel`). If None, an RBF with a length scale per column.
+        Covariance of f: one of the kernels that `skevgp.kernels` lists, sums and products of them, or a function in
+        autograd.numpy (`FunctionKernel`). The outermost constant factor is the signal variance of each output, and a
+        WhiteKernel in the outermost sum sets the noise. If None, an RBF with a length scale per column.
     kernel_map : transformer, default=None
-        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel sees its result: scale
+        Transformer x -> inputs of the kernel, for example a `StandardScaler`. Only the kernel gets its result, so scale
         columns here. It may return a row for each output, (n, n_outputs, d).
     coef_prior : skevgp.CoefPrior or "auto", default="auto"
-        Prior of the weights β. ``"auto"`` asks the feature map.
+        Prior of the weights β. If ``"auto"``, it is that of the feature map. See :doc:`/guide/priors`.
     n_inducing : int or "auto", default=100
-        Number of inducing points; fewer if there are fewer distinct rows. ``"auto"``, for L-BFGS, starts with 10 and
-        adds points until they raise the bound by less than 0.01 nats per row and output.
+        Number of inducing points, at most the number of distinct rows. With L-BFGS, ``"auto"`` starts with 10 and adds
+        points until they raise the bound by less than 0.01 nats per row and output.
     inducing_init : {"auto", "k-means", "greedy"} or array-like of shape (m, d), default="auto"
-        Where inducing points start: at cluster centres, one after the other at the row that the kernel knows least
-        (``"greedy"``, Burt et al. 2020), or at given points in the space of ``kernel_map``. ``"auto"`` starts at
-        cluster centres, and with L-BFGS places the points again, greedily, under the kernel learned in 25 iterations;
-        the better of the two fits goes on.
+        Start of the inducing points: cluster centres, rows of the largest residual variance (``"greedy"``, Burt et al.
+        2020), or points in the space of ``kernel_map``. ``"auto"`` is ``"k-means"``, and with L-BFGS also tries
+        ``"greedy"`` after 25 iterations.
     sharing : {"auto", "all", "kernel", "none"} or list of list of int, default="auto"
-        What the outputs share: inducing points and kernel shape (``"all"``, the fastest), the kernel's shape
-        (``"kernel"``, the paper's), or nothing. Groups such as ``[[0, 1], [2, 3]]`` share as ``"all"`` inside each
-        group. ``"auto"`` finds groups by short fits to up to 1,000 rows. Signal variance and noise variance are always
-        per output.
+        Parameters that outputs share: inducing points and kernel shape (``"all"``, the fastest), kernel shape
+        (``"kernel"``, as in the paper), or none. Outputs in a group of ``[[0, 1], [2, 3]]`` share as in ``"all"``.
+        ``"auto"`` finds groups by short fits. See :doc:`/guide/sharing`.
     noise : {"gaussian", "student-t"}, `skevgp.noise.Gaussian` or `skevgp.noise.StudentT`, default="gaussian"
-        Model of the noise. ``"student-t"`` is for data of which a few rows are wrong.
-        ``Gaussian(inputs=...)`` is for noise in X.
+        Noise model. Use ``"student-t"`` if a few rows are outliers, and ``Gaussian(inputs=...)`` for noise in X.
     noise_cv : int, default=5
-        Number of folds by which signal and noise variance are calibrated after the iterations: whole ``groups`` of
-        `fit`, or else random rows. Without it, the bound takes what inducing points cannot represent for noise, and
-        rows of a trajectory for independent ones. If None, or with fewer than 50 rows, there is no calibration.
+        Number of folds that calibrate signal and noise variance after the iterations. Folds are whole ``groups`` of
+        `fit`, or random rows. If None, or with fewer than 50 rows, there is no calibration. See :doc:`/guide/noise`.
     normalize_y : bool, default=False
         Whether the prior mean is the training mean of y instead of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
-        L-BFGS on the bound with q at its optimum, or the paper's Adam on mini-batches over all parameters. Solver
-        objects have further options, such as ``LBFGS(n_restarts=2)`` and ``Adam(batch_size=1000)``, which a grid search
-        reaches as ``solver__batch_size``.
+        L-BFGS on the bound with q at its optimum, or Adam on mini-batches over all parameters, as in the paper. Solver
+        objects have further options, such as ``Adam(batch_size=1000)``. A grid search sets them as
+        ``solver__batch_size``.
     max_iter : int, default=None
-        Maximum number of iterations of L-BFGS, on all rows and on each sample of them, or of steps of Adam. None means
-        1000 or 16000. With 0, kernel and inducing points stay where they start, and q is at its optimum.
+        Maximum number of iterations of L-BFGS (None: 1000) or of steps of Adam (None: 16000). With 0, kernel and
+        inducing points stay at their start, and only q is fitted.
     warm_start : bool, default=False
-        Whether to start from the kernel, noise, inducing points and groups of the last fit, where shapes agree.
+        Whether to start from the kernel, noise, inducing points and groups of the last fit, if shapes agree.
     n_jobs : int, default=None
         Number of threads; None means 1, -1 all cores. The result does not depend on it.
     random_state : int, RandomState instance or None, default=None
-        Source of chance for inducing points, mini-batches and restarts.
+        Seed of inducing points, mini-batches and restarts.
     verbose : int, default=0
-        Verbosity. 0 prints nothing. 1 shows the rows that are fitted, the iteration, the bound and the seconds so far:
-        in one live line if tqdm is installed and the output is a terminal or a notebook, else in a line every ten
-        seconds. 2 prints a line at each iteration.
+        Verbosity: 0 prints nothing, 1 shows the progress in a live line or every ten seconds, and 2 prints a line at
+        each iteration.
 
     Attributes
     ----------
     coef_, coef_std_ : ndarray of shape (n_h,) or (n_outputs, n_h)
-        Posterior means and standard deviations of the weights. Only with a ``feature_map``: they are per feature of
-        it, not per column of X. Where scikit-learn ranks columns (`SelectFromModel`, `RFE`), give it for example
-        ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``, for one output, the default kernel and
-        columns of like scale. A y of shape (n_samples, 1) is one output, as of shape (n_samples,): nothing has an axis
-        of outputs then.
+        Posterior means and standard deviations of the weights, per feature. Only with a ``feature_map``, as the other
+        attributes ``coef_...``. The axis of outputs is left out if y has one column or outputs share their weights.
     coef_cov_ : ndarray of shape (n_h, n_h) or (n_outputs, n_h, n_h)
-        Their posterior covariances. Only with a ``feature_map``. (Where outputs share their weights, nothing of them
-        has an axis of outputs.)
+        Posterior covariances of the weights.
     coef_names_ : ndarray of str of shape (n_h,)
-        What the feature map calls them, by its ``get_feature_names_out``; h0, h1, ... if it does not say. Only with a
-        ``feature_map``.
+        Names of the features by ``get_feature_names_out`` of the feature map, or h0, h1, ...
     coef_prior_mean_, coef_prior_scale_ : ndarray of the shape of ``coef_``
-        The prior that was used. Only with a ``feature_map``.
+        Prior means and standard deviations of the weights.
     feature_map_, kernel_map_ : transformer or None
         Fitted clones of the maps.
     inducing_points_ : ndarray of shape (m, d) or, for several outputs unless all share them, (n_outputs, m, d)
-        In the space of ``kernel_map``. A list of arrays where ``n_inducing="auto"`` found other numbers for other
-        outputs, which share nothing.
+        Inducing points in the space of ``kernel_map``. With ``n_inducing="auto"``, a list of arrays if outputs have
+        different numbers of points.
     sharing_ : list of list of int
-        The outputs of each independent model: groups, all outputs (``"all"`` and ``"kernel"``) or single ones.
+        Outputs of each independent model.
     kernel_ : Kernel, or list of Kernel for several outputs
-        Fitted, without the noise: ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
+        Fitted kernel without noise. ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
     noise_variance_ : float or ndarray of shape (n_outputs,)
-        σ², in squared units of y.
+        Noise variance σ² in squared units of y.
     weights_ : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-        Only with ``noise="student-t"``: the expected τ of each row, by which its noise variance is divided: 1 for an
-        ordinary row, near 0 for one that is doubted; NaN for one of weight 0. After `partial_fit`, of the new rows.
+        Only with ``noise="student-t"``: the factor on the precision of each row, 1 for ordinary rows, near 0 for
+        outliers, and NaN for rows of weight 0. After `partial_fit`, those of the new rows.
     lower_bound_, upper_bound_ : float
-        On the log marginal likelihood at the fitted parameters; nats, summed over outputs; good to a few nats where
-        features are alike to 1e-9. Where they agree, points cost nothing. The upper one (Titsias 2014) holds for either
-        posterior, loose with many rows. With ``noise_cv`` the lower one is below the last iteration's: noise has moved.
+        Bounds on the log marginal likelihood at the fitted parameters, in nats, summed over outputs. If they agree,
+        more inducing points cannot improve the fit. The upper bound (Titsias 2014) is loose with many rows.
     loss_curve_ : ndarray of shape (n_iter,)
-        Minus the bound per iteration on all rows (of Adam: a mini-batch's estimate; of a fit that was interrupted on a
-        sample of the rows: the sample's, times the number of rows over its size).
+        Minus the lower bound per iteration; for Adam, minus its estimate by a mini-batch.
     n_iter_ : int
-        Iterations of the start that was kept (a fit whose noise comes to explain everything is tried from others).
+        Number of iterations of the best start.
     n_parameters_ : int
-        Parameters of kernel, noise and inducing points that are not fixed, and all of q.
+        Number of parameters of kernel, noise and inducing points that are not fixed, and of q.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it had any.
 
     See Also
     --------
     EGPRegressor : The same model without inducing points, exact, for a few thousand rows.
     sklearn.gaussian_process.GaussianProcessRegressor : The exact GP without features.
+
+    Notes
+    -----
+    `SelectFromModel` and `RFE` of scikit-learn rank columns of X, not features. For one output, the default kernel and
+    columns of similar scale, use ``importance_getter=lambda model: 1 / model.kernel_.k2.length_scale``.
+
+    Bounds are accurate to a few nats if features are collinear to 1e-9. With ``noise_cv``, ``lower_bound_`` is below
+    the bound of the last iteration, because the calibration changes the noise.
 
     References
     ----------
@@ -169,12 +165,10 @@ class EVGPRegressor(GaussianProcess):
     - M. K. Titsias (2014): Variational Inference for Gaussian and Determinantal Point Processes.
     - J. Hensman, N. Fusi, N. D. Lawrence (2013): Gaussian Processes for Big Data.
     - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, section 2.7.
-    - M. E. Tipping, N. D. Lawrence (2005): Variational Inference for Student-t Models.
-    - P. Jylänki, J. Vanhatalo, A. Vehtari (2011): Robust Gaussian Process Regression with a Student-t Likelihood.
 
     Examples
     --------
-    A wave on a linear trend; the explicit features are x and 1:
+    Learn a wave on a linear trend, with the explicit features x and 1:
 
     >>> from sklearn.preprocessing import PolynomialFeatures
     >>> from skevgp import EVGPRegressor
@@ -185,7 +179,8 @@ class EVGPRegressor(GaussianProcess):
     >>> round(model.score(X, y), 2)
     0.96
 
-    Gravity's torque in two joints is linear in the same two first moments, 20 and 5; each joint has a row of features:
+    The torques of gravity in two joints are linear in the same two first moments, 20 and 5. Each joint has a row of
+    features:
 
     >>> import numpy as np
     >>> from sklearn.preprocessing import FunctionTransformer
@@ -275,24 +270,20 @@ class EVGPRegressor(GaussianProcess):
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            Numbers up to 1e100. The maps see it as it is given: a data frame (pandas, polars, pyarrow) stays one, and
-            with a ``kernel_map`` it may hold what is no number, such as words that the maps encode. Memory-mapped
-            arrays of float64 or float32 are not copied. Chunks of a Dask array stay on their workers, and the maps see
-            chunks: they are fitted by ``partial_fit`` where they have it, else to 10,000 rows spread over X.
-            Without a ``dask.distributed.Client`` chunks are read anew at each pass.
+            Rows, with numbers up to 1e100. The maps get X as given: a data frame (pandas, polars, pyarrow) stays one,
+            and with a ``kernel_map`` it may hold words that the maps encode. Memory-mapped arrays of float64 or float32
+            are not copied. On Dask arrays, see :doc:`/howto/dask`.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
-            Numbers up to 1e100; the largest of a column 0 or above 1e-140.
+            Targets, up to 1e100. The largest of a column must be 0 or above 1e-140.
         sample_weight : array-like or dask.array.Array of shape (n_samples,), default=None
-            What each row's log likelihood is multiplied by: 0 removes the row (before the maps are fitted, but to a
-            Dask array's chunks), 2 is the row twice. Maps whose ``fit`` has a ``sample_weight`` are given it.
+            Factor on the log likelihood of each row: 0 removes the row, 2 counts it twice. Maps whose ``fit`` has a
+            ``sample_weight`` get it too.
         groups : array-like of shape (n_samples,), default=None
-            Which rows belong together, by any labels: for rows of trajectories their numbers, such as
-            ``make_dynamics(...).groups``. ``noise_cv`` then leaves out whole groups, so that ``std`` is that of new
-            ones; where half of the rows or more are of one group, blocks of rows that follow each other inside a group.
-            None: rows are independent, and folds random.
+            Labels of the trajectory of each row, such as ``make_dynamics(...).groups``. ``noise_cv`` then leaves out
+            whole groups, so that ``std`` is valid for new trajectories. If None, rows are independent.
         relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
-            Known differences between the rows' noise: its variance is σ² times this number, the same of all outputs.
-            With σ² fixed at 1, by ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
+            Known noise variance of each row in units of σ², the same for all outputs. With σ² fixed by
+            ``WhiteKernel(1, "fixed")``, it is the ``alpha`` of GaussianProcessRegressor.
 
         Returns
         -------
@@ -302,22 +293,30 @@ class EVGPRegressor(GaussianProcess):
         Raises
         ------
         ValueError, TypeError
-            If an argument is out of its range, the data are not finite, or shapes do not fit; the message names the
-            argument, the value and what is allowed.
+            If an argument is out of its range, the data are not finite, or shapes do not fit.
         KeyboardInterrupt
-            Upon Ctrl-C before there is anything to keep, as while ``sharing="auto"`` looks for groups.
+            Upon Ctrl-C before there are any parameters to keep.
 
         Warns
         -----
         ConvergenceWarning
-            If iterations or time were used up, rounding errors or Ctrl-C ended them (the best parameters so far are
-            kept); if the Gaussian process learned nothing, or nothing that holds for groups left out, y is far from its
-            prior mean, or a parameter of the given kernel ended at a bound of it. It says what to change.
+            If iterations or time were used up, or rounding errors or Ctrl-C ended them; the best parameters so far are
+            kept. If the Gaussian process learned nothing, or nothing that is valid for left-out groups. If y is far
+            from its prior mean, or a parameter of the given kernel is at a bound. The message gives advice.
         skevgp.exceptions.DependentRowsWarning
-            If rows near each other, in the order given, are so alike that the noise would be more than four times as
-            large if blocks of them were left out, or rows follow a path (two directions of the kernel's inputs change
-            slowly, and none is sorted) and their log density would be lower by 0.1: ``groups`` should say which belong
-            together.
+            If neighbouring rows depend on each other and ``groups`` is not given.
+
+        Notes
+        -----
+        If one group has half of the rows or more, ``noise_cv`` leaves out blocks of successive rows of a group.
+
+        Chunks of a Dask array stay on their workers, and are read again at each pass without a
+        ``dask.distributed.Client``. Maps get chunks: they are fitted by ``partial_fit`` if they have it, else to 10,000
+        rows spread over X. Rows of weight 0 are removed before the maps are fitted, except from a Dask array.
+
+        `DependentRowsWarning` is given if the noise would be more than four times as large with blocks of rows left
+        out. It is also given if rows follow a path, and their log density would be lower by 0.1. Rows follow a path if
+        two directions of the kernel's inputs change slowly, and none is sorted.
         """
         solver, noise = as_solver(self.solver), as_noise(self.noise)
         self._check_together(solver, noise, X)
@@ -356,24 +355,23 @@ class EVGPRegressor(GaussianProcess):
         relative_variance: ArrayLike | None = None,
         forgetting_factor: float = 1.0,
     ) -> Self:
-        """Fold new rows into the posterior exactly, keeping kernel, noise and inducing points.
+        """Add new rows to the posterior exactly, with the same kernel, noise and inducing points.
 
-        The first call is a `fit`. After Adam, q moves to its optimum. The rows seen before are known by their sums
-        only: where the noise is below 1e-8 of the signal, ``lower_bound_`` and ``upper_bound_`` are good to about a
-        nat.
+        The first call is a `fit`. After Adam, q moves to its optimum. If the noise variance is below 1e-8 of the signal
+        variance, ``lower_bound_`` and ``upper_bound_`` are accurate to about a nat.
 
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            New rows. The first rows should be like all: they place the inducing points (no more than there are rows),
-            kernel and noise.
+            New rows. The rows of the first call should be typical, because they determine inducing points, kernel and
+            noise.
         y : array-like or dask.array.Array of shape (n_samples,) or (n_samples, n_outputs)
-            With as many outputs as in the first call.
+            Targets, with as many outputs as in the first call.
         sample_weight, relative_variance : array-like or dask.array.Array of shape (n_samples,), default=None
-            Those of the new rows, as for `fit`.
+            Weights and relative noise variances of the new rows, as for `fit`.
         forgetting_factor : float, default=1.0
-            Factor on the log likelihood of the rows seen so far, in (0, 1]: 1 remembers all of them, 0.99 those of
-            about the last hundred calls (exponential forgetting, for a system that drifts).
+            Factor on the log likelihood of all earlier rows, in (0, 1], for a system that drifts. With 1 nothing is
+            forgotten; 0.99 remembers about the last hundred calls.
 
         Returns
         -------
@@ -383,14 +381,14 @@ class EVGPRegressor(GaussianProcess):
         Raises
         ------
         ValueError, TypeError
-            As `fit`, and if y does not have the outputs of the first call.
+            As for `fit`, and if y does not have the outputs of the first call.
         """
         fading = check_real(forgetting_factor, "forgetting_factor", minimum=0.0, strict=True)
         if fading > 1.0:
             raise ValueError(f"forgetting_factor must be at most 1; got {forgetting_factor!r}.")
         if not self.__sklearn_is_fitted__():
             return self.fit(X, y, sample_weight, relative_variance=relative_variance)
-        self._validate_params()  # scikit-learn leaves it out for a model that is fitted
+        self._validate_params()  # scikit-learn validates only models that are not fitted
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(
@@ -419,7 +417,7 @@ class EVGPRegressor(GaussianProcess):
     @property
     def lower_bound_(self) -> float:
         """Lower bound on the log marginal likelihood at the fitted parameters, in nats, summed over outputs."""
-        # After partial_fit it is found when somebody asks.
+        # After partial_fit it is computed when it is read.
         with single_threaded_libraries():
             return float(self._fitted.lower_bound)
 
@@ -429,11 +427,11 @@ class EVGPRegressor(GaussianProcess):
         with single_threaded_libraries():
             return float(self._fitted.upper_bound)
 
-    # If y is what was added to columns of X, which ones: `ResidualRegressor` says so, since their noise is in y too.
+    # Columns of X that were subtracted from y, so that their noise is in y too. `ResidualRegressor` sets them.
     _columns_changed: np.ndarray | None = None
 
     def _check_together(self, solver: Solver, noise: Noise, X: Any) -> None:
-        """Refuse arguments that do not go together."""
+        """Raise an error for combinations of arguments that are not supported."""
         if not isinstance(self.n_inducing, str):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         elif solver.stochastic:
@@ -472,9 +470,9 @@ class EVGPRegressor(GaussianProcess):
         return lambda fitted: Posterior(fitted.predictor(), maps)
 
     def _numbers(self, data: Dataset) -> np.ndarray:
-        """X as numbers, whose noise is known."""
+        """Return X as numbers, for the noise of X."""
         try:
-            # While a model is fitted, its maps are not yet attributes.
+            # During a fit, the maps are not attributes yet.
             self.kernel_map_ = data.maps.kernel_map
             return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
         except ValueError as error:
@@ -497,7 +495,7 @@ class EVGPRegressor(GaussianProcess):
         self._set_weights_of_rows(data)
 
     def _set_weights_of_rows(self, data: Dataset) -> None:
-        """How much each of the user's rows counts, if the noise doubts rows."""
+        """Set ``weights_`` of the user's rows if the noise model has outliers."""
         scales, outputs = self._fitted.row_scales, self._fitted.outputs
         if scales is None:
             self.__dict__.pop("weights_", None)

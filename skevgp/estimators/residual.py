@@ -1,4 +1,4 @@
-"""ResidualRegressor: learn the change of a state in place of the next state."""
+"""ResidualRegressor: learn the change of a state instead of the next state."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from ..utils.validation import (
 
 
 def regressor_has(method: str) -> Callable[[Any], bool]:
-    """For `available_if`: the fitted regressor has a method or, before `fit`, the one that is given."""
+    """Return a check for `available_if`: whether the (fitted) regressor has a method."""
 
     def has(self: Any) -> bool:
         getattr(self.regressor_ if hasattr(self, "regressor_") else self.regressor, method)
@@ -41,12 +41,12 @@ def regressor_has(method: str) -> Callable[[Any], bool]:
 
 
 def _delegate(name: str) -> Any:
-    """What the posterior of the sum is asked for, if the regressor has one."""
+    """Delegate a method to the posterior of the sum, if the regressor has it."""
     return available_if(regressor_has(name))(delegate(name))
 
 
 def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
-    """Columns of an array or a data frame as numbers, (n, len(indices)), or (n,) of a single one."""
+    """Return columns of an array or a data frame as numbers, (n, len(indices)), or (n,) if ndim is 1."""
     if ndim == 1:
         return columns_of(X, indices)[:, 0]
     if not is_frame(X):
@@ -60,30 +60,31 @@ def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
 
 
 class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
-    """Fit a regressor to what y adds to some columns of X, and predict the sum.
+    """Fit a regressor to the difference of y and some columns of X, and predict the sum.
 
-    For x = (state, input) and y the next state, the regressor learns the change of state: RES-VGP and RES-DBNN of the
-    paper. What it says of the uncertainty of the change holds for the sum.
+    For x = (state, input) and y the next state, the regressor learns the change of the state. In the paper this is
+    RES-VGP and RES-DBNN. The uncertainty of the change is that of the sum.
 
     Parameters
     ----------
     regressor : estimator
-        A clone of it is fitted. It sees all of X. Scaling of columns and encoding of angles belong in here,
-        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``: in front of the whole they would change the
-        base columns too.
+        Regressor, of which a clone is fitted to all columns of X. Scale columns and encode angles inside of it, as in
+        ``make_pipeline(AngleEncoder("cartpole"), BayesianMLPRegressor())``. Before it, they would change the base
+        columns too.
     base : int, str or array-like of shape (n_outputs,), default=None
-        The column of X from which each output starts: its index, or its name if X is a data frame. None are the first
-        ``n_outputs`` columns.
+        Column of X that is subtracted from each output, by its index, or by its name if X is a data frame. If None, the
+        first ``n_outputs`` columns.
 
     Attributes
     ----------
     regressor_ : estimator
-        Fitted to ``y - X[:, base_]``.
+        Regressor fitted to ``y - X[:, base_]``.
     base_ : ndarray of shape (n_outputs,)
-        Indices of columns.
+        Indices of the base columns.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it had any.
 
     References
     ----------
@@ -115,22 +116,22 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
 
     @fit_context(prefer_skip_nested_validation=False)
     def fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
-        """Fit a clone of the regressor to what y adds to the base columns.
+        """Fit a clone of the regressor to the difference of y and the base columns.
 
         Parameters
         ----------
         X : array-like or dask.array.Array of shape (n_samples, n_features)
-            A data frame stays one for the regressor; only its base columns need be numbers here. So does a Dask array,
-            whose chunks are not loaded here.
+            Rows. The regressor gets a data frame or a Dask array as given. Base columns must be numbers.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Targets in the units of their base columns.
+            Targets in units of their base columns.
         **params : dict
-            For the regressor's ``fit``, such as ``sample_weight``; with metadata routing what it requests of them.
+            Arguments for ``fit`` of the regressor, such as ``sample_weight``. With metadata routing, those that it
+            requests.
 
         Returns
         -------
         self : ResidualRegressor
-            Fitted.
+            The estimator itself, fitted.
 
         Raises
         ------
@@ -143,26 +144,26 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
     @available_if(regressor_has("partial_fit"))
     @fit_context(prefer_skip_nested_validation=False)
     def partial_fit(self, X: ArrayLike, y: ArrayLike, **params: Any) -> Self:
-        """Go on with some rows, if the regressor can.
+        """Learn further rows by ``partial_fit`` of the regressor, if it has one.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, n_features)
             New rows, with the columns of the first call.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Their targets.
+            Targets of the new rows.
         **params : dict
-            For the regressor's ``partial_fit``.
+            Arguments for ``partial_fit`` of the regressor.
 
         Returns
         -------
         self : ResidualRegressor
-            Fitted.
+            The estimator itself, fitted.
 
         Raises
         ------
         ValueError
-            As `fit`, and if y does not have the outputs of the first call.
+            As for `fit`, and if y does not have the outputs of the first call.
         """
         with unchanged_if_it_fails(self):
             return self._fit("partial_fit", X, y, params)
@@ -175,14 +176,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         X : array-like of shape (n_samples, n_features)
             Rows with the columns of `fit`.
         **params : dict
-            For the regressor's ``predict``, such as ``return_std``, ``return_cov`` and ``include_noise``.
+            Arguments for ``predict`` of the regressor, such as ``return_std``, ``return_cov`` and ``include_noise``.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_outputs)
-            Of y at each row.
+            Mean of y at each row.
         std or cov : ndarray
-            If the regressor was asked for them: as it returns them.
+            Uncertainty as the regressor returns it, if it is asked for.
         """
         check_is_fitted(self)
         X = self._validated(X)
@@ -193,23 +194,23 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
 
     @available_if(regressor_has("sample_y"))
     def sample_y(self, X: ArrayLike, n_samples: int = 1, random_state: Any = 0, **params: Any) -> np.ndarray:
-        """Draw functions from the posterior at some rows, if the regressor can.
+        """Draw functions from the posterior at some rows, if the regressor has ``sample_y``.
 
         Parameters
         ----------
         X : array-like of shape (n_rows, n_features)
             Rows with the columns of `fit`.
         n_samples : int, default=1
-            How many functions.
+            Number of functions.
         random_state : int, RandomState instance or None, default=0
-            Draws the functions.
+            Seed of the functions.
         **params : dict
-            For the regressor's ``sample_y``.
+            Arguments for ``sample_y`` of the regressor.
 
         Returns
         -------
         samples : ndarray of shape (n_rows, n_samples) or (n_rows, n_outputs, n_samples)
-            Each function at all rows, base columns included.
+            One function per entry of the last axis, with the base columns added.
         """
         check_is_fitted(self)
         X = self._validated(X)
@@ -228,7 +229,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
 
     @property
     def _posterior(self) -> Posterior | None:
-        """Of the sum, if the regressor has one."""
+        """Posterior of the sum, or None if the regressor has no posterior."""
         posterior = getattr(self.regressor_, "_posterior", None)
         return None if posterior is None else posterior.with_base(self.base_)
 
@@ -240,12 +241,12 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         return numbers
 
     def get_metadata_routing(self) -> MetadataRouter:
-        """Tell scikit-learn's metadata routing which methods pass what on.
+        """Return the routing of metadata from this estimator to the regressor.
 
         Returns
         -------
         routing : MetadataRouter
-            From `fit`, `partial_fit` and `predict` to those of the regressor.
+            Routing of `fit`, `partial_fit` and `predict` to the methods of the regressor.
         """
         mapping = MethodMapping()
         for method in ("fit", "partial_fit", "predict"):
@@ -266,7 +267,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         return hasattr(self, "regressor_")
 
     def _fit(self, method: str, X: Any, y: Any, params: dict[str, Any]) -> Self:
-        """Fit a new clone, or go on with the last."""
+        """Fit a new clone, or continue with the fitted regressor."""
         first = method == "fit" or not hasattr(self, "regressor_")
         if is_frame(X):
             y = validate_frame(self, X, y, reset=first)
@@ -285,14 +286,14 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
             routed = process_routing(self, method, **params).get("regressor", Bunch())
         residuals = y - columns_of(X, base, y.ndim)
         if hasattr(regressor, "_columns_changed"):
-            # The noise of these columns is in what is learned too.
+            # The noise of these columns is in the differences too.
             regressor._columns_changed = base
         self.regressor_ = getattr(regressor, method)(X, residuals, **routed.get(method, {}))
         self.base_ = base
         return self
 
     def _validated(self, X: Any) -> Any:
-        """X as the regressor shall see it: a data frame stays one, and the regressor looks at what it holds."""
+        """Validate X for the regressor; a data frame stays one, and the regressor checks its values."""
         if is_frame(X):
             validate_frame(self, X, reset=False)
             return X
@@ -302,7 +303,7 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         return validate_numbers(self, X, reset=False, dtype=FLOATS)
 
     def _base(self, n_outputs: int) -> np.ndarray:
-        """The index of the column from which each output starts."""
+        """Return the index of the base column of each output."""
         if self.base is None:
             if n_outputs > self.n_features_in_:
                 raise ValueError(

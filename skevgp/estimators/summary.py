@@ -1,4 +1,4 @@
-"""What a fitted model says of itself: kernel, noise, certificate and weights, as text, HTML and a data frame."""
+"""Summary of a fitted model as text, HTML and a data frame: kernel, noise, bounds and weights."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from sklearn.gaussian_process.kernels import ConstantKernel, Product
 from ..fitting.prior import coef_names
 from ..utils.optional import require
 
-# What the Gaussian process of a joint's torque sees.
+# Inputs of the Gaussian process of a joint's torque.
 _OF_A_JOINT = ("q", "q̇", "q̈", "torque")
-# Lines of weights that are printed, and columns of text.
+# Maximum number of lines of weights, and of columns of text.
 _LINES, _WIDTH = 40, 100
-# Lines of a fact, such as a kernel of many columns.
+# Maximum number of lines of a fact, such as a kernel of many columns.
 _FACT_LINES = 6
 _CELL = 'style="text-align: left; padding: 0 1em 0 0"'
 _TABLE = 'style="margin: 0.3em 0 1em 0; font-size: inherit"'
@@ -27,49 +27,35 @@ _SCROLLED = 'style="max-height: 30em; max-width: fit-content; overflow: auto"'
 
 
 class Parameter(NamedTuple):
-    """A number that was learned.
+    """A learned number."""
 
-    Attributes
-    ----------
-    output : int, str or None
-        Whose it is; None is that of all outputs.
-    part : str
-        ``"weight"``, ``"signal std"``, ``"noise std"``, or a hyperparameter such as ``"length_scale"``.
-    name : str
-        Of the feature, or of the column that the kernel sees.
-    value, std : float
-        What was learned, and its posterior standard deviation (of weights; NaN where there is none).
-    prior_mean, prior_std : float
-        Of weights; NaN where there is none.
-    """
-
-    output: int | str | None
-    part: str
-    name: str
+    output: int | str | None  # None if it belongs to all outputs
+    part: str  # "weight", "signal std", "noise std", or a hyperparameter such as "length_scale"
+    name: str  # of the feature, or of the column of the kernel
     value: float
-    std: float = np.nan
-    prior_mean: float = np.nan
-    prior_std: float = np.nan
+    std: float = np.nan  # posterior standard deviation of weights
+    prior_mean: float = np.nan  # of weights
+    prior_std: float = np.nan  # of weights
 
 
 @dataclass(frozen=True)
 class ModelSummary:
-    """What a fitted model says of itself, as returned by its ``summary``.
+    """Summary of a fitted model, as returned by its ``summary``.
 
-    ``print`` shows it as text, a notebook as tables.
+    ``print`` shows it as text, and a notebook as tables.
 
     Attributes
     ----------
     title : str
-        The model, and its size.
+        Name and size of the model.
     certificate : str
-        What is known of the log marginal likelihood; empty if nothing is.
+        Text on the log marginal likelihood, or empty.
     kernels : dict
-        Of each output, or of None if there is only one: the fitted kernel, as text.
+        Fitted kernel of each output as text. The key is None if there is one output.
     parameters : tuple of Parameter
-        All numbers, in the order in which they are shown.
+        All numbers, in the order of the text.
     lower_bound, upper_bound : float or None
-        On the log marginal likelihood, in nats; of the exact model they are equal. None if nothing is known.
+        Bounds on the log marginal likelihood, in nats, which are equal for an exact model. None if they are not known.
 
     Examples
     --------
@@ -103,23 +89,23 @@ class ModelSummary:
     upper_bound: float | None = None
 
     def to_frame(self) -> Any:
-        """All numbers as a pandas.DataFrame: a row for each, with the columns of `Parameter`.
+        """Return all numbers as a pandas.DataFrame.
 
         Returns
         -------
         frame : pandas.DataFrame
-            For example ``frame[frame.part == "weight"]``.
+            A row for each number, with the columns of `Parameter`: for example ``frame[frame.part == "weight"]``.
 
         Raises
         ------
         ImportError
-            If pandas is not installed; the message gives the pip command.
+            If pandas is not installed.
         """
         pandas = require("pandas", "A data frame")
         return pandas.DataFrame([list(one) for one in self.parameters], columns=list(Parameter._fields))
 
     def __str__(self) -> str:
-        """As text, the first lines of weights if there are many."""
+        """Return the text, with the first lines of weights if there are many."""
         parts = ["\n".join(filter(None, [self.title, self.certificate]))]
         for output, facts in self._facts():
             width = max(map(len, facts)) + 2
@@ -131,7 +117,7 @@ class ModelSummary:
                 labels = [name, *[""] * (len(wrapped) - 1)]
                 lines += [f"{label:{width}}{line}" for label, line in zip(labels, wrapped, strict=True)]
             parts.append("\n".join(lines))
-        # A column's name may have a line end in it.
+        # The name of a column may contain a line end.
         table = [[" ".join(cell.split()) for cell in line] for line in self._weights()]
         if len(table) > 1:
             shown = table[: _LINES + 1]
@@ -146,7 +132,7 @@ class ModelSummary:
         return "\n\n".join(parts)
 
     def _repr_html_(self) -> str:
-        """As tables, all names escaped."""
+        """Return tables, with all names escaped."""
         parts = [f"<p><b>{escape(self.title)}</b><br>{escape(self.certificate)}</p>"]
         for output, facts in self._facts():
             parts.append("" if output is None else f"<p>output <b>{escape(str(output))}</b></p>")
@@ -157,7 +143,7 @@ class ModelSummary:
         return f'<div style="font-size: 0.9em">{"".join(parts)}</div>'
 
     def _facts(self) -> Iterator[tuple[int | str | None, dict[str, str]]]:
-        """Of each output what is no weight: name -> text."""
+        """Yield each output with its numbers other than weights: name -> text."""
         outputs = [*self.kernels, *(one.output for one in self.parameters if one.part != "weight")]
         for output in dict.fromkeys(outputs):
             facts = {"kernel": self.kernels[output]} if output in self.kernels else {}
@@ -169,7 +155,7 @@ class ModelSummary:
             yield output, facts
 
     def _weights(self) -> Iterator[tuple[str, ...]]:
-        """The table of β, its header first."""
+        """Yield the rows of the table of β, the header first."""
         weights = [one for one in self.parameters if one.part == "weight"]
         several = any(one.output is not None for one in weights)
         first = ("output",) if several else ()
@@ -180,7 +166,7 @@ class ModelSummary:
 
 
 def html_of(model: Any) -> str:
-    """The summary of a fitted model, folded, for notebooks; empty before a fit."""
+    """Return the summary of a fitted model for notebooks, folded; empty before a fit."""
     try:
         said = model.summary()._repr_html_()
     except NotFittedError:
@@ -189,7 +175,7 @@ def html_of(model: Any) -> str:
 
 
 def of_gaussian_process(model: Any) -> ModelSummary:
-    """Of a fitted `EVGPRegressor` or `EGPRegressor`."""
+    """Summarise a fitted `EVGPRegressor` or `EGPRegressor`."""
     several = isinstance(model.kernel_, list)
     kernels = dict(enumerate(model.kernel_)) if several else {None: model.kernel_}
     noise = np.atleast_1d(model.noise_variance_)
@@ -221,7 +207,7 @@ def of_gaussian_process(model: Any) -> ModelSummary:
 
 
 def of_inverse_dynamics(model: Any, joints: Sequence[str]) -> ModelSummary:
-    """Of a fitted `InverseDynamics`: weights are those of all joints, the rest is of each."""
+    """Summarise a fitted `InverseDynamics`: weights of all joints, and the kernel and noise of each."""
     numbers: list[Parameter] = []
     kernels: dict[int | str | None, str] = {}
     for index, joint in enumerate(joints):
@@ -253,7 +239,7 @@ def _of_weights(model: Any, outputs: Sequence[int | None]) -> Iterator[Parameter
 
 
 def _kernel_columns(model: Any) -> Sequence[str]:
-    """What the columns that the kernel sees are called."""
+    """Return the names of the kernel's inputs."""
     columns = getattr(model, "feature_names_in_", None)
     if model.kernel_map_ is not None:
         return list(coef_names(model.kernel_map_, columns, model._posterior.maps.shapes[0][-1], "k"))
@@ -261,7 +247,7 @@ def _kernel_columns(model: Any) -> Sequence[str]:
 
 
 def _of_kernel(kernel: Any, output: int | str | None, columns: Sequence[str]) -> Iterator[Parameter]:
-    """Its hyperparameters, the outermost constant as a standard deviation; what is of a column with its name."""
+    """Yield the hyperparameters of a kernel with their columns; the outermost constant as a standard deviation."""
     if isinstance(kernel, Product) and isinstance(kernel.k1, ConstantKernel):
         yield Parameter(output, "signal std", "", float(np.sqrt(kernel.k1.constant_value)))
         kernel = kernel.k2
@@ -283,7 +269,7 @@ def _certificate(lower: Any, upper: Any) -> str:
 
 
 def _plus_minus(value: float, std: float) -> str:
-    """A number, to two digits of its standard deviation if that is known."""
+    """Format a number, with its standard deviation to two digits if that is known."""
     return f"{value:.4g}" if np.isnan(std) else f"{value:.4g} ± {std:.2g}"
 
 

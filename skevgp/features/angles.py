@@ -105,7 +105,7 @@ class AngleEncoder(RobotTransformer):
         self._angles = np.array(self._columns_of_angles(), dtype=int)
         copies = np.ones(self.n_features_in_, dtype=int)
         copies[self._angles] = 2
-        self._source = np.repeat(np.arange(self.n_features_in_), copies)  # the column of X of each encoded one
+        self._source = np.repeat(np.arange(self.n_features_in_), copies)  # the column of X for each encoded column
         self._sines = np.searchsorted(self._source, self._angles)
         self._cosines = self._sines + 1
         self._of_others = np.eye(self.n_features_in_)[self._source]  # the Jacobian without the angles' entries

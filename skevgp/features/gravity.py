@@ -19,7 +19,8 @@ from .robot_map import RobotMap, indices_of
 _TILT = 1e-3
 # Number of rows at a time, so that their rotations stay in the cache.
 _BLOCK = 1024
-# Of w = Rᵀg along (u_x, u_y, u_z): (u_x × w)·u_z = w·u_y, (u_y × w)·u_z = -w·u_x; a slider's axis is its u_z.
+# Index and sign of the component of w = Rᵀg along (u_x, u_y, u_z) for each lever: (u_x × w)·u_z = w·u_y and
+# (u_y × w)·u_z = -w·u_x. The axis of a prismatic joint is its u_z.
 _COMPONENTS = {"u_x": (1, 1.0), "u_y": (0, -1.0), "": (2, 1.0)}
 
 
@@ -73,7 +74,7 @@ class SineGravity(GravityMap):
             angles = [term.angle for term in self._terms()]
         self._first = np.array([columns[0] for columns in angles])
         self._further = [(term, column) for term, columns in enumerate(angles) for column in columns[1:]]
-        self._summed = np.zeros((len(angles), self.n_features_in_))  # an angle of each term by the columns
+        self._summed = np.zeros((len(angles), self.n_features_in_))  # angles of the terms are X @ summed.T
         for term, columns in enumerate(angles):
             self._summed[term, list(columns)] = 1.0
 

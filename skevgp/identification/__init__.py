@@ -1,1 +1,1 @@
-"""Weights that all outputs share, from logs: what rows are worth that follow each other, and standing friction."""
+"""Identification of robots from logs: weights that all joints share, static friction, and payloads."""

@@ -1,4 +1,4 @@
-"""What a fitted model of torques says of the robot: its inertias, a model with them, and what it carries."""
+"""The identified robot: inertias of its links, a model and a URDF file with them, and its payload."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from .payload import find_payload, payload_prior
 from .torque_regression import TorqueRegression
 from .weights import Known
 
-# Of a payload's mass, kg, and size, m, a priori.
+# Largest prior scale of the mass (kg) and size (m) of a payload.
 _LARGEST_SCALE = 1e6
 
 
@@ -29,7 +29,7 @@ def _knows_a_robot(model: IdentifiedRobot) -> bool:
 
 
 class IdentifiedRobot(TorqueRegression):
-    """What `InverseDynamics` knows of the robot after `fit`."""
+    """Methods of `InverseDynamics` on the identified robot."""
 
     _known: Known
     _joints: list[JointResidual]
@@ -41,21 +41,22 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def links(self) -> list[Bunch]:
-        """Say what is known of each link.
+        """Return the inertial parameters of each link with their uncertainty.
 
         Returns
         -------
         links : list of Bunch
-            From the base to the tip, in the frame of the link's joint:
+            Links from the base to the tip, in the frame of their joints:
 
-            - ``joint`` : its name;
+            - ``joint`` : name of the joint;
             - ``mass``, ``mass_std`` : kg;
             - ``com``, ``com_std`` : ndarray of shape (3,), the centre of mass, m;
-            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments about it: Ixx, Ixy, Iyy, Ixz, Iyz, Izz,
-              kg m²;
-            - ``consistency`` : above 0 if a body can have them (`robot_model` takes the nearest that one can have).
+            - ``inertia``, ``inertia_std`` : ndarray of shape (6,), moments about the centre of mass: Ixx, Ixy, Iyy,
+              Ixz, Iyz, Izz, kg m²;
+            - ``consistency`` : above 0 if the parameters are physical (`robot_model` takes the nearest physical ones).
 
-            Standard deviations are to first order; many of them are the prior's, for torques show combinations only.
+            Standard deviations are to first order. Torques depend on combinations of parameters only, so that many
+            standard deviations are those of the prior.
 
         References
         ----------
@@ -67,9 +68,9 @@ class IdentifiedRobot(TorqueRegression):
         >>> import numpy as np
         >>> from skevgp import InverseDynamics
         >>> X = np.random.default_rng(0).normal(size=(300, 3))
-        >>> y = 1.2 * (X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]))  # 1.2 kg in place of the model's 1
+        >>> y = 1.2 * (X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]))  # 1.2 kg instead of 1 kg in the model
         >>> (link,) = InverseDynamics("pendulum", n_inducing=0).fit(X, y).links()
-        >>> link.joint, float(round(link.mass * -link.com[2], 2))  # what gravity's torque tells: m c
+        >>> link.joint, float(round(link.mass * -link.com[2], 2))  # the torque of gravity depends on m c
         ('q', 0.6)
         """
         check_is_fitted(self)
@@ -96,19 +97,18 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def robot_model(self) -> Any:
-        """Make a model of the robot as it was found.
+        """Make a model of the identified robot.
 
         Returns
         -------
         model : pinocchio.Model
-            A copy of the robot's with identified inertias (the most probable ones that bodies can have), armatures,
-            ``damping`` and ``friction``; what would be negative is 0. Offsets and what physics missed are not in it,
-            and torques are those of the model, without ``gains_``.
+            A copy of the robot's model with the most probable physical inertias, armatures, ``damping`` and
+            ``friction``, where negative values are set to 0. It has no offsets, no f_j and no ``gains_``.
 
         Raises
         ------
         ImportError
-            If Pinocchio is not installed; the message gives the pip command.
+            If Pinocchio is not installed.
 
         Examples
         --------
@@ -131,19 +131,19 @@ class IdentifiedRobot(TorqueRegression):
 
     @available_if(_knows_a_robot)
     def write_urdf(self, target: str | os.PathLike[str], *, overwrite: bool = False) -> None:
-        """Write the robot's URDF file with what was found, and its standard deviations as comments.
+        """Write the robot's URDF file with the identified parameters, and their standard deviations as comments.
 
         Parameters
         ----------
         target : str or path-like
-            The file to write.
+            File to write.
         overwrite : bool, default=False
-            Whether it may be the robot's own file.
+            Whether the target may be the robot's own file.
 
         Raises
         ------
         ValueError
-            If the robot has no file, or is not one that can be rewritten, or has other joints since `fit`.
+            If the robot has no file, its file cannot be rewritten, or has other joints than at `fit`.
 
         Examples
         --------
@@ -179,12 +179,12 @@ class IdentifiedRobot(TorqueRegression):
         )
 
     def _inertial(self) -> tuple[np.ndarray, np.ndarray]:
-        """Means (n_links, 10) and covariance of the links' parameters."""
+        """Return means (n_links, 10) and covariance of the links' parameters."""
         size = 10 * len(self._outputs)
         return self.coef_[:size].reshape(-1, 10), self.coef_cov_[:size, :size]
 
     def _friction(self, values: np.ndarray) -> dict[str, np.ndarray]:
-        """Of weights, or their standard deviations, those of friction by name, in the model's units."""
+        """Return the friction in weights or in their standard deviations, by name and in the model's units."""
         n_joints = len(self._outputs)
         rest = values[10 * n_joints :].reshape(-1, n_joints) / np.abs(self.gains_)
         return dict(zip(self.feature_map_.friction, rest, strict=True))
@@ -201,36 +201,37 @@ class IdentifiedRobot(TorqueRegression):
         mass_scale: float = 5.0,
         size: float = 0.2,
     ) -> Bunch:
-        """Find what the robot carries in other logs than those of `fit`.
+        """Estimate the payload of the robot from a log with the payload.
 
-        Torques with the load are those of the robot and of the ten parameters of the load. All of them, friction and
-        gains are found anew from what both logs say, so what is uncertain of the robot widens the load's interval. (Of
-        what physics missed the mean is subtracted, as if it were known.)
+        All parameters of the robot and the ten parameters of the payload are identified again from both logs. The
+        uncertainty of the robot therefore widens the interval of the payload. The mean of each f_j is subtracted as if
+        it were known.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, 3 * n_joints)
-            With the load, in the order of time.
+            Rows [q, q̇, q̈] with the payload, in the order of time.
         y : array-like of shape (n_samples, n_joints)
-            Torques with the load, in the units of `fit`.
+            Torques with the payload, in the units of `fit`.
         groups, pieces : array-like of shape (n_samples,), default=None
-            As in `fit`.
+            Labels of trajectories and of pieces without gaps, as in `fit`.
         link : int, default=-1
-            Which joint's link it is fixed to: the last.
+            Index of the link that the payload is fixed to. The default is the last link.
         mass_scale : float, default=5.0
-            Prior standard deviation of its mass, kg, around 0.
+            Prior standard deviation of the mass of the payload, kg. The prior mean is 0.
         size : float, default=0.2
-            Its size with its distance from the joint's frame, m: prior standard deviation of its centre of mass.
+            Prior standard deviation of the centre of mass, m: size of the payload plus its distance from the joint's
+            frame.
 
         Returns
         -------
         payload : Bunch
-            What it carries:
+            Parameters of the payload:
 
-            - ``mass``, ``mass_std``, kg, and ``mass_interval``, which holds 95 %;
+            - ``mass``, ``mass_std``, kg, and ``mass_interval``, the 95 % credible interval;
             - ``com``, ``com_std`` : ndarray of shape (3,), in the frame of the link's joint, m (to first order; NaN and
               inf if the mass is not positive);
-            - ``parameters`` (10,), ``covariance`` (10, 10): as of a link.
+            - ``parameters`` (10,), ``covariance`` (10, 10): inertial parameters, as those of a link.
 
         Raises
         ------
@@ -251,7 +252,7 @@ class IdentifiedRobot(TorqueRegression):
         >>> y = X[:, 2] / 4 + 9.81 / 2 * np.sin(X[:, 0]) + 0.01 * rng.normal(size=600)  # 1 kg at 0.5 m
         >>> model = InverseDynamics("pendulum", n_inducing=0).fit(X, y)
         >>> payload = model.estimate_payload(X, 1.5 * y, size=0.5)  # and 0.5 kg at the same place
-        >>> (payload.parameters[[3]] / [-0.5]).round(2)  # its first moment is what torques tell
+        >>> (payload.parameters[[3]] / [-0.5]).round(2)  # torques depend on its first moment
         array([0.5])
         """
         check_is_fitted(self)

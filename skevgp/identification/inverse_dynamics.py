@@ -1,4 +1,4 @@
-"""InverseDynamics: joint torques with bands, and a posterior over masses and friction, from a robot's own logs."""
+"""InverseDynamics: joint torques with credible intervals, and a posterior over masses and friction, from logs."""
 
 from __future__ import annotations
 
@@ -30,105 +30,109 @@ from .likely_causes import likely_causes
 from .stiction import likeliest_noise
 from .weights import Rows, condensed, left_out
 
-# So many prior standard deviations make the prior doubtful.
+# Weights that differ from their prior by more prior standard deviations than this make the prior doubtful.
 _FAR = 4.0
-# Physics that leaves this share of a torque's variance explains hardly anything.
+# Physics explains hardly anything if its residual has more than this share of the variance of a torque.
 _LITTLE = 0.5
-# Physics that leaves this share of it may do so since columns are in another order, or in degrees.
+# Above this share, columns may be in another order, or in degrees.
 _DOUBTFUL = 0.1
-# Of torques: their variances, and ratios of these to what noise may be, are numbers.
+# Limits of torques. Their variances, and the ratios of these to noise variances, neither vanish nor overflow.
 _SMALLEST_TORQUE, _LARGEST_TORQUE = 1e-105, 1e40
-# The largest speed below which rows count less for f_j: filters blur friction's sign, but f_j learns its average there.
+# Largest speed below which rows count less for f_j. Filters blur the sign of friction above it too, but f_j learns the
+# average friction there.
 _SHARP = 0.01
 
 
 class InverseDynamics(RegressorMixin, IdentifiedRobot):
-    r"""Joint torques of a robot with bands, and its masses and friction with their uncertainty, from logs.
+    r"""Joint torques of a robot, its masses and its friction from logs, with their uncertainty.
 
     .. math::
 
         \tau_j = (1 + c_j) \, Y_j(q, \dot q, \ddot q)\,\pi + F_j(\dot q, \ddot q)\,\varphi + f_j(x_j) + \varepsilon_j
 
-    The weights β = (π, φ) of `RigidBodyRegressor`, which all joints share, have the robot's model as prior mean; c are
-    errors of the motors' gains, if these are not known. f_j is a sparse Gaussian process (`EVGPRegressor`) of what that
-    leaves in joint j, and sees the joint's own columns only, :math:`x_j = (q_j, \dot q_j, \ddot q_j, \hat\tau_j)`, with
-    the torque that the rest predicts (friction of gears depends on load and speed): columns of other joints would be
-    excuses that hold for one trajectory. Below some speed friction has no sign: the noise is larger there by what
-    Coulomb's friction leaves open.
+    The weights β = (π, φ) of `RigidBodyRegressor` are common to all joints, and have the robot's model as prior mean.
+    The c are errors of the motors' gains, if these are not known. Each f_j is a sparse Gaussian process
+    (`EVGPRegressor`) of the residual torque of joint j. Its inputs are those of the joint, :math:`x_j = (q_j, \dot q_j,
+    \ddot q_j, \hat\tau_j)`, with the torque :math:`\hat\tau_j` by the weights, because friction of gears depends on
+    load and speed. The noise is larger at low speeds, where the sign of Coulomb friction is not known. See
+    :doc:`/guide/torques`.
 
     Parameters
     ----------
     robot : RigidBodyRegressor, str, path-like, System, pinocchio.Model or None, default=None
-        The approximate model: a URDF with wrong masses. `RigidBodyRegressor` sets friction and the prior's scales.
-        Without one each output has a linear model, and a Gaussian process of all columns.
+        Approximate model of the robot, such as a URDF with inaccurate masses. Pass a `RigidBodyRegressor` to set
+        friction and prior scales. If None, each output has a linear model and a Gaussian process of all columns.
     gain_scale : float, default=0.0
-        Prior standard deviation of the relative error of each joint's gain, as between currents and torques: 0.1 for
-        gains of a catalogue. 0: y are torques. Predictions hardly depend on it, masses and their intervals do.
+        Prior standard deviation of the relative error of each joint's gain: for example 0.1 if y are currents times
+        gains of a catalogue, and 0 if y are torques. It mostly affects masses and their intervals.
     consistent : bool, default=False
-        Whether the weights are the most probable ones that bodies can have (masses above 0, pseudo-inertias positive
-        definite). Where torques do not show a parameter, the estimate may have none of that, and predict as well. Means
-        move, covariances and noise stay.
+        Whether to move the weights to the most probable physical ones (masses above 0, positive definite
+        pseudo-inertias). Covariances and noise do not change.
     stiction_velocity : "auto" or None, default="auto"
-        ``"auto"`` finds the speed at which friction of each joint has a sign (filters blur it), if there are three
-        ``groups`` or more to tell; None leaves it as `RigidBodyRegressor` has it.
+        If ``"auto"``, find the speed above which the sign of friction of each joint is known, which needs at least
+        three ``groups``. If None, use that of `RigidBodyRegressor`.
     n_inducing : int, default=40
-        Inducing points of each f_j; 0 leaves f_j out.
+        Number of inducing points of each f_j. With 0 there are no f_j.
     max_rows : int, default=3000
-        Rows that each f_j is fitted to, evenly spread: those of a log at 100 Hz hardly differ. Weights see all.
+        Number of evenly spread rows that each f_j is fitted to. Weights are fitted to all rows.
     max_iter : int or None, default=None
-        As in `EVGPRegressor`.
+        Maximum number of iterations, as in `EVGPRegressor`.
     n_jobs : int or None, default=None
-        Joints that are fitted at the same time, in threads; None means 1, -1 all cores.
+        Number of joints that are fitted in parallel, in threads; None means 1, -1 all cores.
     random_state : int, RandomState instance or None, default=None
-        Places inducing points.
+        Seed of the inducing points.
 
     Attributes
     ----------
     coef_, coef_std_ : ndarray of shape (n_h,)
         Posterior means and standard deviations of β, in the order of ``coef_names_``.
     coef_cov_ : ndarray of shape (n_h, n_h)
+        Posterior covariance of β.
     coef_names_ : ndarray of str of shape (n_h,)
-        As m(q1), mcx(q1), ..., viscous(q1), ...
+        Names of the weights: m(q1), mcx(q1), ..., viscous(q1), ...
     coef_prior_mean_, coef_prior_scale_ : ndarray of shape (n_h,)
-        Where a standard deviation is still that of the prior, torques did not show it.
+        Prior means and standard deviations of β. Torques do not determine a weight whose standard deviation is still
+        that of the prior.
     gains_, gains_std_ : ndarray of shape (n_outputs,)
-        1 + c: torques of the model times these are those of y.
+        Gains 1 + c and their standard deviations. Torques of the model times gains are those of y.
     noise_variance_ : ndarray of shape (n_outputs,)
-        σ², of a joint that moves.
+        Noise variance σ² of moving joints.
     standing_std_ : ndarray of shape (n_outputs,)
-        What friction adds at rest, a standard deviation.
+        Additional standard deviation by friction at rest.
     residual_std_ : ndarray of shape (n_outputs,)
-        Standard deviation of each f_j a priori, 0 where there is none.
+        Prior standard deviation of each f_j, or 0 if there is none.
     residual_models_ : list of EVGPRegressor or None
-        The f_j.
+        The models f_j.
     correlation_time_ : ndarray of shape (n_outputs,)
-        How many rows say as much about the weights as an independent one.
+        Number of rows that contain as much information on the weights as an independent row.
     inflation_ : float
-        By how much more than that groups differ from each other, at least 1: all that rows say of the weights counts
-        so much less.
+        Factor by which groups differ more from each other than ``correlation_time_`` explains, at least 1. The
+        information of all rows is divided by it.
     stiction_velocity_ : ndarray of shape (n_outputs,)
-        Up to which speed friction's sign is open in the log, rad/s or m/s.
+        Speed below which the sign of friction is not known, rad/s or m/s.
     n_iter_ : int
-        The most iterations that an f_j took.
+        Largest number of iterations of an f_j.
     feature_map_ : transformer
+        Fitted `RigidBodyRegressor`.
     n_features_in_ : int
+        Number of columns of X.
     feature_names_in_ : ndarray of str
-        If X had column names.
+        Names of the columns of X, if it had any.
 
     See Also
     --------
-    skevgp.datasets.load_log : Positions, velocities, accelerations and torques of a log.
-    skevgp.features.RigidBodyRegressor : The features, and their prior.
-    EVGPRegressor : With ``feature_map=RigidBodyRegressor(robot)`` the joint model, without what is special here.
+    skevgp.datasets.load_log : Read positions, velocities, accelerations and torques of a log.
+    skevgp.features.RigidBodyRegressor : Features and their prior.
+    EVGPRegressor : With ``feature_map=RigidBodyRegressor(robot)``, the same model without its treatment of logs.
 
     Notes
     -----
-    Weights are found first, by Bayesian regression in which filtered rows count as what they are worth
-    (``correlation_time_``), and as blocks or groups differ from each other; noise, its part from standing friction
-    and gains are found with them. :math:`\hat\tau` of a training row is predicted from other groups, or blocks of rows,
-    so that y is not used twice. Signal and noise of f_j are calibrated by groups that are left out; f_j is never larger
-    than the residuals, and its lengthscales (but for speeds) are no shorter than a column's standard deviation.
-    Memory: 8 bytes times n_samples * n_outputs * n_h, a few times.
+    Weights are fitted first by Bayesian regression, together with noise, static friction and gains. Filtered rows count
+    less than independent ones (``correlation_time_``, ``inflation_``). The :math:`\hat\tau` of a training row is
+    predicted from other groups or blocks of rows, so that y is not used twice. Signal and noise of f_j are calibrated
+    by left-out groups. Each f_j is at most as large as the residuals, and its length scales, except that of the speed,
+    are at least the standard deviation of their column. Memory is a few times 8 bytes times n_samples * n_outputs *
+    n_h.
 
     References
     ----------
@@ -137,7 +141,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
 
     Examples
     --------
-    A pendulum of 1 kg that is believed to weigh 1.2, with friction:
+    Identify a pendulum with friction from a perturbed model:
 
     >>> import numpy as np
     >>> from skevgp import InverseDynamics
@@ -202,20 +206,21 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
     def fit(
         self, X: ArrayLike, y: ArrayLike, *, groups: ArrayLike | None = None, pieces: ArrayLike | None = None
     ) -> Self:
-        """Find weights, noise, and what physics missed.
+        """Fit weights, noise and residuals.
 
         Parameters
         ----------
         X : array-like of shape (n_samples, 3 * n_joints)
-            Rows [q, q̇, q̈] in the order of time: rad, rad/s, rad/s² (of prismatic joints m, ...).
+            Rows [q, q̇, q̈] in the order of time, in rad, rad/s and rad/s² (m, m/s and m/s² for prismatic joints).
         y : array-like of shape (n_samples, n_joints) or, of one joint, (n_samples,)
-            Torques, N m (N), or with ``gain_scale`` what a catalogue's gains make of currents. Up to 1e40, and the
-            largest of a column 0 or above 1e-105.
+            Torques in N m (N), or with ``gain_scale`` currents times gains of a catalogue. Up to 1e40, and the largest
+            of a column must be 0 or above 1e-105.
         groups : array-like of shape (n_samples,), default=None
-            Which rows are of one trajectory, by any labels. What bands promise for new trajectories needs at least
-            three of them, none with half of the rows; of fewer, blocks of rows stand in.
+            Labels of the trajectory of each row. Credible intervals for new trajectories need at least three of them,
+            each with less than half of the rows. Otherwise blocks of rows are used.
         pieces : array-like of shape (n_samples,), default=None
-            Which rows follow each other without a gap, such as ``load_log(...).pieces``; None: all rows of a group.
+            Labels of rows that follow each other without a gap, such as ``load_log(...).pieces``. If None, the rows of
+            a group have no gaps.
 
         Returns
         -------
@@ -225,20 +230,19 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         Raises
         ------
         ImportError
-            If Pinocchio is needed and not installed; the message gives the pip command.
+            If Pinocchio is needed and not installed.
         ValueError, TypeError
-            If an argument is out of its range, the data are not finite, or shapes do not fit. If X or y is a data frame
-            whose columns bear the names of the robot's joints in another order.
+            If an argument is out of its range, the data are not finite, shapes do not fit, or X or y is a data frame
+            with the robot's joints in another order.
 
         Warns
         -----
         ConvergenceWarning
-            If weights end far from the robot's model, as with placeholders for its masses or y in other units. If
-            torques are explained badly, and much better with columns in another order or angles in degrees: the message
-            names the order, or the signals and joints; and it names positions beyond the limits of the robot's model.
-            If f_j of some joints holds for no group that was left out: its signal is then nearly 0.
+            If weights are far from the robot's model, for example because y has other units. If columns seem to be in
+            another order, angles in degrees, or positions beyond the limits of the model. If f_j of some joints is
+            valid for no left-out group; its signal is then nearly 0.
         RobotModelWarning
-            As `skevgp.datasets.load_robot`.
+            If the model of the robot is unphysical, as in `skevgp.datasets.load_robot`.
         """
         with unchanged_if_it_fails(self):
             doubt = self._fit(X, y, groups, pieces)
@@ -254,7 +258,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return self
 
     def _fit(self, X: ArrayLike, y: ArrayLike, groups: ArrayLike | None, pieces: ArrayLike | None) -> str:
-        """Fit, and a message if the robot's model is in doubt."""
+        """Fit, and return a message if the robot's model is in doubt."""
         rows_x: np.ndarray
         rows_x, targets = validate_numbers(self, X, y, reset=True, dtype=np.float64, ensure_min_samples=2)
         targets = np.asarray(targets, dtype=np.float64)
@@ -263,9 +267,9 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         check_magnitude(rows_x, "X")
         check_magnitude(targets, "y", _LARGEST_TORQUE)
         check_not_vanishing(np.abs(targets).max(axis=0), "y", _SMALLEST_TORQUE)
-        self.feature_map_ = self._map().fit(X)  # a frame's columns must be in the robot's order
+        self.feature_map_ = self._map().fit(X)  # checks the order of a data frame's columns
         self._check_columns_of_y(y)
-        with ignored(category=RobotModelWarning):  # said already
+        with ignored(category=RobotModelWarning):  # given already
             self.feature_map_ = self._map().fit(rows_x)
         rows = self._find_weights(rows_x, targets, groups, pieces)
         self._known = condensed(rows, self._weights)
@@ -285,7 +289,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return doubt
 
     def _doubt(self, X: np.ndarray, y: np.ndarray, is_doubtful: bool | np.bool_) -> str:
-        """What to warn of where the robot's model explains torques badly, or ""."""
+        """Return a warning if the robot's model explains torques badly, or ""."""
         is_far = self._weights.surprise > _FAR or bool(self._unexplained)
         causes: list[str] = []
         if is_far or is_doubtful:
@@ -303,7 +307,7 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         )
 
     def _check_columns_of_y(self, y: ArrayLike) -> None:
-        """Refuse a frame whose names say that its columns are of the robot's joints in another order."""
+        """Raise ValueError for a data frame with the robot's joints in another order."""
         frame = FrameColumns.of(y) if self._has_robot else None
         if frame is not None:
             joints = self._output_names(len(frame.names))
@@ -371,16 +375,16 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         X : array-like of shape (n_samples, 3 * n_joints)
             Rows [q, q̇, q̈].
         return_std : bool, default=False
-            Whether standard deviations are wanted.
+            Whether to return the standard deviation too.
         include_noise : bool, default=True
-            Whether standard deviations are those of measured torques.
+            Whether standard deviations are those of measured torques, with noise.
 
         Returns
         -------
         mean : ndarray of shape (n_samples,) or (n_samples, n_joints)
-            Torques, like y.
+            Mean of the torques, in the units of y.
         std : ndarray of the same shape
-            Their standard deviations; only with ``return_std``.
+            Standard deviation of the torques. Only if ``return_std``.
         """
         check_is_fitted(self)
         rows: np.ndarray = validate_numbers(self, X, reset=False, dtype=np.float64)
@@ -403,19 +407,19 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         return like_y(values) if self._one_dimensional else values
 
     def summary(self) -> ModelSummary:
-        """Summarise what was learned: weights next to their prior, noise, and the residual of each joint.
+        """Summarise the fit: weights with their prior, noise, and the residual of each joint.
 
         Returns
         -------
         summary : ModelSummary
-            It prints as text, shows as tables in notebooks, and has ``to_frame()``.
+            Object that prints as text, shows as tables in notebooks, and has ``to_frame()``.
         """
         check_is_fitted(self)
         return of_inverse_dynamics(self, self._outputs)
 
     @property
     def _repr_html_(self) -> Callable[[], str]:
-        # scikit-learn has it only if its option ``display`` is "diagram".
+        # The attribute exists only if scikit-learn's option ``display`` is "diagram".
         diagram: Callable[[], str] = super()._repr_html_
         return lambda: diagram() + html_of(self)
 

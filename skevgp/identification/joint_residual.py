@@ -1,4 +1,4 @@
-"""What physics missed of one joint's torque: a Gaussian process of the joint's own columns, and its noise."""
+"""The residual torque of one joint: a Gaussian process of the joint's own signals, and its noise."""
 
 from __future__ import annotations
 
@@ -13,19 +13,19 @@ from ..fitting.messages import signal_gone
 from ..kernels.parse import KernelSpec
 from .stiction import JointNoise, likeliest_noise, noise_at
 
-# What is left of a torque, squared: less is nothing, and no kernel's variance.
+# Smallest mean square of a residual torque that a kernel is fitted to.
 _NOTHING = 1e-90
-# The kernel's limits, in standard deviations of residuals and of columns. A signal that is larger than what it was
-# fitted to, or changes within less of a position than was visited, is an excuse that holds for one trajectory only;
-# friction does change within a fraction of the speeds.
+# Limits of the kernel, in standard deviations of residuals and of columns. A signal that is larger than the residuals,
+# or changes within less than the range of positions, is valid for one trajectory only. Friction does change within a
+# fraction of the range of speeds.
 _LARGEST_SIGNAL, _SMALLEST_SIGNAL = 1.0, 1e-3
 _SHORTEST, _SHORTEST_OF_SPEED, _START, _LONGEST = 1.0, 0.01, 1.5, 100.0
-# Of the noise without f, the share that it leaves at least.
+# Least noise with f, as a share of the noise without f.
 _LEAST = 1e-6
 
 
 class QuietRegressor(EVGPRegressor):
-    """Its limits are not the user's, who is not told that fits end at them."""
+    """A regressor that does not warn about parameters at their bounds, which the user did not set."""
 
     def _warn(self, messages: tuple[str, ...], spec: KernelSpec) -> None:
         self._held_for_no_group = signal_gone(1, 1) in messages
@@ -33,24 +33,15 @@ class QuietRegressor(EVGPRegressor):
 
 @dataclass(frozen=True)
 class JointResidual:
-    """f(x_j) ~ GP of a joint's residual torque, and its noise.
+    """f(x_j) ~ GP of a joint's residual torque, and its noise."""
 
-    Attributes
-    ----------
-    model : EVGPRegressor or None
-        Of the joint's own columns; None where physics alone predicts.
-    noise : JointNoise
-    held_for_no_group : bool
-        Whether there was something to learn, of which groups that were left out had nothing.
-    """
-
-    model: EVGPRegressor | None
+    model: EVGPRegressor | None  # of the joint's own columns; None if physics alone predicts
     noise: JointNoise
-    held_for_no_group: bool = False
+    held_for_no_group: bool = False  # whether the signal was valid for no left-out group
 
     @property
     def signal(self) -> float:
-        """The standard deviation of f a priori."""
+        """Prior standard deviation of f."""
         if self.model is None:
             return 0.0
         kernel: Any = self.model.kernel_
@@ -60,7 +51,7 @@ class JointResidual:
         return np.zeros(len(x)) if self.model is None else self.model.predict(x)
 
     def moments(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Mean and variance of f, (n,)."""
+        """Return mean and variance of f, (n,) each."""
         if self.model is None:
             return np.zeros(len(x)), np.zeros(len(x))
         mean, std = self.model.predict(x, return_std=True, include_noise=False)
@@ -78,31 +69,11 @@ def fit_joint_residual(
     smooth: np.ndarray,
     **options: Any,
 ) -> JointResidual:
-    """Fit the Gaussian process of a joint, and the noise that it leaves.
-
-    Parameters
-    ----------
-    x : ndarray of shape (n, d)
-        The joint's own columns.
-    residual, speed : ndarray of shape (n,)
-    noise : JointNoise
-        Of the residual without f.
-    velocity : float
-        v_s, the lowest one at which friction may have a sign: below it rows count less for f. (Where filters blur the
-        sign the noise reaches further, but there f learns what friction is on average.)
-    groups : ndarray of shape (n,)
-        What is left out together when signal and noise are calibrated.
-    rows : ndarray of int
-        Those that the model is fitted to.
-    smooth : ndarray of bool of shape (d,)
-        Of which columns of x the lengthscale may not be short.
-    **options
-        Of `EVGPRegressor`.
-
-    Returns
-    -------
-    joint : JointResidual
-    """
+    """Fit the Gaussian process of a joint to some rows of x (n, d), and its noise to all rows."""
+    # noise is that of the residual (n,) without f. Below velocity v_s, the lowest speed at which friction may have a
+    # sign, rows count less for f. If filters blur the sign, the noise is larger up to a higher speed, but there f
+    # learns the average friction. groups (n,) are left out to calibrate signal and noise; rows are the indices that f
+    # is fitted to; smooth (d,) are the columns of x with long length scales; options are those of EVGPRegressor.
     size = float(np.mean(residual**2))
     if size <= _NOTHING:
         return JointResidual(None, noise)
@@ -118,6 +89,6 @@ def fit_joint_residual(
     model.fit(x[rows], residual[rows], groups=groups[rows], relative_variance=relative[rows])
     left = residual - model.predict(x)
     found = likeliest_noise(left, speed, noise.coulomb, noise.velocity, least)
-    # Groups that were left out show how much larger noise is than where f was fitted.
+    # Left-out groups show how much larger the noise is than on the rows that f was fitted to.
     growth = max(1.0, float(model.noise_variance_ / max(np.mean(left**2 / relative), 1e-300)))
     return JointResidual(model, found._replace(variance=growth * found.variance), model._held_for_no_group)

@@ -1,4 +1,4 @@
-"""Why a robot's model explains torques badly: columns in another order, degrees, positions beyond the joints' limits.
+"""Likely causes if a robot's model explains torques badly: order of columns, degrees, positions beyond limits.
 
 Torques of some rows are regressed on the model's features with a wide prior. The regression is repeated with columns in
 another order and with angles in radians. A cause is named if it leaves far less of the torques' variance.
@@ -32,38 +32,24 @@ _MOST_ALL, _MOST_SEARCHED, _MOST_TRIALS = 6, 12, 1000
 # Positions are beyond limits if they exceed them by this share of the range. They look like degrees if they are larger
 # than a turn, and than the larger limit times the second number.
 _BEYOND, _DEGREES = 0.1, 3.0
-# Positions, velocities and accelerations of robots in radians are mostly below it: what is so small is not in degrees.
+# Positions, velocities and accelerations in radians are mostly below it. Smaller signals are not in degrees.
 _RADIANS = 2.0 * np.pi
 _MOST_NAMED, _MOST_SAID = 8, 3
 _UNITS = (("q",), ("q", "v", "a"), ("q", "v"), ("q", "a"), ("v", "a"), ("v",), ("a",))
 _BLOCKS = {"q": "positions", "v": "velocities", "a": "accelerations"}
-# Largest difference from a turn, in rad, of limits that stand for none: joints that turn freely have them.
+# Limits that differ from a turn by at most this many rad are those of joints that turn freely, and are ignored.
 _A_TURN = 0.05
-# A limit beyond it is none.
+# Larger limits are ignored.
 _LARGEST_LIMIT = 1e6
 
 
-@single_threaded_libraries()  # matrices are small: with more threads these wait for each other
+@single_threaded_libraries()  # with small matrices, threads would only wait for each other
 def likely_causes(
     feature_map: Any, X: np.ndarray, y: np.ndarray, prior: tuple[np.ndarray, np.ndarray], *, is_far: bool
 ) -> list[str]:
-    """Sentences that name likely causes, without a full stop.
-
-    Parameters
-    ----------
-    feature_map : RigidBodyRegressor
-        Fitted, with a robot.
-    X : ndarray of shape (n, 3 * n_joints)
-    y : ndarray of shape (n, n_joints)
-    prior : tuple of ndarray
-        Mean and covariance of the map's weights.
-    is_far : bool
-        Whether the model is far from what torques say: positions somewhat beyond limits are named only then.
-
-    Returns
-    -------
-    causes : list of str
-    """
+    """Return sentences that name likely causes, without a full stop."""
+    # prior is (mean, covariance) of the map's weights. Positions slightly beyond limits are named only if is_far: if
+    # the identified weights are far from the model.
     n_joints = y.shape[1]
     said, degrees = _beyond_limits(feature_map.model_, X[:, :n_joints])
     if not is_far:
@@ -90,7 +76,7 @@ def likely_causes(
 
 
 class _Trial:
-    """Rows of a log, and what a regression leaves of the torques."""
+    """Some rows of a log, with regressions of their torques."""
 
     def __init__(self, feature_map: Any, prior: tuple[np.ndarray, np.ndarray], X: np.ndarray, y: np.ndarray):
         self.model, self.X, self.y = feature_map.model_, X, y
@@ -102,7 +88,7 @@ class _Trial:
         self._root = _WIDER * vectors * np.sqrt(np.maximum(values, 0.0))
 
     def left(self, X: np.ndarray, y: np.ndarray) -> float:
-        """The share of the torques' variance that is left, a mean over joints whose torque varies."""
+        """Return the residual's share of the variance of torques: a mean over joints whose torque varies."""
         H = self._map.transform(X)
         variance = y.var(axis=0)
         moves = variance > 0.0
@@ -121,19 +107,14 @@ class _Trial:
         return float(np.mean(np.minimum(share, 1.0)))
 
     def left_without(self, one: _Degrees) -> float:
-        """The share that is left with signals set to 0."""
+        """Return the residual's share with signals set to 0."""
         X = self.X.copy()
         X[:, one.columns] = 0.0
         return self.left(X, self.y)
 
     def costs(self, X: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """Logarithms of the shares that the model's torque of each joint, with friction there, leaves of columns of y.
-
-        Returns
-        -------
-        costs : ndarray of shape (n_joints, n_columns)
-            0 for a column that does not vary.
-        """
+        """Return log shares (n_joints, n_columns) of columns of y that model torques with friction do not explain."""
+        # A column that does not vary has the cost 0.
         q, v, a = np.split(X, 3, axis=1)
         designs = np.stack([self._body.forces(q, v, a), v, np.sign(v), a], axis=2).swapaxes(0, 1)
         designs -= designs.mean(axis=1, keepdims=True)
@@ -151,7 +132,7 @@ def _much_less(left: float, before: float) -> bool:
 
 
 def _beyond_limits(model: Any, q: np.ndarray) -> tuple[dict[int, str], list[int]]:
-    """Of the joints whose positions are beyond their limits: what a sentence says of each, and which may be degrees."""
+    """Describe the joints with positions beyond their limits, and list those that may be in degrees."""
     said: dict[int, str] = {}
     degrees: list[int] = []
     turns = np.any(joint_axes(model)[:, 3:], axis=1)
@@ -189,7 +170,7 @@ def _listed(said: dict[int, str], joints: list[int]) -> str:
 
 
 class _Degrees(NamedTuple):
-    """Signals in degrees: where they are, the rows with these in radians, and what is left of torques then."""
+    """Signals that may be in degrees, the rows with these in radians, and the residual's share of torques then."""
 
     blocks: tuple[str, ...]
     joints: list[int]
@@ -203,7 +184,7 @@ class _Degrees(NamedTuple):
 
 
 def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
-    """What may be in degrees: signals of all joints that turn, or of the suspects."""
+    """List signals that may be in degrees, for all revolute joints and for the suspects."""
     n, turning, found = len(trial.names), np.flatnonzero(trial.turns).tolist(), []
     for joints in [turning] * bool(turning) + [suspects] * (bool(suspects) and suspects != turning):
         for blocks in _UNITS:
@@ -216,7 +197,7 @@ def _degrees(trial: _Trial, suspects: list[int]) -> list[_Degrees]:
 
 
 def _order(trial: _Trial, X: np.ndarray) -> list[str]:
-    """A sentence about the order of columns, if another one explains torques better."""
+    """Return a sentence on the order of columns, if another order explains torques better."""
     n = len(trial.names)
     if n == 1:
         return []
@@ -243,7 +224,7 @@ def _order(trial: _Trial, X: np.ndarray) -> list[str]:
 
 
 def _taken(X: np.ndarray, order: Sequence[int]) -> np.ndarray:
-    """Rows whose joint j is what was column order[j] of each block."""
+    """Return rows with joint j taken from column order[j] of each block."""
     n = len(order)
     return X[:, [n * block + column for block in range(3) for column in order]]
 
@@ -253,7 +234,7 @@ def _best_order(names: list[str], cost: Callable[[list[int]], float]) -> list[in
     identity = list(range(n))
     if n <= _MOST_ALL:
         return min(map(list, permutations(identity)), key=cost)
-    # Drivers sort joints by name, or begin at the tip.
+    # Some drivers sort joints by name, or begin at the tip.
     starts = [identity, np.argsort(np.argsort(names)).tolist(), identity[::-1]]
     best, lowest, trials = identity, np.inf, 0
     for start in starts:
@@ -270,7 +251,7 @@ def _best_order(names: list[str], cost: Callable[[list[int]], float]) -> list[in
 
 
 def _neighbours(order: list[int]) -> Iterator[list[int]]:
-    """The orders in which two joints are exchanged, or one is moved."""
+    """Yield the orders with two joints exchanged, or one moved."""
     for first, second in combinations(range(len(order)), 2):
         swapped = order.copy()
         swapped[first], swapped[second] = swapped[second], swapped[first]

@@ -1,4 +1,4 @@
-"""What a robot carries, by torques with it and a model without it."""
+"""The payload of a robot, from torques with it and a model without it."""
 
 from __future__ import annotations
 
@@ -10,27 +10,14 @@ from sklearn.utils import Bunch
 
 from .weights import Known, Prior, Rows, identify
 
-# Half of the width of an interval that holds 95 % of a normal distribution, in standard deviations.
+# Half width of the 95 % interval of a normal distribution, in standard deviations.
 _95 = 1.959963984540054
 
 
 def payload_prior(prior: Prior, mass_scale: float, size: float) -> Prior:
-    """The prior of the robot alone, and a body of ten parameters of which hardly anything is known.
-
-    Parameters
-    ----------
-    prior : Prior
-        Of the robot.
-    mass_scale : float
-        Standard deviation of the body's mass, kg; the prior mean is 0.
-    size : float
-        m: first moments have that times mass_scale, moments of inertia once more.
-
-    Returns
-    -------
-    prior : Prior
-        The body's parameters follow the weights; gains are last.
-    """
+    """Add a body with ten nearly unknown parameters to the prior of a robot, between its weights and its gains."""
+    # The mass has mean 0 and standard deviation mass_scale (kg). First moments have size (m) times that, and moments of
+    # inertia size² times that.
     p, total = len(prior.scaled), len(prior.mean)
     robot = np.concatenate([np.arange(p), np.arange(p + 10, total + 10)])
     mean, covariance = np.zeros(total + 10), np.zeros((total + 10, total + 10))
@@ -44,28 +31,10 @@ def payload_prior(prior: Prior, mass_scale: float, size: float) -> Prior:
 def find_payload(
     rows: Rows, link: int, prior: Prior, known: Known, residual: Callable[[np.ndarray], np.ndarray], rounds: int = 2
 ) -> Bunch:
-    """The body that explains what a robot's torques have more than its model.
-
-    Parameters
-    ----------
-    rows : Rows
-        With the payload; features of the robot alone.
-    link : int
-        From 0, that it is fixed to.
-    prior : Prior
-        `payload_prior`.
-    known : Known
-        What rows without the payload said: weights and gains are found anew from both, for their product is what
-        either knows.
-    residual : callable
-        Torques (n, o) of the model -> what its Gaussian processes add.
-    rounds : int
-        The residual depends on the load, and the load on the residual.
-
-    Returns
-    -------
-    payload : Bunch
-    """
+    """Identify the body on a link (from 0) from rows with the payload, given rows without it as ``known``."""
+    # Weights and gains are identified again from both logs, because each log determines their product only. residual
+    # returns the Gaussian processes' part of torques (n, o) of the model. It depends on the load, and the load depends
+    # on it, so that there are several rounds.
     body = rows.features[:, :, 10 * link : 10 * link + 10]
     carried = replace(rows, features=np.concatenate([rows.features, body], axis=2))
     nothing = np.zeros((*known.targets.shape, 10))

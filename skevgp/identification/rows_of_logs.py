@@ -1,31 +1,18 @@
-"""What the rows of a log are worth: they follow each other, and signals were filtered."""
+"""Information of the rows of a log, which follow each other and were filtered."""
 
 from __future__ import annotations
 
 import numpy as np
 
-# Groups of which one has this share of the rows are too few to say what others would: they are cut into so many blocks.
+# If one group has at least this share of the rows, groups are cut into this number of blocks.
 _LARGEST_SHARE, _BLOCKS = 0.5, 5
 
 
 def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
-    """How many rows say as much as one independent row: 1 + 2 Σ ρ_k, with the autocorrelations ρ_k of the errors.
-
-    Summed up to the first pair of neighbouring lags whose sum is not positive (Geyer 1992, "Practical Markov chain
-    Monte Carlo", initial positive sequence).
-
-    Parameters
-    ----------
-    errors : ndarray of shape (n,)
-        In the order of time.
-    runs : ndarray of shape (n,)
-        Labels of the runs without gaps; no product is taken across them.
-
-    Returns
-    -------
-    time : float
-        In rows, from 1 to n.
-    """
+    """Return the number of rows, from 1 to n, with as much information as an independent row."""
+    # 1 + 2 Σ ρ_k, with the autocorrelations ρ_k of the errors (n,) in the order of time, up to the first pair of
+    # neighbouring lags whose sum is not positive (Geyer 1992, "Practical Markov chain Monte Carlo", initial positive
+    # sequence). No products are taken across runs (n,).
     total = np.zeros(0)
     for run in np.unique(runs):
         part = errors[runs == run]
@@ -43,11 +30,9 @@ def correlation_time(errors: np.ndarray, runs: np.ndarray) -> float:
 
 
 def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
-    """Labels (n,) from 0 of what is left out together: whole groups, or blocks of rows that follow each other in one.
-
-    Blocks stand in where there are fewer than three groups, or one has half of the rows or more. More groups than
-    blocks are joined, the largest with the smallest.
-    """
+    """Return labels (n,) from 0 of rows that are left out together: whole groups, or blocks of successive rows."""
+    # Blocks are used if there are fewer than three groups, or one has half of the rows or more. If there are more
+    # groups than blocks, groups are joined, the largest with the smallest.
     labels = np.zeros(n_rows, dtype=int) if groups is None else np.unique(groups, return_inverse=True)[1].ravel()
     sizes = np.bincount(labels)
     if len(sizes) > 2 and sizes.max() < _LARGEST_SHARE * n_rows:
@@ -60,14 +45,14 @@ def blocks_of(groups: np.ndarray | None, n_rows: int) -> np.ndarray:
 
 
 def groups_of(groups: np.ndarray | None, blocks: np.ndarray) -> np.ndarray:
-    """Labels (n,) of what may differ as a whole: the groups if there are some, else blocks."""
+    """Return labels (n,) of rows that may differ as a whole: the groups if there are several, else blocks."""
     if groups is None or len(np.unique(groups)) < 2:
         return blocks
     return np.unique(groups, return_inverse=True)[1].ravel()
 
 
 def _joined(sizes: np.ndarray) -> np.ndarray:
-    """The block of each group: one after the other, from the largest on, to the block that has the fewest rows."""
+    """Assign groups, from the largest on, to the block with the fewest rows."""
     blocks, rows = np.zeros(len(sizes), dtype=int), np.zeros(_BLOCKS)
     for group in np.argsort(-sizes, kind="stable"):
         blocks[group] = np.argmin(rows)

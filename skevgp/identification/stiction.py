@@ -1,4 +1,4 @@
-"""Noise of a joint that hardly moves: Coulomb's friction has no sign there, and holds whatever the others ask."""
+"""Noise of a joint at low speed, where Coulomb friction has no known sign."""
 
 from __future__ import annotations
 
@@ -7,51 +7,40 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize, minimize_scalar
 
-# A row moves if friction leaves less than this share of its variance open.
+# A joint moves if less than this share of the variance of friction at rest remains.
 _MOVING = 0.1
-# rad/s or m/s: between which the speed is found at which friction has a sign.
+# Limits of the speed v_s above which friction has a sign, rad/s or m/s.
 _SLOWEST, _FASTEST = 1e-3, 0.3
-# What is tried for that of mean friction, and its prior: the usual one and the standard deviation of its logarithm.
+# Candidates of v_s for mean friction, and its log-normal prior: usual value and standard deviation of the logarithm.
 _VELOCITIES = np.array([0.002, 0.003, 0.005, 0.007, 0.01, 0.015, 0.02, 0.03, 0.05, 0.07, 0.1, 0.15, 0.2])
 _USUAL, _USUAL_SPREAD = 0.015, 0.7
 
 
 def undecided(speed: np.ndarray, velocity: np.ndarray | float) -> np.ndarray:
-    """The share 1 - tanh²(q̇ / v_s) of a joint's largest standing-friction variance, (n,) or (n, o)."""
+    """Return 1 - tanh²(q̇ / v_s), the share of the variance of static friction that remains, (n,) or (n, o)."""
     return 1.0 - np.tanh(speed / velocity) ** 2
 
 
 class JointNoise(NamedTuple):
-    """The variance of a joint's torque, σ² + F²/3 (1 - tanh²(q̇ / v_s)).
+    """The variance of a joint's torque, σ² + F²/3 (1 - tanh²(q̇ / v_s))."""
 
-    At rest friction is anything between -F and F, with variance F²/3 if nothing else is known; at a speed at which its
-    mean is F tanh(q̇ / v_s), the rest of F² is left to chance.
-
-    Attributes
-    ----------
-    variance : float
-        σ².
-    coulomb : float
-        F, Coulomb's friction; 0 where there is none.
-    velocity : float
-        v_s.
-    """
-
-    variance: float
-    coulomb: float
-    velocity: float
+    # At rest friction is between -F and F, with variance F²/3 if nothing else is known. At a speed where its mean is
+    # F tanh(q̇ / v_s), the rest of F² is random.
+    variance: float  # σ²
+    coulomb: float  # F, or 0 without Coulomb friction
+    velocity: float  # v_s
 
     def of(self, speed: np.ndarray) -> np.ndarray:
-        """The variance at each speed."""
+        """Return the variance at each speed."""
         return self.variance + self.standing(speed)
 
     def standing(self, speed: np.ndarray) -> np.ndarray:
-        """Its part from friction."""
+        """Return the part of the variance by friction."""
         return self.coulomb**2 / 3.0 * undecided(speed, self.velocity)
 
 
 def noise_at(errors: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, least: float) -> JointNoise:
-    """The most likely σ² of Gaussian errors (n,) whose other noise is known, no less than some."""
+    """Find the most likely σ², at least ``least``, of Gaussian errors (n,) with the other noise known."""
     standing = coulomb**2 / 3.0 * undecided(speed, velocity)
     most = _most(errors, least)
 
@@ -71,23 +60,8 @@ def likeliest_noise(
     least: float,
     start: JointNoise | None = None,
 ) -> JointNoise:
-    """The same with the most likely v_s, which depends on how signals were filtered.
-
-    Parameters
-    ----------
-    errors, speed : ndarray of shape (n,)
-    coulomb : float
-    velocity : float
-        Where v_s starts.
-    least : float
-        Which σ² is not below, above 0.
-    start : JointNoise, optional
-        Of errors that were nearly the same: it starts there alone.
-
-    Returns
-    -------
-    noise : JointNoise
-    """
+    """Find the most likely σ² and v_s, which depends on the filters of the signals."""
+    # v_s starts at velocity. With a start, the noise of nearly the same errors, it is the only one.
     if coulomb == 0.0:
         return noise_at(errors, speed, coulomb, velocity, least)
     squares, largest, most = errors**2, coulomb**2 / 3.0, _most(errors, least)
@@ -118,35 +92,18 @@ def likeliest_noise(
 
 
 def _most(errors: np.ndarray, least: float) -> float:
-    """A variance that noise does not exceed."""
+    """Return an upper limit of the noise variance."""
     return max(2.0 * float(np.max(errors**2)), 10.0 * least)
 
 
 def likeliest_velocity(
     left: np.ndarray, speed: np.ndarray, coulomb: float, velocity: float, worth: float, least: float
 ) -> float:
-    """The speed v_s at which a joint's mean friction F tanh(q̇ / v_s) has a sign, by what it leaves.
-
-    Parameters
-    ----------
-    left : ndarray of shape (n,)
-        What all weights leave of the joint's torque.
-    speed : ndarray of shape (n,)
-    coulomb : float
-        F, with its sign.
-    velocity : float
-        The v_s with which F was found.
-    worth : float
-        The rows that say as much as an independent one.
-    least : float
-        Which the variance of errors is not below, above 0.
-
-    Returns
-    -------
-    velocity : float
-        Of a grid; F, viscous friction and an offset are fitted anew to each, and a log-normal prior keeps it from ends
-        of which the log says little. All rows count the same, for it is slow ones that tell.
-    """
+    """Find the v_s in a grid whose mean friction F tanh(q̇ / v_s) leaves the smallest residual."""
+    # left (n,) is the residual of all weights, found with F (coulomb, with its sign) and v_s (velocity). F, viscous
+    # friction and an offset are fitted again for each candidate. A log-normal prior avoids the ends of the grid if the
+    # log has little information. worth rows have the information of an independent one. All rows count the same,
+    # because slow ones determine v_s.
     target = left + coulomb * np.tanh(speed / velocity)
     scale = worth * max(float(np.mean(left**2)), least)
     losses = []

@@ -1,4 +1,4 @@
-"""The regression behind torques: rows of logs, their features, the prior of weights, and where friction has a sign."""
+"""The regression of torques: rows of logs, features, the prior of weights, and speeds of static friction."""
 
 from __future__ import annotations
 
@@ -18,12 +18,12 @@ from .rows_of_logs import blocks_of, groups_of
 from .stiction import likeliest_velocity
 from .weights import Prior, Rows, Weights, identify, with_gains
 
-# Speeds at which friction has a sign settle in so many rounds.
+# Maximum number of rounds for the speeds above which friction has a sign.
 _STICTION_ROUNDS = 3
 
 
 class TorqueRegression(StatefulEstimator):
-    """How rows of `InverseDynamics` become those of a regression, and the weights that it finds."""
+    """Base of `InverseDynamics` that turns its rows into those of a regression, and finds the weights."""
 
     robot: Any
     gain_scale: float
@@ -47,11 +47,11 @@ class TorqueRegression(StatefulEstimator):
         return Rows(features, y, self._speed(X, n_outputs), runs, groups_of(labels, blocks), blocks)
 
     def _speed(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
-        """q̇ of each joint, (n, o)."""
+        """Return q̇ of each joint, (n, o)."""
         return X[:, n_outputs : 2 * n_outputs] if self._has_robot else np.zeros((len(X), n_outputs))
 
     def _features(self, X: np.ndarray, n_outputs: int) -> np.ndarray:
-        """H (n, o, p); of a map without a row for each output, weights of each output side by side, with a constant."""
+        """Return H (n, o, p); without a robot, each output has its own weights and a constant."""
         H = self.feature_map_.transform(X)
         if H.ndim == 3:
             return H
@@ -71,17 +71,17 @@ class TorqueRegression(StatefulEstimator):
         return [f"output {o}" for o in range(n_outputs)] if layout is None else list(layout.position_names)
 
     def _own(self, X: np.ndarray, torque: np.ndarray, joint: int) -> np.ndarray:
-        """x_j, the columns that f_j sees."""
+        """Return x_j, the inputs of f_j."""
         if not self._has_robot:
             return X
         return np.column_stack([X[:, joint :: torque.shape[1]], torque[:, joint]])
 
     def _find_weights(self, X: np.ndarray, y: np.ndarray, groups: ArrayLike | None, pieces: ArrayLike | None) -> Rows:
-        """Set the weights, and the map's speeds at which friction has a sign; the rows that they are of."""
+        """Find the weights and the speeds above which friction has a sign; returns the rows."""
         rows = self._as_rows(X, y, groups, pieces)
         prior = self._prior(rows)
         self._weights = identify(rows, prior)
-        # One trajectory says little of the speeds at which friction has a sign in others.
+        # One trajectory has little information on these speeds in others.
         labels = checked_groups(groups, len(X))
         several = labels is not None and labels.max() > 1
         if not (several and self.stiction_velocity == "auto" and prior.coulomb is not None):
@@ -90,7 +90,7 @@ class TorqueRegression(StatefulEstimator):
             velocity = self._likeliest_velocities(rows)
             if (velocity == prior.velocity).all():
                 break
-            with ignored(category=RobotModelWarning):  # said already
+            with ignored(category=RobotModelWarning):  # given already
                 self.feature_map_.set_params(stiction_velocity=velocity).fit(X)
             rows, prior = replace(rows, features=self._features(X, y.shape[1])), replace(prior, velocity=velocity)
             self._weights = identify(rows, prior, start=self._weights)
@@ -119,7 +119,7 @@ class TorqueRegression(StatefulEstimator):
         return RigidBodyRegressor(self.robot)
 
     def _prior(self, rows: Rows) -> Prior:
-        """Of the weights: the map's, or a wide one; and of gains."""
+        """Return the prior of the weights, that of the map or a wide one, and of gains."""
         features, y = rows.features, rows.targets
         n_outputs = y.shape[1]
         names = [str(name) for name in self._names(n_outputs)]
@@ -135,5 +135,5 @@ class TorqueRegression(StatefulEstimator):
         return with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
 
     def _velocities(self, n_outputs: int) -> np.ndarray:
-        """v_s of each joint's Coulomb friction, (o,)."""
+        """Return v_s of each joint's Coulomb friction, (o,)."""
         return np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)

@@ -1,4 +1,4 @@
-"""Bayesian regression of all outputs on weights that they share, with the outputs' gains and the noise of each."""
+"""Bayesian regression of all outputs on common weights, with the gains and the noise of each output."""
 
 from __future__ import annotations
 
@@ -11,38 +11,26 @@ from scipy.linalg import eigh
 from .rows_of_logs import correlation_time
 from .stiction import JointNoise, likeliest_noise
 
-# Noise, its correlation and gains settle in no more than so many rounds, when they move by less than this share.
+# Maximum numbers of rounds for noise, its correlation and gains, and the relative change at which they have settled.
 _TRIAL_ROUNDS, _ROUNDS, _SETTLED = 4, 12, 0.02
-# Where noise starts, in shares of an output's variance.
+# Starts of the noise, as shares of an output's variance.
 _FIRST_NOISE = (1.0, 1e-5)
-# The smallest eigenvalue of a precision with unit diagonal that is no rounding error.
+# Smaller eigenvalues of a precision with unit diagonal are rounding errors.
 _SINGULAR = 1e-15
-# Noise is at least this share of an output's variance.
+# Least noise, as a share of an output's variance.
 _LEAST = 1e-12
 
 
 @dataclass(frozen=True)
 class Rows:
-    """What is known of each row: y = (1 + c) ∘ (H β)_scaled + (H β)_others + ε, with weights β and gains 1 + c.
+    """Rows of the regression y = (1 + c) ∘ (H β)_scaled + (H β)_others + ε, with weights β and gains 1 + c."""
 
-    Attributes
-    ----------
-    features : ndarray of shape (n, o, p)
-        H, a row for each output.
-    targets : ndarray of shape (n, o)
-    speed : ndarray of shape (n, o)
-        By which friction at rest is known (`JointNoise`).
-    runs, groups, blocks : ndarray of shape (n,)
-        Labels of rows that follow each other without a gap, of those that may differ from others as a whole, and of
-        those that are left out together.
-    """
-
-    features: np.ndarray
-    targets: np.ndarray
-    speed: np.ndarray
-    runs: np.ndarray
-    groups: np.ndarray
-    blocks: np.ndarray
+    features: np.ndarray  # H (n, o, p)
+    targets: np.ndarray  # (n, o)
+    speed: np.ndarray  # (n, o), for the noise of friction at rest (`JointNoise`)
+    runs: np.ndarray  # (n,) labels of rows that follow each other without a gap
+    groups: np.ndarray  # (n,) labels of rows that may differ from others as a whole
+    blocks: np.ndarray  # (n,) labels of rows that are left out together
 
     def __getitem__(self, chosen: np.ndarray) -> Rows:
         return Rows(*(getattr(self, name)[chosen] for name in self.__dataclass_fields__))
@@ -50,53 +38,27 @@ class Rows:
 
 @dataclass(frozen=True)
 class Prior:
-    """Of the weights, and of the gains behind them if these are unknown.
+    """Prior of the weights, and of the gains after them if these are unknown."""
 
-    Attributes
-    ----------
-    mean : ndarray of shape (P,)
-        P is p, or p + o with gains.
-    covariance : ndarray of shape (P, P)
-    scaled : ndarray of bool of shape (p,)
-        The weights that gains multiply: not friction, which is found in the units of what was measured.
-    coulomb : ndarray of int of shape (o,), optional
-        Which weight is Coulomb's friction of each output. None: nothing stands still.
-    velocity : ndarray of shape (o,)
-        Up to which friction has no sign.
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
-    scaled: np.ndarray
-    coulomb: np.ndarray | None
-    velocity: np.ndarray
+    mean: np.ndarray  # (P,), with P = p, or p + o with gains
+    covariance: np.ndarray  # (P, P)
+    scaled: np.ndarray  # (p,) weights that gains multiply; friction is in the units of the measurement
+    coulomb: np.ndarray | None  # (o,) index of Coulomb friction of each output, or None without static friction
+    velocity: np.ndarray  # (o,) speed below which friction has no sign
 
 
 @dataclass(frozen=True)
 class Weights:
-    """The posterior N(mean, covariance) of weights and gains.
+    """The posterior N(mean, covariance) of weights and gains."""
 
-    Attributes
-    ----------
-    mean, covariance : ndarray of shape (P,) and (P, P)
-    prior : Prior
-    noise : list of JointNoise
-        Of each output.
-    correlation_time : ndarray of shape (o,)
-        Rows that say as much as one independent row.
-    inflation : float
-        By which the groups differ more than that allows for, at least 1; the covariance knows of it.
-    surprise : float
-        How far the weights are from the prior mean, in prior standard deviations: a root mean square over what rows
-        show of them; near 1 if the prior is right.
-    """
-
-    mean: np.ndarray
-    covariance: np.ndarray
+    mean: np.ndarray  # (P,)
+    covariance: np.ndarray  # (P, P)
     prior: Prior
-    noise: list[JointNoise]
-    correlation_time: np.ndarray
-    inflation: float
+    noise: list[JointNoise]  # of each output
+    correlation_time: np.ndarray  # (o,) number of rows with the information of an independent row
+    inflation: float  # factor by which groups differ more, at least 1; the covariance includes it
+    # Distance of the weights from the prior mean in prior standard deviations: root mean square over the directions
+    # that rows determine, near 1 if the prior is right.
     surprise: float
 
     @property
@@ -104,16 +66,16 @@ class Weights:
         return len(self.prior.scaled)
 
     def gains(self, n_outputs: int) -> np.ndarray:
-        """1 + c, (o,)."""
+        """Return 1 + c, (o,)."""
         c = self.mean[self.n_weights :]
         return 1.0 + (c if len(c) else np.zeros(n_outputs))
 
     def predict(self, features: np.ndarray) -> np.ndarray:
-        """The mean (n, o) of rows of features (n, o, p)."""
+        """Return the mean (n, o) for features (n, o, p)."""
         return _forward(features, self.mean, self.prior)
 
     def given(self, first: np.ndarray) -> Weights:
-        """The same with the first weights elsewhere, and the others where they then most probably are."""
+        """Return the posterior with the first weights set, and the others at their conditional mean."""
         n = len(first)
         scale = np.sqrt(np.maximum(np.diag(self.covariance), 0.0))
         unit = np.where(scale > 0.0, scale, 1.0)
@@ -125,37 +87,20 @@ class Weights:
         return replace(self, mean=mean)
 
     def variance(self, features: np.ndarray) -> np.ndarray:
-        """What the weights' uncertainty adds to it, (n, o), to first order in the gains."""
+        """Return the variance of predictions by the weights' uncertainty, (n, o), to first order in the gains."""
         slopes, _ = _linearised(features, np.zeros(features.shape[:2]), self.mean, self.prior)
         return np.maximum(np.einsum("nop,nop->no", slopes @ self.covariance, slopes), 0.0)
 
 
 def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: Known | None = None) -> Weights:
-    """The posterior of the weights: exact given noise, its correlation and gains, which are found with it.
-
-    The noise of output j counts as many times as `correlation_time` says, so that filtered rows are counted as what
-    they are worth. What groups of rows tell should then differ from each other as much as their information says: if
-    the scores s_b = B_bᵀ e_b differ more, all of it is worth less by that ratio, ``inflation``.
-
-    Parameters
-    ----------
-    rows : Rows
-    prior : Prior
-    start : Weights, optional
-        Of nearly the same rows: where weights and noise start. Else they start twice, where the prior explains
-        nothing and where it explains nearly all, and the more probable end is kept.
-    known : Known, optional
-        What other rows said before.
-
-    Returns
-    -------
-    weights : Weights
-
-    References
-    ----------
-    - C. E. Rasmussen, C. K. I. Williams (2006): Gaussian Processes for Machine Learning, Eq. 2.8: the posterior of a
-      Bayesian linear model. Gains are linearised around their last value (Gauss-Newton).
-    """
+    """Find the posterior of the weights: exact given noise, its correlation and gains, which are found with it."""
+    # The posterior is that of a Bayesian linear model (Rasmussen & Williams 2006, eq. 2.8). Gains are linearised around
+    # their last value (Gauss-Newton). The noise variance of output j is multiplied by `correlation_time`, so that
+    # filtered rows count less. Scores s_b = B_bᵀ e_b of groups should then differ as much as their information
+    # predicts. If they differ more, all information is divided by that ratio, the inflation.
+    #
+    # With a start, weights and noise start there. Otherwise they start twice, with a prior that explains nothing and
+    # one that explains nearly everything, and the more probable end is kept.
     problem = _Problem.of(rows, prior, known)
     if start is None:
         ends = [problem.settled(problem.first(share), _TRIAL_ROUNDS) for share in _FIRST_NOISE]
@@ -178,7 +123,7 @@ def identify(rows: Rows, prior: Prior, *, start: Weights | None = None, known: K
 
 
 def left_out(rows: Rows, weights: Weights) -> np.ndarray:
-    """What each block of rows is predicted to be by the weights that the others give, (n, o)."""
+    """Predict each block of rows by weights from the other blocks, (n, o)."""
     predicted = np.empty_like(rows.targets)
     for block in np.unique(rows.blocks):
         out = rows.blocks == block
@@ -188,20 +133,14 @@ def left_out(rows: Rows, weights: Weights) -> np.ndarray:
 
 
 class Known(NamedTuple):
-    """A few rows that say what many have said: with unit noise, and the same squared errors for all weights.
+    """A few rows with the information of many: unit noise, and the same squared errors for all weights."""
 
-    Attributes
-    ----------
-    features : ndarray of shape (p + 1, o, p)
-    targets : ndarray of shape (p + 1, o)
-    """
-
-    features: np.ndarray
-    targets: np.ndarray
+    features: np.ndarray  # (p + 1, o, p)
+    targets: np.ndarray  # (p + 1, o)
 
 
 def condensed(rows: Rows, weights: Weights) -> Known:
-    """What rows said when weights were found: of each output the triangular factor of its whitened [H y]."""
+    """Condense rows to the triangular factor of the whitened [H y] of each output."""
     _, n_outputs, p = rows.features.shape
     scale = np.sqrt(weights.inflation * weights.correlation_time * _variances(weights.noise, rows.speed))
     features, targets = np.zeros((p + 1, n_outputs, p)), np.zeros((p + 1, n_outputs))
@@ -214,7 +153,7 @@ def condensed(rows: Rows, weights: Weights) -> Known:
 
 @dataclass(frozen=True)
 class _State:
-    """Where weights, noise and its correlation are while they settle."""
+    """Weights, noise and its correlation between two rounds."""
 
     mean: np.ndarray
     noise: list[JointNoise]
@@ -223,7 +162,7 @@ class _State:
 
 @dataclass(frozen=True)
 class _Problem:
-    """What `identify` settles: rows, their prior with its root C Cᵀ, the outputs' sizes, and what was known before."""
+    """The problem of `identify`: rows, prior with its root C Cᵀ, sizes of the outputs, and known rows."""
 
     rows: Rows
     prior: Prior
@@ -238,7 +177,7 @@ class _Problem:
         return cls(rows, prior, known, _root(prior.covariance), np.where(size > 0.0, size, 1.0))
 
     def first(self, share: float) -> _State:
-        """Noise of so much of each output's variance."""
+        """Return a state with this share of each output's variance as noise."""
         noise = [
             JointNoise(float(share * size), 0.0, float(velocity))
             for size, velocity in zip(self.size, self.prior.velocity, strict=True)
@@ -246,7 +185,7 @@ class _Problem:
         return _State(self.prior.mean, noise, np.ones(len(noise)))
 
     def settled(self, state: _State, rounds: int) -> _State:
-        """After so many rounds, or when noise hardly moves any more."""
+        """Return the state after this number of rounds, or when noise hardly changes."""
         for _ in range(rounds):
             last, state = state, self._next(state)
             moved = [np.log(new.variance / old.variance) for new, old in zip(state.noise, last.noise, strict=True)]
@@ -268,7 +207,7 @@ class _Problem:
         return _State(mean, noise, times)
 
     def whitened(self, state: _State) -> tuple[np.ndarray, np.ndarray]:
-        """B and errors of the linear model errors = B z + N(0, I), z ~ N(0, I): rows, and then what was known."""
+        """Return B and errors of the linear model errors = B z + N(0, I), z ~ N(0, I), for rows and then known rows."""
         scale = 1.0 / np.sqrt(_variances(state.noise, self.rows.speed) * state.times)
         parts = [(self.rows.features, self.rows.targets, scale)]
         if self.known is not None:
@@ -281,7 +220,7 @@ class _Problem:
         return np.concatenate(Bs), np.concatenate(errors)
 
     def log_probability(self, state: _State) -> float:
-        """Of rows, as if they were independent, and weights, up to a constant."""
+        """Return the log probability of rows, as if independent, and weights, up to a constant."""
         variances = _variances(state.noise, self.rows.speed)
         left = self.rows.targets - _forward(self.rows.features, state.mean, self.prior)
         z = _solve(*self.whitened(state))[0]
@@ -289,7 +228,7 @@ class _Problem:
 
 
 def with_gains(prior: Prior, n_outputs: int, scale: float) -> Prior:
-    """A prior with unknown gains behind the weights: c ~ N(0, scale²) each."""
+    """Add unknown gains with c ~ N(0, scale²) each after the weights."""
     if scale == 0.0:
         return prior
     mean = np.concatenate([prior.mean, np.zeros(n_outputs)])
@@ -310,7 +249,7 @@ def _forward(features: np.ndarray, mean: np.ndarray, prior: Prior) -> np.ndarray
 def _linearised(
     features: np.ndarray, targets: np.ndarray, mean: np.ndarray, prior: Prior
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (n, o, P) in weights and gains, and the targets that a linear model of them has."""
+    """Return slopes (n, o, P) in weights and gains, and the targets of a linear model of them."""
     p = len(prior.scaled)
     if len(mean) == p:
         return features, targets
@@ -329,21 +268,18 @@ def _variances(noise: list[JointNoise], speed: np.ndarray) -> np.ndarray:
 
 
 def _solve(B: np.ndarray, errors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mean and covariance of z ~ N(0, I) after errors = B z + N(0, I).
-
-    The precision is scaled to a unit diagonal first: weights whose priors are wide in different degrees then lose no
-    digits to each other.
-    """
+    """Return mean and covariance of z ~ N(0, I) given errors = B z + N(0, I)."""
+    # The precision is scaled to a unit diagonal, so that wide and narrow priors do not cost each other digits.
     precision = np.eye(B.shape[1]) + B.T @ B
     scale = np.sqrt(np.diag(precision))
-    # SciPy's method: NumPy's, dividing and conquering, fails to converge on some finite matrices.
+    # SciPy's method. NumPy's divide and conquer fails to converge on some finite matrices.
     eigenvalues, vectors = eigh(precision / np.outer(scale, scale))
     root = vectors / np.sqrt(np.maximum(eigenvalues, _SINGULAR)) / scale[:, np.newaxis]
     return root @ (root.T @ (B.T @ errors)), root @ root.T
 
 
 def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups: np.ndarray) -> float:
-    """Σ_b s_bᵀ Λ⁻¹ s_b over what it should be, Σ_b tr(Λ⁻¹ G_b - Λ⁻¹ G_b Λ⁻¹ G_b): weights were fitted to all groups."""
+    """Return Σ_b s_bᵀ Λ⁻¹ s_b over its expectation Σ_b tr(Λ⁻¹ G_b - Λ⁻¹ G_b Λ⁻¹ G_b), at least 1."""
     seen = expected = 0.0
     for group in np.unique(groups):
         part = B[groups == group].reshape(-1, B.shape[2])
@@ -355,7 +291,7 @@ def _inflation(B: np.ndarray, errors: np.ndarray, covariance: np.ndarray, groups
 
 
 def _root(covariance: np.ndarray) -> np.ndarray:
-    """C with C Cᵀ = covariance, which may be singular."""
+    """Return C with C Cᵀ = covariance, which may be singular."""
     scale = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     unit = np.where(scale > 0.0, scale, 1.0)
     eigenvalues, vectors = eigh(covariance / np.outer(unit, unit))

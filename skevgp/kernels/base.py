@@ -73,7 +73,7 @@ def one_lengthscale(kernel: Any, n_columns: int) -> bool:
     return not kernel.anisotropic
 
 
-# --- sums over rows, and what is computed once of rows -------------------------------------------------------------
+# --- sums over rows, and preparations of rows ----------------------------------------------------------------------
 
 
 class Sums(tuple[Any, ...]):

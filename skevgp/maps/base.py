@@ -22,7 +22,7 @@ from ..utils.validation import is_frame, words_of
 
 # Step of central differences at which truncation and rounding errors are about equal.
 _STEP = np.cbrt(np.finfo(np.float64).eps)
-# The smallest step, in units of the spacing of numbers like x.
+# Smallest step, in units of the spacing of floats near x.
 _SPACINGS = 256.0
 
 # The adapter of each class of transformers.
@@ -186,7 +186,7 @@ def as_floats(values: Any) -> np.ndarray:
 
 def _scale_of(example: Any) -> np.ndarray:
     """Return the standard deviation of each column, or max(|x|, 1) for a constant column."""
-    if is_frame(example):  # as a whole, one of pandas with gaps may not become numbers
+    if is_frame(example):  # by columns, because a whole pandas frame with gaps may not convert to numbers
         columns = (safe_indexing(example, index, axis=1) for index in range(example.shape[1]))
         example = np.column_stack([np.asarray(column, dtype=np.float64) for column in columns])
     values = np.ma.masked_invalid(example)

@@ -28,7 +28,7 @@ class Unvalidated(Map):
 
     @classmethod
     def covers(cls, transformer: Any) -> bool:
-        # A subclass of ours may add features: it then has a Jacobian of its own. It must not change what they return.
+        # A subclass may add features and their Jacobian. It must not override the public methods.
         return cls is Unvalidated and unchanged(transformer, "_jacobian", "transform", "jacobian")
 
     def value(self, X: np.ndarray) -> np.ndarray:

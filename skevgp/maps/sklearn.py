@@ -64,7 +64,7 @@ class Chained(Map):
                 for earlier in behind:
                     rows = earlier.value(rows)
                 behind = []
-                if rows.ndim > 2:  # a row for each output: the chain rule knows no such inner map
+                if rows.ndim > 2:  # a row for each output, to which the chain rule does not apply
                     return super().jacobian(X) if inner is None else super().chain(X, inner)
             jacobian = step.jacobian(rows) if jacobian is None else step.chain(rows, jacobian)
             behind.append(step)
@@ -182,7 +182,7 @@ def _is_dropped(part: Any) -> bool:
 def column_indices(columns: Any, names: list[str], n_columns: int) -> np.ndarray:
     """Return indices of the columns that a column transformer was given by index, name, slice, list or mask."""
     if isinstance(columns, slice):
-        if isinstance(columns.start, str) or isinstance(columns.stop, str):  # names: the last is taken too
+        if isinstance(columns.start, str) or isinstance(columns.stop, str):  # a slice of names includes the last one
             start = None if columns.start is None else names.index(columns.start)
             stop = None if columns.stop is None else names.index(columns.stop) + 1
             columns = slice(start, stop, columns.step)

@@ -1,4 +1,4 @@
-"""Pictures in scikit-learn's Display convention: ``from_...`` computes, ``plot`` draws. Needs matplotlib."""
+"""Displays in scikit-learn's convention: ``from_...`` computes, ``plot`` draws. They need matplotlib."""
 
 from .calibration import CalibrationDisplay
 from .coefficients import CoefficientDisplay

@@ -1,4 +1,4 @@
-"""CalibrationDisplay: how many values lie in intervals, against how many should."""
+"""CalibrationDisplay: coverage of intervals against their probability."""
 
 from __future__ import annotations
 
@@ -14,29 +14,29 @@ from ..utils.validation import check_integer
 from ._style import axes_of, free_color
 
 _DIAGONAL = "as promised"
-# Of an artist's gid; the number of values follows.
+# Begin of the gid of a band; the number of values follows.
 _BAND = "calibration band "
 
 
 class CalibrationDisplay:
-    """Reliability curve: the share of values inside of central intervals against the intervals' probability.
+    """Reliability curve: the coverage of central intervals against their probability.
 
-    Below the diagonal intervals are too narrow, above it too wide. The band around it is where the curve of n
-    independent values is at a probability in 95 of 100 cases, if standard deviations are right; rows of a trajectory
-    are fewer than they are many. Curves of several models can share axes; the band is then that of the fewest values.
+    Intervals are too narrow below the diagonal, and too wide above it. The band contains 95 % of the curves of n
+    independent values at each probability, if standard deviations are right. Rows of a trajectory are not independent.
+    Curves of several models can share axes; the band is then that of the smallest number of values.
 
     Parameters
     ----------
     nominal : ndarray of shape (n_levels,)
         Probabilities of the intervals, from 0 to 1.
     observed : ndarray of shape (n_curves, n_levels)
-        Shares of values inside.
+        Shares of values inside the intervals.
     errors : ndarray of shape (n_curves,)
         `skevgp.metrics.calibration_error` of each curve.
     n_values : int
-        Behind each curve.
+        Number of values of each curve.
     names : sequence of str of length n_curves, default=None
-        Of outputs, if each has a curve.
+        Names of the outputs, if each has a curve.
 
     Attributes
     ----------
@@ -49,8 +49,8 @@ class CalibrationDisplay:
     --------
     CalibrationDisplay.from_estimator : Make one from a fitted regressor.
     CalibrationDisplay.from_predictions : Make one from means and standard deviations.
-    skevgp.metrics.calibration_error : The area between curve and diagonal.
-    sklearn.calibration.CalibrationDisplay : Of probabilities of a class.
+    skevgp.metrics.calibration_error : Area between curve and diagonal.
+    sklearn.calibration.CalibrationDisplay : Calibration of class probabilities.
 
     References
     ----------
@@ -97,42 +97,39 @@ class CalibrationDisplay:
         label: str | None = None,
         color: str | None = None,
     ) -> Self:
-        """Predict, compare with what was observed, and draw.
+        """Predict, compare with observations, and draw.
 
         Parameters
         ----------
         estimator : regressor
-            Fitted; its ``predict`` takes ``return_std``, or it wraps one that does (see
+            Fitted regressor with ``predict(X, return_std=True)``, or a wrapper of one (see
             `skevgp.metrics.make_std_scorer`).
         X : array-like of shape (n_samples, n_features)
-            Rows, not those of the fit.
+            Rows that were not in the fit.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Observed there.
+            Observations at these rows.
         per_output : bool, default=False
-            Whether each output has a curve, or there is one of all values.
+            Whether to draw a curve for each output instead of one for all values.
         output_names : sequence of str of length n_outputs, default=None
-            For ``per_output``; by default output 0, output 1, ...
+            Names of the outputs for ``per_output``. If None, output 0, output 1, ...
         n_levels : int, default=101
             Probabilities at which the curves are evaluated, at least 2.
         ax : matplotlib Axes, default=None
-            Where to draw; by default on new axes.
+            Axes to draw on. If None, new axes.
         label : str, default=None
-            Name of the curve, for ``display.ax_.legend()``; by default that of the regressor's class, or of outputs
-            theirs alone.
+            Name of the curve, for ``display.ax_.legend()``. If None, the name of the class, or of the output.
         color : str, default=None
-            As in `plot`.
+            Colour of the curve, as in `plot`.
 
         Returns
         -------
         display : CalibrationDisplay
-            Drawn, with ``ax_`` and ``figure_``.
+            The drawn display, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError, TypeError
-            As `from_predictions`, and if the estimator says no standard deviation.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            As for `from_predictions`, and if the estimator has no standard deviation.
         """
         return cls.from_predictions(
             y,
@@ -159,37 +156,35 @@ class CalibrationDisplay:
         label: str | None = None,
         color: str | None = None,
     ) -> Self:
-        """Compare predictions with what was observed, and draw.
+        """Compare predictions with observations, and draw.
 
         Parameters
         ----------
         y_true, y_pred, std : array-like of shape (n_samples,) or (n_samples, n_outputs)
             Observations, predicted means and predicted standard deviations (with noise).
         per_output : bool, default=False
-            Whether each output has a curve, or there is one of all values.
+            Whether to draw a curve for each output instead of one for all values.
         output_names : sequence of str of length n_outputs, default=None
-            For ``per_output``; by default output 0, output 1, ...
+            Names of the outputs for ``per_output``. If None, output 0, output 1, ...
         n_levels : int, default=101
             Probabilities at which the curves are evaluated, at least 2.
         ax : matplotlib Axes, default=None
-            Where to draw; by default on new axes.
+            Axes to draw on. If None, new axes.
         label : str, default=None
             Name of the curve, for ``display.ax_.legend()``.
         color : str, default=None
-            As in `plot`.
+            Colour of the curve, as in `plot`.
 
         Returns
         -------
         display : CalibrationDisplay
-            Drawn, with ``ax_`` and ``figure_``.
+            The drawn display, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError, TypeError
-            If shapes differ, a value is not finite, a standard deviation is negative, there is not a name for each
-            output, or ``n_levels`` is no integer from 2 on.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            If shapes differ, a value is not finite, a standard deviation is negative, the number of names is not that
+            of the outputs, or ``n_levels`` is not an integer of at least 2.
         """
         check_integer(n_levels, "n_levels", minimum=2)
         levels = interval_levels(y_true, y_pred, std)
@@ -210,27 +205,22 @@ class CalibrationDisplay:
         return cls(nominal, observed, np.array(errors), len(own[0]), names).plot(ax, label=label, color=color)
 
     def plot(self, ax: Any = None, *, label: str | None = None, color: str | None = None) -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         label : str, default=None
-            Name of the curve, for ``display.ax_.legend()``; of outputs, what comes before theirs. The calibration error
-            follows.
+            Name of the curve, for ``display.ax_.legend()``. Names of outputs and the calibration error are appended.
         color : str, default=None
-            Of a single curve; by default the first of a colour-blind-safe palette that is not yet on the axes.
+            Colour of a single curve. If None, the first colour of a colour-blind-safe palette that is not on the axes
+            yet.
 
         Returns
         -------
         self : CalibrationDisplay
-            With ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            The display itself, with ``ax_`` and ``figure_``.
         """
         ax = axes_of(ax)
         self._plot_band(ax)
@@ -250,7 +240,7 @@ class CalibrationDisplay:
         return self
 
     def _plot_band(self, ax: Any) -> None:
-        """Where curves are by chance; the band of another display stays if its values are fewer."""
+        """Draw the band of curves by chance, unless the axes have that of fewer values."""
         bands = {band: int(band.get_gid()[len(_BAND) :]) for band in ax.collections if _is_band(band)}
         if min(bands.values(), default=self.n_values + 1) <= self.n_values:
             return

@@ -1,4 +1,4 @@
-"""CoefficientDisplay: what the explicit features' weights have become."""
+"""CoefficientDisplay: weights of the explicit features, before and after the fit."""
 
 from __future__ import annotations
 
@@ -14,17 +14,16 @@ if TYPE_CHECKING:
 
 
 class CoefficientDisplay:
-    """Posterior weights of the explicit features beside their prior, with bars of standard deviations.
+    """Prior and posterior weights of the explicit features, with bars of standard deviations.
 
-    Data often determine weights so well that a bar is shorter than its symbol: posteriors stand at the right in
-    numbers, too.
+    Posteriors are also given as numbers at the right, because a bar may be shorter than its symbol.
 
     Parameters
     ----------
     names : sequence of str
-        Of the weights.
+        Names of the weights.
     mean, std, prior_mean, prior_std : ndarray of shape (n_weights,)
-        Means and standard deviations of the weights, after the fit and before it.
+        Posterior and prior means and standard deviations of the weights.
 
     Attributes
     ----------
@@ -63,30 +62,28 @@ class CoefficientDisplay:
 
     @classmethod
     def from_estimator(cls, estimator: EVGPRegressor, *, output: int = 0, ax: Any = None, n_std: float = 2.0) -> Self:
-        """Read the weights off a fitted regressor and draw.
+        """Take the weights from a fitted regressor, and draw.
 
         Parameters
         ----------
         estimator : EVGPRegressor
-            Fitted, with a feature map.
+            Fitted regressor with a feature map.
         output : int, default=0
-            Which output's weights to draw.
+            Index of the output whose weights are drawn.
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         n_std : float, default=2.0
             Half length of the bars, in standard deviations.
 
         Returns
         -------
         display : CoefficientDisplay
-            Drawn, with ``ax_`` and ``figure_``.
+            The drawn display, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError
             If the regressor has no explicit features, or there is no such output.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
         """
         check_fitted(estimator)
         if not hasattr(estimator, "coef_"):
@@ -106,24 +103,19 @@ class CoefficientDisplay:
         return cls(names, *parts).plot(ax=ax, n_std=n_std)
 
     def plot(self, ax: Any = None, *, n_std: float = 2.0) -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         n_std : float, default=2.0
             Half length of the bars, in standard deviations.
 
         Returns
         -------
         self : CoefficientDisplay
-            With ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            The display itself, with ``ax_`` and ``figure_``.
         """
         ax = axes_of(ax)
         places = np.arange(len(self.names))[::-1]
@@ -152,6 +144,6 @@ class CoefficientDisplay:
 
 
 def _in_numbers(mean: float, half: float) -> str:
-    """A mean, to the digit that its bar leaves certain, and the bar."""
+    """Format a mean, to the digit that its bar leaves certain, and the bar."""
     decimals = int(np.clip(-np.floor(np.log10(half)), 0, 6)) if half > 0.0 else 3
     return f"{round(mean, decimals) + 0.0:.{decimals}f} ± {half:.1g}"

@@ -1,4 +1,4 @@
-"""LearningCurveDisplay: how the score on a test set grows with the training rows."""
+"""LearningCurveDisplay: test score against the number of training rows."""
 
 from __future__ import annotations
 
@@ -19,18 +19,18 @@ from ._style import axes_of, free_color
 
 
 class LearningCurveDisplay:
-    """Test score against the number of training rows: the mean of several runs, in a band from lowest to highest.
+    """Test score against the number of training rows: mean and range of several runs, as in Figure 6 of the paper.
 
-    The paper's Figure 6. Curves of several models can share axes.
+    Curves of several models can share axes.
 
     Parameters
     ----------
     n_rows : ndarray of shape (n_sizes,)
-        Training rows, ascending.
+        Numbers of training rows, ascending.
     scores : ndarray of shape (n_sizes, n_runs)
-        On test rows; NaN where a run is missing.
+        Scores on test rows; NaN if a run is missing.
     score_name : str, default="prediction error"
-        For the vertical axis.
+        Label of the vertical axis.
 
     Attributes
     ----------
@@ -39,8 +39,8 @@ class LearningCurveDisplay:
 
     See Also
     --------
-    LearningCurveDisplay.from_estimator : Make one by fitting a regressor to more and more rows.
-    sklearn.model_selection.LearningCurveDisplay : Scores by cross-validation, without a test set of their own.
+    LearningCurveDisplay.from_estimator : Make one by fits to increasing numbers of rows.
+    sklearn.model_selection.LearningCurveDisplay : Scores by cross-validation, without a test set.
 
     Examples
     --------
@@ -85,43 +85,42 @@ class LearningCurveDisplay:
         label: str | None = None,
         color: str | None = None,
     ) -> Self:
-        """Fit clones to more and more of the training rows, test them all on the same rows, and draw.
+        """Fit clones to increasing numbers of training rows, test them on the same rows, and draw.
 
-        Each run puts the groups in a random order of its own and adds them whole, so that the rows of a smaller size
-        are among those of a larger one.
+        Each run adds whole groups in its own random order, so that larger training sets contain the smaller ones.
 
         Parameters
         ----------
         estimator : regressor
-            Not fitted itself.
+            Regressor, of which clones are fitted.
         X : array-like of shape (n_samples, n_features)
             All training rows.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs)
-            Their targets.
+            Targets of the training rows.
         X_test, y_test : array-like
-            What every fit is tested on; columns like those of X and y.
+            Test rows, with the columns of X and y.
         sizes : array-like of shape (n_sizes,)
-            Numbers of groups to learn from, from 1 to all of them, ascending.
+            Numbers of groups in the training sets, ascending, from 1 to all groups.
         groups : array-like of shape (n_samples,), default=None
-            The trajectory of each row, as in `make_dynamics`; None is a group per row. A regressor whose ``fit`` takes
-            groups is told of them.
+            Labels of the trajectory of each row, as in `make_dynamics`. They are passed to ``fit`` if it takes groups.
+            If None, each row is a group.
         n_runs : int, default=4
-            Orders of the groups, at least 1.
+            Number of random orders of the groups, at least 1.
         score : callable, default=prediction_error
-            ``score(y_test, y_pred) -> float``.
+            Function ``score(y_test, y_pred) -> float``.
         random_state : int, RandomState instance or None, default=None
-            Draws the orders. What the estimator draws is up to its own ``random_state``.
+            Seed of the orders. The estimator has its own ``random_state``.
         ax : matplotlib Axes, default=None
-            Where to draw; by default on new axes.
+            Axes to draw on. If None, new axes.
         log_scale : bool, default=None
-            As in `plot`.
+            Whether both axes are logarithmic, as in `plot`.
         label, color : str, default=None
-            As in `plot`.
+            Name and colour of the line, as in `plot`.
 
         Returns
         -------
         display : LearningCurveDisplay
-            Its ``n_rows`` are means over runs, should groups differ in length.
+            The drawn display. Its ``n_rows`` are means over runs.
 
         Raises
         ------
@@ -129,10 +128,8 @@ class LearningCurveDisplay:
             If a size is not a possible number of groups, sizes do not ascend, or X, y and groups differ in length.
         TypeError
             If a size or n_runs is not an integer.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
         """
-        require("matplotlib.pyplot", "Plotting")  # before the fits, not after them
+        require("matplotlib.pyplot", "Plotting")  # raises the error before the fits
         check_consistent_length(X, y, groups)
         told = groups is not None and has_fit_parameter(estimator, "groups")
         groups = np.arange(num_samples(X)) if groups is None else groups
@@ -158,30 +155,28 @@ class LearningCurveDisplay:
     def plot(
         self, ax: Any = None, *, log_scale: bool | None = None, label: str | None = None, color: str | None = None
     ) -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         log_scale : bool, default=None
-            Whether both axes are logarithmic; None makes them so if all scores are positive.
+            Whether both axes are logarithmic. If None, they are if all scores are positive.
         label : str, default=None
             Name of the line, for ``display.ax_.legend()``.
         color : str, default=None
-            By default the first of a colour-blind-safe palette that is not yet on the axes.
+            Colour. If None, the first colour of a colour-blind-safe palette that is not on the axes yet.
 
         Returns
         -------
         self : LearningCurveDisplay
-            With ``ax_`` and ``figure_``.
+            The display itself, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError
             If ``log_scale=True`` and a score is not positive.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
         """
         positive = bool(np.nanmin(self.scores) > 0)
         if log_scale and not positive:
@@ -192,7 +187,7 @@ class LearningCurveDisplay:
         ax.fill_between(self.n_rows, low, high, color=color, alpha=0.2, linewidth=0)
         ax.plot(self.n_rows, np.nanmean(self.scores, axis=1), ".-", color=color, label=label)
         if positive if log_scale is None else log_scale:
-            # Of curves that are on the axes already; the scale forgets them.
+            # Ticks of curves that are on the axes already, which a change of the scale removes.
             counts = np.union1d(getattr(ax.xaxis.get_major_locator(), "locs", []), self.n_rows)
             ax.set_xscale("log")
             ax.set_yscale("log")

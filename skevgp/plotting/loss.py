@@ -13,14 +13,14 @@ from ._style import axes_of, free_color
 class LossDisplay:
     """The bound on the log marginal likelihood after each iteration of a fit.
 
-    Curves of several fits can share axes: with the same rows and features, the higher bound is the better model.
+    Curves of several fits can share axes. With the same rows and features, the model with the higher bound is better.
 
     Parameters
     ----------
     bound : ndarray of shape (n_iter,)
-        After each iteration, in nats.
+        Bound after each iteration, in nats.
     bound_name : str, default="lower bound (nats)"
-        For the vertical axis.
+        Label of the vertical axis.
 
     Attributes
     ----------
@@ -52,34 +52,32 @@ class LossDisplay:
     def from_estimator(
         cls, estimator: Any, *, gap: bool = False, ax: Any = None, label: str | None = None, color: str | None = None
     ) -> Self:
-        """Read the bound off a fitted regressor and draw.
+        """Take the bound from a fitted regressor, and draw.
 
         Parameters
         ----------
         estimator : EVGPRegressor, EGPRegressor or BayesianMLPRegressor
-            Fitted, with at least one iteration. Of Adam values are estimates from mini-batches.
+            Fitted regressor with at least one iteration. Values of Adam are estimates from mini-batches.
         gap : bool, default=False
-            As in `plot`.
+            Whether to draw the distance to the best bound, as in `plot`.
         ax : matplotlib Axes, default=None
-            Where to draw; by default on new axes.
+            Axes to draw on. If None, new axes.
         label, color : str, default=None
-            As in `plot`.
+            Name and colour of the line, as in `plot`.
 
         Returns
         -------
         display : LossDisplay
-            Drawn, with ``ax_`` and ``figure_``.
+            The drawn display, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError
-            If there are no iterations to show, as after ``max_iter=0``.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            If there are no iterations, for example after ``max_iter=0``.
         """
         check_fitted(estimator)
         bound = -np.asarray(getattr(estimator, "loss_curve_", []), dtype=float)
-        bound[~np.isfinite(bound)] = np.nan  # where an optimizer of the user's tried what cannot be evaluated
+        bound[~np.isfinite(bound)] = np.nan  # a user's optimizer may have tried points that cannot be evaluated
         if not np.isfinite(bound).any():
             raise ValueError(
                 f"{type(estimator).__name__} has no iterations to show: it has no loss_curve_, or an empty one."
@@ -89,32 +87,27 @@ class LossDisplay:
         return cls(bound, name).plot(ax, gap=gap, label=label, color=color)
 
     def plot(self, ax: Any = None, *, gap: bool = False, label: str | None = None, color: str | None = None) -> Self:
-        """Draw.
+        """Draw the display.
 
-        Without ``gap`` the vertical axis begins at what comes after the first quarter of the iterations, which gains so
-        much that nothing else would be seen.
+        Without ``gap``, the vertical axis does not show the first quarter of the iterations, because its large gain
+        would hide all later ones.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         gap : bool, default=False
-            Whether to draw, on a logarithmic scale, how far each iteration is below the best one: where the last part
-            of a fit is to be seen.
+            Whether to draw the distance of each iteration to the best one on a logarithmic scale, which shows the last
+            part of a fit.
         label : str, default=None
             Name of the line, for ``display.ax_.legend()``.
         color : str, default=None
-            By default the first of a colour-blind-safe palette that is not yet on the axes.
+            Colour. If None, the first colour of a colour-blind-safe palette that is not on the axes yet.
 
         Returns
         -------
         self : LossDisplay
-            With ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            The display itself, with ``ax_`` and ``figure_``.
         """
         ax = axes_of(ax)
         others = [ax.get_ylim()] if ax.lines else []

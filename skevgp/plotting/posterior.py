@@ -22,15 +22,15 @@ class PosteriorDisplay:
     Parameters
     ----------
     x : ndarray of shape (n_samples,)
-        Where the predictions are.
+        Positions of the predictions.
     mean, std : ndarray of shape (n_samples,)
-        Predicted there, and how surely.
+        Predicted means and standard deviations.
     y : ndarray of shape (n_samples,), default=None
-        Observations at the same places.
+        Observations at the same positions.
     inducing_points : ndarray of shape (m,), default=None
-        Drawn as crosses along the lower edge.
+        Inducing points, drawn as crosses along the lower edge.
     x_train, y_train : ndarray of shape (n_train,), default=None
-        Observations at places of their own, drawn as dots.
+        Observations at other positions, drawn as dots.
 
     Attributes
     ----------
@@ -91,38 +91,36 @@ class PosteriorDisplay:
         Parameters
         ----------
         estimator : regressor
-            Fitted; its ``predict`` takes ``return_std``.
+            Fitted regressor with ``predict(X, return_std=True)``.
         X : array-like of shape (n_samples, n_features)
             Rows to predict.
         y : array-like of shape (n_samples,) or (n_samples, n_outputs), default=None
             Observations at these rows.
         output : int, default=0
-            Which output to draw.
+            Index of the output to draw.
         x : array-like of shape (n_samples,), default=None
-            Values along the horizontal axis, for example times; by default the only column of X, or the row numbers.
+            Values along the horizontal axis, for example times. If None, the only column of X, or the row numbers.
         x_train : array-like of shape (n_train,), default=None
-            Where on that axis further observations are, for example those of the fit.
+            Positions of further observations, for example those of the fit.
         y_train : array-like of shape (n_train,) or (n_train, n_outputs), default=None
-            These observations.
+            Further observations.
         ax : matplotlib Axes, default=None
-            Where to draw; by default on new axes.
+            Axes to draw on. If None, new axes.
         n_std : float, default=2.0
             Half width of the band, in standard deviations.
         label : str, default="mean"
-            Name of the mean's line, for ``display.ax_.legend()``.
+            Name of the line of the mean, for ``display.ax_.legend()``.
 
         Returns
         -------
         display : PosteriorDisplay
-            Drawn, with ``ax_`` and ``figure_``.
+            The drawn display, with ``ax_`` and ``figure_``.
 
         Raises
         ------
         ValueError
-            If y or x does not have a value per row of X, x_train and y_train are not both given or of different
-            lengths, or there is no such output.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            If y or x does not have a value per row of X, only one of x_train and y_train is given, their lengths
+            differ, or there is no such output.
         """
         check_is_fitted(estimator)
         mean, std = (part.reshape(len(part), -1) for part in estimator.predict(X, return_std=True))
@@ -149,26 +147,21 @@ class PosteriorDisplay:
         return cls(places, mean, std, observed, points, *training).plot(ax=ax, n_std=n_std, label=label)
 
     def plot(self, ax: Any = None, *, n_std: float = 2.0, label: str = "mean") -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         ax : matplotlib Axes, default=None
-            By default new axes.
+            Axes to draw on. If None, new axes.
         n_std : float, default=2.0
             Half width of the band, in standard deviations.
         label : str, default="mean"
-            Name of the mean's line, for ``display.ax_.legend()``.
+            Name of the line of the mean, for ``display.ax_.legend()``.
 
         Returns
         -------
         self : PosteriorDisplay
-            With ``ax_`` and ``figure_``.
-
-        Raises
-        ------
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            The display itself, with ``ax_`` and ``figure_``.
         """
         ax = axes_of(ax)
         order = np.argsort(self.x, kind="stable")
@@ -181,7 +174,7 @@ class PosteriorDisplay:
         if self.x_train is not None:
             ax.plot(self.x_train, self.y_train, ".", color="0.35", markersize=3, zorder=1, label="training data")
         if self.inducing_points is not None:
-            # On the lower edge, whatever the limits: x in data, y in axes units.
+            # On the lower edge for any limits: x in data units, y in axes units.
             ax.plot(
                 self.inducing_points,
                 np.full(len(self.inducing_points), 0.03),

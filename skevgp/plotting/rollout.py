@@ -15,22 +15,22 @@ from ._style import BLUE, ORANGE
 
 
 class RolloutDisplay:
-    """What `rollout` predicts of some states, in a panel each: mean, band, a few samples, and the truth.
+    """Predictions of `rollout` with a panel for each state: mean, band, a few samples, and the true states.
 
     Parameters
     ----------
     times : ndarray of shape (n_steps,)
-        When each step ends.
+        End times of the steps.
     mean, std : ndarray of shape (n_steps, n_panels)
-        Predicted for then, and how surely.
+        Predicted means and standard deviations.
     samples : ndarray of shape (n_samples, n_steps, n_panels), default=None
         Particles.
     truth : ndarray of shape (n_steps, n_panels), default=None
-        What happened.
+        True states.
     state_names : sequence of str of length n_panels, default=None
-        For the vertical axes; by default state 0, state 1, ...
+        Labels of the vertical axes. If None, state 0, state 1, ...
     time_name : str, default="step"
-        For the horizontal axis.
+        Label of the horizontal axis.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class RolloutDisplay:
 
     See Also
     --------
-    RolloutDisplay.from_rollout : Make one from what `rollout` returns.
+    RolloutDisplay.from_rollout : Make one from the result of `rollout`.
 
     Examples
     --------
@@ -90,43 +90,41 @@ class RolloutDisplay:
         n_samples: int = 10,
         label: str = "mean",
     ) -> Self:
-        """Draw what `rollout` returned.
+        """Draw the result of `rollout`.
 
         Parameters
         ----------
         ahead : Bunch
-            Of `rollout`, by any method.
+            Result of `rollout` with any method.
         truth : array-like of shape (n_steps, n_states), default=None
-            The states after each step.
+            True states after each step.
         states : sequence of int, default=None
-            Which states to draw; None is all.
+            Indices of the states to draw. If None, all states.
         state_names : sequence of str of length n_states, default=None
-            Of all states, as in ``make_dynamics(...).target_names``.
+            Names of all states, as in ``make_dynamics(...).target_names``.
         dt : float, default=None
-            Length of a step in seconds; None numbers the steps.
+            Length of a step in seconds. If None, the horizontal axis has the numbers of the steps.
         index : int, default=0
-            Which of the initial states, if there were several.
+            Index of the initial state, if there are several.
         axes : matplotlib Axes or sequence of them, default=None
-            Where to draw, one for each state; by default on a new figure, one above the other.
+            Axes to draw on, one for each state. If None, a new figure.
         n_std : float, default=2.0
             Half width of the bands, in standard deviations.
         n_samples : int, default=10
-            How many samples to draw, if there are as many.
+            Maximum number of samples to draw.
         label : str, default="mean"
-            Name of the mean's line, for ``display.axes_[0].legend()``.
+            Name of the line of the mean, for ``display.axes_[0].legend()``.
 
         Returns
         -------
         display : RolloutDisplay
-            Drawn, with ``axes_`` and ``figure_``.
+            The drawn display, with ``axes_`` and ``figure_``.
 
         Raises
         ------
         ValueError, TypeError
-            If there is no such state or initial state, truth or names do not fit the rollout, or there are not as many
-            axes as states.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            If there is no such state or initial state, truth or names do not fit the rollout, or the number of axes is
+            not that of the states.
         """
         own = _of_one(ahead, index)
         n_steps, n_states = own.mean.shape
@@ -152,30 +150,28 @@ class RolloutDisplay:
         ).plot(axes, n_std=n_std, n_samples=n_samples, label=label)
 
     def plot(self, axes: Any = None, *, n_std: float = 2.0, n_samples: int = 10, label: str = "mean") -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         axes : matplotlib Axes or sequence of them, default=None
-            One for each panel; by default on a new figure, one above the other.
+            Axes to draw on, one for each panel. If None, a new figure.
         n_std : float, default=2.0
             Half width of the bands, in standard deviations.
         n_samples : int, default=10
-            How many samples to draw, if there are as many.
+            Maximum number of samples to draw.
         label : str, default="mean"
-            Name of the mean's line, for ``display.axes_[0].legend()``.
+            Name of the line of the mean, for ``display.axes_[0].legend()``.
 
         Returns
         -------
         self : RolloutDisplay
-            With ``axes_`` and ``figure_``.
+            The display itself, with ``axes_`` and ``figure_``.
 
         Raises
         ------
         ValueError
-            If there are not as many axes as panels.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
+            If the number of axes is not that of the panels.
         """
         check_integer(n_samples, "n_samples", minimum=0)
         panels = _panels(axes, self.mean.shape[1])
@@ -199,7 +195,7 @@ class RolloutDisplay:
 
 
 def _of_one(ahead: Bunch, index: int) -> Bunch:
-    """The rollout from one initial state."""
+    """Return the rollout from one initial state."""
     if ahead.mean.ndim == 2:
         if index not in (0, -1):
             raise ValueError(f"index={index!r}, but the rollout is from one initial state.")
@@ -211,7 +207,7 @@ def _of_one(ahead: Bunch, index: int) -> Bunch:
 
 
 def _panels(axes: Any, n: int) -> np.ndarray:
-    """The given ones, or new ones."""
+    """Return the given axes, or new ones."""
     pyplot = require("matplotlib.pyplot", "Plotting")
     if axes is None:
         options = {"sharex": True, "squeeze": False, "layout": "constrained"}

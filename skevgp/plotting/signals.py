@@ -1,4 +1,4 @@
-"""SignalsDisplay: what was done to the signals of a log."""
+"""SignalsDisplay: the processing of the signals of a log."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ _WORDS = {
     "edge": "cut: filter's edge",
     "too short": "cut: too short",
 }
-_MARGIN = 0.25  # of a panel's height, beyond what was processed
+_MARGIN = 0.25  # above and below the processed signals, as a share of a panel's height
 
 
 class SignalsDisplay:
-    """Velocities, accelerations and torques of a log: as recorded, as processed, and what was cut.
+    """Velocities, accelerations and torques of a log: recorded and processed signals, and the cuts.
 
-    The vertical axes are those of the processed signals, since recorded accelerations (differences of recorded
-    velocities, where the file has none) are mostly noise. Prismatic joints have m in place of rad and N in place of
-    N m.
+    The vertical axes fit the processed signals, because recorded accelerations are mostly noise. If the file has no
+    accelerations, differences of velocities are drawn. Prismatic joints have m instead of rad and N instead of N m.
 
     Parameters
     ----------
     raw, processed : Bunch
-        ``time`` (n,), and ``velocity``, ``acceleration`` and ``torque``, each (n, n_joints) or None where it was not
-        recorded; ``position`` (n, n_joints) of the raw ones, and ``why`` (n,) of the processed ones.
+        Signals ``time`` (n,), ``velocity``, ``acceleration`` and ``torque``, each (n, n_joints) or None if it was not
+        recorded. Raw signals have ``position`` (n, n_joints), and processed ones ``why`` (n,).
     cuts : list of (float, float, str)
-        First and last second, and why: ``"gap"``, ``"jump"``, ``"rest"``, ``"edge"`` or ``"too short"``.
+        First and last second of each cut, and its reason: ``"gap"``, ``"jump"``, ``"rest"``, ``"edge"`` or
+        ``"too short"``.
     joint_names : sequence of str of length n_joints
-        For the titles.
+        Titles of the columns.
     title : str, default=None
-        Of the figure.
+        Title of the figure.
 
     Attributes
     ----------
@@ -50,7 +50,7 @@ class SignalsDisplay:
 
     See Also
     --------
-    SignalsDisplay.from_log : Make one from what `load_log` returns.
+    SignalsDisplay.from_log : Make one from the result of `load_log`.
 
     Examples
     --------
@@ -87,30 +87,28 @@ class SignalsDisplay:
     def from_log(
         cls, log: Bunch, *, file: int = 0, joints: int | str | Sequence[int | str] | None = None, axes: Any = None
     ) -> Self:
-        """Draw what `load_log` returned.
+        """Draw the result of `load_log`.
 
         Parameters
         ----------
         log : Bunch
-            Of `load_log`.
+            Result of `load_log`.
         file : int, default=0
-            Which of its files.
+            Index of the file in the log.
         joints : int, str or sequence of them, default=None
-            Which joints, by index or by name; None is all.
+            Joints to draw, by index or by name. If None, all joints.
         axes : array of matplotlib Axes of shape (3, n_joints), default=None
-            Where to draw, by default on a new figure; of one joint also of shape (3,).
+            Axes to draw on, for one joint also of shape (3,). If None, a new figure.
 
         Returns
         -------
         display : SignalsDisplay
-            Drawn, with ``axes_`` and ``figure_``.
+            The drawn display, with ``axes_`` and ``figure_``.
 
         Raises
         ------
         ValueError
             If there is no such file or joint, or axes are of another shape.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
         """
         n_files = len(log.recordings)
         if file not in range(-n_files, n_files):
@@ -127,24 +125,22 @@ class SignalsDisplay:
         return cls(raw, processed, recording.cuts, [names[joint] for joint in chosen], title).plot(axes)
 
     def plot(self, axes: Any = None) -> Self:
-        """Draw.
+        """Draw the display.
 
         Parameters
         ----------
         axes : array of matplotlib Axes of shape (3, n_joints), default=None
-            By default on a new figure; of one joint also of shape (3,).
+            Axes to draw on, for one joint also of shape (3,). If None, a new figure.
 
         Returns
         -------
         self : SignalsDisplay
-            With ``axes_`` and ``figure_``.
+            The display itself, with ``axes_`` and ``figure_``.
 
         Raises
         ------
         ValueError
             If axes are of another shape.
-        ImportError
-            If matplotlib is not installed; the message gives the pip command.
         """
         panels = _axes(axes, len(self.joint_names))
         for row, (name, label) in enumerate(_PANELS.items()):
@@ -174,7 +170,7 @@ class SignalsDisplay:
             known = why in {before for _, _, before in self.cuts[:number]}
             ax.axvspan(first, last, color=_COLOURS[why], alpha=0.2, linewidth=0, label=None if known else _WORDS[why])
         low, high = np.nanmin(kept), np.nanmax(kept)
-        # A constant, rounding apart, has no height.
+        # A signal that is constant up to rounding has no height.
         flat = high - low <= 1e-9 * max(abs(low), abs(high))
         margin = 1.0 if flat else _MARGIN * (high - low)
         ax.set_ylim(low - margin, high + margin)
@@ -185,13 +181,13 @@ def _of_joints(signals: Bunch, chosen: list[int]) -> Bunch:
 
 
 def _broken(raw: Bunch, cuts: Sequence[tuple[float, float, str]]) -> Bunch:
-    """With a row of NaN in each gap or jump: no line reaches across. (Ends of processed signals there are cut.)"""
+    """Insert a row of NaN in each gap or jump, so that no line crosses it."""
     gaps = np.searchsorted(raw.time, [first for first, _, why in cuts if why in ("gap", "jump")], side="right")
     return Bunch(**{k: v if v is None else np.insert(v, gaps, np.nan, axis=0) for k, v in raw.items()})
 
 
 def _recorded(raw: Bunch, name: str) -> tuple[np.ndarray, np.ndarray]:
-    """A recorded signal, or differences of what was recorded, between the rows."""
+    """Return a recorded signal, or differences of recorded signals between the rows."""
     if raw[name] is not None:
         return raw.time, raw[name]
     time, values = _recorded(raw, "velocity" if name == "acceleration" else "position")

@@ -1,4 +1,4 @@
-"""Robots: the named systems as tables, any other as a Pinocchio model, and what both say of a row x = [q, q̇, u]."""
+"""Robots: the named systems as tables, any other robot as a Pinocchio model, and the columns of rows x = [q, q̇, u]."""
 
 from .consistent import nearest_consistent
 from .inertia import (

@@ -1,4 +1,4 @@
-"""The inertial parameters nearest to estimated ones that bodies can have."""
+"""Physical inertial parameters nearest to estimated ones."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from .inertia import (
     pseudo_inertia,
 )
 
-# Variances that are added, as shares of the largest, until there is a consistent answer: what is pinned may have none.
+# Additional variances, as shares of the largest, that are tried until there is a consistent solution. Directions
+# without variance may leave none.
 _FLOORS = (0.0, 1e-12, 1e-8, 1e-4, 1.0)
-# The barrier's weight falls by _FALL until what is lost by it is this share of the distance
-# (_ROUGHLY where rounding ends it).
+# The weight of the barrier falls by _FALL until its error is this share of the distance (_ROUGHLY if rounding ends it).
 _FALL, _LOST, _ROUGHLY = 0.1, 1e-12, 1e-6
 _STEPS = 100
-# Newton's decrement at which the next weight is taken, and at the last one.
+# Newton decrement at which a weight is done, and the last weight.
 _NEAR, _THERE = 0.3, 1e-6
 _LARGEST_FORCE = 1e15
 
 
 def _basis() -> np.ndarray:
-    """Orthonormal symmetric matrices, (10, 4, 4)."""
+    """Return orthonormal symmetric matrices, (10, 4, 4)."""
     matrices = []
     for row in range(4):
         for column in range(row + 1):
@@ -40,40 +40,39 @@ def _basis() -> np.ndarray:
 
 
 _BASIS = _basis()
-# Coordinates of a link's pseudo-inertia by its parameters.
+# Matrix from a link's parameters to the coordinates of its pseudo-inertia.
 _PSEUDO = np.einsum("aij,pij->ap", _BASIS, pseudo_inertia(np.eye(N_PARAMETERS)))
 
 
 class _Problem(NamedTuple):
-    """Minimise |z|² / 2 over z such that ``target`` <= ``factor`` z, by coordinates of symmetric matrices of links."""
+    """Minimise |z|² / 2 over z with ``target`` <= ``factor`` z, in coordinates of symmetric matrices of links."""
 
     factor: np.ndarray  # (n, 10, n_directions)
     target: np.ndarray  # (n, 10)
 
 
 def nearest_consistent(mean: np.ndarray, covariance: np.ndarray, *, margin: float = 1e-4) -> np.ndarray:
-    """The inertial parameters that bodies can have, nearest to an estimate in units of its uncertainty.
+    """Find the physical inertial parameters nearest to an estimate, in units of its uncertainty.
 
     They minimise the Mahalanobis distance (π - mean)ᵀ covariance⁻¹ (π - mean) over parameters whose pseudo-inertias J
-    (`pseudo_inertia`) satisfy J >= margin R for each link, R = diag(q, q, q, m) with the link's own scale of mass m and
-    of second moments q: a convex problem with one solution. With a Gaussian posterior it is its most probable point
-    among consistent ones, and what the data know well (torques) stays, while unknown directions give way.
+    (`pseudo_inertia`) satisfy J >= margin R for each link. Here R = diag(q, q, q, m) with the link's own scale of mass
+    m and of second moments q. The problem is convex and has one solution: the most probable physical point of a
+    Gaussian posterior. Directions that the data determine well hardly change.
 
     Parameters
     ----------
     mean : array-like of shape (n_links, 10)
-        The estimate. If bodies can have it, it is returned as it is.
+        Estimate of the parameters. It is returned unchanged if it is physical.
     covariance : array-like of shape (10 * n_links, 10 * n_links)
-        Its covariance, link by link. It may be singular: directions without a variance stay, unless nothing consistent
-        is left then; in that case all directions get a share of the largest variance (in units of each link's scales),
-        as small a one as does. A link with mean and variance 0 is no body, and stays so.
+        Covariance of the estimate, link by link. It may be singular: directions without variance do not change if there
+        is a physical solution. A link with mean and variance 0 is not a body, and does not change.
     margin : float, default=1e-4
-        How far inside the links are that could not stay, in (0, 0.1]; those that were consistent may keep less.
+        Distance of changed links from the border of physical parameters, in (0, 0.1].
 
     Returns
     -------
     parameters : ndarray of shape (n_links, 10)
-        `physical_consistency` is above 0 for each link but those that are no bodies.
+        Physical parameters: `physical_consistency` is above 0 for each body.
 
     Raises
     ------
@@ -82,16 +81,18 @@ def nearest_consistent(mean: np.ndarray, covariance: np.ndarray, *, margin: floa
 
     See Also
     --------
-    physical_consistency : Whether a body can have parameters.
+    physical_consistency : Whether parameters are physical.
 
     Notes
     -----
-    A barrier method on the dual problem, whose unknowns are one positive definite matrix Z per link (the force with
-    which its constraint pushes): π = mean + covariance 𝒥ᵀ(Z). The covariance is multiplied with, never inverted, so it
-    does not matter how singular it is; Z = R Rᵀ moves in the coordinates of its own factor R. (A Cholesky factor of J
-    as the unknown, as in Rucker & Wensing, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7(2), 2022, makes
-    it nonlinear least squares: with a full covariance for a UR10, 3,000 evaluations left 0.2 to 0.6 % more distance.)
+    If directions without variance leave no physical solution, all directions get a small share of the largest variance,
+    in units of each link's scales.
     """
+    # A barrier method on the dual problem. Its unknowns are one positive definite matrix Z per link, the multiplier of
+    # its constraint: π = mean + covariance 𝒥ᵀ(Z). The covariance is never inverted, so that it may be singular. Z = R
+    # Rᵀ moves in the coordinates of its own factor R. The alternative, a Cholesky factor of J as the unknown (Rucker &
+    # Wensing, "Smooth parameterization of rigid-body inertia", IEEE RA-L 7(2), 2022), is nonlinear least squares: with
+    # a full covariance for a UR10, 3,000 evaluations left 0.2 to 0.6 % more distance.
     mean = checked_parameters(mean, None, "mean")
     covariance = checked_covariance(covariance, mean.size)
     margin = check_real(margin, "margin", minimum=0.0, strict=True)
@@ -120,14 +121,15 @@ def _nearest(mean: np.ndarray, covariance: np.ndarray, margin: float) -> np.ndar
         z = _least_norm(_Problem(np.einsum("ap,lpk->lak", _PSEUDO, links), target))
         if z is None:
             continue
-        found = mean + (links @ z) * units  # what is pinned keeps its bits
+        found = mean + (links @ z) * units  # directions without variance keep their bits
         if (physical_consistency(found) > 0.0).all():
             return found
     return from_pseudo_inertia(_clipped(pseudo_inertia(scaled), margin)) * units
 
 
 def _units(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-    """Of each link's parameters, by its scales of mass and second moments: the std's where the mean is near 0."""
+    """Return units of each link's parameters from its scales of mass and second moments."""
+    # A scale is the standard deviation if the mean is near 0.
     variances = np.diag(covariance).reshape(mean.shape)
     mass = _scale(np.abs(mean[:, 0]), np.sqrt(variances[:, 0]))
     moments = np.linalg.eigvalsh(pseudo_inertia(mean)[:, :3, :3])
@@ -136,14 +138,14 @@ def _units(mean: np.ndarray, covariance: np.ndarray) -> np.ndarray:
 
 
 def _scale(size: np.ndarray, deviation: np.ndarray) -> np.ndarray:
-    """A deviation counts up to the size that the largest link has: a flat prior says nothing."""
+    """Combine size and deviation, which counts up to the size of the largest link because the prior may be flat."""
     largest = size.max()
     scale = np.hypot(size, np.minimum(deviation, largest) if largest > 0.0 else deviation)
     return np.where(scale > 0.0, scale, scale.max() or 1.0)
 
 
 def _factor(covariance: np.ndarray) -> np.ndarray:
-    """F with F Fᵀ = covariance up to a common scale, without directions that are rounding only."""
+    """Return F with F Fᵀ = covariance up to a common scale, without directions that are rounding errors."""
     deviations = np.sqrt(np.diag(covariance))
     inverse = np.divide(1.0, deviations, out=np.zeros_like(deviations), where=deviations > 0.0)
     values, vectors = eigh(covariance * np.outer(inverse, inverse))
@@ -153,11 +155,12 @@ def _factor(covariance: np.ndarray) -> np.ndarray:
 
 
 def _least_norm(problem: _Problem) -> np.ndarray | None:
-    """The solution z = factorᵀ Z, or None if there is none within reach of numbers."""
+    """Return the solution z = factorᵀ Z, or None if the numbers do not reach one."""
     links = len(problem.target)
     roots = np.tile(np.eye(4), (links, 1, 1))
     z = _pushed(problem, roots)
-    # So large that the start is near the centre: from elsewhere Newton's steps end at the cone's border.
+    # The weight is so large that the start is near the centre. From elsewhere Newton's steps end at the border of the
+    # cone.
     weight = z @ z + np.abs(problem.target).sum()
     while True:
         roots, z, is_near = _centre(problem, roots, weight, _NEAR)
@@ -170,7 +173,7 @@ def _least_norm(problem: _Problem) -> np.ndarray | None:
 
 
 def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) -> tuple[np.ndarray, np.ndarray, bool]:
-    """Newton's steps to the least, over Z = R Rᵀ, of |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z."""
+    """Minimise |factorᵀ Z|² / 2 - targetᵀ Z - weight log det Z over Z = R Rᵀ by Newton's method."""
     identity = np.einsum("aij,ij->a", _BASIS, np.eye(4))
     z = _pushed(problem, roots)
     for _ in range(_STEPS):
@@ -201,8 +204,8 @@ def _centre(problem: _Problem, roots: np.ndarray, weight: float, near: float) ->
 
 
 def _newton(factor: np.ndarray, weight: float, gradient: np.ndarray) -> np.ndarray | None:
-    """-(factor factorᵀ + weight 1)⁻¹ gradient, if numbers can tell it."""
-    # By QR: the product alone would lose what is known 1e8 times better than the rest.
+    """Return -(factor factorᵀ + weight 1)⁻¹ gradient, or None if it is not finite."""
+    # By QR, because the product would lose directions that are known 1e8 times better than others.
     triangle = np.linalg.qr(np.vstack([factor.T, np.sqrt(weight) * np.eye(len(factor))]), mode="r")
     try:
         step = -solve_triangular(triangle, solve_triangular(triangle, gradient, trans="T"))

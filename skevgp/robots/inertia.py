@@ -1,7 +1,7 @@
-"""Inertial parameters of a robot's links: what they say of a body, whether there can be one, and models that have them.
+"""Inertial parameters of links: pseudo-inertias, physical consistency, and models with given parameters.
 
-Parameters of a link are ``[m, m c_x, m c_y, m c_z, Ixx, Ixy, Iyy, Ixz, Iyz, Izz]``, Pinocchio's order: mass, first
-moment and inertia about the origin of its joint's frame, in the axes of that frame. Torques are linear in them.
+The parameters of a link are ``[m, m c_x, m c_y, m c_z, Ixx, Ixy, Iyy, Ixz, Iyz, Izz]`` in Pinocchio's order: mass,
+first moment and inertia about the origin of its joint's frame, in the axes of that frame. Torques are linear in them.
 """
 
 from __future__ import annotations
@@ -14,40 +14,42 @@ from ..utils.optional import require
 from ..utils.validation import as_floats
 
 N_PARAMETERS = 10
-# Of the symmetric inertia, as it is laid out in the parameters.
+# Rows and columns of the symmetric inertia in the order of the parameters.
 _ROWS, _COLUMNS = np.array([0, 0, 1, 0, 1, 2]), np.array([0, 1, 1, 2, 2, 2])
 
 
 def inertial_parameters(model: Any) -> np.ndarray:
-    """The inertial parameters of a model's links.
+    """Return the inertial parameters of a model's links.
 
     Parameters
     ----------
     model : pinocchio.Model
+        Model of a robot.
 
     Returns
     -------
     parameters : ndarray of shape (n_links, 10)
-        Of what moves with each joint, in the joints' order; the world has no row.
+        Parameters of the link of each joint, in the order of the joints.
     """
     return np.array([link.toDynamicParameters() for link in list(model.inertias)[1:]]).reshape(-1, N_PARAMETERS)
 
 
 def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
-    """J = [[Σ, m c], [m cᵀ, m]], with Σ = ½ tr(I) 1 - I, the second moment of the mass.
+    """Return the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], with the second moment of the mass Σ = ½ tr(I) 1 - I.
 
-    There is a body of positive density with these parameters if and only if J is positive definite: Wensing, Kim &
+    A body of positive density with these parameters exists if and only if J is positive definite: Wensing, Kim &
     Slotine, "Linear matrix inequalities for physically-consistent inertial parameter identification: A statistical
     perspective on the mass distribution", IEEE Robotics and Automation Letters 3(1), 60-67, 2018 (arXiv:1701.04395).
 
     Parameters
     ----------
     parameters : ndarray of shape (..., 10)
+        Inertial parameters.
 
     Returns
     -------
     pseudo : ndarray of shape (..., 4, 4)
-        Linear in the parameters.
+        Pseudo-inertias, which are linear in the parameters.
     """
     parameters = np.asarray(parameters, dtype=np.float64)
     inertia = _symmetric(parameters[..., 4:])
@@ -59,16 +61,17 @@ def pseudo_inertia(parameters: np.ndarray) -> np.ndarray:
 
 
 def from_pseudo_inertia(pseudo: np.ndarray) -> np.ndarray:
-    """The inverse of `pseudo_inertia`: I = tr(Σ) 1 - Σ.
+    """Invert `pseudo_inertia`: I = tr(Σ) 1 - Σ.
 
     Parameters
     ----------
     pseudo : ndarray of shape (..., 4, 4)
-        Symmetric.
+        Symmetric matrices.
 
     Returns
     -------
     parameters : ndarray of shape (..., 10)
+        Inertial parameters.
     """
     pseudo = np.asarray(pseudo, dtype=np.float64)
     inertia = _complement(pseudo[..., :3, :3], 1.0)
@@ -76,21 +79,23 @@ def from_pseudo_inertia(pseudo: np.ndarray) -> np.ndarray:
 
 
 def physical_consistency(parameters: np.ndarray) -> np.ndarray:
-    """How far each link is from one that no body can be: a body can be it if this is above 0.
+    """Measure whether links are physical: above 0 if a body with these parameters exists.
 
-    The smallest eigenvalue of the pseudo-inertia at the centre of mass, which is diag(Σ_c, m), in units of the link's
-    own: of mass, ``|m|``, and of Σ_c, the mean absolute value of its three eigenvalues. So it does not depend on units,
-    nor on the joint's frame. It is 1 for a ball or a cube, some hundredths for a slender link, 0 for a plate without
-    thickness, a rod, a point and for no body at all (ten zeros), and below 0 (-3 at the least) where moments of inertia
-    violate the triangle inequality or the mass is negative.
+    It is the smallest eigenvalue of the pseudo-inertia at the centre of mass, diag(Σ_c, m), in units of the link:
+    ``|m|`` for the mass, and for Σ_c the mean absolute value of its three eigenvalues. It is independent of units and
+    of the joint's frame. It is 1 for a ball or a cube, some hundredths for a slender link, and 0 for a plate without
+    thickness, a rod, a point, and ten zeros. It is below 0, and at least -3, if moments of inertia violate the triangle
+    inequality or the mass is negative.
 
     Parameters
     ----------
     parameters : ndarray of shape (..., 10)
+        Inertial parameters.
 
     Returns
     -------
     consistency : ndarray of shape (...)
+        A number for each link.
     """
     pseudo = pseudo_inertia(parameters)
     mass, first = pseudo[..., 3, 3], pseudo[..., :3, 3]
@@ -98,7 +103,7 @@ def physical_consistency(parameters: np.ndarray) -> np.ndarray:
         lever = np.divide(first, mass[..., None], out=np.zeros_like(first), where=mass[..., None] != 0.0)
         spread = pseudo[..., :3, :3] - first[..., :, None] * lever[..., None, :]
     possible = np.isfinite(spread).all(axis=(-2, -1)) & ((mass != 0.0) | (first == 0.0).all(axis=-1))
-    spread = np.where(possible[..., None, None], spread, -np.eye(3))  # a first moment without a mass
+    spread = np.where(possible[..., None, None], spread, -np.eye(3))  # not physical: a first moment without a mass
     moments = np.linalg.eigvalsh(0.5 * (spread + spread.swapaxes(-2, -1)))
     size = np.abs(moments).mean(axis=-1)
     smallest = np.divide(moments[..., 0], size, out=np.zeros_like(size), where=size > 0.0)
@@ -106,18 +111,19 @@ def physical_consistency(parameters: np.ndarray) -> np.ndarray:
 
 
 def body_parameters(parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Mass, centre of mass and inertia about it, as URDF files have them, with their derivatives.
+    """Return mass, centre of mass and inertia about it, as in URDF files, with their derivatives.
 
     Parameters
     ----------
     parameters : ndarray of shape (..., 10)
+        Inertial parameters.
 
     Returns
     -------
     values : ndarray of shape (..., 10)
-        m, c and I_c (laid out as I is). A link without a mass has c = 0.
+        m, c and I_c, in the order of I. A link without mass has c = 0.
     jacobian : ndarray of shape (..., 10, 10)
-        Derivatives of the values by the parameters; standard deviations follow by it from a covariance.
+        Derivatives of the values with respect to the parameters.
     """
     parameters = np.asarray(parameters, dtype=np.float64)
     first, inverse = parameters[..., 1:4], np.zeros(parameters.shape[:-1])
@@ -148,29 +154,30 @@ def with_parameters(
     damping: Any = None,
     friction: Any = None,
 ) -> Any:
-    """A copy of a model with other inertial parameters.
+    """Copy a model with other inertial parameters.
 
     Parameters
     ----------
     model : pinocchio.Model
-        Is not changed.
+        Model of a robot. It is not changed.
     parameters : array-like of shape (n_links, 10)
-        Links that a body can be (`physical_consistency` above 0), or ten zeros: no body.
+        Physical parameters (`physical_consistency` above 0), or ten zeros for a link without mass.
     armature, damping, friction : float or array-like of shape (n_joints,), default=None
-        Reflected inertias of the rotors, viscous and Coulomb friction, none of them negative; None leaves the model's.
+        Reflected inertias of the rotors, viscous and Coulomb friction, at least 0. If None, those of the model.
 
     Returns
     -------
     model : pinocchio.Model
+        The copy.
 
     Raises
     ------
     ValueError
-        If a shape is wrong, a number not finite, or no body can have the parameters of a link, which is named.
+        If a shape is wrong, a number is not finite, or a link is not physical.
 
     See Also
     --------
-    nearest_consistent : The parameters nearest to given ones that bodies can have.
+    nearest_consistent : Find the physical parameters nearest to given ones.
     """
     pin = require("pinocchio", "A robot's model")
     names = list(model.names)[1:]
@@ -186,7 +193,7 @@ def with_parameters(
 
 
 def checked_parameters(parameters: Any, n_links: int | None = None, name: str = "parameters") -> np.ndarray:
-    """Finite numbers of shape (n_links, 10), None for any number of links, or an error that names them."""
+    """Return finite numbers of shape (n_links, 10), None for any number of links, or raise ValueError."""
     array = as_floats(parameters, name)
     if array.ndim != 2 or array.shape != (n_links or len(array), N_PARAMETERS):
         number = "" if n_links is None else f" = ({n_links}, {N_PARAMETERS})"
@@ -197,7 +204,7 @@ def checked_parameters(parameters: Any, n_links: int | None = None, name: str = 
 
 
 def checked_covariance(covariance: Any, size: int) -> np.ndarray:
-    """A finite symmetric matrix of shape (size, size) without negative variances, or an error."""
+    """Return a finite symmetric matrix of shape (size, size) without negative variances, or raise ValueError."""
     array = as_floats(covariance, "covariance")
     if array.shape != (size, size):
         raise ValueError(
@@ -209,7 +216,7 @@ def checked_covariance(covariance: Any, size: int) -> np.ndarray:
 
 
 def checked_links(parameters: Any, names: list[str]) -> np.ndarray:
-    """Parameters of links that bodies can be, or that are none, or an error that names the first other one's joint."""
+    """Return parameters of links that are physical or zero, or raise an error that names the first other joint."""
     array = checked_parameters(parameters, len(names))
     for link, name, consistency in zip(array, names, physical_consistency(array), strict=True):
         if consistency <= 0.0 and link.any():
@@ -222,7 +229,7 @@ def checked_links(parameters: Any, names: list[str]) -> np.ndarray:
 
 
 def checked_joints(values: Any, name: str, n_joints: int) -> np.ndarray:
-    """A number that is not negative for each joint, or an error that names them."""
+    """Return a number of at least 0 for each joint, or raise ValueError."""
     array = as_floats(values, name)
     if array.shape not in ((), (n_joints,)):
         raise ValueError(f"{name} must be a number or have the shape (n_joints,) = ({n_joints},); got {array.shape}.")
@@ -238,6 +245,6 @@ def _symmetric(values: np.ndarray) -> np.ndarray:
 
 
 def _complement(matrix: np.ndarray, share: float) -> np.ndarray:
-    """``share`` tr(A) 1 - A."""
+    """Return ``share`` tr(A) 1 - A."""
     trace = np.trace(matrix, axis1=-2, axis2=-1)[..., None, None]
     return share * trace * np.eye(3) - matrix

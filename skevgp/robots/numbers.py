@@ -1,4 +1,4 @@
-"""Pinocchio's models as numbers and back: for files, so that none of a robot is read when one is loaded."""
+"""Pinocchio models as plain numbers and back, for files, which then need no URDF file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .loading import joint_axes
 
 _ALONG = ("JointModelRevoluteUnaligned", "JointModelPrismaticUnaligned", "JointModelRevoluteUnboundedUnaligned")
 JOINTS = (*(f"JointModel{kind}{axis}" for kind in ("R", "P", "RUB") for axis in "XYZ"), *_ALONG)
-# Of each velocity, or of each position; other versions of Pinocchio have other ones.
+# Attributes with a number for each velocity or position. Versions of Pinocchio have some of them.
 LIMITS = (
     "armature",
     "damping",
@@ -37,55 +37,27 @@ _MOST_BODIES = 10_000
 
 @dataclass(frozen=True)
 class RobotNumbers:
-    """A ``pinocchio.Model`` of revolute and prismatic joints.
-
-    Attributes
-    ----------
-    name : str
-    names, joints : list of str
-        Of the j joints, and their types.
-    parents : ndarray of int of shape (j,)
-        The joint before each; 0 is the world.
-    axes : ndarray of shape (j, 6)
-        As `joint_axes` gives them.
-    placements : ndarray of shape (j, 3, 4)
-        Rotation and translation of each joint in its parent.
-    inertias : ndarray of shape (j + 1, 13)
-        Mass, centre of mass and inertia about it, of the world and of each joint's link.
-    n_bodies : int
-        That links are made of.
-    gravity : ndarray of shape (6,)
-    limits : dict
-        Of velocities or positions, by the names of `LIMITS`.
-    frames : list of str
-        Of the f frames but the first.
-    frame_numbers : ndarray of int of shape (f, 3)
-        Joint, frame and type of each.
-    frame_placements : ndarray of shape (f, 3, 4)
-    frame_inertias : ndarray of shape (f, 13)
-    configurations : dict
-        Named positions.
-    """
+    """The numbers of a ``pinocchio.Model`` with j revolute and prismatic joints and f frames."""
 
     name: str
-    names: list[str]
-    joints: list[str]
-    parents: np.ndarray
-    axes: np.ndarray
-    placements: np.ndarray
-    inertias: np.ndarray
-    n_bodies: int
-    gravity: np.ndarray
-    limits: dict[str, np.ndarray]
-    frames: list[str]
-    frame_numbers: np.ndarray
-    frame_placements: np.ndarray
-    frame_inertias: np.ndarray
-    configurations: dict[str, np.ndarray]
+    names: list[str]  # of the joints
+    joints: list[str]  # types of the joints
+    parents: np.ndarray  # (j,) joint before each; 0 is the world
+    axes: np.ndarray  # (j, 6) of `joint_axes`
+    placements: np.ndarray  # (j, 3, 4) rotation and translation of each joint in its parent
+    inertias: np.ndarray  # (j + 1, 13) mass, centre of mass and inertia about it, of the world and of each link
+    n_bodies: int  # number of bodies that links consist of
+    gravity: np.ndarray  # (6,)
+    limits: dict[str, np.ndarray]  # by the names of `LIMITS`
+    frames: list[str]  # names of all frames except the first
+    frame_numbers: np.ndarray  # (f, 3) joint, parent frame and type of each
+    frame_placements: np.ndarray  # (f, 3, 4)
+    frame_inertias: np.ndarray  # (f, 13)
+    configurations: dict[str, np.ndarray]  # named positions
 
     @classmethod
     def of(cls, model: Any) -> RobotNumbers | None:
-        """A model; None of what is none, or has more in it, such as joints of other types."""
+        """Convert a model; returns None for other objects, and for models with more in them, such as other joints."""
         pin = sys.modules.get("pinocchio")
         if pin is None or not isinstance(model, pin.Model):
             return None
@@ -113,15 +85,7 @@ class RobotNumbers:
         return found if found.model() == model else None
 
     def model(self) -> Any:
-        """The model.
-
-        Raises
-        ------
-        ImportError
-            If Pinocchio is not installed; the message gives the pip command.
-        ValueError
-            If numbers do not fit each other.
-        """
+        """Return the model; ImportError without Pinocchio, ValueError if numbers do not fit each other."""
         pin = require("pinocchio", "The robot of this model")
         self._check(pin)
         model = pin.Model()
@@ -131,7 +95,7 @@ class RobotNumbers:
         ):
             joint = getattr(pin, kind)(*([axis[:3] + axis[3:]] if kind in _ALONG else []))
             model.addJoint(parent, joint, _placement(pin, place), name)
-        # Pinocchio counts what is appended.
+        # Pinocchio counts the bodies that are appended.
         for _ in range(1, self.n_bodies):
             model.appendBodyToJoint(1, pin.Inertia.Zero(), pin.SE3.Identity())
         for number, body in enumerate(self.inertias):
@@ -154,7 +118,7 @@ class RobotNumbers:
         return model
 
     def _check(self, pin: Any) -> None:
-        """Refuse what Pinocchio would not check."""
+        """Raise ValueError for numbers that Pinocchio would not check."""
         n_joints, n_frames = len(self.names), len(self.frames)
         parts = (self.joints, self.parents, self.axes, self.placements, self.inertias[1:])
         if n_joints == 0 or any(len(part) != n_joints for part in parts):
@@ -191,7 +155,7 @@ def _placement(pin: Any, values: np.ndarray) -> Any:
 
 
 def _body(pin: Any, values: np.ndarray) -> Any:
-    body = pin.Inertia.Zero()  # its constructor refuses a moment that rounding made negative
+    body = pin.Inertia.Zero()  # its constructor rejects moments that rounding made negative
     body.mass, body.lever, body.inertia = float(values[0]), values[1:4], values[4:].reshape(3, 3)
     return body
 

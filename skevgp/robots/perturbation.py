@@ -1,4 +1,4 @@
-"""A robot's model made wrong, as a user's model of a real robot is."""
+"""Inaccurate models of robots, for experiments."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ from .loading import Robot, known_robot, load_robot
 
 
 def perturb_robot(robot: Robot, scale: float = 0.2, *, random_state: int | np.random.RandomState | None = None) -> Any:
-    """A copy of a robot's model with wrong masses, centres of mass, inertias and armatures.
+    """Copy a robot's model with random errors of masses, centres of mass, inertias and armatures.
 
     Each mass, each coordinate of a centre of mass in its joint's frame, each link's inertia about its centre of mass
-    and each armature is multiplied by its own ``1 + scale * U(-1, 1)``. All moments of a link's inertia share a factor,
-    so that it stays one that a body can have. Joints, damping and limits stay.
+    and each armature is multiplied by its own ``1 + scale * U(-1, 1)``. All moments of a link's inertia have the same
+    factor, so that the link stays physical. Joints, damping and limits do not change.
 
     Parameters
     ----------
     robot : str, path-like, System or pinocchio.Model
-        As in `load_robot`; a model is not changed.
+        Robot as in `load_robot`. A model is not changed.
     scale : float, default=0.2
-        The largest relative error, in [0, 1).
+        Largest relative error, in [0, 1).
     random_state : int, RandomState instance or None, default=None
-        Draws the factors, link by link from the base on.
+        Seed of the factors, which are drawn link by link from the base on.
 
     Returns
     -------
     model : pinocchio.Model
-        With the name of the original.
+        The perturbed copy, with the name of the original.
 
     Raises
     ------
     ImportError
-        If Pinocchio is not installed; the message gives the pip command.
+        If Pinocchio is not installed.
     ValueError, TypeError
-        If ``scale`` is not a number in [0, 1), or the robot is not one that `load_robot` takes. If the mass matrix
-        of the perturbed robot is not positive definite.
+        If ``scale`` is not a number in [0, 1), `load_robot` does not accept the robot, or the mass matrix of the
+        perturbed robot is not positive definite.
 
     Warns
     -----
     RobotModelWarning
-        As `load_robot`.
+        If the model of the robot is unphysical, as in `load_robot`.
 
     See Also
     --------

@@ -1,4 +1,4 @@
-"""Pinocchio's recursive algorithms over many rows at once."""
+"""Pinocchio's recursive algorithms for many rows at once."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from .numbers import RobotNumbers
 class RigidBody:
     """Forward and inverse dynamics of a robot, for many states at once.
 
-    Pinocchio's articulated-body and recursive Newton-Euler algorithms; each call is one loop over rows in C++ where
-    Pinocchio was built with OpenMP. It can be pickled, and several threads may use it.
+    It uses Pinocchio's articulated-body and recursive Newton-Euler algorithms. Each call is one loop over rows in C++
+    if Pinocchio was built with OpenMP. It can be pickled, and several threads may use it.
 
     Parameters
     ----------
     model : pinocchio.Model
-        With one position and one velocity per joint; it is copied.
+        Model with one position and one velocity per joint. It is copied.
     """
 
     def __init__(self, model: Any):
-        self.model = model.copy()  # what the user does to it later changes nothing
+        self.model = model.copy()  # so that later changes by the user have no effect
         self._damping = np.array(model.damping)
         self._driven = np.array(layout_of(model).driven)
 
@@ -38,38 +38,30 @@ class RigidBody:
         self.__init__(model.model() if isinstance(model, RobotNumbers) else model)  # type: ignore[misc]
 
     def joint_forces(self, u: np.ndarray) -> np.ndarray:
-        """B u, the inputs on the driven joints and 0 on the others.
-
-        Parameters
-        ----------
-        u : ndarray of shape (n, n_inputs)
-
-        Returns
-        -------
-        force : ndarray of shape (n, n_joints)
-        """
+        """Return joint forces B u (n, n_joints) of inputs u (n, n_inputs): 0 on joints without input."""
         force = np.zeros((len(u), self.model.nv))
         force[:, self._driven] = u
         return force
 
     def accelerations_under(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """q̈ = M(q)⁻¹ (B u - D q̇ - C(q, q̇)q̇ - g(q)), with the model's viscous damping D.
+        """Return q̈ = M(q)⁻¹ (B u - D q̇ - C(q, q̇)q̇ - g(q)), with the model's viscous damping D.
 
         Parameters
         ----------
         q, v : ndarray of shape (n, n_joints)
             Positions and velocities.
         u : ndarray of shape (n, n_inputs)
+            Inputs.
 
         Returns
         -------
         a : ndarray of shape (n, n_joints)
-            NaN or infinite where the mass matrix is singular.
+            Accelerations. They are NaN or infinite if the mass matrix is singular.
         """
         return self.accelerations(q, v, self.joint_forces(u) - self._damping * v)
 
     def accelerations(self, q: np.ndarray, v: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """q̈ = M(q)⁻¹ (τ - C(q, q̇)q̇ - g(q)), by the articulated-body algorithm.
+        """Return q̈ = M(q)⁻¹ (τ - C(q, q̇)q̇ - g(q)), by the articulated-body algorithm.
 
         Parameters
         ----------
@@ -79,27 +71,16 @@ class RigidBody:
         Returns
         -------
         a : ndarray of shape (n, n_joints)
-            NaN or infinite where the mass matrix is singular.
+            Accelerations. They are NaN or infinite if the mass matrix is singular.
         """
         return self._over_rows("aba", q, v, force)
 
     def accelerations_by_force(self, q: np.ndarray, force: np.ndarray) -> np.ndarray:
-        """M(q)⁻¹ τ, what joint forces add to the accelerations.
-
-        Parameters
-        ----------
-        q, force : ndarray of shape (n, n_joints)
-            Positions and joint forces τ.
-
-        Returns
-        -------
-        a : ndarray of shape (n, n_joints)
-            NaN or infinite where the mass matrix is singular.
-        """
+        """Return M(q)⁻¹ τ (n, n_joints), the accelerations by joint forces τ, at positions q, (n, n_joints) each."""
         return self._without_gravity.accelerations(q, np.zeros_like(q), force)
 
     def forces(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """τ = M(q)q̈ + C(q, q̇)q̇ + g(q), by the recursive Newton-Euler algorithm.
+        """Return τ = M(q)q̈ + C(q, q̇)q̇ + g(q), by the recursive Newton-Euler algorithm.
 
         Parameters
         ----------
@@ -109,94 +90,56 @@ class RigidBody:
         Returns
         -------
         force : ndarray of shape (n, n_joints)
+            Joint forces.
         """
         return self._over_rows("rnea", q, v, a)
 
     def gravity(self, q: np.ndarray) -> np.ndarray:
-        """g(q), the joint forces that hold the robot still.
-
-        Parameters
-        ----------
-        q : ndarray of shape (n, n_joints)
-
-        Returns
-        -------
-        force : ndarray of shape (n, n_joints)
-        """
+        """Return g(q) (n, n_joints), the joint forces that hold the robot still at positions q (n, n_joints)."""
         still = np.zeros_like(q)
         return self.forces(q, still, still)
 
     def accelerations_under_jacobian(self, q: np.ndarray, v: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Derivatives of `accelerations_under`, by Pinocchio's analytic ones of the articulated-body algorithm.
+        """Return analytic derivatives of `accelerations_under` in [q, q̇, u].
 
-        Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms", RSS 2018.
+        They are those of Pinocchio (Carpentier & Mansard, "Analytical derivatives of rigid body dynamics algorithms",
+        RSS 2018).
 
         Parameters
         ----------
         q, v : ndarray of shape (n, n_joints)
             Positions and velocities.
         u : ndarray of shape (n, n_inputs)
+            Inputs.
 
         Returns
         -------
         jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
-            By [q, q̇, u]; NaN or infinite where the mass matrix is singular.
+            Derivatives. They are NaN or infinite if the mass matrix is singular.
         """
         force = self.joint_forces(u) - self._damping * v
         by_q, by_v, by_force = self._derivatives("computeABADerivatives", q, v, force)
-        # What damping takes away moves with the velocity too.
+        # The force of damping depends on the velocity too.
         return np.concatenate([by_q, by_v - by_force * self._damping, by_force[:, :, self._driven]], axis=2)
 
     def accelerations_by_force_jacobian(self, q: np.ndarray, u: np.ndarray) -> np.ndarray:
-        """Derivatives of `accelerations_by_force` of the joint forces B u: at rest and without gravity.
-
-        Parameters
-        ----------
-        q : ndarray of shape (n, n_joints)
-        u : ndarray of shape (n, n_inputs)
-
-        Returns
-        -------
-        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
-            By [q, q̇, u]; NaN or infinite where the mass matrix is singular.
-        """
+        """Return derivatives of `accelerations_by_force` for forces B u in [q, q̇, u], (n, n_joints, n_columns)."""
         body, force = self._without_gravity, self.joint_forces(u)
         by_q, _, by_force = body._derivatives("computeABADerivatives", q, np.zeros_like(q), force)
         return np.concatenate([by_q, np.zeros_like(by_q), by_force[:, :, self._driven]], axis=2)
 
     def forces_jacobian(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Derivatives of `forces` by the positions and velocities, by those of the recursive Newton-Euler algorithm.
-
-        Parameters
-        ----------
-        q, v, a : ndarray of shape (n, n_joints)
-            Positions, velocities and accelerations.
-
-        Returns
-        -------
-        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
-            By [q, q̇, u], of which u does nothing.
-        """
+        """Return derivatives of `forces` in [q, q̇, u], (n, n_joints, n_columns); those in u are 0."""
         by_q, by_v, _ = self._derivatives("computeRNEADerivatives", q, v, a)
         return self._by_state(by_q, by_v)
 
     def gravity_jacobian(self, q: np.ndarray) -> np.ndarray:
-        """Derivatives of `gravity`.
-
-        Parameters
-        ----------
-        q : ndarray of shape (n, n_joints)
-
-        Returns
-        -------
-        jacobian : ndarray of shape (n, n_joints, 2 * n_joints + n_inputs)
-            By [q, q̇, u], of which the first alone do something.
-        """
+        """Return derivatives of `gravity` in [q, q̇, u], (n, n_joints, n_columns); only those in q are not 0."""
         (by_q,) = self._derivatives("computeGeneralizedGravityDerivatives", q)
         return self._by_state(by_q, np.zeros_like(by_q))
 
     def torque_regressor(self, q: np.ndarray, v: np.ndarray, a: np.ndarray) -> np.ndarray:
-        """Y(q, q̇, q̈) with `forces` = Y π, by Pinocchio's joint torque regressor.
+        """Return Y(q, q̇, q̈) with `forces` = Y π, by Pinocchio's joint torque regressor.
 
         Parameters
         ----------
@@ -206,9 +149,9 @@ class RigidBody:
         Returns
         -------
         regressor : ndarray of shape (n, n_joints, 10 * n_joints)
-            By the inertial parameters π of the joints' links, from the base to the tip: of each the mass m, the first
-            moments m c and the moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the joint's frame. Reflected rotor
-            inertias are no part of it.
+            Factors of the inertial parameters π of the links, from the base to the tip: mass m, first moments m c and
+            moments of inertia Ixx, Ixy, Iyy, Ixz, Iyz, Izz about the joint's frame. Reflected rotor inertias are not
+            included.
         """
         n, n_joints = q.shape
         regressor = np.empty((n, n_joints, 10 * n_joints))
@@ -222,16 +165,7 @@ class RigidBody:
         return np.concatenate([by_q, by_v, np.zeros((*by_q.shape[:2], len(self._driven)))], axis=2)
 
     def mass_matrix(self, q: np.ndarray) -> np.ndarray:
-        """M(q) at one configuration, with reflected rotor inertias, by the composite-rigid-body algorithm.
-
-        Parameters
-        ----------
-        q : ndarray of shape (n_joints,)
-
-        Returns
-        -------
-        mass : ndarray of shape (n_joints, n_joints)
-        """
+        """Return M(q) (n_joints, n_joints) at one configuration q (n_joints,), with reflected rotor inertias."""
         pin = require("pinocchio", "Rigid-body dynamics")
         upper = np.triu(pin.crba(self.model, self.model.createData(), q))
         return upper + np.triu(upper, 1).T
@@ -245,7 +179,7 @@ class RigidBody:
         return self._weightless
 
     def _derivatives(self, algorithm: str, *rows: np.ndarray) -> np.ndarray:
-        """The matrices that one of Pinocchio's algorithms returns for each row, (n_matrices, n, n_joints, n_joints)."""
+        """Return the matrices of one of Pinocchio's algorithms for each row, (n_matrices, n, n_joints, n_joints)."""
         derive = getattr(require("pinocchio", "Rigid-body dynamics"), algorithm)
         n, n_joints = rows[0].shape
         found = np.empty((n, 1 if algorithm == "computeGeneralizedGravityDerivatives" else 3, n_joints, n_joints))
@@ -256,7 +190,7 @@ class RigidBody:
 
     @contextmanager
     def _idle_data(self) -> Iterator[Any]:
-        """Pinocchio's work space: one for each thread that was here at once, for they take long to make."""
+        """Lend a work space of Pinocchio: one for each concurrent thread, because they take long to make."""
         idle = vars(self).setdefault("_idle", [])
         try:
             data = idle.pop()

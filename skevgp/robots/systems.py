@@ -1,7 +1,6 @@
-"""The named systems as tables.
+"""The named systems as tables of joints, masses and motors, in SI units, with gravity 9.81 m/s² along -z.
 
-A system is data: what its joints, masses and motors are. Feature maps and data sets both read it here, so that a
-new system is one entry of ``SYSTEMS``. Everything is in SI units, angles in radians, gravity 9.81 m/s² along -z.
+Feature maps and data sets read the same tables, so that a new system is one entry of ``SYSTEMS``.
 """
 
 from __future__ import annotations
@@ -21,56 +20,31 @@ Vector3 = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Link:
-    """One joint and the rigid body that it moves.
+    """One joint and the rigid body that it moves."""
 
-    Attributes
-    ----------
-    name : str
-        Name of the joint.
-    kind : {"revolute", "prismatic"}
-    axis : tuple of 3 floats
-        Unit vector of the joint in its own frame.
-    mass : float
-        Mass of the body, kg.
-    com : tuple of 3 floats
-        Centre of mass in the joint's frame, m.
-    inertia : tuple of 3 floats
-        Moments of inertia (xx, yy, zz) about the centre of mass, kg m².
-    xyz : tuple of 3 floats
-        Origin of the joint in its parent's frame, m.
-    rpy : tuple of 3 floats
-        Orientation of the joint in its parent's frame: roll, pitch and yaw about that frame's fixed axes, rad.
-    armature : float
-        Reflected inertia of the motor's rotor (squared gear ratio times rotor inertia), kg m² or kg.
-    damping : float
-        Viscous damping, N m s/rad or N s/m.
-    effort : float
-        The largest torque or force of the motor, N m or N; 0 for a joint without a motor.
-    """
-
-    name: str
+    name: str  # of the joint
     kind: Literal["revolute", "prismatic"]
-    axis: Vector3
-    mass: float
-    com: Vector3 = (0.0, 0.0, 0.0)
-    inertia: Vector3 = (0.0, 0.0, 0.0)
-    xyz: Vector3 = (0.0, 0.0, 0.0)
-    rpy: Vector3 = (0.0, 0.0, 0.0)
-    armature: float = 0.0
-    damping: float = 0.0
-    effort: float = np.inf
+    axis: Vector3  # unit vector in the joint's own frame
+    mass: float  # kg
+    com: Vector3 = (0.0, 0.0, 0.0)  # centre of mass in the joint's frame, m
+    inertia: Vector3 = (0.0, 0.0, 0.0)  # moments xx, yy, zz about the centre of mass, kg m²
+    xyz: Vector3 = (0.0, 0.0, 0.0)  # origin in the parent's frame, m
+    rpy: Vector3 = (0.0, 0.0, 0.0)  # roll, pitch and yaw about the parent's fixed axes, rad
+    armature: float = 0.0  # reflected inertia of the rotor: squared gear ratio times rotor inertia, kg m² or kg
+    damping: float = 0.0  # viscous, N m s/rad or N s/m
+    effort: float = np.inf  # largest torque or force of the motor, N m or N; 0 without a motor
 
 
 @dataclass(frozen=True)
 class GravityTerm:
-    """Gravity's pull as the sine of one angle (the paper's IFG prior for planar systems).
+    """The pull of gravity as the sine of one angle (IFG prior of the paper for planar systems).
 
     Attributes
     ----------
     angle : tuple of int
-        The joints whose positions add up to the angle against the vertical.
+        Joints whose positions add up to the angle against the vertical.
     acts_on : tuple of int
-        The joints whose acceleration it changes.
+        Joints that it accelerates.
     """
 
     angle: tuple[int, ...]
@@ -79,18 +53,18 @@ class GravityTerm:
 
 @dataclass(frozen=True)
 class Layout:
-    """What the columns of a robot's states and inputs are: x = [q, q̇, u].
+    """The columns x = [q, q̇, u] of a robot's states and inputs.
 
     Attributes
     ----------
     name : str
-        Of the robot.
+        Name of the robot.
     position_names : tuple of str
-        One per joint.
+        Name of the position of each joint.
     driven : tuple of int
-        The joints that an input drives, in the order of the inputs.
+        Joints with an input, in the order of the inputs.
     revolute : tuple of bool
-        Whether each joint's position is an angle.
+        Whether the position of each joint is an angle.
     """
 
     name: str
@@ -130,10 +104,11 @@ class System:
     Attributes
     ----------
     name : str
+        Name of the system.
     links : tuple of Link
-        From the base to the tip.
+        Links from the base to the tip.
     gravity : tuple of GravityTerm
-        Of a planar system; empty if gravity's pull is not a sine.
+        Pull of gravity in a planar system; empty if it is not a sine.
     """
 
     name: str
@@ -142,7 +117,7 @@ class System:
 
     @property
     def layout(self) -> Layout:
-        """What the columns of its states and inputs are."""
+        """Columns of the states and inputs."""
         return Layout(
             self.name,
             position_names=tuple(link.name for link in self.links),
@@ -183,7 +158,8 @@ _CARTPOLE = System(
     ),
     gravity=(GravityTerm(angle=(1,), acts_on=(1,)),),
 )
-# That of MIT's course Underactuated Robotics until May 2022: Drake's own example, which is the other, has no damping.
+# The cartpole of MIT's course Underactuated Robotics until May 2022. The other one, Drake's own example, has no
+# damping.
 _CARTPOLE_DAMPED = System(
     "cartpole_damped", tuple(replace(link, damping=0.1) for link in _CARTPOLE.links), _CARTPOLE.gravity
 )
@@ -232,21 +208,22 @@ SYSTEMS: Mapping[str, System] = MappingProxyType(
 
 
 def get_system(name: str | System) -> System:
-    """The named system.
+    """Return a named system.
 
     Parameters
     ----------
     name : str or System
-        One of ``SYSTEMS``; a `System` comes back as it is.
+        A name in ``SYSTEMS``. A `System` is returned as it is.
 
     Returns
     -------
     system : System
+        The system.
 
     Raises
     ------
     ValueError
-        If no system has this name; the message lists the known ones.
+        If no system has this name.
     TypeError
         If ``name`` is neither a string nor a `System`.
     """

@@ -164,7 +164,7 @@ class LBFGS(Solver):
             # Without coordinates or iterations the start is the result.
             minimum.converged = len(start) == 0 or max_iter == 0
             x, rng = start, np.random.RandomState(0)
-            for _ in range(max_iter):  # a start whose first line search fails has no iteration
+            for _ in range(max_iter):  # at most: a start whose first line search fails has no iteration
                 if minimum.converged or minimum.n_iter >= max_iter:
                     break
                 before, stalled = guarded.loss, 0

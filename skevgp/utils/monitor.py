@@ -38,7 +38,7 @@ class Monitor:
         # All parts share the objects below, except that `with_time` gives a part its own _late.
         # Whether the fit was stopped, the time of this part is over, and that of some part is.
         self._stop, self._late, self._some_late = Event(), Event(), Event()
-        # Whether there may be something to keep, and how many `keeping_the_best` the main thread is inside of.
+        # Whether there may be parameters to keep, and the depth of `keeping_the_best` in the main thread.
         self._found, self._inside = Event(), [0]
         self._n_before, self._factor, self._shift, self._about = 0, 1.0, 0.0, ""
         self._outputs: Sequence[int] = range(0)
@@ -175,12 +175,12 @@ class Progress:
         if self._tqdm is None:
             print(text, file=self._stream, flush=True)
         elif self._bar is None:
-            # On a terminal, an empty bar fills the line and cuts off what is longer.
+            # On a terminal, an empty bar fills the line, and longer text is cut off.
             fills = self._stream.isatty()
             self._bar = self._tqdm(desc=text, bar_format="{desc}{bar}", file=self._stream, dynamic_ncols=fills)
         else:
             self._bar.set_description_str(text, refresh=False)
-            # Not `refresh`: Ctrl-C inside of it would leave the lock that all bars share locked.
+            # `refresh` would hold the lock of all bars, and Ctrl-C inside of it would leave them locked.
             if not self._bar.disable:
                 self._bar.display()
 

@@ -92,7 +92,7 @@ def mean_and_std(estimator: Any, X: Any) -> tuple[np.ndarray, np.ndarray]:
     """Return mean and std of a fitted estimator, also inside scikit-learn's wrappers; TypeError if there is no std."""
     if hasattr(estimator, "best_estimator_"):  # of a search
         return mean_and_std(estimator.best_estimator_, X)
-    if isinstance(estimator, Pipeline):  # itself it would have to be told by set_predict_request
+    if isinstance(estimator, Pipeline):  # a pipeline passes return_std on only after set_predict_request
         return mean_and_std(estimator[-1], estimator[:-1].transform(X) if len(estimator) > 1 else X)
     if isinstance(estimator, MultiOutputRegressor):
         parts = [mean_and_std(own, X) for own in estimator.estimators_]
