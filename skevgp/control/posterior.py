@@ -471,19 +471,12 @@ class Posterior:
         return Exported(self.predictor, features, inputs, maps.n_columns)
 
 
-# The methods that take rows, and the method of the estimator that validates the rows.
-_TAKES = {
-    "novelty": "_checked",
-    "value_and_jacobian": "_checked_numbers",
-    "jacobian": "_checked_numbers",
-    "predict_gradient": "_checked_numbers",
-}
+def delegate(name: str, takes: Literal["rows", "numbers"] | None = None) -> Any:
+    """Make a method of an estimator that calls the method of its posterior, with the same docstring.
 
-
-def delegate(name: str) -> Any:
-    """Make a method of an estimator that calls the method of its posterior, with the same docstring."""
+    If it takes rows X first, the estimator validates them: ``"rows"`` passes `Rows`, ``"numbers"`` passes an array.
+    """
     method: Callable[..., Any] = getattr(Posterior, name)
-    takes = _TAKES.get(name)
 
     @wraps(method)
     def ask(self: Any, *args: Any, **kwargs: Any) -> Any:
@@ -491,6 +484,7 @@ def delegate(name: str) -> Any:
         if takes is None or not (args or "X" in kwargs):
             return method(self._posterior, *args, **kwargs)
         X, *others = args or (kwargs.pop("X"),)
-        return method(self._posterior, getattr(self, takes)(X, name), *others, **kwargs)
+        checked = self._checked(X, name) if takes == "rows" else self._checked_numbers(X, name)
+        return method(self._posterior, checked, *others, **kwargs)
 
     return ask

@@ -72,7 +72,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
     kernel: Kernel | Callable[..., Any] | None
     kernel_map: TransformerMixin | None
     coef_prior: CoefPrior | Literal["auto"]
-    noise: Literal["gaussian", "student-t"] | Noise
+    noise: str | Noise
     normalize_y: bool
     max_iter: Any
     solver: Any
@@ -174,10 +174,10 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
             return self._before_fit(X).sample_y(X, n_samples, random_state, include_noise)
         return self._posterior.sample_y(self._checked(X, "sample_y"), n_samples, random_state, include_noise)
 
-    value_and_jacobian = delegate("value_and_jacobian")
-    jacobian = delegate("jacobian")
-    predict_gradient = delegate("predict_gradient")
-    novelty = delegate("novelty")
+    value_and_jacobian = delegate("value_and_jacobian", takes="numbers")
+    jacobian = delegate("jacobian", takes="numbers")
+    predict_gradient = delegate("predict_gradient", takes="numbers")
+    novelty = delegate("novelty", takes="rows")
     compile = delegate("compile")
     sample_functions = delegate("sample_functions")
     to_casadi = delegate("to_casadi")

@@ -228,10 +228,10 @@ class EVGPRegressor(GaussianProcess):
         n_inducing: int | Literal["auto"] = 100,
         inducing_init: Literal["auto", "k-means", "greedy"] | ArrayLike = "auto",
         sharing: Sharing = "auto",
-        noise: Literal["gaussian", "student-t"] | Noise = "gaussian",
+        noise: str | Noise = "gaussian",
         noise_cv: int | None = 5,
         normalize_y: bool = False,
-        solver: Literal["lbfgs", "adam"] | Solver = "lbfgs",
+        solver: str | Solver = "lbfgs",
         max_iter: int | None = None,
         warm_start: bool = False,
         n_jobs: int | None = None,
@@ -436,7 +436,7 @@ class EVGPRegressor(GaussianProcess):
             check_integer(self.n_inducing, "n_inducing", minimum=1)
         elif solver.stochastic:
             raise ValueError(f'n_inducing="auto" needs solver="lbfgs" or an LBFGS(...); got solver={self.solver!r}.')
-        asked = 'noise="student-t"' if noise.heavy_tails else "inputs of Gaussian noise"
+        asked = f"noise={self.noise!r}" if noise.heavy_tails else "inputs of Gaussian noise"
         if (noise.heavy_tails or noise.inputs is not None) and (solver.stochastic or is_dask(X)):
             raise ValueError(
                 f'{asked} needs solver="lbfgs" or an LBFGS(...), and rows in memory or in a file; got '
@@ -448,7 +448,7 @@ class EVGPRegressor(GaussianProcess):
         problem = Problem.from_data(
             data, kernel=self.kernel, coef_prior=prior, noise=noise, normalize_y=self.normalize_y
         )
-        folds, tol, most = self.noise_cv, solver.tol, getattr(solver, "max_inducing", None)
+        folds, tol, most = self.noise_cv, solver.tol, solver.max_inducing
         problem = replace(
             problem,
             sharing=self.sharing,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from numbers import Integral
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -40,9 +40,9 @@ def regressor_has(method: str) -> Callable[[Any], bool]:
     return has
 
 
-def _delegate(name: str) -> Any:
+def _delegate(name: str, takes: Literal["rows", "numbers"] | None = None) -> Any:
     """Delegate a method to the posterior of the sum, if the regressor has it."""
-    return available_if(regressor_has(name))(delegate(name))
+    return available_if(regressor_has(name))(delegate(name, takes))
 
 
 def columns_of(X: Any, indices: np.ndarray, ndim: int = 2) -> np.ndarray:
@@ -217,10 +217,10 @@ class ResidualRegressor(MetaEstimatorMixin, RegressorMixin, StatefulEstimator):
         samples = self.regressor_.sample_y(X, n_samples, random_state, **params)
         return samples + columns_of(X, self.base_).reshape(*samples.shape[:-1], 1)
 
-    value_and_jacobian = _delegate("value_and_jacobian")
-    jacobian = _delegate("jacobian")
-    predict_gradient = _delegate("predict_gradient")
-    novelty = _delegate("novelty")
+    value_and_jacobian = _delegate("value_and_jacobian", takes="numbers")
+    jacobian = _delegate("jacobian", takes="numbers")
+    predict_gradient = _delegate("predict_gradient", takes="numbers")
+    novelty = _delegate("novelty", takes="rows")
     compile = _delegate("compile")
     sample_functions = _delegate("sample_functions")
     to_casadi = _delegate("to_casadi")

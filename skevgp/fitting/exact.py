@@ -18,7 +18,7 @@ from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import LARGEST, as_floats
-from .messages import far_from_prior, interrupted, lbfgs_ended, learned_too_little
+from .messages import ended_early, far_from_prior, interrupted, learned_too_little
 from .problem import Problem
 from .search import FeaturesAlone, Fit, Rules, Start, drawn, search
 from .start import centred_kernels, checked_variance, starting_table, with_signal_of_constants
@@ -112,7 +112,7 @@ class ExactTask:
             -n * minimum.loss,
             start.loss_curve + [n * value for value in minimum.loss_curve],
             minimum.converged,
-            lbfgs_ended(minimum, spent + minimum.n_iter, self.max_iter, self.tol, sparse=False),
+            ended_early("LBFGS", minimum, spent + minimum.n_iter, self.max_iter, self.tol, sparse=False),
         )
 
     def _minimised_by(

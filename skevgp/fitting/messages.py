@@ -26,8 +26,10 @@ DEPENDENT_ROWS = (
 )
 
 
-def lbfgs_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True) -> str:
-    """Why L-BFGS ended before it converged, after ``n_iter`` iterations in all.
+def ended_early(
+    solver: str, minimum: Minimum, n_iter: int, max_iter: int, tol: float | None, sparse: bool = True
+) -> str:
+    """Why a solver ended before it converged, after ``n_iter`` iterations in all.
 
     ``tol`` is None if the solver chose it. ``sparse`` says whether there are inducing points.
     """
@@ -35,7 +37,7 @@ def lbfgs_ended(minimum: Minimum, n_iter: int, max_iter: int, tol: float | None,
         return ""
     if n_iter < max_iter:
         return (
-            f"L-BFGS stopped after {n_iter} iterations: rounding errors keep hiding the way up, as in data without "
+            f"{solver} stopped after {n_iter} iterations: rounding errors keep hiding the way up, as in data without "
             f"noise. The best parameters are kept; a larger tol{', fewer inducing points' if sparse else ''} or a "
             "WhiteKernel with a lower bound on the noise end sooner."
         )

@@ -23,7 +23,7 @@ from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
-from .messages import adam_ended, lbfgs_ended, learned_too_little
+from .messages import adam_ended, ended_early, learned_too_little
 from .problem import Problem, Sharing
 from .search import FeaturesAlone, Fit, Rules, Start, drawn
 from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
@@ -408,7 +408,7 @@ class Model:
             -n_rows * minimum.loss,
             start.loss_curve + [n_rows * loss for loss in minimum.loss_curve],
             minimum.converged,
-            lbfgs_ended(minimum, spent + minimum.n_iter, self.max_iter, self.tol),
+            ended_early(type(solver).__name__, minimum, spent + minimum.n_iter, self.max_iter, self.tol),
             n_rows=start.n_rows,
         )
 

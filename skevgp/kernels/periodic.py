@@ -11,14 +11,14 @@ from sklearn.gaussian_process import kernels as sk
 
 from ..utils.casadi import casadi
 from .base import no_functions, reads
-from .stationary import TINY, Derivatives, Stationary
+from .stationary import TINY, Derivatives, Profile, Stationary
 
 # Number of terms of the Fourier series.
 _HARMONICS = 10_000
 
 
 @dataclass(frozen=True)
-class ExpSineSquared:
+class ExpSineSquared(Profile):
     """φ = exp(-2 sin²(π r) / ℓ²), r = |x - x'| / period (Rasmussen & Williams 2006, eq. 4.31). Parameter log ℓ."""
 
     n_parameters = 1

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from functools import reduce
 from math import factorial
-from typing import Any, Protocol
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -14,7 +15,17 @@ from scipy.special import gammaln, kve
 from sklearn.gaussian_process import kernels as sk
 
 from ..utils.casadi import casadi
-from .base import CentredSquares, Covariance, CovarianceAt, PerRow, Sums, exported_kernels, one_lengthscale, reads
+from .base import (
+    CentredSquares,
+    Covariance,
+    CovarianceAt,
+    PerRow,
+    Sums,
+    exported_kernels,
+    no_functions,
+    one_lengthscale,
+    reads,
+)
 from .waves import Waves, widened
 
 # With r² = Σ_d ((x_d - x'_d) / ℓ_d)², each covariance is a profile φ of the exponent E = -½ r². E is linear in
@@ -44,36 +55,42 @@ Derivatives = tuple[np.ndarray, list[np.ndarray]]
 # --- profiles φ(E), E = -½ r² -------------------------------------------------------------------------------------
 
 
-class Profile(Protocol):
+class Profile(ABC):
     """φ(E); the logarithms of its own parameters come before the length scales in the vector of hyperparameters."""
 
-    n_parameters: int
+    n_parameters: ClassVar[int] = 0
 
     @property
     def smooth(self) -> bool:
         """Whether φ'(E) is finite at E = 0."""
+        return True
 
     @property
     def has_root(self) -> bool:
         """Whether φ takes the root of r², which then needs all its digits."""
+        return False
 
+    @abstractmethod
     def value(self, E: np.ndarray, parameters: np.ndarray) -> np.ndarray:
         """Return φ(E)."""
 
+    @abstractmethod
     def derivatives(self, E: np.ndarray, value: np.ndarray, parameters: np.ndarray) -> Derivatives:
         """Return φ'(E) and the derivative in each log parameter, given φ(E)."""
 
     def spectrum(
         self, parameters: np.ndarray, shape: tuple[int, int], rng: np.random.RandomState
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return frequencies (L, d) for length scales of 1, and their weights (L,) with mean 1."""
+        """Return frequencies (L, d) for length scales of 1, and their weights (L,) with mean 1, or raise ValueError."""
+        raise ValueError(no_functions(type(self).__name__))
 
     def expression(self, squared: Any, parameters: np.ndarray) -> Any:
-        """Return φ for CasADi symbols r²."""
+        """Return φ for CasADi symbols r², or raise ValueError."""
+        raise ValueError(f"The kernel {self!r} cannot be written in CasADi. {exported_kernels()}")
 
 
 @dataclass(frozen=True)
-class Exponential:
+class Exponential(Profile):
     """φ = exp(E): the squared exponential (Rasmussen & Williams 2006, eq. 4.9)."""
 
     n_parameters = 0
@@ -96,7 +113,7 @@ class Exponential:
 
 
 @dataclass(frozen=True)
-class Matern12:
+class Matern12(Profile):
     """φ = exp(-r) (Rasmussen & Williams 2006, eq. 4.18)."""
 
     n_parameters = 0
@@ -121,7 +138,7 @@ class Matern12:
 
 
 @dataclass(frozen=True)
-class Matern32:
+class Matern32(Profile):
     """φ = (1 + t) exp(-t), t = √3 r; φ' = 3 exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
 
     n_parameters = 0
@@ -154,7 +171,7 @@ class Matern32:
 
 
 @dataclass(frozen=True)
-class Matern52:
+class Matern52(Profile):
     """φ = (1 + t + t²/3) exp(-t), t = √5 r; φ' = 5/3 (1 + t) exp(-t) (Rasmussen & Williams 2006, eq. 4.17)."""
 
     n_parameters = 0
@@ -195,7 +212,7 @@ class Matern52:
 
 
 @dataclass(frozen=True)
-class Matern:
+class Matern(Profile):
     """φ = 2^(1-ν) / Γ(ν) t^ν K_ν(t), t = √(2ν) r, ν up to `LARGEST_NU` (Rasmussen & Williams 2006, eq. 4.14)."""
 
     nu: float
@@ -260,7 +277,7 @@ class Matern:
 
 
 @dataclass(frozen=True)
-class RationalQuadratic:
+class RationalQuadratic(Profile):
     """φ = (1 + r² / 2α)^(-α) (Rasmussen & Williams 2006, eq. 4.19). Parameter log α."""
 
     n_parameters = 1

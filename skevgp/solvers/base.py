@@ -62,6 +62,8 @@ class Solver(StatefulEstimator):
     posterior: Literal["full", "diagonal"]
     tol: float | Literal["auto"]
     max_time: float | None
+    # Largest number of inducing points for n_inducing="auto". Only a solver that sees all rows uses it.
+    max_inducing: int = 1000
 
     def check(self) -> None:
         """Raise an error if an option is out of range."""

@@ -321,8 +321,8 @@ def test_the_picture_of_noise_has_a_panel_for_each_setting_of_one_scale(drawn, t
 def messages_of_early_ends():
     """In the library's own words."""
     ended, going = (Minimum(np.zeros(1), 0.0, [0.0], converged) for converged in (True, False))
-    yield messages.lbfgs_ended(going, n_iter=9, max_iter=9, tol=0.01)
-    yield messages.lbfgs_ended(going, n_iter=9, max_iter=100, tol=None)
+    yield messages.ended_early("LBFGS", going, n_iter=9, max_iter=9, tol=0.01)
+    yield messages.ended_early("LBFGS", going, n_iter=9, max_iter=100, tol=None)
     yield messages.interrupted(9)
     yield messages.interrupted(9, max_time=1.0)
     yield messages.adam_ended(going, False, 0.1, 512)
