@@ -167,7 +167,7 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
     tree, noise = _without_noise(given)
     if tree is None or len(noise) > 1:
         said = "it has no other term" if tree is None else f"there are {len(noise)}"
-        raise ValueError(f"kernel={kernel!r}: of WhiteKernel there can be one, plus what it is the noise of; {said}.")
+        raise ValueError(f"kernel={kernel!r} may have one WhiteKernel, in a sum with another term; {said}.")
     constant = _outermost_constant(tree)
     signal_start = Start()
     if constant is None:
