@@ -136,7 +136,7 @@ class RobotNumbers:
             or (self.frame_numbers < 0).any()
             or not set(kind.tolist()) <= set(pin.FrameType.values)
         ):
-            raise ValueError("A frame of a robot belongs to a joint or a frame that does not exist.")
+            raise ValueError("A robot has a frame on a joint or a frame that does not exist.")
 
 
 def _of_placements(placements: Any) -> np.ndarray:
