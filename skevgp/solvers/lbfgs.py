@@ -79,10 +79,11 @@ class LBFGS(Solver):
 
     Notes
     -----
-    If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number of rows over
-    the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a callable object,
-    but not a function. Independent models share ``max_time``, and finding groups of outputs (``sharing="auto"``) takes
-    at most half of it. See the user guide, :doc:`/guide/solvers`.
+    Restarts keep inducing points that ``inducing_init`` gives. The gain of ``tol="auto"`` is that over features and
+    noise alone. If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number
+    of rows over the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a
+    callable object, but not a function. Independent models share ``max_time``, and finding groups of outputs
+    (``sharing="auto"``) takes at most half of it. See the user guide, :doc:`/guide/solvers`.
 
     Examples
     --------
