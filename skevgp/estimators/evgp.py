@@ -100,8 +100,8 @@ class EVGPRegressor(GaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Seed of inducing points, mini-batches and restarts.
     verbose : int, default=0
-        Verbosity: 0 prints nothing, 1 shows the progress in a live line or every ten seconds, and 2 prints a line at
-        each iteration.
+        Verbosity: 0 prints nothing, 1 shows the progress, and 2 prints a line at each iteration. Progress is a live
+        line if tqdm is installed and the output is a terminal or a notebook, else a line every ten seconds.
 
     Attributes
     ----------

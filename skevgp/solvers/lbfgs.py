@@ -66,7 +66,7 @@ class LBFGS(Solver):
         and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
-        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations take longer.
+        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations are not cut short.
     max_inducing : int, default=1000
         Maximum number of inducing points of ``n_inducing="auto"``.
 
