@@ -356,7 +356,7 @@ def _compare(model: Any, trial: Any) -> None:
     of_std = allowed + _OF_LARGEST * np.abs(expected).max(axis=0, initial=0.0)
     near = (np.abs(mean - expected) <= allowed) & (np.abs(std - expected_std) <= of_std)
     if not (near & np.isfinite(allowed)).all():
-        raise ValueError("its model does not predict what it did when it was saved")
+        raise ValueError("its model predicts something else than when it was saved")
 
 
 def _about() -> dict[str, Any]:

@@ -153,7 +153,7 @@ def test_where_y_is_scaled_downwards_std_stays_positive():
 )
 def test_where_y_is_bent_there_is_no_std_of_y(options):
     model = TransformedTargetRegressor(SPARSE, **options).fit(X, Y)
-    with pytest.raises(TypeError, match=r"(?s)Of a TransformedTargetRegressor with .* it is known where y is scaled"):
+    with pytest.raises(TypeError, match=r"(?s)A TransformedTargetRegressor with .* has no standard deviation of y"):
         neg_nlpd(model, X, Y)
 
 

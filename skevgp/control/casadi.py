@@ -159,7 +159,8 @@ def _frozen_group(group: PredictorGroup, cross: Any, diagonal: Any, features: An
     sizes = [len(own) for own in deviations.others]
     if any(sizes):
         left = ca.mtimes(ca.DM(np.vstack(deviations.others)), ca.vertcat(V, features)) ** 2
-        variance = variance + ca.mtimes(ca.DM(_sums_of(sizes)), left)
+        sums = np.repeat(np.eye(len(sizes)), sizes, axis=1)  # adds up the rows of each output
+        variance = variance + ca.mtimes(ca.DM(sums), left)
     return mean, variance
 
 
@@ -178,11 +179,6 @@ def _open_group(
 def _unexplained(diagonal: Any, squares: Any) -> Any:
     """Return k̃(x, x) - |v|², the variance that the inducing points do not explain."""
     return casadi().fmax(diagonal - squares, _ROUNDING * diagonal)
-
-
-def _sums_of(sizes: list[int]) -> np.ndarray:
-    """Return the matrix that sums the given numbers of rows, one sum for each output."""
-    return np.repeat(np.eye(len(sizes)), sizes, axis=1)
 
 
 def with_base(function: Any, columns: np.ndarray) -> Any:

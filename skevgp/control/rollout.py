@@ -60,7 +60,7 @@ def rollout(
         - ``"mean"``: feed the mean back. The std is that of the last step alone.
     process_noise : {"learned", "none"}, default="learned"
         Whether to add the learned noise at each step. Use ``"none"`` if the noise was in the measurement of the states
-        and not in the system.
+        and not in the system. Regressors of other packages need ``include_noise`` in ``predict`` for that.
     random_state : int, RandomState instance or None, default=None
         Seed of the particles.
 

@@ -151,7 +151,7 @@ def simulate(
         )
     if callable(U):
         if n_steps is None:
-            raise ValueError("With a controller, n_steps must say how many steps it controls.")
+            raise ValueError("With a controller, n_steps is needed.")
         if isinstance(U, ComputedTorqueController) and not math.isclose(U.dt, dt):
             raise ValueError(f"dt must be that of the controller, {U.dt!r}; got {dt!r}.")
         n_steps, controller = check_integer(n_steps, "n_steps", minimum=0), U

@@ -102,8 +102,8 @@ class EVGPRegressor(GaussianProcess):
     random_state : int, RandomState instance or None, default=None
         Seed of inducing points, mini-batches and restarts.
     verbose : int, default=0
-        Verbosity: 0 prints nothing, 1 shows the progress in a live line or every ten seconds, and 2 prints a line at
-        each iteration.
+        Verbosity: 0 prints nothing, 1 shows the progress, and 2 prints a line at each iteration. Progress is a live
+        line if tqdm is installed and the output is a terminal or a notebook, else a line every ten seconds.
 
     Attributes
     ----------
@@ -392,8 +392,8 @@ class EVGPRegressor(GaussianProcess):
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(
-                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (what '
-                f"changes would be taken for outliers); got forgetting_factor={forgetting_factor!r}."
+                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (a '
+                f"change of the system would look like outliers); got forgetting_factor={forgetting_factor!r}."
             )
         with unchanged_if_it_fails(self), single_threaded_libraries():
             maps, fitted = self._posterior.maps, self._fitted
@@ -402,7 +402,7 @@ class EVGPRegressor(GaussianProcess):
             if n_outputs != self._n_outputs:
                 raise ValueError(f"y has {n_outputs} outputs, but the model has {self._n_outputs}.")
             residuals = fitted.units.rows(data.source).residuals
-            check_magnitude(residuals.largest, "y, in units of what the first fit left over,")
+            check_magnitude(residuals.largest, "y, in units of the residuals of the first fit,")
             noisier = None
             if noise.inputs is not None:
                 covariance, numbers = input_covariance(noise.inputs, maps.n_columns), self._numbers(data)
@@ -478,9 +478,7 @@ class EVGPRegressor(GaussianProcess):
         except ValueError as error:
             if is_frame(data.given) and words_of(data.given):
                 raise
-            raise ValueError(
-                "inputs of Gaussian noise needs an X of numbers, none of them missing: others have no slopes."
-            ) from error
+            raise ValueError("inputs of Gaussian noise needs numbers in X, none of them missing.") from error
 
     def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
         points = [group.points for group in self._posterior.predictor.by_output]

@@ -190,8 +190,8 @@ class InertiaForceGravity(_NewtonFeatures):
         acrobot, and for other robots `LinkGravity` of all links whose features are not always 0.
     gravity_gain : float or array-like of shape (n_terms,) or (n_joints, n_terms), default=0.0
         Guess of the deceleration by gravity per unit of each feature: one for all, one per feature, or one per joint
-        and feature. For a sine it is in rad/s² (g/l for a point mass), for a lever of `LinkGravity` in 1/m (1/l for a
-        point mass at -l times the lever).
+        and feature, where entries of joints that the feature does not accelerate are ignored. For a sine it is in
+        rad/s² (g/l for a point mass), for a lever of `LinkGravity` in 1/m (1/l for a point mass at -l times the lever).
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
     known_scale : float, default=0.1

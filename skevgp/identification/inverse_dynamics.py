@@ -251,8 +251,8 @@ class InverseDynamics(RegressorMixin, IdentifiedRobot):
         lost = [name for name, joint in zip(self._outputs, self._joints, strict=True) if joint.held_for_no_group]
         if lost:
             warn_user(
-                f"What physics leaves of {lost} repeats in no group of rows that was left out: these torques are "
-                "predicted by physics, and std says so. More trajectories may show more; n_inducing=0 does not look.",
+                f"The residuals of {lost} do not repeat in any left-out group of rows, so that physics alone predicts "
+                "these torques. More trajectories may help. Set n_inducing=0 to fit no residuals.",
                 ConvergenceWarning,
             )
         return self

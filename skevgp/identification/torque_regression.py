@@ -131,9 +131,6 @@ class TorqueRegression(StatefulEstimator):
             mean, covariance = np.zeros(len(scale)), np.diag(scale**2)
         coulomb = np.array([number for number, name in enumerate(names) if name.startswith("coulomb(")])
         inertial = np.arange(len(names)) < (10 * n_outputs if self._has_robot else 0)
-        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, self._velocities(n_outputs))
+        velocity = np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)  # v_s, (o,)
+        prior = Prior(mean, covariance, inertial, coulomb if len(coulomb) else None, velocity)
         return with_gains(prior, n_outputs, self.gain_scale if self._has_robot else 0.0)
-
-    def _velocities(self, n_outputs: int) -> np.ndarray:
-        """Return v_s of each joint's Coulomb friction, (o,)."""
-        return np.broadcast_to(getattr(self.feature_map_, "stiction_velocity", 0.01), n_outputs)

@@ -212,7 +212,7 @@ class Covariance(ABC):
 def no_functions(of: str) -> str:
     """Explain why no random functions can be drawn."""
     return (
-        f"No functions can be drawn of a kernel with a {of}: its spectral density is not known. sample_y draws at "
+        f"No functions can be drawn from a kernel with a {of}: its spectral density is not known. sample_y draws at "
         "given rows, and rollout along paths."
     )
 

@@ -32,7 +32,7 @@ class FunctionKernel(sk.Kernel):
     function : callable
         Symmetric, positive semi-definite function in autograd.numpy: ``function(X, Z, **hyperparameters)`` -> array of
         shape (len(X), len(Z)). Its parameters with a float as default are the hyperparameters. They are positive, and
-        start at the default.
+        start at the default. Other defaults (integers, strings) are constants.
     values : dict of str to float, default=None
         Start values of hyperparameters that replace the defaults.
     values_bounds : pair of floats, "fixed", or dict of str to either, default=(1e-5, 1e5)

@@ -167,7 +167,7 @@ def parse_kernel(kernel: sk.Kernel | Callable[..., Any] | None, n_columns: int) 
     tree, noise = _without_noise(given)
     if tree is None or len(noise) > 1:
         said = "it has no other term" if tree is None else f"there are {len(noise)}"
-        raise ValueError(f"kernel={kernel!r}: of WhiteKernel there can be one, plus what it is the noise of; {said}.")
+        raise ValueError(f"kernel={kernel!r} may have one WhiteKernel, in a sum with another term; {said}.")
     constant = _outermost_constant(tree)
     signal_start = Start()
     if constant is None:
@@ -217,18 +217,14 @@ def _covariance(kernel: Any, signal: Any, n_columns: int, starts: list[Start]) -
         operands = _operands(kernel, type(kernel))
         parts = [part for own in operands if (part := _covariance(own, signal, n_columns, starts)) is not None]
         return kind(tuple(parts)) if len(parts) > 1 else parts[0]
-    found = _simple_covariance(kernel, n_columns)
+    if type(kernel) not in READERS:
+        raise ValueError(
+            f"kernel: {type(kernel).__name__} does not work in this place, as {kernel!r}. These work: "
+            f"{known_kernels()}."
+        )
+    found = READERS[type(kernel)](kernel, n_columns)
     starts.append(_starts(kernel))
     return found
-
-
-def _simple_covariance(kernel: Any, n_columns: int) -> Covariance:
-    kind = type(kernel)
-    if kind not in READERS:
-        raise ValueError(
-            f"kernel: {kind.__name__} does not work in this place, as {kernel!r}. These work: {known_kernels()}."
-        )
-    return READERS[kind](kernel, n_columns)
 
 
 def _operands(kernel: Any, operator: Any) -> Iterator[Any]:

@@ -150,8 +150,8 @@ def as_maps(maps: Maps) -> tuple[Map | None, Map | None]:
     """Return feature map and kernel map of a fitted model or None; ValueError if X has columns of words."""
     if is_frame(maps.example) and (words := words_of(maps.example)):
         raise ValueError(
-            f"The columns {words} of X are not numbers: derivatives, functions to be drawn and predictors without "
-            "validation need them to be."
+            f"The columns {words} of X are not numbers, which derivatives, sampled functions and compiled "
+            "predictors need."
         )
     features, inputs = (
         None if each is None else as_map(each, example=maps.example) for each in (maps.feature_map, maps.kernel_map)

@@ -32,6 +32,11 @@ class Gaussian(Noise):
         (McHutchon & Rasmussen 2011); σ² and ``std`` are those of rows without noise in X. Not for Dask arrays or Adam.
         See the user guide, :doc:`/guide/noise`.
 
+    Notes
+    -----
+    With ``inputs``, the variance of a row is averaged over outputs that are fitted together, and fits are repeated
+    until σ² changes no more.
+
     Examples
     --------
     >>> from skevgp import EVGPRegressor

@@ -113,7 +113,7 @@ class RobotNumbers:
             model.addFrame(pin.Frame(name, joint, frame, *own), False)
         for name, values in self.configurations.items():
             if values.shape != (model.nq,):
-                raise ValueError(f"A robot's configuration {name!r} has not {model.nq} positions.")
+                raise ValueError(f"A robot's configuration {name!r} does not have {model.nq} positions.")
             model.referenceConfigurations[name] = values
         return model
 
@@ -122,9 +122,7 @@ class RobotNumbers:
         n_joints, n_frames = len(self.names), len(self.frames)
         parts = (self.joints, self.parents, self.axes, self.placements, self.inertias[1:])
         if n_joints == 0 or any(len(part) != n_joints for part in parts):
-            raise ValueError(
-                f"A robot of {n_joints} joints has not as many {', '.join(('types', 'parents', 'links'))}."
-            )
+            raise ValueError(f"A robot of {n_joints} joints does not have as many types, parents and links.")
         if not set(self.joints) <= set(JOINTS) or not set(self.limits) <= set(LIMITS):
             raise ValueError("A robot has joints, or limits, of an unknown type.")
         if (self.parents < 0).any() or (self.parents > np.arange(n_joints)).any() or not self.n_bodies <= _MOST_BODIES:
@@ -138,7 +136,7 @@ class RobotNumbers:
             or (self.frame_numbers < 0).any()
             or not set(kind.tolist()) <= set(pin.FrameType.values)
         ):
-            raise ValueError("A robot has a frame on a joint, or another frame, that is not there.")
+            raise ValueError("A robot has a frame on a joint or a frame that does not exist.")
 
 
 def _of_placements(placements: Any) -> np.ndarray:

@@ -51,7 +51,7 @@ class LBFGS(Solver):
         and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.
     max_time : float, default=None
         Number of seconds until iterations end. The best parameters so far are kept, with a ConvergenceWarning, and the
-        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations take longer.
+        calibration by ``noise_cv`` is skipped. Passes over the rows before and after the iterations are not cut short.
     max_inducing : int, default=1000
         Maximum number of inducing points of ``n_inducing="auto"``.
 
@@ -64,10 +64,11 @@ class LBFGS(Solver):
 
     Notes
     -----
-    If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number of rows over
-    the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a callable object,
-    but not a function. Independent models share ``max_time``, and finding groups of outputs (``sharing="auto"``) takes
-    at most half of it. See the user guide, :doc:`/guide/solvers`.
+    Restarts keep inducing points that ``inducing_init`` gives. The gain of ``tol="auto"`` is that over features and
+    noise alone. If the fit begins on a sample of the rows, the callback gets the bound of the sample times the number
+    of rows over the size of the sample. ``outputs`` is a range, or a tuple if a group has gaps. ``clone`` copies a
+    callable object, but not a function. Independent models share ``max_time``, and finding groups of outputs
+    (``sharing="auto"``) takes at most half of it. See the user guide, :doc:`/guide/solvers`.
 
     Examples
     --------

@@ -124,8 +124,8 @@ def _scaled_back(model: TransformedTargetRegressor, mean: np.ndarray, std: np.nd
     if not (identity or isinstance(transformer, _SCALERS)) or given.get("clip"):
         names = ", ".join(scaler.__name__ for scaler in _SCALERS)
         raise TypeError(
-            f"Of a TransformedTargetRegressor with {transformer!r} there is no standard deviation of y: it is known "
-            f"where y is scaled ({names}). EVGPRegressor scales y itself, and normalize_y=True centres it."
+            f"A TransformedTargetRegressor with {transformer!r} has no standard deviation of y. Only scalers keep it "
+            f"({names}). EVGPRegressor scales y itself, and normalize_y=True centres it."
         )
     shape, columns = mean.shape, mean.reshape(len(mean), -1)
     unit = transformer.inverse_transform(np.ones((1, columns.shape[1])))

@@ -117,7 +117,7 @@ def test_of_a_residual_regressor_they_are_of_the_sum(data):
 def test_what_cannot_be_is_refused_by_name(data):
     X, Y, _ = data
     model = EVGPRegressor(kernel=FunctionKernel(lambda X, Z: X @ Z.T), n_inducing=2, **QUICK).fit(X, Y)
-    with pytest.raises(ValueError, match="No functions can be drawn of a kernel with a Function"):
+    with pytest.raises(ValueError, match="No functions can be drawn from a kernel with a Function"):
         model.sample_functions()
     for name in ("n", "n_waves"):
         with pytest.raises(ValueError, match=name):

@@ -209,7 +209,7 @@ ZEROS = np.zeros((3, 1))
         (("pendulum", [0.0, 0.0], ZEROS, -0.03), "dt must be .*-0.03"),
         (("pendulum", [0.0, 0.0], ZEROS, np.nan), "dt must be .*nan"),
         (("pendulum", [0.0, 0.0], ZEROS, np.inf), "dt must be .*inf"),
-        (("pendulum", [0.0, 0.0], lambda step, Z: [[0.0]]), "With a controller, n_steps must say how many"),
+        (("pendulum", [0.0, 0.0], lambda step, Z: [[0.0]]), "With a controller, n_steps is needed"),
         (
             ("robot", [0.0, 0.0], ZEROS),
             r"Unknown robot 'robot'.*'acrobot', 'cartpole', .*'iiwa14', 'pendulum'",

@@ -119,7 +119,7 @@ def test_people_are_told_what_works_from_the_registry():
     "kernel", [WhiteKernel(), WhiteKernel() + WhiteKernel(), RBF() + WhiteKernel() + WhiteKernel()]
 )
 def test_noise_is_one_term_of_several(kernel):
-    with pytest.raises(ValueError, match="of WhiteKernel there can be one"):
+    with pytest.raises(ValueError, match="may have one WhiteKernel"):
         parse_kernel(kernel, 2)
 
 

@@ -54,7 +54,7 @@ def test_slopes_agree_with_differences(name):
     [(FunctionKernel(lambda X, Z: X @ Z.T), "Function"), (sk.ExpSineSquared(1.0, 9.0), "ExpSineSquared of 2 columns")],
 )
 def test_kernels_of_which_none_can_be_drawn_are_named(kernel, name):
-    with pytest.raises(ValueError, match=f"No functions can be drawn of a kernel with a {name}"):
+    with pytest.raises(ValueError, match=f"No functions can be drawn from a kernel with a {name}"):
         drawn(kernel)
     with pytest.raises(ValueError, match="No functions can be drawn"):
         drawn(sk.RBF() * kernel + sk.RBF())
