@@ -1,7 +1,7 @@
 """One run of against_checkout.py, in a process of its own, with the skevgp that PYTHONPATH finds.
 
 Checkouts may be old: nothing is used of them but what all have, EVGPRegressor, make_dynamics, features and metrics.
-The job is a JSON object of the arguments of `dynamics` or of `cost`, and the last line that is printed the result.
+The job is a JSON object of the arguments of `dynamics`, `cost` or `call`. The last line that is printed is the result.
 
     python benchmarks/speed/checkout_job.py '{"system": "pendulum", "n_inducing": 10, "seed": 0}'
 """
@@ -9,6 +9,7 @@ The job is a JSON object of the arguments of `dynamics` or of `cost`, and the la
 from __future__ import annotations
 
 import json
+import subprocess
 import sys
 import time
 import warnings
@@ -63,11 +64,33 @@ def cost(n_rows: int, n_inducing: int, max_iter: int, seed: int) -> dict[str, An
     return result | {name: (result[name] - start[name]) / result["n_iter"] for name in ("seconds", "cpu_seconds")}
 
 
+CALLS = 2000
+IMPORT = "import time; t = time.perf_counter(); from skevgp import EVGPRegressor; print(time.perf_counter() - t)"
+
+
+def call(what: str, seed: int) -> dict[str, Any]:
+    """Seconds of the import in a fresh process, or the median time to predict one row, plain or compiled."""
+    if what == "import":
+        done = subprocess.run([sys.executable, "-c", IMPORT], capture_output=True, text=True, check=True)
+        return {"seconds": float(done.stdout), "cpu_seconds": float(done.stdout)}
+    train = make_dynamics("cartpole", 10, random_state=seed)
+    features = InertiaForceGravity("cartpole")
+    model = EVGPRegressor(features, n_inducing=60, max_iter=5, random_state=0).fit(train.data, train.target)
+    predict = model.compile().predict if what == "compiled row" else model.predict
+    row, times = train.data[:1], np.empty((CALLS, 2))
+    for i in range(CALLS):
+        start, cpu_start = time.perf_counter(), time.process_time()
+        predict(row, return_std=True)
+        times[i] = time.perf_counter() - start, time.process_time() - cpu_start
+    seconds, cpu_seconds = np.median(times, axis=0)
+    return {"seconds": seconds, "cpu_seconds": cpu_seconds}
+
+
 def main() -> None:
     job = json.loads(sys.argv[1])
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        result = (dynamics if "system" in job else cost)(**job)
+        result = (call if "what" in job else dynamics if "system" in job else cost)(**job)
     packages = " ".join(f"{package.__name__} {package.__version__}" for package in (skevgp, np, scipy, sklearn))
     numbers = {name: np.asarray(value).item() for name, value in result.items()}
     print(json.dumps({**numbers, "versions": packages, "package": skevgp.__file__}))
