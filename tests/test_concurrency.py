@@ -86,7 +86,7 @@ def test_one_model_in_many_threads_says_what_it_says_in_one(name, tmp_path):
 
 
 @of_fits
-@pytest.mark.slow
+@pytest.mark.long
 def test_fits_at_once_are_the_fits_one_after_the_other():
     models = [THREADED[name] for name in ("auto", "none", "student-t", "adam", "natural")] + [*OTHERS.values()]
     expected = [said_by(clone(model).fit(X, Y)) for model in models]
@@ -95,7 +95,7 @@ def test_fits_at_once_are_the_fits_one_after_the_other():
 
 
 @of_fits
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_are_written_and_read_at_once(tmp_path):
     models = [clone(THREADED[name]).fit(X, Y) for name in ("all", "none", "student-t", "adam")] * 3
 

@@ -77,7 +77,7 @@ def assert_same(found, expected):
         np.testing.assert_array_equal(values, expected[name], err_msg=name)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("name", THREADED)
 def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
     """With blocks so small that threads have something to do."""
@@ -109,7 +109,7 @@ def digests(names=("auto", "natural", "exact", "network")):
     return found
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("hash_seed", "threads"), [("0", "1"), ("random", "4")])
 def test_other_processes_give_the_same_bits(hash_seed, threads):
     """Whatever the order of sets of strings, and the threads that BLAS may have."""

@@ -109,7 +109,7 @@ def test_with_features_it_is_a_gaussian_process_with_their_covariance():
     np.testing.assert_allclose(actual_cov, cov, atol=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_likelihood_bounds_every_sparse_models_bound():
     exact = EGPRegressor(TREND).fit(X, Y)
     for m in (5, 20, 50):
@@ -264,7 +264,7 @@ def test_a_line_search_that_steps_far_off_comes_back():
     assert m.log_marginal_likelihood_value_ > 160.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize(
     "nasty",

@@ -16,7 +16,7 @@ from skevgp.robots.loading import urdf_path
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
 LEARN = EXAMPLES / "plot_learn_dynamics.py"
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture(autouse=True)

@@ -62,7 +62,7 @@ print(all(vars(model)[name] is value for name, value in known.items()), (model.p
 """
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="RLIMIT_AS")
 def test_where_memory_ends_there_is_a_memory_error_and_the_model_is_as_it_was():
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", MEMORY], capture_output=True, text=True, check=False)

@@ -6,7 +6,7 @@ from .hostile import OF_RECORDINGS, OF_TABLES, OF_XML
 from .long.hostile_files import run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "damages"),
     [("tables", OF_TABLES), ("recordings", OF_RECORDINGS), ("urdfs", OF_XML)],

@@ -18,7 +18,7 @@ from skevgp.solvers import LBFGS, Adam
 
 from .interruption import interrupted_at
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (200, 2))

@@ -90,7 +90,7 @@ def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):
     assert (np.sqrt(np.mean((before - truth) ** 2, axis=0)) / truth.std(axis=0)).min() > 0.05
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_intervals_of_what_torques_show_hold_the_truth():
     distances = []
     for seed in range(6):
@@ -134,7 +134,7 @@ def gear(X):
     return 3.0 * np.sin(2.0 * X[:, :n]) * np.tanh(X[:, n : 2 * n])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_joints_own_columns_tell_what_physics_missed():
     arm = Arm(missed=gear)
     truth = arm.torque(arm.new)
@@ -149,7 +149,7 @@ def test_a_joints_own_columns_tell_what_physics_missed():
     assert (model.residual_std_ > 0.0).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_where_nothing_is_missed_nothing_is_made_worse(arm, rigid):
     truth = arm.torque(arm.new)
     with warnings.catch_warnings():
@@ -196,7 +196,7 @@ def test_a_payload_lies_in_its_interval(arm, rigid):
     assert abs(nothing.mass) < 0.1
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_unknown_gains_widen_a_payloads_interval_until_it_holds():
     distances, widths = [], []
     for seed in range(8):

@@ -67,7 +67,7 @@ def test_the_warning_of_a_fit_names_the_order():
     assert warning_of(arm.nominal, arm.X, arm.y) == ""
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
 def test_the_order_of_more_joints_is_searched_step_by_step(robot):
     arm = Arm(robot, noise=NOISE)
@@ -110,7 +110,7 @@ def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robo
     assert not any("degrees" in cause for several in causes.values() for cause in several)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("robot", ["panda", "solo12", "g1_29dof_rev_1_0"])
 def test_the_search_for_causes_is_short(robot):
     """About a second; the limit is for busy machines."""
@@ -150,7 +150,7 @@ def test_of_many_joints_positions_are_compared_with_limits_only():
 
 
 @pytest.mark.parametrize(
-    "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.slow) for robot in ("ur5", "iiwa14"))]
+    "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.long) for robot in ("ur5", "iiwa14"))]
 )
 def test_where_columns_are_right_no_other_cause_is_named(robot):
     """However little torques are explained."""

@@ -46,7 +46,7 @@ def nasty(seed):
     return X, Y, arguments
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(80))
 def test_finite_data_never_fail(seed):
     X, Y, arguments = nasty(seed)

@@ -22,7 +22,7 @@ def model(points):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_after_ten_thousand_updates_the_model_is_that_of_one_fit():
     X, Y = rows(10_020)
     found = model(X[:12]).fit(X[:20], Y[:20])

@@ -86,7 +86,7 @@ def test_importing_the_package_loads_no_other():
     assert not loaded & (OPTIONAL | {"sklearn", "scipy", "numpy", "autograd"})
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     "code",
     [

@@ -29,28 +29,28 @@ def explained_by_the_gp(model):
     return (model.noise_variance_ < 0.1 * model._fitted.units.target_unit**2).all()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_inertia_force_gravity(data):
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0)
     assert error(model, data) <= 0.002
     assert explained_by_the_gp(model)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_inertia_force(data):
     model = EVGPRegressor(InertiaForce("pendulum"), n_inducing=10, random_state=0)
     assert error(model, data) <= 0.020
     assert explained_by_the_gp(model)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_physics(data):
     model = EVGPRegressor(n_inducing=40, random_state=0)
     assert error(model, data) <= 0.1
     assert explained_by_the_gp(model)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_papers_setup(data):
     """Adam, diagonal posterior, inducing points per output; a sixteenth of the default steps."""
     paper = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "max_iter": 1000, "random_state": 0}
@@ -59,7 +59,7 @@ def test_the_papers_setup(data):
     assert model.n_parameters_ == 123
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_uncertainty_is_honest_with_noise():
     train = make_dynamics("pendulum", noise=0.01, random_state=0)
     test = make_dynamics("pendulum", random_state=1000)
@@ -71,7 +71,7 @@ def test_uncertainty_is_honest_with_noise():
     np.testing.assert_allclose(np.sqrt(model.noise_variance_), noise, rtol=0.1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_weights_are_physics():
     train = make_dynamics("pendulum", random_state=0)
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0).fit(train.data, train.target)
@@ -94,7 +94,7 @@ def test_cross_validation_over_trajectories(small):
 
 
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
-@pytest.mark.slow
+@pytest.mark.long
 def test_grid_search_over_the_number_of_inducing_points(small):
     search = GridSearchCV(
         EVGPRegressor(InertiaForceGravity("pendulum"), random_state=0, solver=LBFGS(tol=1.0)),

@@ -17,7 +17,7 @@ README = (Path(__file__).parents[1] / "README.md").read_text()
 SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_toy_and_the_pendulum_run():
     for snippet in SNIPPETS[:2]:
         names = {}
@@ -35,7 +35,7 @@ def test_any_robot_runs():
     assert names["model"].score(names["train"].data, names["train"].target) > 0.99
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_real_arm_runs(tmp_path, monkeypatch, capsys):
     """On logs of a simulated one."""
     monkeypatch.chdir(tmp_path)
@@ -57,7 +57,7 @@ def test_a_real_arm_runs(tmp_path, monkeypatch, capsys):
     assert (tmp_path / "identified.urdf").stat().st_size > 1000
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_control_runs():
     names = {}
     exec(SNIPPETS[4], names)
@@ -66,7 +66,7 @@ def test_control_runs():
     assert names["mean"].shape == names["std"].shape == (4,)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_files_and_chunks_run_as_written(tmp_path, monkeypatch):
     """With a threaded scheduler in place of the cluster, and stored arrays in place of Zarr's."""
     files, chunks = SNIPPETS[5:]

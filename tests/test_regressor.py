@@ -128,7 +128,7 @@ def test_the_bound_rises_and_ends_at_minus_the_loss():
     assert m.lower_bound_ == pytest.approx(-m.loss_curve_[-1], rel=1e-9)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     """Same kernel: Adam has to find q, whose optimum L-BFGS has in closed form; then all of it."""
@@ -144,7 +144,7 @@ def test_adam_and_lbfgs_agree_at_the_optimum(posterior):
     )
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_adam_learns_in_mini_batches(sharing, posterior):
@@ -153,7 +153,7 @@ def test_adam_learns_in_mini_batches(sharing, posterior):
     assert m.n_iter_ == len(m.loss_curve_) == 600
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_natural_gradients_learn_in_mini_batches(sharing):
     m = model(solver=Adam(batch_size=50, natural_gradient=True), sharing=sharing, max_iter=600).fit(X, Y)
@@ -161,7 +161,7 @@ def test_natural_gradients_learn_in_mini_batches(sharing):
     np.testing.assert_allclose(np.sqrt(m.noise_variance_), 0.05, rtol=0.5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_natural_gradients_and_lbfgs_agree_at_the_optimum():
     """Inducing points and noise free, mini-batches of a third of the rows."""
     rng = np.random.RandomState(0)
@@ -231,7 +231,7 @@ def test_parameter_counts_are_the_papers(n_columns, n_features, m, outputs, expe
     assert fitted.fit(x, rng.randn(300, outputs)).n_parameters_ == expected
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("features", "m", "expected"),
     [(None, 500, 161049), (InertiaForce("iiwa14"), 350, 113337), (InertiaForceGravity("iiwa14"), 350, 113673)],
@@ -362,7 +362,7 @@ def test_scaling_in_kernel_map_leaves_the_features_alone():
 # --- going on ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_partial_fit_is_fit_with_the_same_kernel_and_points(sharing, posterior):
@@ -479,7 +479,7 @@ def test_warm_start_with_other_shapes_starts_anew():
     assert m.inducing_points_.shape == (10, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("solver", [LBFGS(tol=1e6), Adam(tol=1e6)], ids=["lbfgs", "adam"])
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch):

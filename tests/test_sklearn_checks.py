@@ -14,7 +14,7 @@ from skevgp.features import (
 )
 from skevgp.solvers import LBFGS
 
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 MAPS = [
     AngleEncoder(),
     InertiaForce(),

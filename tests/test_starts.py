@@ -39,7 +39,7 @@ def model(**arguments):
 # --- n_restarts ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 def test_restarts_keep_the_best_bound(sharing):
     first_bounds = []
@@ -63,7 +63,7 @@ def test_restarts_serve_adam_too():
     assert often.lower_bound_ >= once.lower_bound_
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
     fits = [model(sharing=sharing, solver=LBFGS(n_restarts=2, tol=0.1), n_jobs=n).fit(X, Y) for n in (1, 1, 2)]
@@ -72,7 +72,7 @@ def test_restarts_are_reproducible_for_any_number_of_threads(sharing):
         np.testing.assert_array_equal(other.inducing_points_, fits[0].inducing_points_)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_restarts_stay_inside_the_users_bounds():
     kernel = RBF([1.0, 1.0], [(0.9, 1.1), (0.2, 5.0)]) + WhiteKernel(1e-4, (5e-5, 2e-4))
     with pytest.warns(ConvergenceWarning, match="close to the specified"):
@@ -146,7 +146,7 @@ def test_an_interrupted_fit_keeps_the_best_of_both_places(monkeypatch):
     assert m.lower_bound_ >= before.lower_bound_ - 1e-6
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore:The bound was still rising")
 @pytest.mark.parametrize("why", ["warm start", "as many points as rows", "few iterations", "Adam", "own points"])
 def test_points_stay_where_they_have_a_reason_to(why):
@@ -209,7 +209,7 @@ def test_a_fit_goes_on_from_the_inducing_points_of_another():
     assert again.lower_bound_ > first.lower_bound_ - 10.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_restarts_leave_given_points_alone():
     fixed = RBF([1.0, 1.0], "fixed")
     noise = WhiteKernel(1e-4, "fixed")
@@ -268,7 +268,7 @@ def test_noise_that_is_noise_is_not_a_failure():
         model(kernel=RBF() + WhiteKernel(1.0, "fixed")).fit(X, Y)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("sharing", ["all", "none"])
 def test_targets_far_from_their_prior_mean_are_told(sharing):
     with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
@@ -317,7 +317,7 @@ def test_a_kernel_that_explains_less_than_noise_is_tried_from_other_starts():
     assert model.lower_bound_ > -0.5 * 60 * (np.log(2 * np.pi * np.mean(y**2)) + 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_warm_start_that_leads_nowhere_is_left():
     cold = model(n_inducing=12).fit(1e3 * X, Y)
     warm = model(n_inducing=12, warm_start=True).fit(X, Y).fit(1e3 * X, Y)

@@ -15,7 +15,7 @@ def auto_inducing(benchmarks):
     return auto_inducing
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes(auto_inducing, tmp_path, capsys):
     output = tmp_path / "auto.csv"
     arguments = ["--quick", "--sets", "toy-200", "--jobs", "1", "--output", str(output)]

@@ -5,7 +5,7 @@ import re
 import pytest
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize(("model", "fewest"), [("skevgp", 110), ("renamed", 112)])
 def test_most_of_scikit_learns_tests_pass_and_each_that_does_not_has_a_reason(run_script, model, fewest):
     said = run_script("gpr_tests.py", "--model", model)

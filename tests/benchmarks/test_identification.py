@@ -6,7 +6,7 @@ import pytest
 from .conftest import read
 
 pytest.importorskip("pinocchio")
-pytestmark = pytest.mark.slow
+pytestmark = pytest.mark.long
 
 
 @pytest.fixture

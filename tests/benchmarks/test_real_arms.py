@@ -111,7 +111,7 @@ def test_loads_are_told_by_names(real_arms, name, loaded):
     assert real_arms.has_load(name) == loaded
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_resumes_and_writes_its_page_and_picture(run_script, folder, tmp_path):
     output = tmp_path / "arms.csv"
     models = ["CAD", "least squares", "EVGP", "random forest"]

@@ -77,7 +77,7 @@ def test_an_independent_regressor_hides_its_functions(rollouts):
     assert ahead.samples.shape == (4, 3, 1)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_arm_is_tested_on_slower_moves(rollouts):
     train, test = rollouts.data(rollouts.Cell("iiwa14", "EVGP-IFG", 350, "0.0", "0.1", 0, "quick", 0))
     assert train.data.shape == (6 * 50, 21)

@@ -16,7 +16,7 @@ def swing_up(benchmarks, monkeypatch):
     return swing_up
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_resumes_and_writes_its_page(run_script, tmp_path):
     output = tmp_path / "swing_up.csv"
     run_script("swing_up.py", "--quick", "--jobs", "1", "--output", output)

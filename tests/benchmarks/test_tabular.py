@@ -42,7 +42,7 @@ def test_a_table_is_put_in_the_place_of_the_last(tabular):
     assert tabular.with_tables(filled, rows) == filled
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes(tabular, tmp_path, capsys):
     output = tmp_path / "tabular.csv"
     arguments = ["--sets", "toy-200", "--seeds", "1", "--jobs", "1", "--output", str(output)]
@@ -94,7 +94,7 @@ def test_few_houses_are_cut_off_at_the_top(tabular):
     assert price.max() == 5.0 > np.quantile(price, 0.99)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_trees_find_jumps_and_a_gaussian_process_can_be_told(tabular):
     """The numbers of the page on boosting."""
     data = tabular.SETS["houses-2000"](0)
@@ -125,7 +125,7 @@ def test_trees_find_jumps_and_a_gaussian_process_can_be_told(tabular):
     assert rmse(model.predict(told(data.X_test))) == pytest.approx(0.22, abs=0.005)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_nothing_is_lost_to_the_exact_model_on_the_sines(tabular):
     rows = tabular.harness.read(tabular.harness.RESULTS / "tabular.csv")
     data = tabular.standardised(tabular.SETS["sines-800"](0))

@@ -15,7 +15,7 @@ def tracking(benchmarks, monkeypatch):
     return tracking
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_resumes_and_writes_its_page(tracking, run_script, tmp_path):
     output = tmp_path / "tracking.csv"
     run_script("tracking.py", "--quick", "--output", output)

@@ -17,7 +17,7 @@ from skevgp import EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
 
 pytestmark = [
-    pytest.mark.slow,
+    pytest.mark.long,
     pytest.mark.filterwarnings("ignore::UserWarning:distributed"),
     pytest.mark.filterwarnings("ignore::ResourceWarning"),
     # A few iterations are enough to compare.

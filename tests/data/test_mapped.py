@@ -128,7 +128,7 @@ def little_memory(monkeypatch):
     monkeypatch.setattr("skevgp.fitting.search.LARGEST_SAMPLE", 2**17)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     n, d = 500_000, 8
@@ -143,7 +143,7 @@ def test_memory_mapped_files_are_not_copied(tmp_path, dtype, little_memory):
     assert peak < 0.9 * mapped[0].nbytes
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
     """Beyond what may be kept, four times the rows need no more memory."""
     peaks = []

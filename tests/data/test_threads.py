@@ -128,7 +128,7 @@ def test_libraries_are_set_free_after_an_error():
     assert numbers_of_threads() == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 def test_fits_have_the_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""

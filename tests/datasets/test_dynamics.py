@@ -314,7 +314,7 @@ def test_a_motor_too_weak_to_hold_its_joint_is_no_unstable_controller():
     assert np.abs(dynamics.trajectories[..., 0] - dynamics.trajectories[:, :1, 0]).max() > 1.0
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_number_of_jobs_does_not_change_a_bit():
     one, two = (make_dynamics("iiwa14", 65, 2, random_state=0, n_jobs=jobs) for jobs in (1, 2))
     assert_array_equal(one.data, two.data)

@@ -317,7 +317,7 @@ def test_limits_that_are_all_zero_are_unknown():
     assert_array_equal(simulate("double_pendulum", np.zeros(4), U, dt=0.001, return_inputs=True)[1], U)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_number_of_jobs_does_not_change_a_bit():
     rng = np.random.default_rng(0)
     z0, U = rng.uniform(-1.0, 1.0, (130, 4)), rng.standard_normal((130, 2, 1))
@@ -370,7 +370,7 @@ def test_a_step_that_differs_by_rounding_is_the_controllers():
     assert simulate("ur5", np.zeros(12), controller, 0.3, n_steps=1).shape == (2, 12)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_stiffness_is_decided_per_group_whatever_the_jobs():
     model = load_robot("acrobot")
     model.damping = np.full(2, 1e5)

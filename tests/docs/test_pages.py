@@ -28,7 +28,7 @@ def name_of(page):
     return page.relative_to(DOCS).as_posix()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
 def test_a_page_runs_and_prints_what_it_says(page, tmp_path):
     with warnings.catch_warnings():  # a page may silence one

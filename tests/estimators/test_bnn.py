@@ -280,7 +280,7 @@ def linear():
     return x, y, fit.fit(x, y)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_hidden_layers_means_are_the_exact_posteriors_and_variances_the_mean_field_optimum(linear):
     """Λ = XᵀX / σ² + I / s², of centred inputs; optimal independent variances are 1 / Λ_ii (Bishop 2006, 10.1.2)."""
     x, y, fit = linear
@@ -357,7 +357,7 @@ def test_samples_have_the_predicted_moments():
 # --- learning ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_learns_and_is_calibrated():
     x, y = smooth(600)
     m = BayesianMLPRegressor((20,), batch_size=100, max_iter=250, tol=0.5, random_state=0).fit(x, y)

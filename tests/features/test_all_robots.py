@@ -29,7 +29,7 @@ SLOW = ("tiago_dual",)  # of 101 joints
 
 
 def marked(name):
-    return pytest.param(name, marks=pytest.mark.slow) if name in SLOW else name
+    return pytest.param(name, marks=pytest.mark.long) if name in SLOW else name
 
 
 def uses(robot):

@@ -100,7 +100,7 @@ def test_who_asks_for_white_noise_is_not_told():
         EGPRegressor(kernel=RBF(1e-4, "fixed")).fit(LINE, WAVE[:, 0])
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("columns", [1, 2, 8, 20])
 @pytest.mark.parametrize(
     "target",

@@ -161,7 +161,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(name, sharing):
     assert model.lower_bound_ == pytest.approx(bound, abs=1e-4)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 # Some hyperparameters may end at their limit, and the user is told.
 @pytest.mark.filterwarnings("ignore:The optimal value found")
 @pytest.mark.parametrize("name", TREES)
@@ -257,7 +257,7 @@ def test_a_warm_start_takes_over_hyperparameters_of_the_same_kernel_only():
     assert model.kernel_.k2.get_params()["lengthscale"] == pytest.approx(1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
 @pytest.mark.parametrize("name", TREES)
 def test_nasty_data_are_fitted(name, scale):

@@ -50,7 +50,7 @@ TESTS = {
     "metrics.py": ["tests/test_metrics.py"],
 }
 _SECONDS = 300  # of a mutant's tests; they take 20
-_OPTIONS = ["-s", "-m", "not slow", "-p", "no:cacheprovider", "-p", "no:terminal", "-o", "addopts="]
+_OPTIONS = ["-s", "-m", "not long", "-p", "no:cacheprovider", "-p", "no:terminal", "-o", "addopts="]
 _OPERATORS = {
     ast.Add: ("+", "-"), ast.Sub: ("-", "+"), ast.Mult: ("*", "/"), ast.Div: ("/", "*"), ast.FloorDiv: ("//", "/"),
     ast.Pow: ("**", "*"), ast.Lt: ("<", "<="), ast.LtE: ("<=", "<"), ast.Gt: (">", ">="), ast.GtE: (">=", ">"),

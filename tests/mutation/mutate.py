@@ -135,7 +135,7 @@ def pytest(root: Path, *options: str, tests: Sequence[str] = (), limit: float | 
     within["tests"].write_text("\n".join(tests))
     within["tmp"].mkdir(exist_ok=True)
     paths = {"PYTHONPATH": str(root), "TMPDIR": str(within["tmp"]), "COVERAGE_FILE": str(within["coverage"])}
-    command = [sys.executable, "-m", "pytest", "-q", "-m", "not slow", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
+    command = [sys.executable, "-m", "pytest", "-q", "-m", "not long", "-p", "no:cacheprovider", "--hypothesis-seed=0"]
     with within["printed"].open("w") as printed:
         process = subprocess.Popen([*command, *options, f"@{within['tests']}"], cwd=root, env=os.environ | paths,
                                    start_new_session=True, stdout=printed, stderr=printed)  # fmt: skip

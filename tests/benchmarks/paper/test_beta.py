@@ -27,7 +27,7 @@ def run(run_script, tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes_and_has_a_row_for_each_weight(run, tmp_path):
     run("--settings", "paper")
     before = (tmp_path / "b.csv").read_text()

@@ -11,7 +11,7 @@ from skevgp.metrics import prediction_error
 from ..conftest import read
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_variant_is_the_papers_setting_but_for_its_name(run_script, tmp_path):
     output = tmp_path / "cart.csv"
     options = ("--quick", "--models", "EVGP-IFG", "--jobs", 1, "--output", output, "--variants")

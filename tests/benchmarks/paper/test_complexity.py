@@ -84,7 +84,7 @@ def test_exponents_are_those_of_power_laws(cell):
     np.testing.assert_allclose(curve.exponent(rows), 2.5)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_what_is_there_is_not_measured_again_and_the_page_is_written(run_script, cell, tmp_path):
     from paper.complexity_report import QUICK
 

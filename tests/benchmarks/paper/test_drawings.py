@@ -170,7 +170,7 @@ def test_the_two_parts_of_the_model_add_up(drawings, drawn, tmp_path):
     assert len(crosses.get_xdata()) == 10
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_are_written_small(run_script, tmp_path):
     run_script("paper/drawings.py", "--output", tmp_path / "images")
     sizes = {path.name: path.stat().st_size for path in (tmp_path / "images").iterdir()}

@@ -53,7 +53,7 @@ def test_shares_of_rows_and_errors_are_of_all_rows():
     assert sum(by_kind[kind]["of_error"] for kind in (BEYOND, TURNED, OTHERS)) == pytest.approx(1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_script_fits_once_and_writes_its_page(run_script, tmp_path):
     output = tmp_path / "rows.csv"
     options = ("--quick", "--systems", "pendulum", "--jobs", 1, "--output", output)

@@ -39,7 +39,7 @@ def made_up(**errors):
     ]
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes(run, tmp_path):
     table, page, picture = (tmp_path / f"curves.{suffix}" for suffix in ("csv", "md", "png"))
     assert "[2/2] pendulum EVGP-IFG skevgp 12 0 quick: Error" in run()

@@ -10,7 +10,7 @@ from ..conftest import BENCHMARKS, read
 HELD, TEST, EARLY = "trajectories held back", "test set", "early stopping"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_in_short_mode(run_script, tmp_path):
     said = run_script("paper/network.py", "--quick", "--jobs", 1, "--output", tmp_path / "network.csv")
     assert "[7/7] pendulum" in said

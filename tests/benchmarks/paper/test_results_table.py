@@ -37,7 +37,7 @@ def run(run_script, tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
     table, page, picture = (tmp_path / f"table.{suffix}" for suffix in ("csv", "md", "png"))
     both = ("--models", "RES-VGP", "EVGP-IFG", "--settings")
@@ -82,14 +82,14 @@ def test_it_runs_and_resumes_and_keeps_noises_apart(run, tmp_path):
     assert "EVGP-IFG | 1 |" not in page.read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_cell_that_fails_leaves_no_row(run, tmp_path):
     with pytest.raises(SystemExit, match="1 cells failed"):
         run("--models", "EVGP-IF", "--settings", "skevgp", max_iter=-1)
     assert not (tmp_path / "table.csv").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_network_has_a_row_like_the_others():
     from paper import results_table
 
@@ -156,7 +156,7 @@ def test_intervals_of_normal_errors_hold_what_they_promise():
     assert narrow["within_0.95"] < 0.7
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_wrapped_angles_move_a_row_and_its_target():
     from paper import results_table
 

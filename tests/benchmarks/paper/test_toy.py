@@ -20,7 +20,7 @@ def run(run_script, tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes(run, tmp_path):
     table, page, picture = (tmp_path / f"toy.{suffix}" for suffix in ("csv", "md", "png"))
     assert "[4/4] toy" in run("--data", "toy")
@@ -60,7 +60,7 @@ def test_it_runs_and_resumes(run, tmp_path):
     assert table.read_text() == before
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_without_snelsons_points_those_of_make_toy_are_taken(run, tmp_path, monkeypatch):
     import harness
     from skevgp.datasets import snelson
@@ -75,7 +75,7 @@ def test_without_snelsons_points_those_of_make_toy_are_taken(run, tmp_path, monk
         run("--data", "snelson", *home)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_panel_shows_data_inducing_points_and_line(tmp_path, monkeypatch):
     from paper import toy
 

@@ -22,7 +22,7 @@ def run(run_script, tmp_path):
     return run
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_it_runs_and_resumes_and_leaves_out_what_would_take_too_long(run, tmp_path):
     output = tmp_path / "gpr.csv"
     said = run("--sizes", 30, "--models", "GPR", "EVGP")
@@ -38,7 +38,7 @@ def test_it_runs_and_resumes_and_leaves_out_what_would_take_too_long(run, tmp_pa
     assert "At 30 rows, the most that GPR was fitted to" in output.with_suffix(".md").read_text()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_row_tells_of_the_change_of_state():
     from peers import against_gpr
 

@@ -8,7 +8,7 @@ import pytest
 from ..conftest import read
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_against_peers(run_script, tmp_path):
     output = tmp_path / "peers.csv"
     arguments = ("--quick", "--datasets", "pendulum", "--sharing", "none", "--output", output)
@@ -44,7 +44,7 @@ def test_against_peers(run_script, tmp_path):
     assert np.isfinite(float(redone["error_mean"]))
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_all_splits_of_a_table(run_script, tmp_path):
     rng = np.random.RandomState(0)
     X = 100.0 + rng.randn(120, 2)

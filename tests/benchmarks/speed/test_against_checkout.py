@@ -12,7 +12,7 @@ from skevgp.metrics import negative_log_predictive_density, prediction_error
 from ..conftest import BENCHMARKS, read
 
 
-@pytest.mark.slow
+@pytest.mark.long
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")  # old checkouts know no groups
 def test_runs_take_turns_and_tell_what_a_fit_tells(run_script, tmp_path):
     output = tmp_path / "pairs.csv"
@@ -48,7 +48,7 @@ def test_the_cost_of_an_iteration_is_that_of_a_fit_without_its_start(monkeypatch
     assert (result["n_iter"], result["seconds"], result["cpu_seconds"]) == (5, 2.0, 1.0)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_checkout_that_fails_does_not_take_the_other_with_it(run_script, tmp_path, capsys):
     (tmp_path / "skevgp").mkdir()
     (tmp_path / "skevgp" / "__init__.py").touch()

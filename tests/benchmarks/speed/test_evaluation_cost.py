@@ -5,7 +5,7 @@ import pytest
 from ..conftest import read
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_ratio_is_that_of_the_medians(run_script, tmp_path):
     output = tmp_path / "cost.csv"
     run_script("speed/evaluation_cost.py", "--quick", "--repeats", "3", "--cores", "1", "2", "--output", output)
