@@ -21,7 +21,7 @@ class DependentRowsWarning(UserWarning):
 
     See Also
     --------
-    EVGPRegressor : Its ``fit`` takes ``groups``, which ``noise_cv`` leaves out one at a time.
+    EVGPRegressor : Its ``fit`` takes ``groups``, which ``noise_cv`` holds out in folds.
 
     Examples
     --------

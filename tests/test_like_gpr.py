@@ -29,7 +29,7 @@ BARE = RBF([1.0, 2.0])
 # --- before a fit -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kernel", [None, KERNEL, BARE, BARE + WhiteKernel(0.3)], ids=str)
+@pytest.mark.parametrize("kernel", [None, KERNEL, BARE, BARE + WhiteKernel(0.3), 2.0 * Matern(nu=0.5)], ids=str)
 @pytest.mark.parametrize("n_targets", [None, 3])
 def test_before_a_fit_it_predicts_what_scikit_learns_model_does(kernel, n_targets):
     ours, theirs = (

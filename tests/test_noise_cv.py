@@ -367,6 +367,19 @@ def test_what_groups_do_not_have_in_common_is_told():
     assert np.median(m.predict(3.0 * groups[:, np.newaxis] + 1.5, return_std=True)[1]) > 0.5
 
 
+@pytest.mark.parametrize("seed", [0, 1, 3])
+def test_the_signal_falls_if_it_does_not_hold_for_other_groups(seed):
+    """Groups overlap, and each has a phase of its own."""
+    rng = np.random.RandomState(seed)
+    groups = np.repeat(np.arange(12), 25)
+    X = rng.uniform(-1, 1, (12, 2))[groups] + 0.4 * rng.randn(300, 2)
+    y = np.sin(2 * X[:, 0] + rng.uniform(0, 2 * np.pi, 12)[groups]) + 0.1 * rng.randn(300)
+    alone = EVGPRegressor(n_inducing=60, noise_cv=None, random_state=0).fit(X, y)
+    m = EVGPRegressor(n_inducing=60, random_state=0).fit(X, y, groups=groups)
+    assert m.kernel_.k1.constant_value < 0.5 * alone.kernel_.k1.constant_value
+    assert m.noise_variance_ > alone.noise_variance_
+
+
 def test_a_residual_regressor_hands_groups_on():
     m = ResidualRegressor(model(feature_map=None, max_iter=5)).fit(X, Y, groups=GROUPS)
     expected = model(feature_map=None, max_iter=5).fit(X, Y - X, groups=GROUPS)

@@ -22,9 +22,8 @@ _WORTH_THREADS = 2**17
 # Blocks are summed in at most this many groups, and the groups in order, for any number of threads.
 _MAX_GROUPS = 64
 
-# A block frees arrays as large as the next one needs. If they are given back to the system, they return page by page,
-# which takes a quarter of the time. Once memory as large as this was freed without being touched, glibc keeps what is
-# freed later. 32 MiB is the largest size that it accepts.
+# glibc returns freed arrays to the system, and getting them back page by page costs a quarter of the time. Freeing one
+# large untouched array raises its threshold, up to 32 MiB.
 np.empty(2**25 - 2**14, dtype=np.uint8)
 
 

@@ -26,10 +26,11 @@ class Chosen:
     # (n,): as of `RawRows`.
     counts: np.ndarray | None = None
     precision: np.ndarray | None = None
-    # (n_samples,): the used row that stands for each of the user's rows, -1 for rows of weight 0. None: no rows were
-    # merged.
+    # (n_samples,): the used row that stands for each of the user's rows, -1 for rows of weight 0. None: ``positions``
+    # says it all.
     merged_into: np.ndarray | None = None
-    # Indices in the user's X of all rows of positive weight, in the order of ``positions``. None: no rows were merged.
+    # Indices in the user's X of all rows of positive weight, in the order of ``positions``. None: they are
+    # ``positions``.
     unmerged: np.ndarray | None = None
 
     @property
@@ -49,8 +50,9 @@ class Chosen:
     ) -> Chosen:
         """Choose the rows of X, an array or a data frame, with positive weight.
 
-        If ``ordered``, few rows are sorted, and equal rows of the same group (n_samples,) are merged. Then a fit does
-        not depend on the order of the rows, and a weight of 2 is the same as the row twice.
+        If ``ordered`` and there are at most `ORDERED_ROWS` rows, they are sorted, and equal rows of the same group
+        (n_samples,) are merged. Then a fit does not depend on the order of the rows, and a weight of 2 is the same as
+        the row twice.
         """
         n = len(y)
         counts, variance = (

@@ -23,6 +23,7 @@ from ..fitting.fit import Fitted
 from ..fitting.prior import CoefPrior, coef_names
 from ..fitting.problem import Problem
 from ..kernels.parse import KernelSpec
+from ..noise import as_noise
 from ..noise.base import Noise
 from ..solvers import as_solver
 from ..utils.state import StatefulEstimator
@@ -208,7 +209,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         return bundle
 
     def set_params(self, **params: Any) -> Self:
-        """Set parameters. A parameter ``solver__...`` turns a solver that is a string into an object.
+        """Set parameters. With ``solver__...`` or ``noise__...``, a solver or noise that is a string becomes an object.
 
         Parameters
         ----------
@@ -220,8 +221,10 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self : object
             The estimator itself.
         """
-        if isinstance(getattr(self, "solver", None), str) and any(name.startswith("solver__") for name in params):
-            self.solver = as_solver(self.solver)
+        for name, as_object in (("solver", as_solver), ("noise", as_noise)):
+            value = params.get(name, getattr(self, name, None))
+            if isinstance(value, str) and any(key.startswith(f"{name}__") for key in params):
+                params[name] = as_object(value)
         return super().set_params(**params)
 
     def __sklearn_is_fitted__(self) -> bool:

@@ -90,8 +90,8 @@ class EVGPRegressor(GaussianProcess):
         Whether the prior mean is the training mean of y instead of 0.
     solver : {"lbfgs", "adam"}, `skevgp.solvers.LBFGS` or `skevgp.solvers.Adam`, default="lbfgs"
         L-BFGS on the bound with q at its optimum, or Adam on mini-batches over all parameters, as in the paper. Solver
-        objects have further options, such as ``Adam(batch_size=1000)``. A grid search sets them as
-        ``solver__batch_size``.
+        objects have further options, such as ``Adam(batch_size=1000)``. A grid search over a model with such an object
+        sets them as ``solver__batch_size``.
     max_iter : int, default=None
         Maximum number of iterations of L-BFGS (None: 1000) or of steps of Adam (None: 16000). With 0, kernel and
         inducing points stay at their start, and only q is fitted.
@@ -122,7 +122,7 @@ class EVGPRegressor(GaussianProcess):
         Inducing points in the space of ``kernel_map``. With ``n_inducing="auto"``, a list of arrays if outputs have
         different numbers of points.
     sharing_ : list of list of int
-        Outputs of each independent model.
+        Groups of outputs that share a kernel.
     kernel_ : Kernel, or list of Kernel for several outputs
         Fitted kernel without noise. ``GaussianProcessRegressor(kernel=m.kernel_, alpha=m.noise_variance_,
         optimizer=None)`` is the exact counterpart.
@@ -392,7 +392,7 @@ class EVGPRegressor(GaussianProcess):
         noise = as_noise(self.noise)
         if self._fitted.row_scales is not None and (is_dask(X) or fading < 1.0):
             raise ValueError(
-                'With noise="student-t", partial_fit needs rows in memory or in a file, and forgetting_factor=1 (a '
+                f"With noise={self.noise!r}, partial_fit needs rows in memory or in a file, and forgetting_factor=1 (a "
                 f"change of the system would look like outliers); got forgetting_factor={forgetting_factor!r}."
             )
         with unchanged_if_it_fails(self), single_threaded_libraries():
@@ -476,9 +476,9 @@ class EVGPRegressor(GaussianProcess):
             self.kernel_map_ = data.maps.kernel_map
             return checked_numbers(self, data.given)[0] if is_frame(data.given) else data.X
         except ValueError as error:
-            if is_frame(data.given) and words_of(data.given):
-                raise
-            raise ValueError("inputs of Gaussian noise needs numbers in X, none of them missing.") from error
+            words = words_of(data.given) if is_frame(data.given) else []
+            which = f" The columns {words} are not numbers." if words else ""
+            raise ValueError(f"inputs of Gaussian noise needs numbers in X, none of them missing.{which}") from error
 
     def _set_attributes(self, fitted: Fitted, data: Dataset) -> None:
         points = [group.points for group in self._posterior.predictor.by_output]

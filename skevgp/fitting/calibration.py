@@ -11,7 +11,7 @@ inducing points for noise, and predictions count it twice. Therefore rows are he
 The prior is log-normal around the values that maximise the bound: where held-out rows say nothing, these stay. The
 second term keeps the mean accurate where rows are uncertain anyway. `LeftOut` computes the predictions.
 
-There are only a few groups, such as trajectories: a fold of them hardly tells how far a new one may be from all.
+There are only a few groups, such as trajectories. One fold says little about how much a new group may differ.
 Therefore the signal, by which std grows away from the data, does not fall, unless nothing that was learned holds for
 held-out groups. Both variances are multiplied by a factor of Student's t distribution, with the degrees of freedom that
 the errors of the groups leave.
@@ -129,7 +129,8 @@ def _by_folds(
             little = own.without_signal() - _GAIN
             if own.loss(*found[o]) > little:
                 # All of the signal does not hold for held-out groups. A part of it may.
-                found[o] = replace(own, signal=free[o]).best()
+                own = replace(own, signal=free[o])
+                found[o] = own.best()
                 gone += int(explained[o] and own.loss(*found[o]) > little)
             factor = own.in_doubt(*found[o], groups)
             found[o] = own.signal.clip(factor * found[o][0]), own.noise.clip(factor * found[o][1])
@@ -289,7 +290,7 @@ class VarianceSearch:
         return self.loss(0.0, max(float(squares[0]), _LOWEST))
 
     def in_doubt(self, signal: float, noise: float, groups: Sequence[np.ndarray]) -> float:
-        """The factor on variances that so few groups call for. ``groups`` has the labels (n,) of each fold's rows."""
+        """The factor by which variances grow because there are few groups. ``groups`` has labels (n,) for each fold."""
         # The root mean square of a group's errors over std is one observation of the scale of std. Their mean leaves
         # ν = 1 / (2 variance) degrees of freedom. Errors of a new group then follow Student's t distribution.
         means: list[np.ndarray] = []
@@ -668,7 +669,7 @@ def _divided(ratio: float, D: np.ndarray) -> np.ndarray:
 
 # Fewer rows than this are not calibrated.
 FEWEST_ROWS = 50
-# A standard deviation needs no more rows than this. If there are more, so many are drawn to be predicted.
+# At most this many rows are predicted in all, drawn at random. More do not improve a standard deviation.
 PREDICTED_ROWS = 2000
 # If one group has this share of the rows (one of two has), there are too few others to predict it from. Then blocks of
 # consecutive rows are held out. This share of a block at either end is close to its neighbours and is not predicted.

@@ -48,16 +48,16 @@ def ended_early(
     )
 
 
-def adam_ended(minimum: Minimum, fell: bool, learning_rate: float, batch_size: int) -> str:
-    """Why Adam failed. ``fell`` says whether its bound ended below the first one."""
+def mini_batches_ended(solver: str, minimum: Minimum, fell: bool, learning_rate: float, batch_size: int) -> str:
+    """Why a solver on mini-batches failed. ``fell`` says whether its bound ended below the first one."""
     if not minimum.converged:
         return (
-            f"Adam diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
+            f"{solver} diverged after {minimum.n_iter} steps; the best parameters so far are kept. Lower learning_rate "
             f"(now {learning_rate}), or raise batch_size (now {batch_size})."
         )
     if fell:
         return (
-            f"Adam ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters "
+            f"{solver} ended with a bound below the first after all its {minimum.n_iter} steps; the best parameters "
             "are kept. Raise max_iter (steps become small only towards the end) or batch_size, or lower "
             f"learning_rate (now {learning_rate})."
         )
@@ -65,13 +65,13 @@ def adam_ended(minimum: Minimum, fell: bool, learning_rate: float, batch_size: i
 
 
 def interrupted(n_iter: int, max_time: float | None = None) -> str:
-    """That Ctrl-C, or the end of ``max_time``, ended the fit."""
+    """Message that Ctrl-C, or the end of ``max_time``, ended the fit."""
     how = "was interrupted" if max_time is None else f"ended since max_time={max_time:g} seconds were over,"
     return f"The fit {how} after {n_iter} iterations; the best parameters so far are kept."
 
 
 def signal_gone(gone: int, n_outputs: int) -> str:
-    """That nothing of ``gone`` outputs holds for held-out groups."""
+    """Message that the Gaussian process of ``gone`` outputs does not predict held-out groups."""
     if not gone:
         return ""
     return (
@@ -82,7 +82,7 @@ def signal_gone(gone: int, n_outputs: int) -> str:
 
 
 def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
-    """That y, or a weight, is too far from its prior mean."""
+    """Message that y, or a weight, is too far from its prior mean."""
     # Residuals that are rounding errors of y are not of size one.
     far = rows.residuals.mean[rows.columns] ** 2
     if (rows.scatter() / rows.mean_precision < _FAR**-2 * np.minimum(far, 1.0)).any():
@@ -99,7 +99,7 @@ def far_from_prior(prior: CoefficientPrior, rows: Rows) -> str:
 
 
 def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, rows: Rows, sparse: bool = True) -> str:
-    """That the noise, or a white kernel, explains what the Gaussian process could have learned."""
+    """Message that the noise, or a white kernel, explains what the Gaussian process could have learned."""
     told = ""
     if table["noise"].free.any():
         told = nothing_learned(values["noise"], rows, sparse)
@@ -109,7 +109,7 @@ def learned_too_little(kernel: Kernel, values: Values, table: ParameterTable, ro
 
 
 def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
-    """That noise variances (o,) explain all of targets whose neighbouring rows are alike."""
+    """Message that noise variances (o,) explain all of targets whose neighbouring rows are alike."""
     nothing = noise > _NOTHING_LEARNED * rows.scatter()
     if nothing.any():
         # If residuals look like noise, noise is the right answer.
@@ -132,7 +132,7 @@ def nothing_learned(noise: np.ndarray, rows: Rows, sparse: bool = True) -> str:
 
 
 def white_kernel(kernel: Kernel, hyperparameters: np.ndarray, rows: Rows) -> str:
-    """That the kernel k̃ itself became white noise, though neighbouring rows are alike."""
+    """Message that the kernel k̃ itself became white noise, though neighbouring rows are alike."""
     if len(rows) < 2:
         return ""
     each, other = neighbours(rows, _PAIRS)

@@ -23,7 +23,7 @@ from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from .inducing import Placement, are_all_rows, distinct_rows, greedy_sample_size, with_more
-from .messages import adam_ended, ended_early, learned_too_little
+from .messages import ended_early, learned_too_little, mini_batches_ended
 from .problem import Problem, Sharing
 from .search import FeaturesAlone, Fit, Rules, Start, drawn
 from .start import LOWEST_NOISE, centred_kernels, checked_variance, starting_table
@@ -445,7 +445,7 @@ class Model:
             bound,
             [n_rows * loss for loss in minimum.loss_curve],
             minimum.converged,
-            adam_ended(minimum, fell, solver.learning_rate, solver.batch_size),
+            mini_batches_ended(type(solver).__name__, minimum, fell, solver.learning_rate, solver.batch_size),
             predictor,
         )
 

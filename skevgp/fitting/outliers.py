@@ -1,4 +1,4 @@
-"""Fits with Student-t noise: fits of the model, and estimates of the noise of each row, alternate."""
+"""Fits with heavy-tailed noise: fits of the model, and estimates of the noise of each row, alternate."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class RowDoubts:
 
 
 def fit_doubting(model: Model, run: Callable[[Model], tuple[Model, Fit]]) -> tuple[Model, Fit, RowDoubts]:
-    """Fit a model with Student-t noise by coordinate ascent. No step lowers the bound."""
+    """Fit a model with heavy-tailed noise by coordinate ascent. No step lowers the bound."""
     rows, doubts = model.rows, _first_doubts(model)
     first = model.max_iter - int((1.0 - _BEFORE) * model.max_iter)
     # Without outliers, the first fit is that with Gaussian noise.

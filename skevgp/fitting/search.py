@@ -65,12 +65,11 @@ class Rules:
     other_starts: tuple[tuple[float, float], ...] = ()
     # Whether a fit that ended below the features alone starts once more, from the noise that is best for these.
     last_start: bool = True
-    # The second start has a noise so many times higher, on a sample of the rows or with as many inducing points as
-    # rows, where it costs little. Otherwise a low noise may lead to a plateau where the kernel explains each row by
-    # itself. A high one finds much noise sooner.
+    # Factor on the first noise for a second start, tried on a sample or with a point for each row, where it costs
+    # little. A low noise may lead to a plateau where the kernel explains each row by itself.
     much_noise: float | None = None
-    # Inducing points are placed again after so many iterations on all rows or on the smallest sample. After so many
-    # again, the better of both fits is kept. None: the points are placed once.
+    # Inducing points are placed again after ``stage`` iterations on all rows or on the smallest sample. After ``stage``
+    # more, the better fit is kept. None: the points are placed once.
     stage: int | None = None
     # The first sample has so many rows, or so many per inducing point and feature if that is more. None: all rows.
     sample: tuple[int, int] | None = None

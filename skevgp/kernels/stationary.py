@@ -459,7 +459,7 @@ class StationaryAt(CovarianceAt):
         """Return E (m, n), and the largest ½ (|x/ℓ|² + |z/ℓ|²), which its rounding errors are relative to."""
         E = self._exponent @ prepared
         np.minimum(E, 0.0, out=E)
-        if self.profile.smooth:
+        if self.profile.smooth or not len(self.points):
             return E, 0.0
         d = len(prepared) // 2
         size = -float((self._exponent[0, d + 1 :] @ prepared[d + 1 :]).min() + self._exponent[:, d].min())

@@ -195,7 +195,7 @@ class NaturalFamily:
         self._root_inv = [q.root_inv for q in optima]
 
     def pace(self, share: float) -> None:
-        """Set the step length to this share of the first. If other parameters slow down, q averages over more rows."""
+        """Set the step to ``share`` times the first: q averages over more rows as other parameters slow down."""
         self.rate = max(share * self._first_rate, self._least_rate)
 
     def forget(self) -> None:

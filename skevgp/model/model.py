@@ -25,7 +25,7 @@ from .parameters import Parameter, Values
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, SufficientStatistics, Whitening, collect, errors
 
-# Means are refined if the precision of q has rounding errors below this, where the prior's precision is 1.
+# Means are refined only if the rounding error of B, in directions in which B is about 1, is below this.
 _REFINABLE = 0.1
 
 

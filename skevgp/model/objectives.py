@@ -100,7 +100,7 @@ class ElboObjective:
         return lambda x: self.evaluate(x, next(batches))
 
     def pace(self, share: float) -> None:
-        """Shorten natural gradients to this share of the first, which is that of Adam's steps."""
+        """Scale the natural gradient step by ``share``, as Adam's steps."""
         if self.natural is not None:
             self.natural.pace(share)
 

@@ -35,7 +35,7 @@ class Gaussian(Noise):
     Notes
     -----
     With ``inputs``, the variance of a row is averaged over outputs that are fitted together, and fits are repeated
-    until σ² changes no more.
+    until σ² changes by less than 5 %, at most five times.
 
     Examples
     --------

@@ -58,9 +58,9 @@ def load_robot(robot: Robot) -> Any:
         If no robot has this name (the message lists the known ones), the file does not exist or is not a URDF, no
         joint moves, a joint is neither revolute nor prismatic (a floating base, a ball joint, a mimic joint), or a
         number of the model makes no sense (not finite, a negative mass, armature, damping or dry friction, an axis
-        that is not of length 1 or, in a file, has no direction, negative masses of fixed links as large as what they
-        are fixed to). If moments of inertia are so far below 0 that the mass matrix is not positive definite. The
-        message names the joint or the link, and the number.
+        that is not of length 1 or, in a file, has no direction, negative masses of fixed links that are not smaller
+        than the mass that they are fixed to). If moments of inertia are so far below 0 that the mass matrix is not
+        positive definite. The message names the joint or the link, and the number.
     TypeError
         If ``robot`` is none of the above.
 
@@ -153,7 +153,7 @@ def list_robots() -> list[str]:
 
 
 def layout_of(robot: Robot) -> Layout:
-    """What the columns of a robot's states and inputs are.
+    """Names of the columns of a robot's states and inputs.
 
     Parameters
     ----------
@@ -189,7 +189,7 @@ def read_once(robot: Robot) -> Robot:
 
 
 def effort_limits(model: Any) -> np.ndarray:
-    """What the motors of a model can give.
+    """Effort limits of the motors of a model.
 
     Parameters
     ----------
@@ -319,13 +319,7 @@ def _lift_efforts(model: Any, joints: list[str]) -> None:
 
 
 def _plain(model: Any, called: str, possible_links: Container[str] = ()) -> tuple[Any, list[str]]:
-    """The model itself, or a copy whose continuous joints have an angle each, and what to warn of.
-
-    Raises
-    ------
-    ValueError
-        If that is not possible.
-    """
+    """The model, or a copy whose continuous joints have one angle each, and warnings; or a ValueError."""
     joints = list(model.joints)[1:]
     if not joints:
         raise ValueError(f"{called} has no joint that moves.")
@@ -359,7 +353,7 @@ def _names_of_links(model: Any) -> list[list[str]]:
 
 
 def _check_numbers(model: Any, called: str) -> None:
-    """Refuse what no robot can have; Pinocchio would compute with it."""
+    """Raise an error for impossible numbers, which Pinocchio accepts."""
     links = list(model.inertias)[1:]
     numbers = {
         "gravity": model.gravity.vector,

@@ -40,8 +40,8 @@ def check_bodies(model: Any, called: str, links: list[list[str]], possible_links
     links : list of list of str
         Names of the links that move with each joint, as far as they are known.
     possible_links : container of str, default=()
-        Names of the links whose digits, before a file rounded them, can have been those of a body. There is no warning
-        of a body that is made of such links.
+        Names of the links whose inertia is physical up to the rounding of its digits. Bodies made of such links cause
+        no warning.
 
     Returns
     -------

@@ -135,7 +135,7 @@ def checked_urdf(path: Path) -> CheckedUrdf:
 
 
 class _Part(NamedTuple):
-    """What is read of an element: attributes of so many numbers or (0) of a word, and the tags of its children."""
+    """The attributes of an element that are read, with the count of numbers in each (0 for text), and its children."""
 
     attributes: Mapping[str, int]
     needed: tuple[str, ...] = ()
@@ -164,7 +164,7 @@ _PARTS = {
 
 
 def _copied(element: ET.Element, inside: str = "") -> ET.Element:
-    """Copy what is read of an element, of most tags the first one, if nothing is missing and numbers are finite."""
+    """Copy the parts of an element that are read, and check them. Only the first child of most tags counts."""
     part, name = _PARTS[element.tag], element.get("name")
     where = f"<{element.tag}>{inside}" if name is None else f"<{element.tag} name={name!r:.80}>"
     for needed in part.needed:

@@ -64,6 +64,11 @@ class Solver(StatefulEstimator):
     max_time: float | None
     # Largest number of inducing points for n_inducing="auto". Only a solver that sees all rows uses it.
     max_inducing: int = 1000
+    # Only a solver that sees mini-batches uses these: rows of a mini-batch, length of the first step, and whether q
+    # moves by natural gradients.
+    batch_size: int = 256
+    learning_rate: float = 0.01
+    natural_gradient: bool = False
 
     def check(self) -> None:
         """Raise an error if an option is out of range."""

@@ -204,3 +204,6 @@ def test_parameters_of_a_solver_that_is_a_string_are_reached():
     assert EVGPRegressor(solver="adam").set_params(n_inducing=3).solver == "adam"
     with pytest.raises(ValueError, match="Invalid parameter 'batch_size' for estimator LBFGS"):
         EVGPRegressor().set_params(solver__batch_size=7)
+    # A new string counts, not the old one; and a noise model has parameters too.
+    model = EVGPRegressor().set_params(solver="adam", solver__batch_size=9, noise__variance=0.5)
+    assert (type(model.solver), model.solver.batch_size, model.noise.variance) == (Adam, 9, 0.5)

@@ -25,8 +25,8 @@ _ERRORS = 6.0  # standard errors that a slope is away from 1, at least
 _FITS = 0.3  # median deviation over median change: less is a cause that explains the signal
 _PART = 0.25  # of all motion, in one direction or half of the record: less says nothing
 _LATE, _LATEST = 0.03, 0.5  # s: delays that matter, and those that are looked for
-_BETTER = 4.0  # standard errors by which more than half of the windows must have less of a deviation then
-_ALIAS = 0.1  # deviations that differ by less say nothing of which delay it is
+_BETTER = 4.0  # a delay counts if it improves more than half of the windows by this many standard errors
+_ALIAS = 0.1  # delays whose deviations differ by less than this are equally good
 _UNITS = {
     "velocity": {
         -1.0: "of opposite sign",

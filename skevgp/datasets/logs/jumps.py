@@ -33,9 +33,9 @@ _LONELY = 8.0  # ... and so many times what its neighbours deviate in its direct
 _COUNTS = 50.0  # ... and so many times the resolution of the positions
 _SMOOTH = 0.125  # of a period: 95 % of steps are predicted better than that where an angle is sampled well
 _STRONGEST = 1e3  # rad/s²: a step that a motor could make between two rows is no jump
-_RANGE = 0.9  # of the positions: where it is more than a turn they may be in degrees or mm, and steps are larger
+_RANGE = 0.9  # share of positions that gives their range; above a turn, units may be degrees or mm, with larger steps
 _SPIKE = 3  # rows that are away and come back, at most
-_MOST = 0.02  # of the steps in which it moves: a joint with more lone steps is one that moves in steps
+_MOST = 0.02  # above this share of lone steps, the joint really moves in steps
 _BINS = 16  # of the positions' range; an angle that turned several times, there and back, was in most of them
 _UNLIMITED = 1e10  # limits beyond it are none
 
@@ -49,7 +49,7 @@ class Jumps:
 
     position: np.ndarray  # (n, n_joints), unwrapped
     wraps: list[int]  # per joint: how many jumps were unwrapped
-    periods: list[float | None]  # per joint: of what; None where nothing was unwrapped
+    periods: list[float | None]  # of each joint; None if it was not unwrapped
     cuts: list[tuple[int, int]]  # last row before a jump of another size, first row after it
     wrapped: np.ndarray  # (n - 1, n_joints) of bool: the steps that were unwrapped
 

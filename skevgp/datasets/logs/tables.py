@@ -171,7 +171,7 @@ def _hint(cell: str, decimal: str) -> str:
 
 def _delimiter(line: str, decimal: str) -> str | None:
     """Find what separates cells; None stands for spaces."""
-    bare = re.sub(r'"[^"]*"', "", line).rstrip("\t; \r\n")
+    bare = re.sub(r'"[^"]*"', "x", line).rstrip("\t; \r\n")
     for other in ("\t", ";"):
         cells = [cell.strip() for cell in bare.split(other)]
         # A comma then stands before decimals, or in a name. One at the end of a cell separates it from the next.

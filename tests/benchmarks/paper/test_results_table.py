@@ -325,8 +325,8 @@ def messages_of_early_ends():
     yield messages.ended_early("LBFGS", going, n_iter=9, max_iter=100, tol=None)
     yield messages.interrupted(9)
     yield messages.interrupted(9, max_time=1.0)
-    yield messages.adam_ended(going, False, 0.1, 512)
-    yield messages.adam_ended(ended, True, 0.1, 512)
+    yield messages.mini_batches_ended("Adam", going, False, 0.1, 512)
+    yield messages.mini_batches_ended("Adam", ended, True, 0.1, 512)
     yield from (bnn._INTERRUPTED, bnn._NOT_FINITE, bnn._STILL_FELL)
 
 

@@ -62,6 +62,13 @@ def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
     assert_equal(load_log(file, columns=BY_NUMBER), expected)
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t"])
+def test_a_header_of_quoted_names_is_found(tmp_path, expected, delimiter):
+    quoted = [f'"{name}"' for name in HEADER]
+    file = write_table(tmp_path / "log.csv", TABLE, quoted, delimiter)
+    assert_equal(load_log(file, columns=BY_NAME), expected)
+
+
 @pytest.mark.parametrize(
     "beginning",
     [
