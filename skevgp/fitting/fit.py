@@ -132,6 +132,9 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     if found is not None:
         values = values | {"signal": found.signal, "noise": found.noise}
         messages.append(signal_gone(found.gone, len(found.noise)))
+    if sparse.tight and (found is not None or changed):
+        # The charge of the tight bound is that of one signal and noise.
+        statistics = sparse.statistics(values, model.blocks)
     # If the bound is not known, errors are summed row by row, which keeps digits where the noise is low.
     known = found is None and not changed and np.isfinite(fit.bound) and fit.n_rows is None
     if exact is None:

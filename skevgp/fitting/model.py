@@ -163,6 +163,7 @@ def models_of(
                     problem.rules.jitter,
                     stay,
                     own_kernels if part.split else None,
+                    problem.tight,
                 ),
                 own_rows.noisier(problem.row_variance),
                 table,

@@ -62,6 +62,8 @@ class Problem:
     # Whether ``sharing`` was found by the fit, and not given.
     found: bool = False
     family: PosteriorFamily = "full"
+    # Whether the bound is the tight one (see `model.bounds.BoundAtOptimum`).
+    tight: bool = False
     # The folds by which signal and noise are calibrated.
     noise_cv: CrossValidation | None = None
     noise: Noise = field(default_factory=Gaussian)

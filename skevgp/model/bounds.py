@@ -45,6 +45,8 @@ class Group:
     prior: CoefficientPrior
     # Whether the inducing points are all rows, so that they explain the whole variance.
     complete: bool = False
+    # Whether the bound is the tight one. ``statistics`` then have the charge at ``signal`` and ``noise``.
+    tight: bool = False
 
     @cached_property
     def scales(self) -> np.ndarray:
@@ -246,6 +248,17 @@ class BoundAtOptimum:
     # If rows have weights w and relative noise variances v, N is Σ w, products have the factor ω = w / v since the rows
     # of P and r are multiplied by √ω, and Σ w log v is added to N log 2πσ².
     #
+    # The last term is the charge of Titsias (2009) for the variance d_i = s² (k̃ - |v(x)|²) of row i that the inducing
+    # points do not explain. It comes from q(f|u) = p(f|u). The tight bound (Titsias 2025, arXiv 2502.08730; Bui, Ashman
+    # & Turner 2025, arXiv 2502.04750) lets q(f|u) have its own variances: f_i given u has variance a_i d_i and the mean
+    # of p(f|u). Row i then contributes
+    #
+    #     -½ a_i d_i / (σ² v_i) + ½ (log a_i - a_i + 1),   highest at   a_i = 1 / (1 + d_i / (σ² v_i)),
+    #
+    # which is -½ log(1 + d_i / (σ² v_i)) ≥ -½ d_i / (σ² v_i). All other terms, and so q(v, w), are the same. A row of
+    # weight w counts w times. With x_i = d_i / (σ² v_i), the derivative in d_i is -½ (w_i / (σ² v_i)) / (1 + x_i), and
+    # in log s² it is -½ Σ w_i x_i / (1 + x_i), and minus that in log σ².
+    #
     # If e is summed row by row, as in `statistics.pull_back`, no digits cancel at any signal-to-noise ratio.
 
     def __init__(self, group: Group, family: PosteriorFamily, posteriors: list[WhitenedPosterior]):
@@ -282,8 +295,11 @@ class BoundAtOptimum:
             self.weights[:m] / noise,
             0.0 if group.complete else unexplained_bar.sum(),
             factor_bar,
+            group.signal / noise if group.tight else None,
         )
-        unexplained = unexplained_bar * statistics.unexplained
+        unexplained = unexplained_slope = unexplained_bar * statistics.unexplained
+        if group.tight:
+            unexplained, unexplained_slope = -0.5 * (statistics.charge * np.ones((2, len(noise))))
         # |v|² + |w + w₀|² of each output. Shared weights count once.
         mean[:, m:] += group.prior.reference
         if group.prior.shared:
@@ -293,8 +309,8 @@ class BoundAtOptimum:
         # (o,) each: the bound without eᵀe, and its derivatives in log s² and log σ².
         log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
         self._value = unexplained - 0.5 * (log_noise + log_det + penalty)
-        self._log_signal = from_signal + unexplained
-        self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained
+        self._log_signal = from_signal + unexplained_slope
+        self._log_noise = -0.5 * statistics.n_rows - from_noise - unexplained_slope
 
     def residuals(self, blocks: Blocks | None = None) -> Residuals:
         """Sums of e over the rows or, without rows, differences of the statistics.
@@ -372,7 +388,7 @@ def upper_bound(groups: Sequence[Group], blocks: Blocks | None = None) -> float:
             n_repeated = statistics.n_rows + statistics.surplus - len(statistics.VV)
             trace = group.whitening.jitter() * max(n_repeated + 1, 1)
         noise = group.noise + group.signal * trace
-        wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0)))
+        wide.append(replace(group, noise=noise, statistics=replace(statistics, unexplained=0.0), tight=False))
         log_ratio += float(statistics.n_rows * np.log(noise / group.noise).sum())
     # The log likelihood with the noise variance σ² + t, with the determinant for σ².
     bounds = bounds_at_optimum(wide, "full")

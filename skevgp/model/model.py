@@ -50,6 +50,8 @@ class SparseModel:
     # The kernel of each group, if groups have inputs of their own or are joined by their weights only. All have the
     # same hyperparameters (n_hyper,), or each its own row of (g, n_hyper).
     kernels: tuple[Kernel, ...] | None = None
+    # Whether the bound is the tight one of Titsias (2025), not that of Titsias (2009).
+    tight: bool = False
 
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
         """k̃ of a group, and its hyperparameters (n_hyper,)."""
@@ -80,14 +82,19 @@ class SparseModel:
         """The statistics of each group: a pass over the rows for each."""
         # Unlike in `group`, the unexplained variance stays if the points are all rows: `partial_fit` adds rows.
         sets = zip(self.groups, whitenings or self.whitenings(values), strict=True)
-        return [collect(blocks, whitening, outputs) for outputs, whitening in sets]
+        return [collect(blocks, whitening, outputs, self._ratio(values, outputs)) for outputs, whitening in sets]
+
+    def _ratio(self, values: Values, outputs: slice) -> np.ndarray | None:
+        """s²/σ² (o,) of a group, for the tight bound."""
+        return values["signal"][outputs] / values["noise"][outputs] if self.tight else None
 
     def group(self, values: Values, outputs: slice, whitening: Whitening, statistics: SufficientStatistics) -> Group:
         """The group of one set of inducing points."""
         signal, noise = values["signal"][outputs], values["noise"][outputs]
         if self.complete:
-            statistics = replace(statistics, unexplained=0.0)
-        return Group(outputs, whitening, statistics, signal, noise, self.prior.outputs(outputs), self.complete)
+            statistics = replace(statistics, unexplained=0.0, charge=0.0)
+        prior = self.prior.outputs(outputs)
+        return Group(outputs, whitening, statistics, signal, noise, prior, self.complete, self.tight)
 
     def groups_of(
         self,
@@ -99,10 +106,15 @@ class SparseModel:
         sets = zip(self.groups, whitenings or self.whitenings(values), statistics, strict=True)
         return [self.group(values, *own) for own in sets]
 
-    def groups_on(self, values: Values, blocks: Blocks) -> Iterator[Group]:
-        """Each group, with the statistics of some rows. The pass over the rows is made when the group is asked for."""
+    def groups_on(self, values: Values, blocks: Blocks, share: float = 1.0) -> Iterator[Group]:
+        """Each group, with the statistics of some rows. The pass over the rows is made when the group is asked for.
+
+        The noise variance in ``values`` is σ² times ``share``.
+        """
         for outputs, whitening in zip(self.groups, self.whitenings(values), strict=True):
-            yield self.group(values, outputs, whitening, collect(blocks, whitening, outputs))
+            ratio = self._ratio(values, outputs)
+            statistics = collect(blocks, whitening, outputs, None if ratio is None else share * ratio)
+            yield self.group(values, outputs, whitening, statistics)
 
     def bound(self, values: Values, statistics: Sequence[SufficientStatistics], blocks: Blocks | None = None) -> float:
         """The lower bound with q at its optimum. Without ``blocks``, digits cancel if there is little noise."""

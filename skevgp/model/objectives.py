@@ -21,16 +21,18 @@ def evaluate(
     values: Values,
     blocks: Blocks,
     terms_of: Callable[[Sequence[Group]], Sequence[BoundAtOptimum | ElboTerms]],
+    share: float = 1.0,
 ) -> tuple[float, Values]:
     """A scalar summed over outputs, and its gradient in the values, or the logarithms of all but inducing points.
 
     It takes two passes over the rows for each set of inducing points. ``terms_of`` returns the term of each group. If
-    outputs share their weights it gets all groups at once, else one at a time. Raises `NotPositiveDefiniteError` if a
+    outputs share their weights it gets all groups at once, else one at a time. The noise variance in ``values`` is σ²
+    times ``share``. Raises `NotPositiveDefiniteError` if a
     matrix is not finite.
     """
     total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
     separate = values["hyperparameters"].ndim == 2
-    groups = model.groups_on(values, blocks)
+    groups = model.groups_on(values, blocks, share)
     together: Iterable[Sequence[Group]] = [list(groups)] if model.prior.shared else ([group] for group in groups)
     index = 0
     for some in together:
@@ -108,9 +110,14 @@ class ElboObjective:
         """The loss per row and its gradient (size,) at x (size,), from rows that represent all."""
         values = self.table.values(x)
         # Each row counts N/n times, as with a noise variance of σ² n/N. N and n ignore weights: rows are drawn equally.
-        counted = values | {"noise": values["noise"] * (blocks.linear.length / self.blocks.linear.length)}
+        share = blocks.linear.length / self.blocks.linear.length
+        counted = values | {"noise": values["noise"] * share}
         loss, gradient = evaluate(
-            self.model, counted, blocks, lambda groups: [ElboTerms(self, values, group) for group in groups]
+            self.model,
+            counted,
+            blocks,
+            lambda groups: [ElboTerms(self, values, group, share) for group in groups],
+            share,
         )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         loss += 0.5 * len(values["noise"]) * self.blocks.linear.log_variance
@@ -135,8 +142,8 @@ class ElboObjective:
 class ElboTerms:
     """The paper's loss of a group of outputs, without ½ N log 2πσ², and its gradient.
 
-    ``group`` has the noise variance σ² n/N, because each row of a batch counts N/n times. The loss is complete once the
-    residuals e are known from the second pass over the rows.
+    ``group`` has the noise variance σ² n/N, because each row of a batch counts N/n times. ``share`` is n/N. The loss is
+    complete once the residuals e are known from the second pass over the rows.
     """
 
     # q has a whitened mean (a = s L v) and a covariance of its family. With e = r - P mean (n,), summed row by row, the
@@ -144,9 +151,11 @@ class ElboTerms:
     #
     #     ½ [N log 2πσ² + (eᵀe + s² Σ (k̃ - |v(x)|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`.
     #
-    # The first term, with σ² itself, is added in `ElboObjective.evaluate`.
+    # The first term, with σ² itself, is added in `ElboObjective.evaluate`. In the tight bound (see `BoundAtOptimum`),
+    # N/n Σ w log(1 + x) takes the place of s² Σ (k̃ - |v(x)|²) / σ². Its x has σ² itself.
 
-    def __init__(self, elbo: ElboObjective, values: Values, group: Group):
+    def __init__(self, elbo: ElboObjective, values: Values, group: Group, share: float):
+        self._share = share
         self._group, self._n_rows, m = group, elbo.n_rows, len(group.whitening.L)
         self._mean = elbo.family.mean(values, group)
         self._spread = elbo.family.terms(values, group)
@@ -161,6 +170,7 @@ class ElboTerms:
             -f / group.noise,
             0.0 if group.complete else 0.5 * self._ratio.sum(),
             self._spread.factor,
+            share * self._ratio if group.tight else None,
         )
 
     def finish(self, residuals: Residuals) -> tuple[float, Values]:
@@ -169,13 +179,15 @@ class ElboTerms:
         f, b = self.weights[:m], self.weights[m:]
         shift = self._mean.copy()
         shift[:, m:] += group.prior.reference
-        unexplained = self._ratio * statistics.unexplained
-        data = residuals.squares / group.noise + unexplained
-        loss = 0.5 * float(data.sum() + np.vdot(shift, shift) - shift.size) + spread.value
+        unexplained = slope = self._ratio * statistics.unexplained
+        if group.tight:
+            unexplained, slope = statistics.charge * np.ones((2, len(group.noise))) / self._share
+        data = residuals.squares / group.noise
+        loss = 0.5 * float((data + unexplained).sum() + np.vdot(shift, shift) - shift.size) + spread.value
         from_mean = 0.5 * np.einsum("mo,mo->o", f, residuals.VE) / group.noise
         gradient = {
-            "signal": 0.5 * unexplained - from_mean + spread.log_signal,
-            "noise": 0.5 * (self._n_rows - data) + spread.log_noise,
+            "signal": 0.5 * slope - from_mean + spread.log_signal,
+            "noise": 0.5 * (self._n_rows - data - slope) + spread.log_noise,
         }
         if self._has_parameters:
             HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b

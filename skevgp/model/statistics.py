@@ -131,6 +131,9 @@ class SufficientStatistics:
     # Σ w log v and Σ max(ω, 1) - Σ w, as in `LinearSums`.
     log_variance: float
     surplus: float
+    # (2, o): Σ w log(1 + x) and Σ w x / (1 + x), x = (s²/σ²) (k(x, x) - |v|²) / v, for the tight bound at one signal
+    # and noise variance (see `BoundAtOptimum`). 0 for the bound of Titsias (2009).
+    charge: Any = 0.0
 
     @cached_property
     def joint(self) -> np.ndarray:
@@ -158,10 +161,12 @@ class StatisticsGradient:
     VH: np.ndarray
     # (m, o): the gradient in V e, where e = r - [V; Hᵀ]ᵀ weights.
     VE: np.ndarray
-    # The gradient in Σ (k(x, x) - |v|²).
+    # The gradient in Σ (k(x, x) - |v|²). With ``ratio``, that of a row is multiplied by a mean of its 1 / (1 + x).
     unexplained: float
     # (m, m): Lᵀ L̄, where L̄ is the gradient in L itself (see `cholesky_pullback`).
     factor: np.ndarray
+    # (o,): s²/σ² n/N of each output, for the tight bound.
+    ratio: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -178,24 +183,38 @@ class Residuals:
 # --- passes over the rows ---------------------------------------------------------------------------------------------
 
 
-def collect(blocks: Blocks, whitening: Whitening, outputs: slice) -> SufficientStatistics:
-    """The sufficient statistics of some outputs: the first pass over the rows."""
+def collect(
+    blocks: Blocks, whitening: Whitening, outputs: slice, ratio: np.ndarray | None = None
+) -> SufficientStatistics:
+    """The sufficient statistics of some outputs: the first pass over the rows.
+
+    ``ratio`` (o,) is s²/σ² of each output, for the tight bound.
+    """
     sums = blocks.linear
     HH, HR, RR = sums.of(outputs)
-    VV, VL, unexplained = blocks.sum(partial(_first_pass, whitening, outputs))
+    VV, VL, unexplained, charge = blocks.sum(partial(_first_pass, whitening, outputs, ratio))
     p = len(HH)
     return SufficientStatistics(
-        sums.n_rows, VV, VL[:, :p], VL[:, p:], HH, HR, RR, float(unexplained), sums.log_variance, sums.surplus
+        sums.n_rows, VV, VL[:, :p], VL[:, p:], HH, HR, RR, float(unexplained), sums.log_variance, sums.surplus, charge
     )
 
 
-def _first_pass(whitening: Whitening, outputs: slice, block: AnyBlock) -> tuple[np.ndarray, np.ndarray, float]:
-    """V Vᵀ, V [H, r] and Σ max(k(x, x) - |v|², 0) of one block."""
+def _first_pass(
+    whitening: Whitening, outputs: slice, ratio: np.ndarray | None, block: AnyBlock
+) -> tuple[np.ndarray, np.ndarray, float, Any]:
+    """V Vᵀ, V [H, r], Σ max(k(x, x) - |v|², 0) and the charge of one block."""
     block, outputs = block.of(outputs)
     U, P = _projected(block, whitening, outputs)
-    block.kept = (whitening, U, P) if block.may_keep else None
     V, linear = P[: len(U)], P[len(U) :]
-    return V @ V.T, V @ linear.T, whitening.unexplained(block.prepared, V, block.roots).sum()
+    unexplained = whitening.unexplained(block.prepared, V, block.roots)
+    charge: Any = 0.0
+    if ratio is not None:
+        # (o, n): x of each output and row. ``unexplained`` has the factor ω, x has 1 / v = ω / w.
+        x = np.multiply.outer(ratio, unexplained if block.counts is None else unexplained / block.counts)
+        counts = np.ones(len(unexplained)) if block.counts is None else block.counts
+        charge = np.array([np.log1p(x) @ counts, (x / (1.0 + x)) @ counts])
+    block.kept = (whitening, U, P, unexplained) if block.may_keep else None
+    return V @ V.T, V @ linear.T, unexplained.sum(), charge
 
 
 def _projected(block: Block, whitening: Whitening, outputs: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -248,12 +267,17 @@ def pull_back(
     #
     # so that Lᵀ L̄ = Lᵀ Ḡ_L - V̄ Vᵀ in the lower triangle, where V̄ Vᵀ comes from the sums. (Clipping the unexplained
     # variance at 0 changes it by rounding only. Its gradient is left out.)
+    #
+    # In the tight bound, ḡ_unexplained = ḡ_i differs from row to row: -2 V diag(ḡ) (m, n) takes the place of
+    # -2 ḡ V in V̄, so that Ū gets -2 L⁻ᵀ V diag(ḡ), and V̄ Vᵀ gets -2 V diag(ḡ) Vᵀ.
     symmetric = gradient.VV + gradient.VV.T
-    diagonal_of(symmetric)[...] -= 2.0 * gradient.unexplained
+    if gradient.ratio is None:
+        diagonal_of(symmetric)[...] -= 2.0 * gradient.unexplained
     back = lower_transposed_times(whitening.L_inv, np.hstack([symmetric, gradient.VH, gradient.VE]))
-    rows_bar, squares, VE = blocks.sum(partial(_second_pass, whitening, outputs, back, gradient.unexplained, weights))
+    second_pass = partial(_second_pass, whitening, outputs, back, gradient.unexplained, gradient.ratio, weights)
+    rows_bar, squares, VE, VgV = blocks.sum(second_pass)
     VbarV = symmetric @ statistics.VV + gradient.VH @ statistics.VH.T + gradient.VE @ VE.T
-    return whitening.pull_back(rows_bar, gradient.factor - VbarV), Residuals(squares, VE)
+    return whitening.pull_back(rows_bar, gradient.factor - (VbarV - VgV)), Residuals(squares, VE)
 
 
 def _second_pass(
@@ -261,16 +285,18 @@ def _second_pass(
     outputs: slice,
     back: np.ndarray,
     unexplained_bar: float,
+    ratio: np.ndarray | None,
     weights: np.ndarray,
     block: AnyBlock,
-) -> tuple[Any, np.ndarray, np.ndarray]:
-    """The term of one block in the kernel's gradient, eᵀe (o,) and V e (m, o)."""
+) -> tuple[Any, np.ndarray, np.ndarray, Any]:
+    """The term of one block in the kernel's gradient, eᵀe (o,), V e (m, o), and 2 V diag(ḡ) Vᵀ for the tight bound."""
     block, outputs = block.of(outputs)
     # Kept arrays stay until the next first pass replaces them: freed memory would be given back to the system.
     if block.kept is not None and block.kept[0] is whitening:
-        _, U, P = block.kept
+        _, U, P, unexplained = block.kept
     else:
         U, P = _projected(block, whitening, outputs)
+        unexplained = None
     # eᵀ (o, n) replaces rᵀ in [V; Hᵀ; rᵀ].
     k = len(weights)
     e = np.subtract(block.residuals[:, outputs].T, weights.T @ P[:k], out=P[k:])
@@ -278,5 +304,21 @@ def _second_pass(
     U_bar, omega = back @ P, 1.0 if block.roots is None else block.roots**2
     if block.roots is not None:
         U_bar *= block.roots
-    rows_bar = whitening.covariance.cross_pullback(block.prepared, U, U_bar, unexplained_bar * omega)
-    return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T
+    diagonal_bar: Any = unexplained_bar * omega
+    VgV: Any = 0.0
+    if ratio is not None and unexplained_bar != 0.0:
+        V = P[: len(U)]
+        if unexplained is None:
+            unexplained = whitening.unexplained(block.prepared, V, block.roots)
+        # (n,): ḡ_i = ḡ Σ_o ratio_o / (1 + x_io) / Σ_o ratio_o.
+        x = np.multiply.outer(ratio, unexplained if block.counts is None else unexplained / block.counts)
+        shrunk = unexplained_bar / ratio.sum() * (ratio @ (1.0 / (1.0 + x)))
+        scaled = V * (2.0 * shrunk)
+        VgV = scaled @ V.T
+        extra = lower_transposed_times(whitening.L_inv, scaled)
+        if block.roots is not None:
+            extra *= block.roots
+        U_bar -= extra
+        diagonal_bar = shrunk * omega
+    rows_bar = whitening.covariance.cross_pullback(block.prepared, U, U_bar, diagonal_bar)
+    return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T, VgV

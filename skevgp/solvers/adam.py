@@ -43,6 +43,10 @@ class Adam(MiniBatchSolver):
 
     posterior : {"full", "diagonal"}, default="full"
         Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
+    bound : {"tight", "titsias"}, default="titsias"
+        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025),
+        which is never lower. Predictions at the same parameters are the same. With heavy-tailed noise, the bound is
+        always ``"titsias"``.
     tol : float or "auto", default="auto"
         Tolerance in nats; ``"auto"`` is 0.01. Adam begins its last steps when the median loss over a third of the steps
         changes by less than this, or by no more than chance.
@@ -86,6 +90,7 @@ class Adam(MiniBatchSolver):
         schedule: Literal["cosine", "constant"] = "cosine",
         *,
         posterior: Literal["full", "diagonal"] = "full",
+        bound: Literal["tight", "titsias"] = "titsias",
         tol: float | Literal["auto"] = "auto",
         max_time: float | None = None,
     ):
@@ -96,6 +101,7 @@ class Adam(MiniBatchSolver):
         self.callback = callback
         self.schedule = schedule
         self.posterior = posterior
+        self.bound = bound
         self.tol = tol
         self.max_time = max_time
 
