@@ -313,11 +313,12 @@ def _second_pass(
         # (n,): ḡ_i = ḡ Σ_o ratio_o / (1 + x_io) / Σ_o ratio_o.
         x = np.multiply.outer(ratio, unexplained if block.counts is None else unexplained / block.counts)
         shrunk = unexplained_bar / ratio.sum() * (ratio @ (1.0 / (1.0 + x)))
-        scaled = V * (2.0 * shrunk)
-        VgV = scaled @ V.T
+        # A product with its own transpose costs half of another one.
+        root = np.sqrt(2.0 * np.abs(shrunk))
+        scaled = V * root
+        VgV = np.sign(unexplained_bar) * (scaled @ scaled.T)
         extra = lower_transposed_times(whitening.L_inv, scaled)
-        if block.roots is not None:
-            extra *= block.roots
+        extra *= np.sign(unexplained_bar) * (root if block.roots is None else root * block.roots)
         U_bar -= extra
         diagonal_bar = shrunk * omega
     rows_bar = whitening.covariance.cross_pullback(block.prepared, U, U_bar, diagonal_bar)
