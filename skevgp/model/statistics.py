@@ -317,7 +317,7 @@ def _second_pass(
         root = np.sqrt(2.0 * np.abs(shrunk))
         scaled = V * root
         VgV = np.sign(unexplained_bar) * (scaled @ scaled.T)
-        extra = lower_transposed_times(whitening.L_inv, scaled)
+        extra = triangular_product(whitening.L_inv, scaled, np.empty(scaled.shape), transposed=True)
         extra *= np.sign(unexplained_bar) * (root if block.roots is None else root * block.roots)
         U_bar -= extra
         diagonal_bar = shrunk * omega

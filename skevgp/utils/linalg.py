@@ -112,12 +112,15 @@ def triangular_inverse(L: np.ndarray) -> np.ndarray:
     return lapack.dtrtri(L, lower=1)[0] if len(L) else L.copy()
 
 
-def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray) -> np.ndarray:
-    """Write L B to ``out`` for a lower triangular L, by bands of rows without most of its zeros."""
+def triangular_product(L: np.ndarray, B: np.ndarray, out: np.ndarray, transposed: bool = False) -> np.ndarray:
+    """Write L B, or Lᵀ B, to ``out`` for a lower triangular L, by bands of rows without most of its zeros."""
     # BLAS has a product for this, but SciPy holds the lock of the interpreter meanwhile, so that no other thread runs.
     for first in range(0, len(L), _BAND):
         end = first + _BAND
-        np.matmul(L[first:end, :end], B[:end], out=out[first:end])
+        if transposed:
+            np.matmul(L[first:, first:end].T, B[first:], out=out[first:end])
+        else:
+            np.matmul(L[first:end, :end], B[:end], out=out[first:end])
     return out
 
 
