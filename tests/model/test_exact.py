@@ -179,19 +179,6 @@ def test_of_no_more_features_than_rows_or_vague_or_shared_ones_all_are_kept():
         assert model.with_fewer_features() is model
 
 
-def test_without_features_it_is_a_gaussian_process():
-    model, Y = problem(np.zeros((O, 0), dtype=bool), p=0)
-    expected = 0.0
-    for o in range(O):
-        K = VALUES["signal"][o] * squared_exponential(model.rows.inputs, model.rows.inputs, VALUES["hyperparameters"])
-        K += VALUES["noise"][o] * np.eye(N)
-        expected -= 0.5 * (Y[:, o] @ np.linalg.solve(K, Y[:, o]) + np.linalg.slogdet(K)[1] + N * LOG_2PI)
-    assert model.log_likelihood(VALUES)[0] == pytest.approx(expected, rel=1e-12)
-    coef, covariance = model.predictor(VALUES).coefficients()
-    assert coef.shape == (O, 0)
-    assert covariance.shape == (O, 0, 0)
-
-
 def test_badly_scaled_vague_features_keep_their_digits():
     # Normal equations would square a condition of 1e10.
     rng = np.random.RandomState(0)

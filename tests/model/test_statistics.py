@@ -7,10 +7,10 @@ import pytest
 
 from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.model.statistics import StatisticsGradient, SufficientStatistics, Whitening, collect, errors, pull_back
+from skevgp.model.statistics import StatisticsGradient, Whitening, collect, errors, pull_back
 from skevgp.utils.linalg import JITTER, Jitter
 
-from ..oracle import ArrayRows, central_differences, problem, relative_error, squared_exponential
+from ..oracle import ArrayRows, central_differences, relative_error, squared_exponential
 
 RNG = np.random.RandomState(0)
 N, M, D, P, O = 60, 6, 2, 3, 2  # noqa: E741
@@ -52,22 +52,6 @@ def test_whitened_rows_agree_with_a_solve():
     np.testing.assert_allclose(V, np.linalg.solve(L, U), rtol=1e-8, atol=1e-10)
 
 
-def test_whitened_rows_go_where_one_says():
-    out = np.empty((M, N))
-    _, V = whitening().project(KERNEL.prepare(X), out=out)
-    assert V is out
-    np.testing.assert_array_equal(V, whitening().project(KERNEL.prepare(X))[1])
-
-
-def test_what_the_points_leave_of_a_row_agrees_with_a_solve():
-    L, U = dense()
-    expected = 1.0 - np.einsum("mn,mn->n", U, np.linalg.solve(L @ L.T, U))
-    own, prepared = whitening(), KERNEL.prepare(X)
-    left = own.unexplained(prepared, own.project(prepared)[1])
-    np.testing.assert_allclose(left, expected, rtol=1e-8, atol=1e-12)
-    assert (left > 0.0).any()
-
-
 def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
     """Nor of any row within a long lengthscale, whatever rounding says."""
     prepared = KERNEL.prepare(Z)
@@ -86,16 +70,6 @@ def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
     own, prepared = Whitening.of(kernel, np.ones(1), np.zeros((1, 1))), kernel.prepare(x)
     shift = own.unexplained(prepared, own.project(prepared)[1]) + np.expm1(-(x[:, 0] ** 2))
     assert abs(shift.mean()) < np.finfo(float).eps
-
-
-@pytest.mark.parametrize("n", [1, 7])
-def test_solved_rows_are_the_projected_ones(n):
-    own, prepared = whitening(), KERNEL.prepare(X[:n])
-    P = np.zeros((M + 1, n))
-    V = own.solve(prepared, out=P[:M])
-    np.testing.assert_allclose(P[:M], own.project(prepared)[1], rtol=1e-10, atol=1e-10)
-    assert np.shares_memory(V, P)
-    assert not P[M].any()
 
 
 @pytest.mark.parametrize(("kernel", "size"), [(SquaredExponential(3), 1.0), (DotProduct(), 1e3)], ids=["near 1", "1e6"])
@@ -164,16 +138,6 @@ def test_the_first_pass_collects_the_sums(size):
     expected["unexplained"] = N - np.sum(V**2)
     for name, value in expected.items():
         np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)
-
-
-@pytest.mark.parametrize("output", range(O))
-def test_sums_of_some_outputs_are_among_those_of_all(output):
-    every, own = (collect(blocks(), whitening(), outputs) for outputs in (slice(0, O), slice(output, output + 1)))
-    for name in STATISTICS:
-        expected = getattr(every, name)
-        if name in ("VR", "HR", "RR"):
-            expected = expected[..., [output]]
-        np.testing.assert_allclose(getattr(own, name), expected, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
 def test_sums_add_and_fade():
@@ -257,16 +221,6 @@ def test_a_jitter_moves_with_the_diagonal():
     assert Whitening.of(KERNEL, LENGTHSCALES, np.empty((0, D))).jitter() == 0.0
 
 
-def test_errors_without_features_have_no_sums_over_them():
-    """And with them the sums are as long as these are many."""
-    own = whitening()
-    left = errors(blocks(), own, slice(0, O), RNG.randn(M + P, O))
-    assert left.VE.shape == (M, O)
-    assert left.HE.shape == (P, O)
-    none = errors(blocks(rows=ArrayRows(X, np.empty((N, 0)), R)), own, slice(0, O), RNG.randn(M, O))
-    assert none.HE.shape == (0, O)
-
-
 def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     weights = RNG.randn(M + P, O)
@@ -315,13 +269,3 @@ def test_what_the_first_pass_left_serves_the_second_and_no_other_whitening():
     assert made[0].kept is None
     for part, expected in zip(pull_back(made, own, outputs, statistics, gradient, weights)[0], first[0], strict=True):
         np.testing.assert_array_equal(part, expected)
-
-
-def test_statistics_of_a_model_are_those_of_its_points():
-    model, rows, table = problem(shared=False)
-    values = table.values_at_start()
-    found = model.statistics(values, rows.blocks(model.kernel, 17))
-    assert [type(own) for own in found] == [SufficientStatistics] * 2
-    for own, outputs, points in zip(found, model.groups, values["inducing_points"], strict=True):
-        at = Whitening.of(model.kernel, values["hyperparameters"], points)
-        np.testing.assert_array_equal(own.VR, collect(rows.blocks(model.kernel, 17), at, outputs).VR)
