@@ -156,7 +156,10 @@ class Dense:
         prior = self.covariance(values, self.k, A, H_A, A, H_A)
         if self.family == "full":
             return mean, prior - cross @ np.linalg.solve(S, cross.T)
-        known = [self.projected(values, o, A, H_A) ** 2 / np.diag(self.of_values_and_weights(values, o)) for o in self.outputs]
+        known = [
+            self.projected(values, o, A, H_A) ** 2 / np.diag(self.of_values_and_weights(values, o))
+            for o in self.outputs
+        ]
         left = [np.diag(self.k(values, o, A, A) - self.sparse_k(values, o, A, A)) for o in self.outputs]
         return mean, np.transpose([own.sum(axis=1) + rest for own, rest in zip(known, left, strict=True)])
 

@@ -4,8 +4,6 @@ import re
 
 import numpy as np
 import pytest
-from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
@@ -37,23 +35,11 @@ def test_what_the_features_explain_needs_no_points():
     assert len(m.inducing_points_) == 10
 
 
-@pytest.mark.parametrize("n_rows", [1, 2, 12])
-def test_few_rows_are_all_of_them_points(n_rows):
-    m = model(max_iter=20, solver=LBFGS(tol=1.0)).fit(X[:n_rows], Y[:n_rows, 1])
-    assert len(m.inducing_points_) <= n_rows
-    assert np.isfinite(m.predict(X_NEW)).all()
-
-
 @pytest.mark.filterwarnings("ignore:The noise explains everything:sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("most", [1, 7, 10, 17])
 def test_there_are_no_more_points_than_allowed(most):
     m = model(solver=LBFGS(max_inducing=most, tol=1.0), max_iter=50).fit(X, Y[:, 1])
     assert len(m.inducing_points_) == most
-
-
-def test_a_number_is_what_it_was():
-    for arguments in ({}, {"solver": LBFGS(max_inducing=5)}):
-        assert len(model(n_inducing=12, max_iter=0, **arguments).fit(X, Y).inducing_points_) == 12
 
 
 def test_outputs_that_share_nothing_have_their_own_numbers():
@@ -69,56 +55,9 @@ def test_outputs_that_share_nothing_have_their_own_numbers():
     assert m.partial_fit(X_NEW, mean).inducing_points_[1].shape == wave.shape
 
 
-@pytest.mark.parametrize("sharing", ["all", "kernel"])
-def test_outputs_that_share_a_kernel_have_one_number(sharing):
-    m = model(sharing=sharing, max_iter=50, solver=LBFGS(tol=1.0)).fit(X, Y)
-    assert m.inducing_points_.shape[:-2] == (() if sharing == "all" else (2,))
-    assert m.inducing_points_.shape[-2] > 10
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_the_number_of_threads_does_not_change_a_bit():
-    one, two = (model(n_jobs=n_jobs, max_iter=30).fit(X, Y) for n_jobs in (1, 2))
-    np.testing.assert_array_equal(one.inducing_points_, two.inducing_points_)
-    np.testing.assert_array_equal(one.predict(X_NEW), two.predict(X_NEW))
-
-
-def test_given_points_are_the_first_of_them():
-    m = model(inducing_init=X[:12], max_iter=0).fit(X, Y[:, 1])
-    np.testing.assert_allclose(m.inducing_points_[:12], X[:12], atol=1e-12)
-    assert len(m.inducing_points_) > 12
-
-
-def test_a_warm_start_begins_with_the_points_that_were_found():
-    m = model(warm_start=True, max_iter=200, solver=LBFGS(tol=1.0)).fit(X, Y[:, 1])
-    first, bound = len(m.inducing_points_), m.lower_bound_
-    m.fit(X, Y[:, 1])
-    assert first <= len(m.inducing_points_) <= 1.5 * first + 1
-    assert m.lower_bound_ > bound - 1.0
-
-
-def test_an_interrupted_fit_keeps_the_best():
-    def stop(iteration, bound, outputs):
-        bounds.append(bound)
-        if len(bounds) == 150:
-            raise KeyboardInterrupt
-
-    bounds = []
-    with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(solver=LBFGS(callback=stop)).fit(X, Y[:, 1])
-    assert len(bounds) == 150
-    assert m.lower_bound_ > bounds[0]
-    assert np.isfinite(m.predict(X_NEW)).all()
-
-
 def test_who_looks_on_is_told_how_many_points_there_are(capsys):
     model(verbose=1, max_iter=30, solver=LBFGS(tol=1.0)).fit(X, Y[:, 1])
     assert re.match(r"\d+ points, all rows, iteration ", capsys.readouterr().out.splitlines()[-1])
-
-
-def test_it_is_a_parameter_like_others():
-    m = clone(model(solver=LBFGS(max_inducing=30)))
-    assert (m.n_inducing, m.get_params()["solver__max_inducing"]) == ("auto", 30)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """coef_names_: what the feature map calls its features."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
@@ -25,13 +24,6 @@ def test_they_are_those_of_the_map(estimator):
 
 
 @each_estimator
-def test_columns_of_a_data_frame_have_names(estimator):
-    frame = pd.DataFrame(X, columns=["angle", "speed"])
-    m = estimator.set_params(feature_map=PolynomialFeatures(1)).fit(frame, Y)
-    assert m.coef_names_.tolist() == ["1", "angle", "speed"]
-
-
-@each_estimator
 @pytest.mark.parametrize(
     "feature_map",
     [
@@ -42,13 +34,6 @@ def test_columns_of_a_data_frame_have_names(estimator):
 )
 def test_a_map_that_does_not_say_has_numbers(estimator, feature_map):
     assert estimator.set_params(feature_map=feature_map).fit(X, Y).coef_names_.tolist() == ["h0", "h1"]
-
-
-@each_estimator
-def test_without_features_there_are_none(estimator):
-    m = estimator.set_params(feature_map=None).fit(X, Y)
-    with pytest.raises(AttributeError, match="coef_names_ only after a fit with a feature_map"):
-        m.coef_names_  # noqa: B018
 
 
 def test_of_a_robot_they_are_its_own():

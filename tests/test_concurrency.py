@@ -3,15 +3,12 @@
 import sys
 import warnings
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 from threading import Barrier, Event
 
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 
-import skevgp
 from skevgp import rollout
 from skevgp.exceptions import ignored
 from skevgp.io import load, save
@@ -130,30 +127,3 @@ def test_two_threads_that_ignore_warnings_leave_the_filters_as_they_were():
     before = list(warnings.filters)
     at_once([first, second])
     assert warnings.filters == before
-
-
-def test_what_a_fit_ignores_is_no_other_fits_warning(monkeypatch):
-    """Where k-means is at work, another thread's fit warns that it did not converge."""
-    from skevgp.fitting import inducing
-
-    class Warned(inducing.KMeans):
-        def fit(self, *rows):
-            # Warnings are errors here.
-            with pytest.raises(ConvergenceWarning, match="of another fit"):
-                warnings.warn("of another fit", ConvergenceWarning, stacklevel=1)
-            warnings.warn("Number of distinct clusters (1) found smaller", ConvergenceWarning, stacklevel=1)
-            return super().fit(*rows)
-
-    monkeypatch.setattr(inducing, "KMeans", Warned)
-    clone(THREADED["all"]).set_params(max_iter=0).fit(X, Y)
-
-
-def test_one_module_changes_the_filters_of_warnings():
-    package = Path(skevgp.__file__).parent
-    changing = {
-        path.name
-        for path in package.rglob("*.py")
-        for line in path.read_text(encoding="utf-8").splitlines()
-        if "catch_warnings" in line and not line.lstrip().startswith((">>>", "..."))
-    }
-    assert changing == {"exceptions.py"}

@@ -83,37 +83,3 @@ def test_the_variance_of_a_noise_free_parabola_is_right_to_rounding():
     assert_allclose(
         [model.predict(X[[i]], return_std=True)[1][0] ** 2 for i in rows], truth, atol=len(X) * EPS * signal
     )
-
-
-@pytest.mark.parametrize(
-    "function", [np.square, np.exp, lambda x: x + 1.0, np.sinc], ids=["square", "exp", "line", "sinc"]
-)
-def test_more_inducing_points_do_not_widen_the_std(function):
-    """With points at all rows it is the exact model's; the signal does not grow to make up for a jitter."""
-    between = (X[:-1] + X[1:]) / 2.0
-    y, truth = function(X[:, 0]), function(between[:, 0])
-    stds, errors = [], []
-    for model in (*(EVGPRegressor(n_inducing=m, random_state=0) for m in (10, 30, 100)), EGPRegressor()):
-        mean, std = model.fit(X, y).predict(between, return_std=True)
-        stds.append(np.median(std))
-        errors.append(np.sqrt(np.mean((mean - truth) ** 2)))
-    assert stds[1] < 1.3 * stds[0]
-    assert stds[2] < 0.5 * stds[1]
-    assert_allclose(stds[2], stds[3], rtol=0.1)
-    # Honest: neither far above the errors nor far below.
-    assert (np.array(errors) < 4.0 * np.array(stds)).all()
-
-
-def test_rows_after_a_fit_to_few_noise_free_ones_are_folded_in():
-    """The first fit is the exact model's, what follows the sparse one's with its lowest noise."""
-    truth = X[:, 0] ** 2
-    model = EVGPRegressor(random_state=0).fit(X[::2], truth[::2])
-    points = model.inducing_points_.shape
-    before = model.predict(X, return_std=True)
-    model.partial_fit(X[1::2], truth[1::2])
-    mean, std = model.predict(X, return_std=True)
-    assert model.inducing_points_.shape == points == (30, 1)
-    assert_allclose(before[0], truth, atol=1e-5)
-    assert_allclose(mean, truth, atol=1e-5)
-    assert (std < 1e-4).all()
-    assert model.lower_bound_ <= model.upper_bound_ + 1e-6 * abs(model.upper_bound_)

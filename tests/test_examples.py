@@ -138,13 +138,6 @@ def test_crocoddyl(monkeypatch, capsys, tmp_path, system):
     assert (tmp_path / f"crocoddyl_{system}.png").stat().st_size > 10_000
 
 
-def test_tables_without_matplotlib():
-    result = command_line(script=EXAMPLES / "plot_tabular.py", code="sys.modules['matplotlib'] = None")
-    assert result.returncode == 1
-    assert "pip install matplotlib" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
 def test_without_crocoddyl():
     result = command_line(script=EXAMPLES / "plot_crocoddyl.py", code="sys.modules['crocoddyl'] = None")
     assert result.returncode == 1
@@ -220,28 +213,6 @@ def test_a_wrong_system_lists_the_right_ones():
     assert result.returncode == 2
     assert "invalid choice: 'pendulums'" in result.stderr
     assert "cartpole" in result.stderr
-
-
-def test_an_unknown_robot_is_a_line_not_a_traceback():
-    result = command_line("--robot", "urr5", script=EXAMPLES / "plot_any_robot.py")
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: Unknown robot 'urr5'")
-    assert "Traceback" not in result.stderr
-
-
-@pytest.mark.parametrize("script", ["plot_real_arm.py", "plot_payload.py"])
-def test_a_folder_without_a_urdf_is_a_line_not_a_traceback(tmp_path, script):
-    result = command_line(str(tmp_path), script=EXAMPLES / script)
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: ")
-    assert "robot.urdf" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
-def test_a_wrong_size_is_a_line_not_a_traceback():
-    result = command_line("--trajectories", "0")
-    assert result.returncode == 1
-    assert result.stderr == "error: n_trajectories must be at least 1; got 0.\n"
 
 
 @pytest.mark.parametrize(

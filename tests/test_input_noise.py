@@ -4,24 +4,13 @@ import numpy as np
 import pandas as pd
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
-from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
 from skevgp.data.dataset import Dataset
 from skevgp.fitting.noisy_inputs import look_at_slopes
-from skevgp.metrics import containing_ratios, prediction_error
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
-from tests.nasty import BadMap
-
-
-def waves(n, x_noise, y_noise, seed=0):
-    """Steep on one side, flat on the other: X as measured, y, and the truth behind."""
-    rng = np.random.RandomState(seed)
-    x = rng.uniform(-2.0, 2.0, (n, 1))
-    g = np.where(x > 0.0, np.sin(6.0 * x), 0.2 * x)[:, 0] + 0.0
-    return x + x_noise * rng.randn(n, 1), g + y_noise * rng.randn(n), x, g
 
 
 def variance_by_inputs(model, X, Y, covariance):
@@ -45,22 +34,6 @@ def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
     assert found.noise_variance_ == pytest.approx(0.012, rel=0.4)
     covariance = np.diag([0.1**2, 0.05**2])
     np.testing.assert_allclose(variance_by_inputs(found, X, y, covariance), by_inputs, rtol=0.15)
-
-
-def test_where_the_function_is_steep_rows_count_less():
-    X, y, _, _ = waves(600, 0.02, 0.02)
-    options = {"n_inducing": 40, "random_state": 0}
-    plain = EVGPRegressor(**options).fit(X, y)
-    found = EVGPRegressor(noise=Gaussian(inputs=0.02), **options).fit(X, y)
-    assert np.sqrt(found.noise_variance_) == pytest.approx(0.02, rel=0.3)
-    assert np.sqrt(plain.noise_variance_) > 0.04
-    _, _, x, g = waves(2000, 0.0, 0.0, seed=1)
-    flat = x[:, 0] < -0.3
-    mean, std = found.predict(x[flat], return_std=True, include_noise=False)
-    # Where rows are good it says so, and that holds.
-    assert std.mean() < 0.6 * plain.predict(x[flat], return_std=True, include_noise=False)[1].mean()
-    assert containing_ratios(g[flat], mean, std)[1] > 0.7
-    assert prediction_error(g, found.predict(x)) < 1.3 * prediction_error(g, plain.predict(x))
 
 
 def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
@@ -96,22 +69,6 @@ def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
     assert np.isfinite(model.lower_bound_)
 
 
-def test_rows_that_are_noisier_say_less_when_they_come_later():
-    X, y, _, _ = waves(300, 0.0, 0.05)
-    options = {"n_inducing": 15, "random_state": 0, "max_iter": 0}
-    exact = EVGPRegressor(**options).fit(X[:100], y[:100]).partial_fit(X[100:], y[100:])
-    noisy = (
-        EVGPRegressor(**options)
-        .fit(X[:100], y[:100])
-        .set_params(noise=Gaussian(inputs=0.5))
-        .partial_fit(X[100:], y[100:])
-    )
-    grid = np.linspace(-2.0, 2.0, 50)[:, np.newaxis]
-    stds = [each.predict(grid, return_std=True, include_noise=False)[1] for each in (exact, noisy)]
-    assert (stds[1] >= stds[0] * (1.0 - 1e-9)).all()
-    assert stds[1].mean() > 1.02 * stds[0].mean()
-
-
 @pytest.mark.parametrize(
     ("options", "message"),
     [
@@ -128,16 +85,6 @@ def test_what_cannot_be_is_refused_by_name(options, message):
     X = np.random.RandomState(0).randn(30, 2)
     with pytest.raises((ValueError, TypeError), match=message):
         EVGPRegressor(**{"n_inducing": 5, "max_iter": 3, "solver": LBFGS(tol=1e6), **options}).fit(X, X[:, 0])
-
-
-def test_values_that_are_missing_have_no_slopes():
-    X = pd.DataFrame(np.random.RandomState(0).randn(30, 2), columns=["a", "b"])
-    y = X["a"].copy()
-    X.loc[3, "b"] = np.nan
-    with pytest.raises(ValueError, match="none of them missing"):
-        EVGPRegressor(
-            kernel_map=SimpleImputer(), n_inducing=5, max_iter=3, solver=LBFGS(tol=1e6), noise=Gaussian(inputs=0.1)
-        ).fit(X, y)
 
 
 def test_dask_arrays_are_refused():
@@ -161,43 +108,6 @@ def test_changes_of_noisy_columns_are_noisy_by_these_too():
     assert np.sqrt(changes.regressor_.noise_variance_) == pytest.approx(0.01, rel=0.4)
     before = changes.predict(X, return_std=True)[1].mean()
     assert changes.partial_fit(X[:50], y[:50]).predict(X, return_std=True)[1].mean() == pytest.approx(before, rel=0.1)
-
-
-def test_known_differences_between_rows_noise_are_beside_that_of_inputs():
-    """A row's noise variance is v σ² + ∂g Σ ∂gᵀ."""
-    rng = np.random.RandomState(0)
-    x, v = rng.uniform(-1.0, 1.0, (4000, 1)), np.where(np.arange(4000) % 2, 1.0, 100.0)
-    X, y = x + 0.05 * rng.randn(4000, 1), 2.0 * x[:, 0] + 0.05 * np.sqrt(v) * rng.randn(4000)
-    kernel = ConstantKernel(1e-8, "fixed") * RBF(1.0, "fixed")
-    model = EVGPRegressor(
-        FunctionTransformer(),
-        kernel,
-        n_inducing=5,
-        coef_prior=CoefPrior(scale=10.0),
-        noise=Gaussian(inputs=0.05),
-        random_state=0,
-    )
-    model.fit(X, y, relative_variance=v)
-    assert model.noise_variance_ == pytest.approx(0.0025, rel=0.25)
-
-
-@pytest.mark.parametrize(("how", "message"), [(how, text) for how, text in BadMap.messages.items() if how != "raises"])
-def test_a_map_that_goes_wrong_on_the_way_is_named(how, message):
-    X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
-    model = EVGPRegressor(BadMap(how=how, late=True), noise=Gaussian(inputs=0.1), n_inducing=3, max_iter=5)
-    with pytest.raises(ValueError, match=f"feature_map.*{message}"):
-        model.fit(X, X[:, 0])
-
-
-@pytest.mark.parametrize("unit", [1.0, 1e-135])
-def test_so_little_noise_that_it_is_rounded_to_nothing(unit):
-    X = np.linspace(0.0, 1.0, 30)[:, np.newaxis]
-    y = unit * (X[:, 0] + np.sin(9.0 * X[:, 0]))
-    model = EVGPRegressor(noise=Gaussian(inputs=1e-3), n_inducing=10, max_iter=20, random_state=0).fit(X, y)
-    mean, std = model.predict(X, return_std=True)
-    assert np.isfinite(mean).all()
-    assert (std > 0.0).all()
-    np.testing.assert_allclose(mean / unit, y / unit, atol=0.3)
 
 
 @pytest.mark.parametrize("n_inducing", [30, 200])

@@ -8,13 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.io import load, save
 from skevgp.noise import Gaussian
-from skevgp.solvers import LBFGS, Adam
+from skevgp.solvers import Adam
 
 from .interruption import interrupted_at
 
@@ -92,34 +91,6 @@ def _fit(model, n):
         except KeyboardInterrupt:
             return f"raised at {places[-1]}" if "Monitor.iteration" in places else "raised"
     return "kept" if any("interrupted" in str(warning.message) for warning in caught) else f"untold: {places[-1]}"
-
-
-def test_a_second_ctrl_c_does_not_wait():
-    """It ends the fit where it is; the model is as it was."""
-
-    class Impatient(LBFGS):
-        def minimise(self, *arguments):
-            minimum = super().minimise(*arguments)
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGINT)
-            return minimum
-
-    model = sparse(solver=Impatient())
-    with pytest.raises(KeyboardInterrupt):
-        model.fit(X, Y)
-    with pytest.raises(NotFittedError):
-        model.predict(X)
-
-
-def test_who_handles_ctrl_c_goes_on_to_do_so():
-    seen = []
-    before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
-    try:
-        with interrupted_at(fitted("lbfgs")[1] + 50), pytest.warns(ConvergenceWarning, match="Raise max_iter"):
-            sparse().fit(X, Y)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert seen == [1]
 
 
 @pytest.mark.parametrize(

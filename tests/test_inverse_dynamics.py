@@ -6,11 +6,9 @@ import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn import config_context
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.model_selection import GroupKFold, cross_val_score
-from sklearn.preprocessing import StandardScaler
 
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
@@ -108,26 +106,6 @@ def test_what_torques_do_not_show_stays_at_the_prior(arm, rigid):
     assert (rigid.coef_std_ <= rigid.coef_prior_scale_ * (1.0 + 1e-9)).all()
 
 
-def test_friction_is_found(arm, rigid):
-    found = dict(zip(rigid.coef_names_, rigid.coef_, strict=True))
-    joints = list(arm.nominal.names)[1:]
-    assert_allclose([found[f"coulomb({joint})"] for joint in joints], arm.coulomb, rtol=0.1)
-    assert_allclose([found[f"viscous({joint})"] for joint in joints], arm.viscous, rtol=0.2)
-    assert_allclose(rigid.standing_std_, arm.coulomb / np.sqrt(3.0), rtol=0.1)
-
-
-def test_bands_hold_new_torques_and_are_wider_at_rest(arm, rigid):
-    rng = np.random.default_rng(5)
-    truth = arm.torque(arm.new)
-    measured = truth + 0.02 * arm.y.std(axis=0) * rng.normal(size=truth.shape)
-    mean, std = rigid.predict(arm.new, return_std=True)
-    inside = np.mean(np.abs(measured - mean) < 2.0 * std, axis=0)
-    assert (inside > 0.9).all()
-    assert (rigid.predict(arm.new, return_std=True, include_noise=False)[1] < std).all()
-    rest = np.zeros((1, 18))
-    assert (rigid.predict(rest, return_std=True)[1] > std.min(axis=0)).all()
-
-
 def gear(X):
     """Friction that grows with load, and a wave of the gear: what a rigid body does not have."""
     n = X.shape[1] // 3
@@ -147,33 +125,6 @@ def test_a_joints_own_columns_tell_what_physics_missed():
     mean, std = model.predict(arm.new, return_std=True)
     assert (np.mean(np.abs(truth - mean) < 2.0 * std, axis=0) > 0.85).all()
     assert (model.residual_std_ > 0.0).all()
-
-
-@pytest.mark.long
-def test_where_nothing_is_missed_nothing_is_made_worse(arm, rigid):
-    truth = arm.torque(arm.new)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model = arm.fit()
-    ours, physics = (np.mean((one.predict(arm.new) - truth) ** 2, axis=0) for one in (model, rigid))
-    noise = (0.02 * truth.std(axis=0)) ** 2
-    assert (ours < physics + 0.1 * noise).all()
-
-
-def test_the_same_bits_for_any_number_of_threads():
-    arm = Arm("acrobot", missed=gear)
-    one, two = (arm.fit(n_inducing=5, max_iter=10, n_jobs=jobs) for jobs in (1, 2))
-    for first, second in zip(one.predict(arm.new, return_std=True), two.predict(arm.new, return_std=True), strict=True):
-        assert_array_equal(first, second)
-
-
-def test_gains_widen_masses_and_leave_torques(arm, rigid):
-    arm_of_catalogue = arm.fit(n_inducing=0, gain_scale=0.1)
-    assert_allclose(arm_of_catalogue.predict(arm.new), rigid.predict(arm.new), atol=0.02 * arm.y.std())
-    mass = list(rigid.coef_names_).index(f"mcz({list(arm.nominal.names)[2]})")
-    assert arm_of_catalogue.coef_std_[mass] >= rigid.coef_std_[mass]
-    assert_allclose(rigid.gains_, 1.0)
-    assert (arm_of_catalogue.gains_std_ > 0.0).all()
 
 
 def carrying(arm, model, seed, gains=1.0, mass=2.0):
@@ -196,20 +147,6 @@ def test_a_payload_lies_in_its_interval(arm, rigid):
     assert abs(nothing.mass) < 0.1
 
 
-@pytest.mark.long
-def test_unknown_gains_widen_a_payloads_interval_until_it_holds():
-    distances, widths = [], []
-    for seed in range(8):
-        gains = 1.0 + 0.1 * np.random.default_rng(100 + seed).normal(size=6)
-        arm = Arm(seed=seed)
-        arm.y = gains * arm.y
-        payload, _ = carrying(arm, arm.fit(n_inducing=0, gain_scale=0.1), seed, gains)
-        distances.append(abs(payload.mass - 2.0) / payload.mass_std)
-        widths.append(payload.mass_std)
-    assert np.mean(np.array(distances) < 1.96) >= 0.75  # 6 of 8; fewer is one chance in 200
-    assert 0.01 < np.median(widths) < 0.3
-
-
 def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
     truth = arm.torque(arm.new)
     q, v, a = np.split(arm.new, 3, axis=1)
@@ -230,33 +167,6 @@ def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
     assert_allclose(loaded.damping, found.damping, rtol=1e-9)
     with pytest.raises(ValueError, match="file"):
         rigid.write_urdf(tmp_path / "none.urdf")
-
-
-def test_links_are_told_with_their_uncertainty(arm, rigid):
-    links = rigid.links()
-    assert [link.joint for link in links] == list(arm.nominal.names)[1:]
-    for link, true in zip(links, list(arm.model.inertias)[1:], strict=True):
-        assert abs(link.mass - true.mass) < 4.0 * link.mass_std
-        assert (np.abs(link.com - true.lever) < 5.0 * link.com_std).all()
-    assert links[0].mass_std == pytest.approx(0.2 * arm.nominal.inertias[1].mass, rel=1e-3)
-
-
-def test_consistent_weights_predict_as_well(arm, rigid):
-    model = arm.fit(n_inducing=0, consistent=True)
-    assert all(link.consistency > 0.0 for link in model.links())
-    assert_allclose(model.predict(arm.new), rigid.predict(arm.new), atol=0.02 * arm.y.std())
-
-
-def test_one_joint_and_a_sliding_one():
-    arm = Arm("cartpole")
-    assert arm.fit(n_inducing=5, max_iter=5).predict(arm.new).shape == (500, 2)
-    one = Arm("pendulum")
-    model = InverseDynamics("pendulum", n_inducing=0).fit(one.X, one.y[:, 0])
-    mean, std = model.predict(one.new, return_std=True)
-    assert mean.shape == std.shape == (500,)
-    assert_allclose(mean, one.torque(one.new)[:, 0], atol=0.05 * one.y.std())
-    column = InverseDynamics("pendulum", n_inducing=0).fit(one.X, one.y)
-    assert_allclose(column.predict(one.new)[:, 0], mean)
 
 
 def test_scikit_learn_knows_it():
@@ -308,34 +218,6 @@ def test_masses_that_are_placeholders_are_told(factor):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
 
 
-@pytest.mark.parametrize("factor", [0.3, 5.0])
-def test_masses_that_are_far_off_are_found(factor):
-    arm = Arm()
-    found = InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
-    truth = arm.torque(arm.new)
-    error = np.sqrt(np.mean((found.predict(arm.new) - truth) ** 2, axis=0)) / truth.std(axis=0)
-    assert error.max() < 0.01
-
-
-def test_limits_of_effort_that_are_placeholders_lose_no_digits():
-    arm = Arm(noise=1e-3)
-    model = arm.nominal.copy()
-    model.upperEffortLimit, model.lowerEffortLimit = np.full(6, 1e8), np.full(6, -1e8)
-    found = InverseDynamics(RigidBodyRegressor(model), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
-    truth = arm.torque(arm.new)
-    error = np.sqrt(np.mean((found.predict(arm.new) - truth) ** 2, axis=0)) / truth.std(axis=0)
-    assert error.max() < 0.005
-
-
-def test_torques_without_noise_and_joints_that_do_not_move():
-    arm = Arm("ur5", noise=0.0)
-    arm.X[:, [2, 8, 14]] = [0.3, 0.0, 0.0]
-    y = arm.torque(arm.X)
-    model = InverseDynamics(arm.nominal, n_inducing=0).fit(arm.X, y)
-    assert_allclose(model.predict(arm.X), y, atol=1e-3 * y.std())
-    assert np.isfinite(model.predict(arm.X, return_std=True)[1]).all()
-
-
 @pytest.mark.parametrize("n_inducing", [0, 5])
 @pytest.mark.parametrize("scale", [0.0, 1e-100, 1.0])
 def test_torques_that_are_the_models_own(scale, n_inducing):
@@ -379,36 +261,6 @@ def test_the_speed_at_which_friction_has_a_sign_is_found_from_several_trajectori
     assert (np.array(velocity(arm.groups).stiction_velocity) > 0.04).all()
     assert velocity(None).stiction_velocity == 0.01
     assert velocity(arm.groups, stiction_velocity=None).stiction_velocity == 0.01
-
-
-def test_the_robot_that_was_fitted_is_kept():
-    arm = Arm("acrobot")
-    model = arm.nominal.copy()
-    fitted = InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y)
-    model.gravity.linear = np.zeros(3)
-    assert fitted.robot_model().gravity.linear[2] < -9.0
-
-
-def test_frames_of_output_are_no_matter():
-    arm = Arm("acrobot")
-    with config_context(transform_output="pandas"):
-        model = InverseDynamics(arm.nominal, n_inducing=0).fit(arm.X, arm.y)
-        assert model.predict(arm.new).shape == arm.new[:, :2].shape
-
-
-def test_other_transformers_are_no_robots():
-    with pytest.raises(TypeError, match="robot must be a name"):
-        InverseDynamics(StandardScaler()).fit(np.zeros((5, 3)), np.zeros(5))
-
-
-def test_two_trajectories_that_differ_widen_what_is_known(arm):
-    rows = arm.groups < 2
-    X, y, groups = arm.X[rows], arm.y[rows].copy(), arm.groups[rows]
-    same = InverseDynamics("ur5", n_inducing=0).fit(X, y, groups=groups)
-    y += np.where(groups == 0, 3.0, -3.0)[:, np.newaxis] * np.sin(X[:, :6])
-    other = InverseDynamics("ur5", n_inducing=0).fit(X, y, groups=groups)
-    seen = same.coef_std_ < 0.5 * same.coef_prior_scale_
-    assert np.median(other.coef_std_[seen] / same.coef_std_[seen]) > 2.0
 
 
 def test_bad_payloads_are_named(arm, rigid):

@@ -7,7 +7,7 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
-from sklearn.preprocessing import PolynomialFeatures, StandardScaler
+from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
@@ -15,7 +15,7 @@ from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor, ro
 from skevgp.datasets import make_toy
 from skevgp.features import InertiaForceGravity
 from skevgp.noise import Gaussian
-from skevgp.plotting import CoefficientDisplay, PosteriorDisplay
+from skevgp.plotting import CoefficientDisplay
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (30, 2))
@@ -43,20 +43,6 @@ def test_before_a_fit_it_predicts_what_scikit_learns_model_does(kernel, n_target
     samples = ours.sample_y(X_NEW, 5, random_state=1)
     assert samples.shape == theirs.sample_y(X_NEW, 5, random_state=1).shape
     assert vars(ours) == vars(clone(ours))
-
-
-def test_the_prior_has_weights_and_known_noise():
-    model = EGPRegressor(
-        TREND, 2.0 * BARE, coef_prior=CoefPrior(mean=[1.0, 0.0, -1.0], scale=[1.0, 2.0, 0.0]), alpha=0.25
-    )
-    mean, cov = model.predict(X_NEW, return_cov=True)
-    H = TREND.fit_transform(X_NEW)
-    np.testing.assert_allclose(mean, H @ [1.0, 0.0, -1.0], atol=1e-12)
-    expected = (2.0 * BARE)(X_NEW) + (H * [1.0, 4.0, 0.0]) @ H.T + 0.25 * np.eye(12)
-    np.testing.assert_allclose(cov, expected, atol=1e-10)
-    np.testing.assert_allclose(model.predict(X_NEW, return_std=True, include_noise=False)[1] ** 2 + 0.25, np.diag(cov))
-    samples = model.sample_y(X_NEW, 20_000)
-    np.testing.assert_allclose(np.cov(samples), cov, atol=0.04 * cov.max())
 
 
 def test_physics_predicts_before_there_are_data():
@@ -98,20 +84,6 @@ def test_what_needs_a_fit_says_so():
             call()
 
 
-def test_the_prior_can_be_drawn():
-    display = PosteriorDisplay.from_estimator(EGPRegressor(), np.linspace(0, 1, 5)[:, np.newaxis])
-    np.testing.assert_allclose(display.std, 1.0)
-
-
-def test_the_prior_refuses_what_a_fit_would():
-    with pytest.raises(ValueError, match="NaN"):
-        EGPRegressor().predict([[np.nan]])
-    with pytest.raises(ValueError, match="length_scale|columns"):
-        EGPRegressor(kernel=BARE).predict(X[:, :1])
-    with pytest.raises(ValueError, match=r"number of targets seen in `y`.*Got 2 != 1"):
-        EGPRegressor(n_targets=1).fit(X, Y)
-
-
 # --- known noise --------------------------------------------------------------------------------------------------
 
 
@@ -127,21 +99,6 @@ def test_with_alpha_and_no_optimizer_it_is_scikit_learns_model(y, alpha):
     np.testing.assert_allclose(std**2, expected_std**2 + alpha, atol=1e-8)
     np.testing.assert_allclose(ours.predict(X_NEW, True, include_noise=False)[1], expected_std, atol=1e-6)
     assert ours.log_marginal_likelihood_value_ == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-4)
-
-
-def test_kernels_as_given_stay_to_the_last_digit():
-    for kernel in (None, BARE, KERNEL):
-        kernel_ = EGPRegressor(kernel=kernel, optimizer=None).fit(X, 7.0 * Y[:, 0]).kernel_
-        expected = ConstantKernel() * RBF([1.0, 1.0]) if kernel is None else kernel
-        assert kernel_ == (ConstantKernel() * expected if kernel is not None else expected)
-
-
-def test_with_alpha_the_kernel_is_learned_and_the_noise_is_not():
-    kernel = ConstantKernel(1.0) * RBF(1.0)
-    ours = EGPRegressor(kernel=kernel, alpha=0.02).fit(X, Y[:, 0])
-    theirs = GaussianProcessRegressor(kernel, alpha=0.02, n_restarts_optimizer=2, random_state=0).fit(X, Y[:, 0])
-    assert ours.noise_variance_ == pytest.approx(0.02, rel=1e-12)
-    np.testing.assert_allclose(ours.kernel_.theta, theirs.kernel_.theta, atol=1e-3)
 
 
 def test_known_noise_of_each_row():
@@ -226,18 +183,6 @@ def test_an_optimizer_that_asks_for_nonsense_is_told_so():
         EGPRegressor(optimizer=asks).fit(X, Y[:, 0])
 
 
-def test_an_optimizer_has_the_widest_bounds():
-    def look(objective, theta, bounds):
-        seen.append(bounds - np.log(Y[:, 0].var()))
-        return theta, 0.0
-
-    seen = []
-    EGPRegressor(optimizer=look).fit(X, Y[:, 0])
-    # Of the signal, from each start.
-    assert all(np.log(9e3) < bounds[2, 1] < np.log(1.1e4) for bounds in seen)
-    np.testing.assert_array_equal(seen[0], seen[-1])
-
-
 def test_ctrl_c_keeps_the_best_that_an_optimizer_of_ones_own_has_seen():
     def interrupted(objective, theta, bounds):
         for shift in (0.0, 0.2, 5.0):
@@ -266,15 +211,6 @@ def test_theta_of_the_kernel_as_given(kernel):
         model.log_marginal_likelihood(theta, clone_kernel=False)
 
 
-def test_few_rows_without_noise_are_met_to_rounding():
-    x = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
-    y = x[:, 0] * np.sin(x[:, 0])
-    mean, std = EGPRegressor(kernel=RBF(), kernel_map=StandardScaler()).fit(x, y).predict(x, return_std=True)
-    np.testing.assert_allclose(mean, y, atol=1e-8)
-    np.testing.assert_allclose(std, 0.0, atol=1e-4)
-    assert np.abs(EGPRegressor(kernel=RBF(), tol=0.01).fit(x, y).predict(x) - y).max() > 1e-6
-
-
 @pytest.mark.parametrize(
     ("parameters", "named"),
     [
@@ -291,12 +227,6 @@ def test_few_rows_without_noise_are_met_to_rounding():
 def test_parameters_are_checked_before_a_fit_too(parameters, named):
     with pytest.raises(InvalidParameterError, match=f"'{named}' parameter"):
         EGPRegressor(**parameters).predict([[0.0, 1.0]], return_std=True)
-
-
-@pytest.mark.parametrize("nonsense", ["abc", None, 3.0], ids=str)
-def test_what_is_no_table_is_refused_before_a_fit_too(nonsense):
-    with pytest.raises(ValueError, match=r"array|scalar|convert|string"):
-        EGPRegressor().predict(nonsense)
 
 
 @pytest.mark.parametrize("rubbish", [None, (1.0, 2.0, 3.0), ("a", "b"), np.zeros(7)], ids=str)

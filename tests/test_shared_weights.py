@@ -1,7 +1,5 @@
 """Rows for each output, weights that outputs share, and correlated weights: against a dense Gaussian process."""
 
-import pickle
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -173,27 +171,6 @@ def test_shared_weights_are_those_of_a_dense_process(data, sharing, per_output):
     assert_allclose(model.coef_, mean + Sigma @ dense.flat.T @ np.linalg.solve(dense.S, dense.r), rtol=1e-7)
 
 
-@pytest.mark.parametrize("per_output", [True, False])
-def test_the_exact_model_with_shared_weights_is_the_dense_process(data, per_output):
-    X, Y, Sigma, mean, X_new = data
-    kernel_map = FunctionTransformer(own_columns) if per_output else FunctionTransformer(lambda X: X[:, :2])
-    H, H_new = Rows().transform(X), Rows().transform(X_new)
-    inputs, inputs_new = kernel_map.transform(X), kernel_map.transform(X_new)
-    if not per_output:
-        inputs, inputs_new = (np.repeat(own[:, np.newaxis], O, axis=1) for own in (inputs, inputs_new))
-    model = EGPRegressor(
-        Rows(),
-        KERNEL,
-        kernel_map=kernel_map,
-        coef_prior=CoefPrior(shared=True, mean=mean, cov=Sigma),
-        noise=Gaussian(variance=0.3),
-        max_iter=0,
-    ).fit(X, Y)
-    dense = Dense(H, inputs, Y, mean, Sigma, np.full(O, 0.3))
-    assert model.log_marginal_likelihood_value_ == pytest.approx(dense.bound(), rel=1e-9)
-    check(model, dense, data, inputs_new, H_new)
-
-
 @pytest.mark.parametrize("sharing", ["none", "kernel", "all"])
 def test_the_gradient_is_that_of_finite_differences(data, sharing):
     X, Y, Sigma, _, _ = data
@@ -285,50 +262,6 @@ def test_samples_have_the_joint_covariance(data):
     assert np.abs(across).max() > 0.1
 
 
-@pytest.mark.parametrize("sharing", ["none", "kernel"])
-def test_parts_of_the_rows_agree_with_all_of_them(data, sharing):
-    X, Y, Sigma, _, X_new = data
-
-    def model():
-        return EVGPRegressor(
-            Rows(),
-            KERNEL,
-            kernel_map=FunctionTransformer(own_columns),
-            coef_prior=CoefPrior(shared=True, cov=Sigma, mean=0.0),
-            noise=Gaussian(variance=0.3),
-            n_inducing=12,
-            max_iter=0,
-            sharing=sharing,
-            random_state=0,
-        )
-
-    whole = model().fit(X[:12], Y[:12]).partial_fit(X[12:], Y[12:])
-    parts = model().fit(X[:12], Y[:12]).partial_fit(X[12:20], Y[12:20]).partial_fit(X[20:], Y[20:])
-    for found, expected in zip(
-        parts.predict(X_new, return_std=True), whole.predict(X_new, return_std=True), strict=True
-    ):
-        assert_allclose(found, expected, rtol=1e-9)
-    assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-9)
-    assert_allclose(parts.coef_, whole.coef_, rtol=1e-9)
-
-
-def test_threads_and_pickles_change_nothing(data):
-    X, Y, _, _, X_new = data
-    options = {
-        "kernel_map": FunctionTransformer(own_columns),
-        "coef_prior": CoefPrior(shared=True),
-        "n_inducing": 8,
-        "random_state": 0,
-    }
-    one = EVGPRegressor(Rows(), max_iter=20, solver=LBFGS(tol=1e3), **options).fit(X, Y)
-    two = EVGPRegressor(Rows(), max_iter=20, solver=LBFGS(tol=1e3), n_jobs=2, **options).fit(X, Y)
-    np.testing.assert_array_equal(one.predict(X_new), two.predict(X_new))
-    again = pickle.loads(pickle.dumps(one))
-    np.testing.assert_array_equal(
-        one.predict(X_new, return_cov="joint")[1], again.predict(X_new, return_cov="joint")[1]
-    )
-
-
 def test_dask_agrees(data):
     da = pytest.importorskip("dask.array")
     X, Y, Sigma, _, X_new = data
@@ -393,22 +326,6 @@ def test_priors_of_unions_in_a_frame_with_rows_for_each_output(data, around):
     model = EGPRegressor(rows, max_iter=0, coef_prior=CoefPrior(shared=True)).fit(frame, Y)
     assert_allclose(model.coef_prior_scale_[-P:], np.sqrt(np.diagonal(Sigma)))
     assert model.predict(frame).shape == Y.shape
-
-
-def test_a_diagonal_covariance_is_a_scale(data):
-    X, Y, _, _, X_new = data
-    scale = np.array([0.5, 1.0, 2.0, 0.1])
-    options = {"n_inducing": 8, "max_iter": 0, "random_state": 0, "noise": Gaussian(variance=0.3)}
-    by_scale = EVGPRegressor(
-        Rows(per_output=False), KERNEL_OF_ALL, coef_prior=CoefPrior(scale=np.tile(scale, (O, 1))), **options
-    )
-    by_cov = EVGPRegressor(
-        Rows(per_output=False), KERNEL_OF_ALL, coef_prior=CoefPrior(cov=np.diag(scale**2)), **options
-    )
-    np.testing.assert_array_equal(by_scale.fit(X, Y).predict(X_new), by_cov.fit(X, Y).predict(X_new))
-
-
-KERNEL_OF_ALL = ConstantKernel(1.0) * RBF(np.ones(O + 1))
 
 
 def test_a_weight_without_variance_keeps_its_mean(data):

@@ -8,7 +8,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
-from skevgp.data.threads import BlockMap, add, ordered_sum, single_threaded_libraries, thread_pool
+from skevgp.data.threads import BlockMap, single_threaded_libraries, thread_pool
 from skevgp.solvers import LBFGS
 
 
@@ -21,23 +21,6 @@ def threads():
 
 def numbers_of_threads():
     return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
-
-
-def test_tuples_are_added_entry_by_entry():
-    total = add((1, np.ones(2), "a"), (2, np.ones(2), "b"))
-    assert total[::2] == (3, "ab")
-    np.testing.assert_array_equal(total[1], [2.0, 2.0])
-    with pytest.raises(ValueError, match="zip"):
-        add((1, 2), (1,))
-
-
-def test_sums_are_in_order():
-    assert ordered_sum(iter("abc")) == "abc"
-    assert ordered_sum([("a", 1), ("b", 2), ("c", 3)]) == ("abc", 6)
-
-
-def test_one_thread_is_the_callers():
-    assert set(BlockMap()(lambda part: get_ident(), range(3))) == {get_ident()}
 
 
 def test_several_threads_are_others_and_results_come_in_the_parts_order(threads):
@@ -119,13 +102,6 @@ def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
         first_is_out.set()
         late.result()
         assert numbers_of_threads() == before
-
-
-def test_libraries_are_set_free_after_an_error():
-    before = numbers_of_threads()
-    with pytest.raises(ZeroDivisionError), single_threaded_libraries():
-        raise ZeroDivisionError
-    assert numbers_of_threads() == before
 
 
 @pytest.mark.long

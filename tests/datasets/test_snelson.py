@@ -2,7 +2,6 @@ import io
 import re
 import tarfile
 import threading
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from hashlib import sha256
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -15,7 +14,6 @@ from skevgp.datasets import fetch_snelson, snelson
 
 X, Y, TEST = np.array([2.5, 0.25, 1.0]), np.array([-1.0, 0.125, 3.0]), np.array([-3.0, 10.0])
 FAKE = {"train_inputs": X, "train_outputs": Y, "test_inputs": TEST}
-TRUE_CHECKSUMS = snelson._CHECKSUMS
 
 
 def text(values, end="\n"):
@@ -89,39 +87,12 @@ def test_the_target_is_the_papers(fetch, serve):
     assert "6 y + 3 x" in toy.DESCR
 
 
-def test_without_the_trend_the_target_is_snelsons(fetch, serve):
-    serve(archive(GOOD))
-    toy = fetch(trend=False)
-    assert_array_equal(toy.target, Y)
-    assert "6 y" not in toy.DESCR
-
-
-def test_return_x_y_gives_the_two_arrays(fetch, serve):
-    serve(archive(GOOD))
-    data, target = fetch(return_X_y=True)
-    assert_array_equal(data, fetch().data)
-    assert_array_equal(target, fetch().target)
-
-
 def test_a_second_call_does_not_download(fetch, serve, home):
     path = serve(archive(GOOD))
     first = fetch()
     path.unlink()
     assert_array_equal(fetch(download_if_missing=False).target, first.target)
     assert sorted(file.name for file in (home / "SPGP_dist").iterdir()) == sorted(FAKE)
-
-
-@pytest.mark.parametrize("folder", [".", "SPGP_dist"])
-@pytest.mark.parametrize(("ending", "end"), [("", "\n"), (".dat", "\n"), (".dat", "\r\n")])
-def test_a_local_folder_is_enough(offline, fetch, home, folder, ending, end):
-    put(home / folder, ending, end)
-    assert_array_equal(fetch().target, 6.0 * Y + 3.0 * X)
-
-
-def test_the_folder_of_scikit_learn_is_the_default(offline, monkeypatch, home):
-    monkeypatch.setenv("SCIKIT_LEARN_DATA", str(home))
-    put(home / "SPGP_dist")
-    assert_array_equal(fetch_snelson(trend=False).target, Y)
 
 
 def test_a_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
@@ -146,13 +117,6 @@ def test_wrong_numbers_in_a_folder_are_named(offline, fetch, home):
         fetch()
 
 
-def test_a_file_without_numbers_is_named(offline, fetch, home):
-    put(home)
-    (home / "test_inputs").write_text("<html>moved</html>")
-    with pytest.raises(OSError, match="test_inputs .* is not a list of numbers"):
-        fetch()
-
-
 @pytest.mark.parametrize(
     ("content", "reason"),
     [
@@ -172,46 +136,6 @@ def test_a_bad_archive_is_told_and_leaves_nothing(fetch, serve, home, content, r
     with pytest.raises(OSError, match=rf"could not be fetched from {re.escape(path.as_uri())} \(.*{reason}.*data_home"):
         fetch()
     assert list(home.iterdir()) == []
-
-
-def test_only_the_named_files_are_written(fetch, serve, tmp_path, home):
-    strangers = ("../evil", "/evil", "SPGP_dist/../../evil", "SPGP_dist/spgp_pred.m")
-    before = serve(archive({**GOOD, **dict.fromkeys(strangers, b"evil")}))
-    fetch()
-    assert sorted(tmp_path.iterdir()) == sorted([before, home])
-    assert sorted(file.name for file in home.rglob("*")) == sorted([*FAKE, "SPGP_dist"])
-
-
-def test_a_link_is_no_file(fetch, serve):
-    stream = io.BytesIO()
-    with tarfile.open(fileobj=stream, mode="w:gz") as members:
-        link = tarfile.TarInfo("SPGP_dist/train_inputs")
-        link.type, link.linkname = tarfile.SYMTYPE, "/etc/hostname"
-        members.addfile(link)
-    serve(stream.getvalue())
-    with pytest.raises(OSError, match="has no file SPGP_dist/train_inputs"):
-        fetch()
-
-
-def test_a_full_disk_leaves_no_half_file(fetch, serve, home, monkeypatch):
-    serve(archive(GOOD))
-    monkeypatch.setattr("os.fsync", full_disk)
-    with pytest.raises(OSError, match="No space left"):
-        fetch()
-    assert list((home / "SPGP_dist").iterdir()) == []
-
-
-def full_disk(*_):
-    raise OSError(28, "No space left on device")
-
-
-def test_several_fetch_at_once(serve, home):
-    serve(archive(GOOD))
-    with ThreadPoolExecutor(8) as pool:
-        found = list(pool.map(lambda _: fetch_snelson(home, return_X_y=True)[1], range(16)))
-    for target in found:
-        assert_array_equal(target, 6.0 * Y + 3.0 * X)
-    assert sorted(file.name for file in (home / "SPGP_dist").iterdir()) == sorted(FAKE)
 
 
 @pytest.fixture
@@ -246,13 +170,6 @@ def test_a_server_that_stumbles_is_asked_again(server, home):
     assert server.calls == 3
 
 
-def test_a_server_that_fails_is_told(server, home):
-    server.failures = 9
-    with pytest.raises(OSError, match=r"fetched from http://127.0.0.1:\d+/SPGP_dist.tgz \(HTTP Error 503.*data_home"):
-        fetch_snelson(home, n_retries=1, delay=0.0)
-    assert server.calls == 2
-
-
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -265,11 +182,3 @@ def test_a_server_that_fails_is_told(server, home):
 def test_bad_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         fetch_snelson(**arguments)
-
-
-def test_other_numbers_in_the_same_files_are_not_snelsons(monkeypatch, offline, fetch, home):
-    """Against the checksums of the true files, which are not ours to ship."""
-    monkeypatch.setattr(snelson, "_CHECKSUMS", TRUE_CHECKSUMS)
-    put(home, ".dat")
-    with pytest.raises(OSError, match=r"train_inputs\.dat .*are not Snelson's.*expected 8b1ccec3"):
-        fetch()

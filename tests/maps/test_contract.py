@@ -33,7 +33,7 @@ from skevgp.features import (
     RigidBodyRegressor,
 )
 from skevgp.features.robot_map import RobotTransformer
-from skevgp.maps import ADAPTERS, Map, NoExpressionError, as_map
+from skevgp.maps import ADAPTERS, NoExpressionError, as_map
 
 TERMS = ["acceleration", "gravity", "bias", "input"]
 MASK = np.array([False, True, False, False, True])
@@ -216,11 +216,6 @@ WITHOUT_EXPRESSION = {
     "torques, no robot": "RigidBodyRegressor",
     **dict.fromkeys([name for name in SKLEARN if name.startswith("spline")], r"SplineTransformer\("),
 }
-LINEAR = {
-    *(name for name in SKLEARN if name.startswith(("standard", "robust", "pca", "svd", "identity"))),
-    *("min max", "max abs", "pipeline, nothing", "union, of nothing"),
-    *("columns, and the rest", "columns, weights", "columns, called"),
-}
 
 
 def rows(n_columns, n_rows=200, seed=0, timed=False):
@@ -314,23 +309,6 @@ def test_the_expression_is_the_function_and_its_derivative(name, transformer):
         close(found[-1].full(), own_slopes, 1e-7 if name in BY_DIFFERENCES else 1e-9)
 
 
-def test_what_is_known_is_neither_validated_nor_differentiated(name, transformer, monkeypatch):
-    def never(*arguments):
-        raise AssertionError("not to be called")
-
-    X, own = rows_of(name), as_map(transformer)
-    expected = transformer.transform(X)
-    monkeypatch.setattr(Map, "_differences", never)
-    if not name.startswith("spline"):  # whose values have no short way
-        monkeypatch.setattr(Map, "value", never)
-    if name in BY_DIFFERENCES:
-        with pytest.raises(AssertionError, match="not to be called"):
-            own.jacobian(X), own.value(X)
-    else:
-        assert own.jacobian(X).shape == (*expected.shape, X.shape[1])
-        assert own.value(X).shape == expected.shape
-
-
 def test_it_can_be_pickled_and_changes_no_row(name, transformer):
     X = rows_of(name, 9)
     own = as_map(transformer)
@@ -340,10 +318,3 @@ def test_it_can_be_pickled_and_changes_no_row(name, transformer):
     assert_array_equal(X, rows_of(name, 9))
     assert_array_equal(again.value(X), before[0])
     assert_array_equal(again.jacobian(X), before[1])
-
-
-def test_a_map_that_calls_itself_linear_has_one_jacobian_for_all_rows(name, transformer):
-    own, X = as_map(transformer), rows_of(name)
-    assert own.linear == (name in LINEAR)
-    if own.linear:
-        assert np.ptp(own.jacobian(X), axis=0).max(initial=0.0) == 0.0

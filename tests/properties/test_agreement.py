@@ -8,7 +8,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -124,22 +123,6 @@ def test_files_and_pickles_hold_the_model_to_the_bit(case):
         assert_same_bits(copy, model, case.X_new)
         np.testing.assert_array_equal(copy.sample_y(case.X_new), model.sample_y(case.X_new))
         assert copy.get_params().keys() == model.get_params().keys()
-
-
-@given(fixed_cases())
-def test_how_rows_lie_in_memory_does_not_matter(case):
-    model, X = case.fitted(), case.X_new
-    wide = np.zeros((2 * len(X), 2 * X.shape[1]))
-    wide[::2, ::2] = X
-    for rows in (np.asfortranarray(X), wide[::2, ::2], X[::-1].copy()[::-1], X.tolist()):
-        for found, expected in zip(
-            model.predict(rows, return_std=True), model.predict(X, return_std=True), strict=True
-        ):
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * size_of(model, case))
-    names = [f"x{i}" for i in range(X.shape[1])]
-    framed = case.fitted(X=pd.DataFrame(case.X, columns=names)).predict(pd.DataFrame(X, columns=names), return_std=True)
-    for found, expected in zip(framed, model.predict(X, return_std=True), strict=True):
-        assert_near(found, expected, size_of(model, case), 1e-9)
 
 
 @st.composite

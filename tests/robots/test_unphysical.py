@@ -8,7 +8,7 @@ import pytest
 from skevgp.datasets import make_dynamics
 from skevgp.exceptions import RobotModelWarning
 from skevgp.features import NominalDynamics, RigidBodyRegressor
-from skevgp.robots import inertial_parameters, load_robot, perturb_robot, write_urdf
+from skevgp.robots import load_robot, perturb_robot
 
 LINK = """<link name="{}"><inertial><origin xyz="0 0 -0.1"/><mass value="{mass}"/>
 <inertia ixx="{}" iyy="{}" izz="{}" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
@@ -46,26 +46,6 @@ def test_a_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_load
         use(arm(tmp_path / "arm.urdf", (-1.0, -1.0, -1.0)))
 
 
-def test_a_small_negative_moment_is_refused_where_a_joint_turns_about_it(tmp_path):
-    """Files round moments, by more than this one; but a push moves the joint the other way."""
-    path = arm(tmp_path / "arm.urdf", (0.01, -0.00001, 0.01))
-    path.write_text(path.read_text().replace("0 0 -0.1", "0 0 0"))
-    with pytest.raises(
-        ValueError, match=r"not positive definite.*'b' of the joint 'j2' has 1 kg and moments .* of -1e-05"
-    ):
-        load_robot(path)
-
-
-def test_a_model_in_memory_is_checked_too(tmp_path):
-    model = load_robot(arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.01)))
-    model.inertias[2].inertia = -np.eye(3)
-    with pytest.raises(ValueError, match=r"The model 'r' has a mass matrix.*that of the joint 'j2' has 1 kg"):
-        load_robot(model)
-    model.armature = np.full(2, 2.0)  # of rotors: M = J + 2 1, with J above -2
-    with pytest.warns(RobotModelWarning, match="No mass matrix has a negative eigenvalue in 300 configurations"):
-        load_robot(model)
-
-
 @pytest.mark.parametrize(
     ("moments", "mass", "told"),
     [
@@ -81,13 +61,6 @@ def test_what_moves_by_the_laws_of_mechanics_all_the_same_is_warned_of(tmp_path,
         model = load_robot(path)
     with pytest.warns(RobotModelWarning, match="triangle inequality"):
         load_robot(model)
-
-
-def test_a_map_warns_once_of_its_robot(tmp_path):
-    path = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.04))
-    with pytest.warns(RobotModelWarning) as caught:
-        NominalDynamics(path).fit_transform(np.zeros((2, 6)))
-    assert len(caught) == 1
 
 
 @pytest.mark.parametrize(
@@ -118,18 +91,3 @@ def test_a_violation_below_the_rounding_of_the_digits_is_not_warned_of(tmp_path,
         warnings.simplefilter("always")
         load_robot(arm(tmp_path / "arm.urdf", moments))
     assert len(caught) == impossible
-
-
-def test_simulation_does_not_warn_of_rounded_digits(tmp_path):
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RobotModelWarning)
-        make_dynamics(arm(tmp_path / "arm.urdf", ("0.01", "0.01", "0.03")), 1)
-
-
-def test_the_file_that_mends_a_robot_is_not_warned_of(tmp_path):
-    source = arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.04))
-    good = inertial_parameters(load_robot(arm(tmp_path / "good.urdf", (0.02, 0.02, 0.02))))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        write_urdf(source, tmp_path / "mended.urdf", good)
-        assert np.allclose(inertial_parameters(load_robot(tmp_path / "mended.urdf")), good)

@@ -113,28 +113,6 @@ def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
         load(ARM.replace(old, new, 1))
 
 
-@pytest.mark.parametrize("kind", ["fixed", "revolute"])
-def test_the_world_need_not_be_declared(load, kind):
-    """As Drake has it."""
-    joints = joint("world", "a", kind), joint("a", "b")
-    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
-    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
-        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
-
-
-def test_links_in_a_circle_are_told(load):
-    """Pinocchio leaves them out, and makes a robot of the rest."""
-    with pytest.raises(ValueError, match=r"it has links in a circle: \['c', 'd'\]"):
-        load(robot("abcd", joint("a", "b"), joint("c", "d"), joint("d", "c")))
-
-
-def test_a_joint_without_limits_is_told(load):
-    text = robot("ab", joint("a", "b")).replace('<limit effort="1" velocity="1"/>', "")
-    with pytest.raises(ValueError, match="the joint 'to_b' has no <limit>, which a revolute one needs"):
-        load(text)
-    assert load(text.replace("revolute", "continuous")).nv == 1
-
-
 def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
     """Pinocchio goes from joint to joint by recursion: one of 5000 ends the interpreter."""
 
@@ -195,40 +173,6 @@ def test_a_file_is_warned_of_once(load):
     assert message.endswith("(3 more are like these.)")
 
 
-@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
-def test_a_negative_limit_of_velocity_is_not_used(load, kind):
-    text = robot("ab", joint("a", "b", kind)).replace('velocity="1"', 'velocity="-1"')
-    model, messages = warned(load, text)
-    assert len(messages) == 1
-    assert '<limit velocity="-1">; a limit of velocity must be 0 or above' in messages[0]
-    assert_array_equal(model.velocityLimit, [0.0])
-
-
-def test_limits_of_position_in_the_wrong_order_are_not_used(load):
-    text = robot("ab", joint("a", "b")).replace("<limit", '<limit lower="3" upper="-3"')
-    model, messages = warned(load, text)
-    assert "'to_b' has <limit> with lower=3 above upper=-3; its limits of position are not used" in messages[0]
-    assert_array_equal(model.lowerPositionLimit, model.upperPositionLimit)
-    assert warned(load, text.replace("revolute", "continuous"))[1] == []
-
-
-@pytest.mark.parametrize("other", ["none", "to_b", ""])
-def test_a_joint_that_mimics_none_is_warned_of(load, other):
-    """Joints that mimic move on their own, so that it does not matter."""
-    text = robot("abc", joint("a", "b").replace("</joint>", '<mimic joint="{}"/></joint>'), joint("b", "c"))
-    model, messages = warned(load, text.format(other))
-    assert model.nv == 2
-    assert len(messages) == 1
-    assert f"The joint 'to_b' has <mimic joint=\"{other}\">, which is not another joint of the file" in messages[0]
-    assert warned(load, text.format("to_c"))[1] == []
-
-
-@pytest.mark.parametrize("limit", ['effort="0" velocity="0"', 'lower="0" upper="0" effort="0" velocity="0"'])
-def test_limits_of_zero_are_unknown_ones(load, limit):
-    """Exporters of CAD programs write them."""
-    assert warned(load, robot("ab", joint("a", "b")).replace('effort="1" velocity="1"', limit))[1] == []
-
-
 BODY = """<link name="{}"><inertial><mass value="{}"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 
@@ -240,25 +184,3 @@ def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     assert model.inertias[1].mass == 1.5
     with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
         load(text.format(joint("b", "c")))
-
-
-@pytest.mark.parametrize("masses", [(2, -2), (2, -2, 3), (-0.5, 2), (2, -2.5, 3), (0.3, -0.1, -0.2)])
-def test_negative_masses_that_pinocchio_cannot_add_are_refused(load, masses):
-    """It divides by the sum after each link, and by some 1e-16 in place of a sum of 0."""
-    bodies = "".join(BODY.format(link, mass) for link, mass in zip("bcd", masses, strict=False))
-    welds = "".join(joint("b", link, "fixed") for link, _ in zip("cd", masses[1:], strict=False))
-    with pytest.raises(ValueError, match=r"the link '.' has <mass value=\"-.*first of them, 'b', which is"):
-        load(f'<robot name="r"><link name="a"/>{bodies}{joint("a", "b")}{welds}</robot>')
-
-
-def test_a_joint_may_have_the_name_of_pinocchios_root(load):
-    text = robot("abc", joint("a", "b", name="universe"), joint("b", "c"))
-    model, _ = warned(load, text.replace('"1" velocity', '"-5" velocity', 1))
-    assert_array_equal(effort_limits(model), [[-np.inf, -1.0], [np.inf, 1.0]])
-
-
-@pytest.mark.parametrize("of", ["gazebo", "transmission"])
-def test_what_simulators_and_controllers_read_may_be_in_xacro(load, of):
-    plain = robot("ab", joint("a", "b"))
-    text = plain.replace("</robot>", f'<{of}><xacro:thing xmlns:xacro="http://x"/></{of}></robot>')
-    assert load(text) == load(plain)

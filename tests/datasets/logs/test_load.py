@@ -35,23 +35,6 @@ def test_the_bunch_has_what_is_documented(files):
     assert recording.start == pytest.approx(T[0])
 
 
-def test_each_file_is_a_group(files):
-    log = load_log(files, columns=BY_NUMBER)
-    alone = [load_log(file, columns=BY_NUMBER) for file in files]
-    assert_array_equal(log.groups, np.repeat([0, 1], [len(one.data) for one in alone]))
-    assert_array_equal(log.pieces, log.groups)
-    for name in ("data", "target", "time"):
-        assert_array_equal(log[name], np.concatenate([one[name] for one in alone]))
-    assert log.recordings[1].start == pytest.approx(100.0 + T[0])
-
-
-def test_return_x_y_gives_the_two_arrays(files):
-    log = load_log(files, columns=BY_NUMBER)
-    X, y = load_log(files, columns=BY_NUMBER, return_X_y=True)
-    assert_array_equal(X, log.data)
-    assert_array_equal(y, log.target)
-
-
 @pytest.mark.parametrize("gains", [3.0, [3.0, -2.0]], ids=str)
 def test_torques_are_gains_times_currents(files, gains):
     plain, log = (load_log(files[0], columns=BY_NUMBER, gains=given) for given in (1.0, gains))
@@ -79,18 +62,6 @@ def test_only_what_is_kept_is_read(tmp_path, files, keep, rows):
     alone = load_log(write_table(tmp_path / "alone.csv", table[inside]), columns=BY_NUMBER)
     assert_allclose(log.data, alone.data, atol=1e-9)
     assert_allclose(log.time, alone.time + T[inside][0] - T[0], atol=1e-9)
-
-
-def test_each_file_is_kept_as_it_is_said(files):
-    log = load_log(files, columns=BY_NUMBER, keep=[(1.0, 4.0), None])
-    alone = [load_log(file, columns=BY_NUMBER, keep=keep) for file, keep in zip(files, [(1.0, 4.0), None], strict=True)]
-    assert_array_equal(log.data, np.vstack([one.data for one in alone]))
-
-
-def test_joints_of_tables_can_be_named(files):
-    log = load_log(files, columns=BY_NUMBER, joints=["elbow", "wrist"])
-    assert log.joint_names == ["elbow", "wrist"]
-    assert log.target_names == ["u_elbow", "u_wrist"]
 
 
 def test_the_description_tells_what_was_done(files):
@@ -143,21 +114,6 @@ def test_bad_values_are_named(files, arguments, message):
         load_log(files[0], **{"columns": BY_NUMBER, **arguments})
 
 
-@pytest.mark.parametrize("keep", [(1.0, 2.0), [None], slice(0, 9)], ids=str)
-def test_of_several_files_keep_is_a_list(files, keep):
-    with pytest.raises(ValueError, match="keep must be a list with one for each of the 2 files; got"):
-        load_log(files, columns=BY_NUMBER, keep=keep)
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [({"dt": "fast"}, "dt must be a number; got 'fast'"), ({"keep": ("1", 2.0)}, "keep must be a number; got '1'")],
-)
-def test_bad_types_are_named(files, arguments, message):
-    with pytest.raises(TypeError, match=message):
-        load_log(files[0], columns=BY_NUMBER, **arguments)
-
-
 def test_files_must_have_the_same_joints(files):
     write_table(files[1], table_of(T)[:, [0, 1, 4, 6]], ["t", "q_1", "dq_1", "i_1"])
     columns = {"time": "t", "position": "q_*", "velocity": "dq_*", "current": "i_*"}
@@ -165,30 +121,7 @@ def test_files_must_have_the_same_joints(files):
         load_log(files, columns=columns)
 
 
-def test_there_must_be_a_file():
-    with pytest.raises(ValueError, match="path must be a file or several; got none"):
-        load_log([])
-
-
 def test_a_file_that_is_not_there_is_an_os_error(tmp_path):
     for name in ("no.csv", "no.csv.gz"):
         with pytest.raises(FileNotFoundError, match=name):
             load_log(tmp_path / name, columns=BY_NUMBER)
-
-
-@pytest.mark.parametrize(
-    ("name", "message"),
-    [("log.pkl", r"its name must end in one of .csv, .*, .mcap\."), ("log.bag", "Convert it with: rosbags-convert")],
-)
-def test_other_kinds_of_files_are_refused(tmp_path, name, message):
-    (tmp_path / name).write_bytes(b"")
-    with pytest.raises(ValueError, match=f"{name}: .*{message}"):
-        load_log(tmp_path / name)
-
-
-def test_signals_that_overflow_are_named(tmp_path):
-    table = table_of(irregular_times(3.0))
-    table[100, 6] = 1e308  # a position would be cut out as a jump
-    path = write_table(tmp_path / "log.csv", table)
-    with pytest.raises(ValueError, match=r"log\.csv: its \w+ overflows when it is filtered and differentiated"):
-        load_log(path, columns=BY_NUMBER)

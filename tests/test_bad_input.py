@@ -1,4 +1,4 @@
-"""Bad input of all kinds, for every estimator; and a sample of `tests/long/torture.py`."""
+"""Bad input of all kinds: it is refused by an error that names the cause, or does no harm."""
 
 import warnings
 
@@ -7,14 +7,11 @@ import pandas as pd
 import polars as pl
 import pytest
 from scipy import sparse
-from sklearn.base import clone
-from sklearn.impute import SimpleImputer
+from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import InertiaForce
-from tests.long.torture import run
-from tests.nasty import BadMap, MapError
 
 RNG = np.random.RandomState(0)
 # Numbers that float32 holds.
@@ -30,27 +27,52 @@ ESTIMATORS = {
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 
 
-@pytest.fixture(params=ESTIMATORS)
-def estimator(request):
-    return clone(ESTIMATORS[request.param])
+def crossed(names, few):
+    """All of them with one estimator, a few with the others."""
+    every = [("EVGPRegressor", name) for name in names]
+    return every + [(other, name) for other in ESTIMATORS if other != "EVGPRegressor" for name in few]
 
 
-# --- a sample of all of it ---------------------------------------------------------------------------------------
+class MapError(Exception):
+    """Of a user's own map: it must come through as it is."""
 
 
-@pytest.mark.parametrize("first", range(0, 80, 8))
-def test_whatever_comes_is_fitted_or_refused(first):
-    _, defects, _ = run(range(first, first + 8))
-    assert not defects
+class BadMap(TransformerMixin, BaseEstimator):
+    """A map that goes wrong in one way, when it is fitted or at a later call."""
 
+    def __init__(self, how="raises", late=False):
+        self.how = how
+        self.late = late
 
-def test_what_was_a_defect_is_none_any_more():
-    """Found by longer searches."""
-    once = (25, 198, 296, 444, 460, 722, 1443, 2372, 2811, 3298, 3860, 4571, 508113, 524561, 524792, 528175, 528248)
-    later = (601365, 603127, 900591, 1000450, 2000708, 2002349, 32001940, 32003684, 49499150, 1010265947)
-    latest = (42000097, 42001009, 42001934, 51004349)
-    _, defects, _ = run(once + later + latest)
-    assert not defects
+    def fit(self, X, y=None):
+        self.calls_ = 0
+        return self
+
+    def transform(self, X):
+        X = np.asarray(X, dtype=float)
+        self.calls_ += 1
+        if self.late and self.calls_ == 1:
+            return X
+        if self.how == "raises":
+            raise MapError("the sensor model is not defined here")
+        if self.how == "rows":
+            return X[:-1]
+        if self.how == "width":
+            return np.column_stack([X, X])[:, : X.shape[1] + 1]
+        if self.how == "words":
+            return np.full(X.shape, "a")
+        return np.full(X.shape, {"nan": np.nan, "infinity": np.inf, "huge": 1e200}[self.how])
+
+    # What each may be refused with.
+    messages = {  # noqa: RUF012
+        "raises": "the sensor model is not defined here",
+        "rows": "one row per row of X",
+        "width": "columns",
+        "words": "must be real numbers",
+        "nan": "NaN or infinity",
+        "infinity": "NaN or infinity",
+        "huge": "must not exceed",
+    }
 
 
 # --- containers --------------------------------------------------------------------------------------------------
@@ -82,8 +104,9 @@ CONTAINERS = {
 }
 
 
-@pytest.mark.parametrize("container", CONTAINERS)
-def test_how_rows_are_held_does_not_matter(estimator, container, tmp_path):
+@pytest.mark.parametrize(("name", "container"), crossed(CONTAINERS, ["float32", "backwards", "read-only"]))
+def test_containers_give_same_predictions(name, container, tmp_path):
+    estimator = clone(ESTIMATORS[name])
     rows = CONTAINERS[container](X, tmp_path / "rows.bin")
     before = np.array(rows, dtype=float)
     expected = clone(estimator).fit(X, Y).predict(X, return_std=True)
@@ -93,7 +116,9 @@ def test_how_rows_are_held_does_not_matter(estimator, container, tmp_path):
     np.testing.assert_array_equal(np.array(rows, dtype=float), before)
 
 
-def test_integers_are_numbers(estimator):
+@pytest.mark.parametrize("name", ESTIMATORS)
+def test_integers_give_predictions_of_floats(name):
+    estimator = clone(ESTIMATORS[name])
     rows, y = np.round(8 * X).astype(np.int16), np.round(50 * Y).astype(np.int64)
     expected = clone(estimator).fit(rows.astype(float), y.astype(float)).predict(rows.astype(float))
     np.testing.assert_allclose(estimator.fit(rows, y).predict(rows), expected, rtol=1e-6, atol=1e-6)
@@ -169,11 +194,13 @@ BAD = {
 
 
 @pytest.mark.filterwarnings("ignore:Feature names only support names that are all strings")
-@pytest.mark.parametrize("name", BAD)
-def test_bad_rows_are_refused_by_every_estimator(estimator, name):
-    rows, y, kind, message = BAD[name]
+@pytest.mark.parametrize(
+    ("name", "bad"), crossed(BAD, ["NaN", "y with NaN", "y nearly 0", "y masked", "no rows", "nullable pandas"])
+)
+def test_bad_rows_raise_in_fit(name, bad):
+    estimator, (rows, y, kind, message) = clone(ESTIMATORS[name]), BAD[bad]
     if isinstance(estimator, ResidualRegressor):
-        if name == "y nearly 0":
+        if bad == "y nearly 0":
             rows = np.zeros_like(rows)  # what it fits is what y adds to columns of X
         if hasattr(rows, "columns"):
             message = "^The base columns of X must be finite; they contain NaN or infinity"
@@ -183,9 +210,11 @@ def test_bad_rows_are_refused_by_every_estimator(estimator, name):
     assert not [attribute for attribute in vars(estimator) if attribute.endswith("_")]
 
 
-@pytest.mark.parametrize("name", [name for name in BAD if not name.startswith(("y", "no y"))])
-def test_a_fitted_model_refuses_bad_rows(estimator, name):
-    rows, _, kind, message = BAD[name]
+@pytest.mark.parametrize(
+    ("name", "bad"), crossed([bad for bad in BAD if not bad.startswith(("y", "no y"))], ["infinity", "words"])
+)
+def test_bad_rows_raise_in_predict(name, bad):
+    estimator, (rows, _, kind, message) = clone(ESTIMATORS[name]), BAD[bad]
     if isinstance(rows, pl.DataFrame):
         estimator.fit(pl.DataFrame(X, schema=rows.columns), Y)
     else:
@@ -202,22 +231,14 @@ def test_a_fitted_model_refuses_bad_rows(estimator, name):
         (1e-120, r"^y must be 0 or exceed 1e-105 in size; a column's largest value is 4\.8e-119"),
     ],
 )
-def test_torques_of_no_robot_are_refused(scale, message):
+def test_torques_of_extreme_size_raise(scale, message):
     y = scale * np.linspace(-48.0, 24.0, 40)
     with pytest.raises(ValueError, match=message):
         InverseDynamics(n_inducing=5, max_iter=1).fit(X, y)
 
 
-@pytest.mark.parametrize("scale", [1e-100, 1e-60, 1e-40, 1e35])
-def test_torques_of_any_size_between_are_not(scale):
-    y = scale * Y
-    mean, std = InverseDynamics(n_inducing=5, max_iter=2).fit(X, y).predict(X, return_std=True)
-    assert np.abs(mean - y).max() < 10.0 * np.abs(y).max()
-    assert (std > 0.0).all()
-
-
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
+def test_overflowing_prior_scale_raises(kind):
     spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
     message = rf"^{spread} must not exceed 1e\+130 in size; "
     model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)
@@ -240,14 +261,14 @@ def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(
         ),
     ],
 )
-def test_features_of_sizes_whose_squares_vanish_or_overflow_are_refused(kind, factor, weights, message):
+def test_features_of_extreme_size_raise(kind, factor, weights, message):
     with pytest.raises(ValueError, match=message):
         kind(FunctionTransformer(lambda X: factor * X)).fit(X, Y, **weights)
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
 @pytest.mark.parametrize("coef_scale", [1.0, "auto"])
-def test_bumps_so_far_from_all_rows_that_their_squares_vanish_do_no_harm(kind, coef_scale):
+def test_features_with_vanishing_squares_are_fitted(kind, coef_scale):
     rng, centres = np.random.RandomState(0), np.linspace(0.0, 1.0, 50)
     rows = rng.uniform(0.0, 0.4, (40, 1))
     y = np.sin(9.0 * rows[:, 0]) + 0.05 * rng.randn(40)
@@ -256,7 +277,7 @@ def test_bumps_so_far_from_all_rows_that_their_squares_vanish_do_no_harm(kind, c
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor, BayesianMLPRegressor])
-def test_frames_with_dates_are_refused_and_any_name_is_allowed(kind):
+def test_frame_with_dates_raises(kind):
     dates = pd.date_range("2026-01-01", periods=len(X))
     for frame in (pd.DataFrame({"a": dates}), pd.DataFrame({"a": dates, "b": X[:, 0]})):
         with pytest.raises(ValueError, match=r"X must be real numbers|The columns \['a'\] of X are not numbers"):
@@ -264,39 +285,14 @@ def test_frames_with_dates_are_refused_and_any_name_is_allowed(kind):
     kind(max_iter=2).fit(pd.DataFrame({"_mask": X[:, 0], "b": X[:, 1]}), Y)
 
 
-@pytest.mark.parametrize(
-    ("y", "error", "message"),
-    [
-        (sparse.csr_matrix(Y), TypeError, "^y must be a dense array"),
-        (np.ma.masked_greater(Y, 0.5), ValueError, "^y must have no masked values"),
-    ],
-)
-def test_targets_beside_a_frame_for_a_kernel_map_are_looked_at_too(y, error, message):
-    with pytest.raises(error, match=message):
-        EVGPRegressor(kernel_map=FunctionTransformer(np.asarray)).fit(pd.DataFrame(X, columns=list("abc")), y)
-
-
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_targets_whose_weighted_squares_overflow_are_refused(kind):
-    message = r"^√\(sample_weight / relative_variance\) times y must not exceed 1e\+130 in size"
-    with pytest.raises(ValueError, match=message):
-        kind().fit(X, 1e98 * Y, **EXTREME)
-
-
 @pytest.mark.parametrize("name", ["NaN", "huge", "y with NaN", "y short", "sparse matrix", "one dimension"])
-def test_bad_new_rows_are_not_folded_in(name):
+def test_partial_fit_with_bad_rows_keeps_model(name):
     rows, y, kind, message = BAD[name]
     model = clone(ESTIMATORS["EVGPRegressor"]).fit(X, Y)
     before = model.predict(X, return_std=True)
     with pytest.raises(kind, match=message):
         model.partial_fit(rows, y)
     np.testing.assert_array_equal(model.predict(X, return_std=True), before)
-
-
-def test_missing_values_are_the_maps_to_fill():
-    rows = pd.DataFrame(with_one(X, np.nan), columns=["a", "b", "c"])
-    model = EVGPRegressor(kernel_map=SimpleImputer(), n_inducing=8, max_iter=5, random_state=0).fit(rows, Y)
-    assert np.isfinite(model.predict(rows)).all()
 
 
 # --- maps --------------------------------------------------------------------------------------------------------
@@ -306,9 +302,8 @@ def test_missing_values_are_the_maps_to_fill():
 @pytest.mark.parametrize(
     ("how", "late"), [(how, late) for how in BadMap.messages for late in (False, True) if late or how != "width"]
 )
-@pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_maps_that_go_wrong_are_named(kind, argument, how, late):
+@pytest.mark.parametrize(("kind", "argument"), [(EVGPRegressor, "feature_map"), (EGPRegressor, "kernel_map")])
+def test_map_error_names_map(kind, argument, how, late):
     """In a fit, or after it: the second call may be in either."""
     model = kind(**{argument: BadMap(how, late)}, max_iter=2)
     with pytest.raises(MapError if how == "raises" else ValueError, match=BadMap.messages[how]) as raised:
@@ -327,8 +322,7 @@ class Breaks(StandardScaler):
         return values if Breaks.now is None else Breaks.now(values)
 
 
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-@pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
+@pytest.mark.parametrize(("kind", "argument"), [(EVGPRegressor, "feature_map"), (EGPRegressor, "kernel_map")])
 @pytest.mark.parametrize(
     ("broken", "message"),
     [
@@ -344,7 +338,7 @@ class Breaks(StandardScaler):
     ],
     ids=["narrow", "wide", "NaN", "rows", "1-D", "huge"],
 )
-def test_a_map_that_goes_wrong_after_the_fit_leaves_the_model_as_it_was(monkeypatch, kind, argument, broken, message):
+def test_map_error_after_fit_keeps_model(monkeypatch, kind, argument, broken, message):
     model = kind(**{argument: Breaks()}, max_iter=2).fit(X, Y)
     before = model.predict(X[:4], return_std=True)
     monkeypatch.setattr(Breaks, "now", staticmethod(broken))
@@ -359,7 +353,7 @@ def test_a_map_that_goes_wrong_after_the_fit_leaves_the_model_as_it_was(monkeypa
     np.testing.assert_array_equal(model.predict(X[:4], return_std=True), before)
 
 
-def test_a_slow_map_is_seen_by_each_row_a_few_times_only():
+def test_map_is_called_few_times():
     """However many iterations there are."""
     rows = []
 
@@ -379,7 +373,7 @@ def test_a_slow_map_is_seen_by_each_row_a_few_times_only():
 @pytest.mark.parametrize("n", [1, 2, 3])
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
 @pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(2)], ids=["plain", "features"])
-def test_hardly_any_rows(kind, n, feature_map):
+def test_one_to_three_rows_are_fitted(kind, n, feature_map):
     model = kind(feature_map, max_iter=50, random_state=0).fit(X[:n], Y[:n])
     mean, std = model.predict(X, return_std=True)
     assert mean.shape == std.shape == Y.shape
@@ -388,10 +382,9 @@ def test_hardly_any_rows(kind, n, feature_map):
     assert (std > 0.0).all()
 
 
-@pytest.mark.parametrize("d", [1, 500])
-def test_one_column_to_five_hundred(d):
+def test_five_hundred_columns_are_fitted():
     rng = np.random.RandomState(0)
-    rows = rng.randn(60, d)
+    rows = rng.randn(60, 500)
     y = rows[:, 0] + 0.1 * rng.randn(60)
     model = EVGPRegressor(n_inducing=20, max_iter=10, random_state=0).fit(rows, y)
     mean, std = model.predict(rows, return_std=True)
@@ -400,17 +393,7 @@ def test_one_column_to_five_hundred(d):
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-@pytest.mark.parametrize("value", [0.0, 5.1, -1e8, 1e-12, 1e12])
-def test_a_constant_target_is_predicted(kind, value):
-    mean, std = kind(normalize_y=True, random_state=0).fit(X, np.full(40, value)).predict(X, return_std=True)
-    np.testing.assert_allclose(mean, value, rtol=1e-9, atol=1e-12)
-    assert (std > 0.0).all()
-    assert (std < 1e-3 * max(abs(value), 1.0)).all() if value else np.isfinite(std).all()
-
-
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-@pytest.mark.parametrize("offset", [0.0, 1e8])
-@pytest.mark.parametrize("scale", [1e-12, 1.0, 1e12])
+@pytest.mark.parametrize(("offset", "scale"), [(1e8, 1e-12), (0.0, 1e12)])
 def test_a_perfect_line_is_found_and_extrapolated(kind, scale, offset):
     """With inputs of any scale, far from 0 compared with their scatter."""
     rows = scale * (X + offset)
@@ -425,7 +408,7 @@ def test_a_perfect_line_is_found_and_extrapolated(kind, scale, offset):
 
 
 @pytest.mark.parametrize("noise", [1e-8, 1e-4])
-def test_hardly_any_noise(noise):
+def test_tiny_noise_is_fitted(noise):
     x = np.linspace(0.0, 3.0, 60)[:, np.newaxis]
     y = np.sin(2.0 * x[:, 0]) + noise * np.random.RandomState(0).randn(60)
     model = EVGPRegressor(n_inducing=30, random_state=0).fit(x, y)
@@ -434,16 +417,7 @@ def test_hardly_any_noise(noise):
     assert (std < 1e-3 + 10.0 * noise).all()
 
 
-def test_a_row_far_away_does_not_hide_the_others():
-    x = np.append(np.linspace(0.0, 3.0, 60), 1e6)[:, np.newaxis]
-    y = np.sin(2.0 * x[:, 0])
-    model = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=20, random_state=0).fit(x, y)
-    mean, std = model.predict(x, return_std=True)
-    assert np.isfinite(mean).all()
-    assert (std > 0.0).all()
-
-
-def test_what_features_explain_to_the_last_digit_is_not_told_to_be_far_from_its_mean():
+def test_no_prior_mean_warning_if_features_explain_targets():
     """Their residuals scatter by rounding, which is little, but so is their mean."""
     rng = np.random.RandomState(0)
     rows = rng.randn(10, 5)
