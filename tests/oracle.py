@@ -45,6 +45,11 @@ def whitened(lengthscales, Z, X):
     return L, anp.linalg.solve(L, squared_exponential(Z, X, lengthscales))
 
 
+def own(values, o):
+    """Of output o, if outputs have rows of their own (n, o, d)."""
+    return values[:, o] if values.ndim == 3 else values
+
+
 class Dense:
     """The model from (N, N) matrices, in autograd.numpy: y ~ N(H β, Q + σ² V) for each output, one below the other.
 
@@ -59,7 +64,10 @@ class Dense:
         self.precision = ones if rows.precision is None else rows.precision
         self.prior, self.family, self.exact = prior, family, exact
         self.outputs = range(len(prior.scale))
-        self.residuals = targets + self.H @ (prior.offset - prior.mean).T
+        self.residuals = targets + self.linear(self.H, prior.offset - prior.mean)
+
+    def linear(self, H, weights):
+        return np.stack([own(H, o) @ weights[o] for o in self.outputs], axis=1)
 
     def k(self, values, o, A, B):
         return values["signal"][o] * squared_exponential(A, B, values["hyperparameters"])
@@ -78,8 +86,10 @@ class Dense:
         C = self.prior.roots()
 
         def block(i, j):
-            linear = H_A @ C[i] @ C[j].T @ H_B.T if i == j or self.prior.shared else np.zeros((len(A), len(B)))
-            return linear + k(values, i, A, B) if i == j else linear
+            if i != j and not self.prior.shared:
+                return np.zeros((len(A), len(B)))
+            linear = own(H_A, i) @ C[i] @ C[j].T @ own(H_B, j).T
+            return linear + k(values, i, own(A, i), own(B, i)) if i == j else linear
 
         return anp.concatenate([anp.concatenate([block(i, j) for j in self.outputs], axis=1) for i in self.outputs])
 
@@ -101,8 +111,9 @@ class Dense:
 
     def traces(self, values):
         """Of what the inducing points leave of each output's covariance, per unit of noise."""
-        left = (self.k(values, o, self.X, self.X) - self.sparse_k(values, o, self.X, self.X) for o in self.outputs)
-        return [self.precision @ anp.diag(own) for own in left]
+        inputs = [own(self.X, o) for o in self.outputs]
+        left = (self.k(values, o, X, X) - self.sparse_k(values, o, X, X) for o, X in enumerate(inputs))
+        return [self.precision @ anp.diag(each) for each in left]
 
     def bound(self, values):
         """The lower bound of the family; the likelihood if the model is exact."""
@@ -115,12 +126,12 @@ class Dense:
         """Of rows that count once, and weights of each output."""
         total = 0.0
         for o in self.outputs:
-            own = Dense(SimpleNamespace(**vars(self), inputs=self.X, features=self.H,
-                        targets=self.residuals[:, [o]] + self.H @ (self.prior.mean - self.prior.offset)[[o]].T),
-                        self.prior.outputs([o]))  # fmt: skip
+            targets = self.residuals[:, [o]] + self.H @ (self.prior.mean - self.prior.offset)[[o]].T
+            rows = SimpleNamespace(inputs=self.X, features=self.H, targets=targets, counts=None, precision=None)
+            alone = Dense(rows, self.prior.outputs([o]))
             its = values | {name: values[name][[o]] for name in ("signal", "noise")}
             its["inducing_points"] = values["inducing_points"][[o % len(values["inducing_points"])]]
-            total += own.log_density(its, own.total(its, own.sparse_k), own.traces(its)[0])
+            total += alone.log_density(its, alone.total(its, alone.sparse_k), alone.traces(its)[0])
         return total
 
     # --- a diagonal q ---------------------------------------------------------------------------------------------
@@ -144,7 +155,7 @@ class Dense:
         if self.family == "full":
             return 0.0
         precisions = (self.of_values_and_weights(values, o) for o in self.outputs)
-        return sum(anp.sum(anp.log(anp.diag(own))) - anp.linalg.slogdet(own)[1] for own in precisions)
+        return sum(anp.sum(anp.log(anp.diag(each))) - anp.linalg.slogdet(each)[1] for each in precisions)
 
     # --- predictions ----------------------------------------------------------------------------------------------
 
@@ -152,7 +163,9 @@ class Dense:
         """Mean (n, o), and covariance (o n, o n) of noise-free rows; of a diagonal q the variances only (n, o)."""
         S, n = self.total(values, self.known_k), len(A)
         cross = self.covariance(values, self.known_k, A, H_A, self.X, self.H)
-        mean = (cross @ np.linalg.solve(S, self.residuals.T.ravel())).reshape(-1, n).T + H_A @ self.prior.mean.T
+        mean = (cross @ np.linalg.solve(S, self.residuals.T.ravel())).reshape(-1, n).T + self.linear(
+            H_A, self.prior.mean
+        )
         prior = self.covariance(values, self.k, A, H_A, A, H_A)
         if self.family == "full":
             return mean, prior - cross @ np.linalg.solve(S, cross.T)
@@ -168,8 +181,8 @@ class Dense:
         C, S = self.prior.roots(), self.total(values, self.known_k)
         means, covariances = [], []
         for o in self.outputs:
-            own = [C[o] @ C[i].T @ self.H.T * float(i == o or self.prior.shared) for i in self.outputs]
-            cross = np.hstack(own)
+            each = [C[o] @ C[i].T @ own(self.H, i).T * float(i == o or self.prior.shared) for i in self.outputs]
+            cross = np.hstack(each)
             means.append(self.prior.mean[o] + cross @ np.linalg.solve(S, self.residuals.T.ravel()))
             covariances.append(C[o] @ C[o].T - cross @ np.linalg.solve(S, cross.T))
             if self.family == "diagonal":

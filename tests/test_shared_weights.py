@@ -19,7 +19,7 @@ from skevgp.model.predictor import CoefficientPrior
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
-from .oracle import central_differences, relative_error
+from .oracle import Dense, central_differences, relative_error
 
 N, O, P = 40, 3, 4  # noqa: E741
 
@@ -69,106 +69,65 @@ def data():
 KERNEL = ConstantKernel(1.5) * RBF([0.8, 1.3])
 
 
-class Dense:
-    """y stacked output by output: mean, joint covariance and log likelihood of a GP with kernel k + hΣhᵀ.
-
-    With inducing points Z (one set per output) the covariance of f is the sparse one, as of the bound.
-    """
-
-    def __init__(self, H, inputs, Y, mean, Sigma, noise, Z=None, kernel=KERNEL, relative=1.0):
-        self.Z, self.kernel, self.Sigma, self.beta = Z, kernel, Sigma, mean
-        self.H, self.inputs = H, inputs
-        self.y = np.concatenate(list(Y.T))
-        self.noise = np.ravel(np.outer(noise, relative * np.ones(len(Y))))
-        self.Q, self.K = self.of_f(inputs, inputs)
-        self.flat = self.stacked(H)
-        self.S = self.Q + self.flat @ Sigma @ self.flat.T + np.diag(self.noise)
-        self.r = self.y - self.flat @ mean
-
-    def stacked(self, H):
-        return np.concatenate([H[:, o] for o in range(O)])
-
-    def of_f(self, A, B):
-        """q(A, B) and k(A, B), block by block."""
-        n, m = len(A), len(B)
-        Q, K = np.zeros((O * n, O * m)), np.zeros((O * n, O * m))
-        for o in range(O):
-            at = slice(o * n, (o + 1) * n), slice(o * m, (o + 1) * m)
-            K[at] = Q[at] = self.kernel(A[:, o], B[:, o])
-            if self.Z is not None:
-                Z = self.Z[o]
-                Q[at] = self.kernel(A[:, o], Z) @ np.linalg.solve(self.kernel(Z), self.kernel(Z, B[:, o]))
-        return Q, K
-
-    def bound(self):
-        trace = np.sum(np.diagonal(self.K - self.Q) / self.noise)
-        log_det = np.linalg.slogdet(self.S)[1]
-        return -0.5 * (len(self.y) * np.log(2 * np.pi) + log_det + self.r @ np.linalg.solve(self.S, self.r) + trace)
-
-    def predict(self, H, inputs):
-        """Mean (n, o) and covariance of the noise-free g, rows first."""
-        Q, _ = self.of_f(inputs, self.inputs)
-        cross = Q + self.stacked(H) @ self.Sigma @ self.flat.T
-        mean = self.stacked(H) @ self.beta + cross @ np.linalg.solve(self.S, self.r)
-        prior = self.of_f(inputs, inputs)[1] + self.stacked(H) @ self.Sigma @ self.stacked(H).T
-        covariance = prior - cross @ np.linalg.solve(self.S, cross.T)
-        n = len(inputs)
-        order = np.arange(O * n).reshape(O, n).T.ravel()
-        return mean.reshape(O, n).T, covariance[np.ix_(order, order)]
+def dense(H, inputs, Y, mean, Sigma, Z=None, relative=1.0):
+    """The model of `KERNEL`, a noise variance of 0.3 and β ~ N(mean, Sigma); exact without inducing points."""
+    root, ones = np.linalg.cholesky(Sigma)[np.newaxis].repeat(O, axis=0), np.ones(N)
+    prior = CoefficientPrior(np.tile(mean, (O, 1)), np.ones((O, P)), np.zeros((O, P)), root, shared=True)
+    values = {"hyperparameters": np.array([0.8, 1.3]), "signal": np.full(O, 1.5), "noise": np.full(O, 0.3)}
+    rows = RawRows(inputs, H, Y - np.reshape(H @ mean, (N, -1)), ones, ones / relative)
+    return Dense(rows, prior, exact=Z is None), values | {"inducing_points": Z}
 
 
-def check(model, dense, data, kernel_map, feature_map):
-    X_new = data[4]
-    mean, covariance = dense.predict(feature_map, kernel_map)
-    found, joint = model.predict(X_new, return_cov="joint", include_noise=False)
-    assert_allclose(found, mean, rtol=1e-8, atol=1e-9)
-    assert_allclose(joint, covariance, rtol=1e-7, atol=1e-8 * np.abs(covariance).max())
-    _, std = model.predict(X_new, return_std=True, include_noise=False)
-    assert_allclose(std.ravel(), np.sqrt(np.diagonal(covariance)), rtol=1e-6)
-    _, cov = model.predict(X_new, return_cov=True)
+def check(model, expected, X_new, inputs, H):
+    oracle, values = expected
+    bound = model.log_marginal_likelihood_value_ if oracle.exact else model.lower_bound_
+    assert bound == pytest.approx(oracle.bound(values), rel=1e-9)
+    mean, covariance = oracle.predict(values, inputs, H)
     n = len(X_new)
-    expected = np.einsum("nomo->nmo", covariance.reshape(n, O, n, O)) + np.eye(n)[:, :, None] * model.noise_variance_
-    assert_allclose(cov, expected, rtol=1e-7, atol=1e-8 * np.abs(expected).max())
+    covariance = covariance.reshape(O, n, O, n).transpose(1, 0, 3, 2)
+    found, joint = model.predict(X_new, return_cov="joint", include_noise=False)
+    close = {"rtol": 1e-7, "atol": 1e-8 * np.abs(covariance).max()}
+    assert_allclose(found, mean, rtol=1e-8, atol=1e-9)
+    assert_allclose(joint, covariance.reshape(n * O, n * O), **close)
+    _, std = model.predict(X_new, return_std=True, include_noise=False)
+    assert_allclose(std, np.sqrt(np.einsum("nono->no", covariance)), rtol=1e-6)
+    _, cov = model.predict(X_new, return_cov=True)
+    assert_allclose(cov, np.einsum("nomo->nmo", covariance) + np.eye(n)[:, :, None] * model.noise_variance_, **close)
+    coef, coef_cov = (each[0] for each in oracle.weights(values))
+    assert_allclose(model.coef_, coef, rtol=1e-7)
+    assert_allclose(model.coef_cov_, coef_cov, rtol=1e-6, atol=1e-9)
 
 
 @pytest.mark.parametrize(
-    ("sharing", "per_output"),
-    [("none", True), ("none", False), ("kernel", True), ("kernel", False), ("all", False), ([[1], [0, 2]], False)],
+    ("sharing", "per_output"), [("none", True), ("kernel", True), ("kernel", False), ([[1], [0, 2]], False)]
 )
-def test_shared_weights_are_those_of_a_dense_process(data, sharing, per_output):
+def test_shared_weights_are_dense_ones(data, sharing, per_output):
     X, Y, Sigma, mean, X_new = data
-    joined = not isinstance(sharing, str) or sharing == "all"
+    joined = not isinstance(sharing, str)
+    features = Rows(per_output=not joined)
     kernel_map = FunctionTransformer(own_columns) if per_output else FunctionTransformer(lambda X: X[:, :2])
-    H, H_new = (Rows(per_output=not joined).transform(rows) for rows in (X, X_new))
     inputs, inputs_new = (kernel_map.transform(rows) for rows in (X, X_new))
-    Z = inputs[:9] if per_output else np.repeat(inputs[:9, np.newaxis], O, axis=1)
     model = EVGPRegressor(
-        Rows(per_output=not joined),
+        features,
         KERNEL,
         kernel_map=kernel_map,
         coef_prior=CoefPrior(shared=True, mean=mean, cov=Sigma),
         noise=Gaussian(variance=0.3),
-        inducing_init=inputs[:9] if not per_output else "auto",
+        inducing_init="auto" if per_output else inputs[:9],
         n_inducing=9,
         sharing=sharing,
         max_iter=0,
         random_state=0,
     ).fit(X, Y)
-    if per_output:
-        Z = model.inducing_points_.transpose(1, 0, 2)
-
-    def each(values):
-        return values if values.ndim == 3 else np.repeat(values[:, np.newaxis], O, axis=1)
-
-    dense = Dense(each(H), each(inputs), Y, mean, Sigma, np.full(O, 0.3), Z.transpose(1, 0, 2))
-    assert model.coef_.shape == (P,)
-    assert model.coef_cov_.shape == (P, P)
-    assert model.lower_bound_ == pytest.approx(dense.bound(), rel=1e-9)
+    Z = model.inducing_points_ if per_output else inputs[np.newaxis, :9]
+    check(
+        model,
+        dense(features.transform(X), inputs, Y, mean, Sigma, Z),
+        X_new,
+        inputs_new,
+        features.transform(X_new),
+    )
     assert model.upper_bound_ > model.lower_bound_
-    check(model, dense, data, each(inputs_new), each(H_new))
-    whole = Sigma - Sigma @ dense.flat.T @ np.linalg.solve(dense.S, dense.flat @ Sigma)
-    assert_allclose(model.coef_cov_, whole, rtol=1e-6, atol=1e-9)
-    assert_allclose(model.coef_, mean + Sigma @ dense.flat.T @ np.linalg.solve(dense.S, dense.r), rtol=1e-7)
 
 
 @pytest.mark.parametrize("sharing", ["none", "kernel", "all"])
@@ -425,21 +384,18 @@ def test_the_joint_covariance_is_asked_for_by_name(data):
             np.testing.assert_array_equal(joint[:, i, :, j], cov[:, :, i] if i == j else 0.0)
 
 
-def test_rows_with_known_noise_and_shared_weights_are_those_of_the_dense_process(data):
+def test_shared_weights_with_known_noise_are_dense_ones(data):
     X, Y, Sigma, mean, X_new = data
     relative = np.random.RandomState(1).uniform(0.2, 5.0, N)
-    kernel_map = FunctionTransformer(own_columns)
-    options = {"kernel_map": kernel_map, "coef_prior": CoefPrior(shared=True, mean=mean, cov=Sigma), "max_iter": 0}
-    sparse = EVGPRegressor(Rows(), KERNEL, noise=Gaussian(variance=0.3), n_inducing=9, random_state=0, **options)
-    sparse.fit(X, Y, relative_variance=relative)
-    exact = EGPRegressor(Rows(), KERNEL, noise=Gaussian(variance=0.3), **options).fit(X, Y, relative_variance=relative)
-    for model, Z in ((sparse, sparse.inducing_points_), (exact, None)):
-        dense = Dense(
-            Rows().transform(X), own_columns(X), Y, mean, Sigma, np.full(O, 0.3), Z, KERNEL, relative=relative
-        )
-        bound = model.lower_bound_ if model is sparse else model.log_marginal_likelihood_value_
-        assert bound == pytest.approx(dense.bound(), rel=1e-9)
-        check(model, dense, data, own_columns(X_new), Rows().transform(X_new))
+    options = {"kernel_map": FunctionTransformer(own_columns), "noise": Gaussian(variance=0.3), "max_iter": 0}
+    options |= {"coef_prior": CoefPrior(shared=True, mean=mean, cov=Sigma)}
+    sparse = EVGPRegressor(Rows(), KERNEL, n_inducing=9, random_state=0, **options)
+    exact = EGPRegressor(Rows(), KERNEL, **options)
+    for model in (sparse, exact):
+        model.fit(X, Y, relative_variance=relative)
+        Z = model.inducing_points_ if model is sparse else None
+        expected = dense(Rows().transform(X), own_columns(X), Y, mean, Sigma, Z, relative)
+        check(model, expected, X_new, own_columns(X_new), Rows().transform(X_new))
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
