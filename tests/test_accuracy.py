@@ -31,9 +31,11 @@ def test_little_is_lost_at_a_ratio_of_1e8(name):
     assert library.get("gradient", 0.0) < 1e-6
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1e8, 1e10])
+@pytest.mark.parametrize(
+    "ratio", [1e8, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1e10, marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_with_k_nearly_singular_no_more_is_lost_than_doubles_of_its_values_lose(name, ratio, seed):
     """That is more than 1e-8 of the bound and 1e-6 of variances: no algorithm has them who has doubles of K."""
     model = MODELS[name](Problem.drawn(ratio, 1e16, seed=seed, **SHAPE))
@@ -44,12 +46,6 @@ def test_with_k_nearly_singular_no_more_is_lost_than_doubles_of_its_values_lose(
         assert inputs[figure] < 1e-8
     if name != "given q":
         assert library["mean"] < 1e-8
-
-
-@pytest.mark.parametrize("name", ["collapsed", "given q", "exact"])
-def test_so_it_is_of_the_gradient(name):
-    library, _, kernel = errors(MODELS[name](Problem.drawn(1e8, 1e16, seed=1, **SHAPE)), draws=2)
-    assert library["gradient"] < SLACK * kernel["gradient"]
 
 
 # --- inducing points at all rows --------------------------------------------------------------------------------------

@@ -69,13 +69,6 @@ def test_a_union_concatenates():
     assert_allclose(scale, np.hstack([IF_SCALE, wide(polynomials.fit_transform(X))]))
 
 
-def test_a_union_may_pass_columns_through_and_drop_parts():
-    union = FeatureUnion([("gone", "drop"), ("x", "passthrough"), ("physics", InertiaForce("pendulum"))])
-    mean, scale = resolve(union)
-    assert_array_equal(mean, np.hstack([np.zeros((2, 3)), IF_MEAN]))
-    assert_allclose(scale, np.hstack([wide(X), IF_SCALE]))
-
-
 def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
     names = ["theta", "dtheta/dt", "u"]
     frame = frame_of({"kind": ["x", "y"] * 10} | dict(zip(names, X.T, strict=True)))
@@ -94,18 +87,6 @@ def test_the_weights_of_a_union_are_divided_out():
     mean, scale = resolve(union)
     assert_allclose(mean, np.hstack([IF_MEAN / 4.0, np.zeros((2, 3))]))
     assert_allclose(scale, np.hstack([IF_SCALE / 4.0, wide(0.5 * X)]))
-
-
-def test_a_pipeline_has_the_prior_of_its_last_step():
-    mean, scale = resolve(make_pipeline(FunctionTransformer(), InertiaForce("pendulum")))
-    assert_array_equal(mean, IF_MEAN)
-    assert_array_equal(scale, IF_SCALE)
-
-
-def test_a_scaler_behind_the_physics_takes_its_prior_away():
-    mean, scale = resolve(make_pipeline(InertiaForce("pendulum"), StandardScaler()))
-    assert_array_equal(mean, np.zeros((2, 3)))
-    assert_allclose(scale, wide(StandardScaler().fit_transform(X)))
 
 
 def test_unions_and_pipelines_nest():
@@ -128,11 +109,6 @@ def test_a_number_fills_the_table():
 def test_a_table_of_another_shape_is_named(name, shape):
     with pytest.raises(ValueError, match=rf"{name} of CoefPrior must be .* \(2, 3\); got the shape \({shape[0]},"):
         resolve(FunctionTransformer(), **{name: np.ones(shape)})
-
-
-def test_a_negative_scale_is_an_error():
-    with pytest.raises(ValueError, match=r"scale of CoefPrior must not be negative; its smallest value is -2\.0"):
-        resolve(FunctionTransformer(), scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
 
 
 @pytest.mark.parametrize("name", ["mean", "scale"])
@@ -172,21 +148,6 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
     assert_array_equal(scale[:, 2:5], IF_SCALE)
     assert_array_equal(mean[:, [0, 1, 5]], 0.0)
     assert_allclose(scale[:, [0, 1, 5]], wide(columns.transform(X))[:, [0, 1, 5]])
-
-
-@pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
-def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
-    union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
-    mean, scale, _ = resolved(CoefPrior(), union.fit(X), X, wide(X), 2)
-    assert_allclose(mean, factor * IF_MEAN)
-    assert_allclose(scale, abs(factor) * IF_SCALE)
-
-
-def test_nan_in_a_scale_leaves_it_to_the_data():
-    mean, scale = resolve(Opinionated(np.ones((2, 3)), np.array([[1.0, np.nan, 2.0]] * 2)))
-    assert_array_equal(mean, 1.0)
-    assert_array_equal(scale[:, [0, 2]], [[1.0, 2.0]] * 2)
-    assert_allclose(scale[:, 1], wide(X)[:, 1])
 
 
 @pytest.mark.parametrize("prior", [None, np.ones((2, 3))])

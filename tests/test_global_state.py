@@ -20,9 +20,7 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import threadpool_info
 
-from skevgp import InverseDynamics, rollout
-from skevgp.datasets import make_dynamics
-from skevgp.features import InertiaForceGravity
+from skevgp import rollout
 from skevgp.io import load, save
 from skevgp.solvers import LBFGS, Adam
 
@@ -110,16 +108,3 @@ def test_files(tmp_path):
     (tmp_path / "model").write_bytes(b"no model")
     with pytest.raises(ValueError, match="cannot be loaded"):
         load(tmp_path / "model")
-
-
-def test_exports(tmp_path):
-    model = clone(THREADED["all"]).fit(X, Y)
-    model.to_casadi()(X_NEW[0])
-    model.to_c(tmp_path)
-
-
-def test_data_and_physics():
-    train = make_dynamics("pendulum", 3, 20, n_jobs=2, random_state=0)
-    evgp(InertiaForceGravity("pendulum")).fit(train.data, train.target, groups=train.groups)
-    rows = np.random.RandomState(0).uniform(-1.0, 1.0, (40, 6))
-    InverseDynamics("acrobot", n_inducing=4, max_iter=2, random_state=0).fit(rows, rows[:, :2])

@@ -11,7 +11,6 @@ from sklearn.base import clone
 from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
-from skevgp.io import load, save
 from skevgp.noise import Gaussian
 from skevgp.solvers import Adam
 
@@ -115,18 +114,3 @@ def test_what_is_done_with_a_model_ends_at_once_and_leaves_it_as_it_was(use):
         with interrupted_at(n), pytest.raises(KeyboardInterrupt):
             use(model)
         np.testing.assert_array_equal(predictions(model), before)
-
-
-def test_a_file_is_replaced_or_as_it_was(tmp_path):
-    model, path = fitted("lbfgs")[0], tmp_path / "model.skevgp"
-    save(model, path)
-    before = path.read_bytes()
-    with interrupted_at() as places:
-        save(fitted("exact")[0], path)
-    path.write_bytes(before)
-    for n in np.linspace(2, len(places) - 5, 6).astype(int):
-        with interrupted_at(n), pytest.raises(KeyboardInterrupt):
-            save(fitted("exact")[0], path)
-        assert path.read_bytes() == before
-        assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    np.testing.assert_array_equal(predictions(load(path)), predictions(model))

@@ -1,19 +1,14 @@
-import pickle
 import warnings
 
 import numpy as np
-import pandas as pd
 import pinocchio
 import pytest
-from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.base import clone
+from numpy.testing import assert_allclose
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import GroupKFold, cross_val_score
 
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
 from skevgp.features import RigidBodyRegressor
-from skevgp.identification.weights import _root
 from skevgp.robots import RigidBody, inertial_parameters, physical_consistency
 
 
@@ -70,15 +65,6 @@ def rigid(arm):
     return arm.fit(n_inducing=0)
 
 
-def identifiable(model, truth):
-    """Distances, in standard deviations, of the combinations of which torques know more than the prior did."""
-    root = _root(model._weights.prior.covariance)
-    to_unit = np.linalg.pinv(root, rcond=1e-9)
-    variance, directions = np.linalg.eigh(to_unit @ model.coef_cov_ @ to_unit.T)
-    known = (variance < 0.25) & (variance > 1e-20)
-    return (directions.T @ to_unit @ (truth - model.coef_))[known] / np.sqrt(variance[known])
-
-
 def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):
     truth = arm.torque(arm.new)
     error = np.sqrt(np.mean((rigid.predict(arm.new) - truth) ** 2, axis=0)) / truth.std(axis=0)
@@ -86,24 +72,6 @@ def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):
     model = RigidBodyRegressor(arm.nominal, stiction_velocity=0.01)
     before = model.fit_transform(arm.new) @ model.coef_prior(6)[0]
     assert (np.sqrt(np.mean((before - truth) ** 2, axis=0)) / truth.std(axis=0)).min() > 0.05
-
-
-@pytest.mark.long
-def test_intervals_of_what_torques_show_hold_the_truth():
-    distances = []
-    for seed in range(6):
-        arm = Arm(seed=seed)
-        distances.append(np.abs(identifiable(arm.fit(n_inducing=0), arm.weights)))
-    inside = np.concatenate(distances) < 1.96
-    assert len(inside) > 200
-    assert 0.88 <= inside.mean() <= 0.995
-
-
-def test_what_torques_do_not_show_stays_at_the_prior(arm, rigid):
-    # The first link turns about a vertical axis: its mass does nothing.
-    assert rigid.coef_[0] == pytest.approx(rigid.coef_prior_mean_[0], rel=1e-6)
-    assert rigid.coef_std_[0] == pytest.approx(rigid.coef_prior_scale_[0], rel=1e-3)
-    assert (rigid.coef_std_ <= rigid.coef_prior_scale_ * (1.0 + 1e-9)).all()
 
 
 def gear(X):
@@ -167,40 +135,6 @@ def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
     assert_allclose(loaded.damping, found.damping, rtol=1e-9)
     with pytest.raises(ValueError, match="file"):
         rigid.write_urdf(tmp_path / "none.urdf")
-
-
-def test_scikit_learn_knows_it():
-    arm = Arm("acrobot")
-    model = InverseDynamics(RigidBodyRegressor("acrobot", friction=["viscous", "coulomb"]), n_inducing=0)
-    model.set_params(robot__mass_scale=0.5)
-    scores = cross_val_score(model, arm.X, arm.y, cv=GroupKFold(3), groups=arm.groups)
-    assert scores.min() > 0.99
-    fitted = clone(model).fit(arm.X, arm.y)
-    assert_array_equal(pickle.loads(pickle.dumps(fitted)).predict(arm.new), fitted.predict(arm.new))
-    assert fitted.coef_.shape == (24,)
-
-
-def test_frames_must_be_in_the_robots_order():
-    arm = Arm("pendulum")
-    frame = pd.DataFrame(arm.X, columns=["q", "dq/dt", "d2q/dt2"])
-    model = InverseDynamics("pendulum", n_inducing=0).fit(frame, arm.y)
-    assert_allclose(model.predict(frame), InverseDynamics("pendulum", n_inducing=0).fit(arm.X, arm.y).predict(arm.X))
-    with pytest.raises(ValueError, match="order"):
-        InverseDynamics("pendulum").fit(frame[["dq/dt", "q", "d2q/dt2"]], arm.y)
-
-
-@pytest.mark.parametrize("scale", [0.0, 1e-6, 1e6])
-def test_torques_of_any_size(scale):
-    """Without a prior that knows their units."""
-    arm = Arm("acrobot")
-    wide = RigidBodyRegressor(arm.nominal, mass_scale=1e8, com_scale=1.0, inertia_scale=1e8, friction_scale=1e8)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model = InverseDynamics(wide, n_inducing=5, max_iter=5).fit(arm.X, scale * arm.y)
-    mean, std = model.predict(arm.new, return_std=True)
-    assert np.isfinite(std).all()
-    assert (std >= 0.0).all()
-    assert_allclose(mean, scale * arm.torque(arm.new), atol=0.05 * scale * arm.y.std() + 1e-12)
 
 
 def with_masses(arm, factor):

@@ -12,9 +12,6 @@ from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
-from skevgp.datasets import make_toy
-from skevgp.features import InertiaForceGravity
-from skevgp.noise import Gaussian
 from skevgp.plotting import CoefficientDisplay
 
 RNG = np.random.RandomState(0)
@@ -43,15 +40,6 @@ def test_before_a_fit_it_predicts_what_scikit_learns_model_does(kernel, n_target
     samples = ours.sample_y(X_NEW, 5, random_state=1)
     assert samples.shape == theirs.sample_y(X_NEW, 5, random_state=1).shape
     assert vars(ours) == vars(clone(ours))
-
-
-def test_physics_predicts_before_there_are_data():
-    """A pendulum's gravity pulls it back."""
-    model = EGPRegressor(InertiaForceGravity("pendulum"), n_targets=2)
-    mean, std = model.predict([[0.1, 1.0, 0.0]], return_std=True)
-    np.testing.assert_allclose(mean, [[0.13, 1.0]], atol=1e-12)
-    assert (std > 0).all()
-    assert model.sample_y([[0.1, 1.0, 0.0]], 4).shape == (1, 2, 4)
 
 
 def test_the_posterior_of_a_kernel_as_given_is_its_prior_given_the_data():
@@ -99,23 +87,6 @@ def test_with_alpha_and_no_optimizer_it_is_scikit_learns_model(y, alpha):
     np.testing.assert_allclose(std**2, expected_std**2 + alpha, atol=1e-8)
     np.testing.assert_allclose(ours.predict(X_NEW, True, include_noise=False)[1], expected_std, atol=1e-6)
     assert ours.log_marginal_likelihood_value_ == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-4)
-
-
-def test_known_noise_of_each_row():
-    variances = RNG.uniform(0.01, 0.5, 30)
-    ours = EGPRegressor(kernel=KERNEL, alpha=variances.mean(), optimizer=None)
-    ours.fit(X, Y[:, 0], relative_variance=variances / variances.mean())
-    theirs = GaussianProcessRegressor(KERNEL, alpha=variances, optimizer=None).fit(X, Y[:, 0])
-    for actual, expected in zip(
-        ours.predict(X_NEW, return_cov=True, include_noise=False), theirs.predict(X_NEW, return_cov=True), strict=True
-    ):
-        np.testing.assert_allclose(actual, expected, atol=1e-8)
-
-
-@pytest.mark.parametrize("arguments", [{"noise": Gaussian(variance=0.1)}, {"kernel": RBF() + WhiteKernel()}], ids=str)
-def test_noise_is_known_or_learned(arguments):
-    with pytest.raises(ValueError, match=r"alpha=0\.1 is the noise"):
-        EGPRegressor(alpha=0.1, **arguments).fit(X, Y)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -1.0, np.full(30, 0.1)], ids=str)
@@ -175,14 +146,6 @@ def test_an_optimizer_that_returns_nonsense_is_refused():
             EGPRegressor(optimizer=lambda objective, theta, bounds, answer=answer: (answer, 0.0)).fit(X, Y[:, 0])
 
 
-def test_an_optimizer_that_asks_for_nonsense_is_told_so():
-    def asks(objective, theta, bounds):
-        return objective(np.stack([theta, theta]))
-
-    with pytest.raises(ValueError, match=r"theta must be 4 numbers; got an array of shape \(2, 4\)"):
-        EGPRegressor(optimizer=asks).fit(X, Y[:, 0])
-
-
 def test_ctrl_c_keeps_the_best_that_an_optimizer_of_ones_own_has_seen():
     def interrupted(objective, theta, bounds):
         for shift in (0.0, 0.2, 5.0):
@@ -227,10 +190,3 @@ def test_theta_of_the_kernel_as_given(kernel):
 def test_parameters_are_checked_before_a_fit_too(parameters, named):
     with pytest.raises(InvalidParameterError, match=f"'{named}' parameter"):
         EGPRegressor(**parameters).predict([[0.0, 1.0]], return_std=True)
-
-
-@pytest.mark.parametrize("rubbish", [None, (1.0, 2.0, 3.0), ("a", "b"), np.zeros(7)], ids=str)
-def test_what_an_optimizer_returns_is_named(rubbish):
-    X, y = make_toy(20, random_state=0, return_X_y=True)
-    with pytest.raises(ValueError, match="optimizer must return 3 finite numbers and their value; got"):
-        EGPRegressor(optimizer=lambda objective, theta, bounds: rubbish).fit(X, y)

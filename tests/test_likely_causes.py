@@ -3,7 +3,6 @@
 import warnings
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.exceptions import ConvergenceWarning
 
@@ -43,8 +42,7 @@ def warning_of(robot, X, y, **data):
     return str(caught[0].message) if caught else ""
 
 
-@pytest.mark.parametrize("masses", [1.0, 0.1], ids=["rough", "placeholders"])
-@pytest.mark.parametrize("what", ["X and y", "X", "y"])
+@pytest.mark.parametrize(("what", "masses"), [("X and y", 1.0), ("X", 0.1), ("y", 1.0)])
 def test_columns_in_another_order_are_named_in_their_order(what, masses):
     arm = Arm(noise=NOISE)
     order = [2, 1, 0, 5, 3, 4]
@@ -66,8 +64,7 @@ def test_the_order_of_more_joints_is_searched_step_by_step(robot):
     assert any(f"columns of X and y seem to be in the order {columns}" in cause for cause in found)
 
 
-@pytest.mark.parametrize("blocks", ["qva", "q"])
-@pytest.mark.parametrize("robot", ["ur5", "kinova"])  # the latter has joints without limits
+@pytest.mark.parametrize(("robot", "blocks"), [("ur5", "qva"), ("kinova", "q")])  # the latter has joints without limits
 def test_degrees_are_named(robot, blocks):
     arm = Arm(robot, noise=NOISE)
     names = list(arm.nominal.names)[1:]
@@ -76,11 +73,10 @@ def test_degrees_are_named(robot, blocks):
     assert cause == f"{signals} of {names} look like degrees, and must be in radians"
 
 
-@pytest.mark.parametrize("robot", ["cartpole", "so100", "kinova", "ur10"])
-@pytest.mark.parametrize("seed", range(2))
-def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robot, seed):
+@pytest.mark.parametrize("robot", ["cartpole", "ur10"])
+def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robot):
     """Without gravity, in amperes, or with signs of their own, torques are explained best without some signals."""
-    arm, rng = Arm(robot, noise=0.0), np.random.default_rng(seed)
+    arm, rng = Arm(robot, noise=0.0), np.random.default_rng(0)
     q, v, a = np.split(arm.X, 3, axis=1)
     forces = RigidBody(arm.nominal).forces
     wrong = {
@@ -90,16 +86,6 @@ def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robo
     }
     causes = {name: causes_of(arm.nominal, arm.X, y) for name, y in wrong.items()}
     assert not any("degrees" in cause for several in causes.values() for cause in several)
-
-
-def test_positions_beyond_their_limits_are_named_if_the_model_is_far_off():
-    arm = Arm(noise=NOISE)
-    X = arm.X.copy()
-    X[:, 0] += 9.0  # of the vertical axis: torques do not know it
-    (cause,) = causes_of(arm.nominal, X, arm.y)
-    assert cause.startswith("positions of 'shoulder_pan_joint' (from ")
-    assert "with limits of -6.28 and 6.28 rad) are beyond the joints' limits" in cause
-    assert causes_of(arm.nominal, X, arm.y, is_far=False) == []
 
 
 @pytest.mark.parametrize(
@@ -138,9 +124,3 @@ def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(fra
         InverseDynamics("ur5").fit(other, y)
     with pytest.raises(ValueError, match=r"columns of y must be in the robot's order.*got \['elbow_joint'"):
         InverseDynamics("ur5").fit(X, frame_of({name: arm.y[:, UR5.index(name)] for name in by_name}))
-
-
-@pytest.mark.parametrize("names", [list("abcdef") * 3, [f"x{number}" for number in range(18)]])
-def test_names_that_say_nothing_of_joints_are_any(names):
-    names = [f"{name}{number}" for number, name in enumerate(names)]
-    RigidBodyRegressor("ur5").fit(pd.DataFrame(np.zeros((2, 18)), columns=names))

@@ -4,9 +4,7 @@ import pytest
 from autograd import grad
 
 from skevgp.utils.linalg import (
-    Jitter,
     NotPositiveDefiniteError,
-    cholesky_of_covariance,
     cholesky_pullback,
     jittered_cholesky,
     lower_transposed_times,
@@ -33,41 +31,11 @@ def test_jitter_is_relative_to_the_diagonal():
     np.testing.assert_allclose(np.diag(L) ** 2, 1.01 * np.diag(A), rtol=1e-14)
 
 
-def test_a_singular_matrix_gets_just_enough_jitter():
-    A = np.ones((5, 5))
-    L = jittered_cholesky(A)
-    np.testing.assert_allclose(L @ L.T, A, atol=1e-12)
-
-
 def test_a_jitter_above_the_most_is_not_tried():
     indefinite = np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])
     assert np.isfinite(jittered_cholesky(indefinite)).all()
     with pytest.raises(NotPositiveDefiniteError, match="with a relative jitter of 1e-08"):
         jittered_cholesky(indefinite, most=1e-8)
-
-
-# --- a jitter only where it is needed -----------------------------------------------------------------------------
-
-
-LARGE = Jitter(1e-3, well_conditioned=1e-6)
-
-
-def with_last_pivot(pivot):
-    """A covariance whose last row is known from the first but for this share of its variance."""
-    L = np.array([[1.0, 0.0], [np.sqrt(1.0 - pivot), np.sqrt(pivot)]])
-    return 4.0 * L @ L.T
-
-
-@pytest.mark.parametrize("pivot", [5e-7, 1e-12, 0.0])
-def test_one_whose_rows_nearly_follow_from_each_other_gets_it(pivot):
-    A = with_last_pivot(pivot)
-    L = cholesky_of_covariance(A, LARGE)
-    np.testing.assert_allclose(L @ L.T, A + 1e-3 * np.diag(np.diag(A)), rtol=1e-14)
-
-
-def test_a_covariance_that_is_none_raises_a_named_error():
-    with pytest.raises(NotPositiveDefiniteError, match="not positive definite"):
-        cholesky_of_covariance(np.array([[1.0, 2.0], [2.0, 1.0]]), Jitter())
 
 
 # --- errors -------------------------------------------------------------------------------------------------------

@@ -34,20 +34,6 @@ def test_the_line_is_minus_the_loss(sparse):
     assert display.ax_.get_ylabel() == "lower bound (nats)"
 
 
-def test_the_exact_model_shows_its_likelihood():
-    display = LossDisplay.from_estimator(EGPRegressor().fit(X, y))
-    assert display.ax_.get_ylabel() == "log marginal likelihood (nats)"
-
-
-def test_curves_share_axes_and_all_are_seen():
-    first = LossDisplay(np.linspace(10.0, 20.0, 8)).plot(label="a")
-    second = LossDisplay(np.linspace(-40.0, 0.0, 8)).plot(ax=first.ax_, label="b")
-    low, high = first.ax_.get_ylim()
-    assert low < -28.0
-    assert high > 20.0
-    assert first.line_.get_color() != second.line_.get_color()
-
-
 def test_what_has_no_iterations_is_an_error():
     with pytest.raises(ValueError, match="EVGPRegressor has no iterations to show"):
         LossDisplay.from_estimator(EVGPRegressor(n_inducing=8, max_iter=0, random_state=0).fit(X, y))

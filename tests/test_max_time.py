@@ -5,7 +5,7 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.solvers import LBFGS, Adam
+from skevgp.solvers import LBFGS
 from skevgp.utils.monitor import Monitor
 
 rng = np.random.RandomState(0)
@@ -56,19 +56,6 @@ def test_when_it_is_over_the_best_so_far_is_kept(sharing, n_jobs):
         model.fit(X, Y)
     assert model.n_iter_ == 1
     assert np.isfinite(model.predict(X)).all()
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("solver", [LBFGS, Adam])
-def test_time_enough_changes_nothing(solver):
-    settings = {"n_inducing": 10, "max_iter": 5, "random_state": 0}
-    plain, timed = (EVGPRegressor(**settings, solver=solver(max_time=seconds)) for seconds in (None, 1e6))
-    np.testing.assert_array_equal(plain.fit(X, Y).predict(X), timed.fit(X, Y).predict(X))
-
-
-def test_adam_too():
-    with pytest.warns(ConvergenceWarning, match="max_time=1e-09"):
-        assert EVGPRegressor(solver=Adam(max_time=1e-9), n_inducing=10, random_state=0).fit(X, Y).n_iter_ == 1
 
 
 @pytest.mark.parametrize("max_time", [0, -1.0, "10"])

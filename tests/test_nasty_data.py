@@ -19,13 +19,6 @@ def test_rows_on_top_of_each_other_count_as_one_place():
     np.testing.assert_allclose(model.predict([[0.0], [3.0]]), [0.0, 3.0], atol=0.2)
 
 
-def test_noise_that_is_all_there_is_is_found():
-    rng = np.random.RandomState(0)
-    X, y = rng.randn(300, 2), 2.0 * rng.randn(300)
-    model = EVGPRegressor(n_inducing=10, random_state=0).fit(X, y)
-    assert np.sqrt(model.noise_variance_) == pytest.approx(2.0, rel=0.1)
-
-
 @pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1])
 def test_a_constant_column_may_move_a_little_afterwards(constant):
     """The mean of equal numbers rounds; the column must not end with a lengthscale of 1e-17."""
@@ -34,14 +27,6 @@ def test_a_constant_column_may_move_a_little_afterwards(constant):
     y = np.sin(2 * X[:, 0]) + 0.05 * rng.randn(1000)
     model = EVGPRegressor(n_inducing=15, random_state=0, solver=LBFGS(tol=1.0)).fit(X, y)
     assert model.score(X * [1.0, 1.0 + 1e-9], y) > 0.99
-
-
-@pytest.mark.parametrize("offset", [1e2, 5e3])
-def test_a_wave_far_from_zero_is_learned(offset):
-    rng = np.random.RandomState(0)
-    X = rng.uniform(-2, 2, (300, 1))
-    y = offset + np.sin(2 * X[:, 0]) + 0.05 * rng.randn(300)
-    assert EVGPRegressor(n_inducing=20, random_state=0).fit(X, y).score(X, y) > 0.98
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e8])
@@ -55,13 +40,6 @@ def test_powers_of_columns_far_from_zero_explain_a_line(scale):
     # The weights of 20 products of 1e16, which add up to a line of size 1, leave 1e-7 of it.
     assert np.abs(model.predict(X) - line).max() <= 1e-5
     assert model.noise_variance_ <= 1e-10
-
-
-def test_rows_that_differ_by_rounding_share_inducing_points():
-    rng = np.random.RandomState(0)
-    X = np.repeat([[0.0], [1.0], [2.0]], 20, axis=0) + 1e-14 * rng.randn(60, 1)
-    model = EVGPRegressor(n_inducing=20, random_state=0, solver=LBFGS(tol=1.0)).fit(X, X[:, 0] + 0.1 * rng.randn(60))
-    assert np.isfinite(model.predict(X)).all()
 
 
 GOOD = np.random.RandomState(0).randn(20, 3)

@@ -11,12 +11,10 @@ from sklearn.preprocessing import PolynomialFeatures
 from skevgp import CoefPrior, EVGPRegressor
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.metrics import negative_log_predictive_density
-from skevgp.solvers import LBFGS, SOLVERS
+from skevgp.solvers import LBFGS
 
 # A few iterations are enough.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-
-SETTINGS = [("lbfgs", "full"), ("lbfgs", "diagonal"), ("adam", "full"), ("adam", "diagonal")]
 
 
 def trajectories(n, seed, length=100):
@@ -47,32 +45,8 @@ def independent(n=2000, noise=(0.1, 0.5), seed=0):
     return X, np.column_stack([np.sin(X[:, 0]), X[:, 0] * X[:, 1]]) + np.array(noise) * rng.randn(n, 2)
 
 
-def mean_square_z(m):
-    """Of each output on new trajectories; 1 if std is honest."""
-    mean, std = m.predict(X_NEW, return_std=True)
-    return np.mean(((Y_NEW - mean) / std) ** 2, axis=0)
-
-
 def nlpd(m, X, Y):
     return negative_log_predictive_density(Y, *m.predict(X, return_std=True))
-
-
-@pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
-@pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["no features", "features"])
-def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
-    settings = {"feature_map": feature_map, "sharing": sharing, "solver": SOLVERS[solver](posterior=posterior)}
-    # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
-    settings |= {"max_iter": 10, "X": X[:1900], "Y": Y[:1900], "groups": GROUPS[:1900]}
-    plain, calibrated = (fitted(**settings, noise_cv=noise_cv) for noise_cv in (None, 5))
-    np.testing.assert_array_equal(calibrated.inducing_points_, plain.inducing_points_)
-    np.testing.assert_array_equal(*([k.k2.theta for k in m.kernel_] for m in (calibrated, plain)))
-    np.testing.assert_array_equal(calibrated.loss_curve_, plain.loss_curve_)
-    before, z = mean_square_z(plain), mean_square_z(calibrated)
-    assert (before > 2.0).all()
-    assert (z > 0.3).all()
-    assert (z < 2.5).all()
-    assert (z < before).all()
 
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
@@ -137,7 +111,7 @@ def test_points_at_all_rows_leave_nothing_to_folds_but_to_groups():
     assert np.isfinite(grouped.predict(X_NEW, return_std=True)).all()
 
 
-@pytest.mark.parametrize("groups", [GROUPS.tolist(), GROUPS.astype(str), [None if g == 0 else f"{g}" for g in GROUPS]])
+@pytest.mark.parametrize("groups", [[None if g == 0 else f"{g}" for g in GROUPS]])
 def test_labels_may_be_anything(groups):
     m = fitted(groups, noise_cv=20)
     expected = fitted(noise_cv=20)
@@ -157,8 +131,7 @@ def test_a_wrong_number_of_folds_is_refused(noise_cv):
         fitted(noise_cv=noise_cv)
 
 
-@pytest.mark.parametrize("groups", [None, GROUPS], ids=["random", "groups"])
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS)])
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_same_bits_for_any_n_jobs(sharing, groups, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 64)
@@ -224,17 +197,6 @@ def test_others_are_not(fit):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DependentRowsWarning)
         fit()
-
-
-def test_what_groups_do_not_have_in_common_is_told():
-    """Each has a level of its own: within it rows say a lot of each other, and nothing of other groups."""
-    rng = np.random.RandomState(0)
-    groups = np.repeat(np.arange(40), 25)
-    X = (3.0 * groups + rng.uniform(-0.3, 0.3, 1000))[:, np.newaxis]
-    y = rng.randn(40)[groups] + 0.1 * rng.randn(1000)
-    with pytest.warns(ConvergenceWarning, match="learned of 1 of 1 outputs fitted together does not hold for groups"):
-        m = EVGPRegressor(n_inducing=40, random_state=0).fit(X, y, groups=groups)
-    assert np.median(m.predict(3.0 * groups[:, np.newaxis] + 1.5, return_std=True)[1]) > 0.5
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 import skevgp
-from skevgp.datasets import make_dynamics, simulate
+from skevgp.datasets import make_dynamics
 from skevgp.utils.optional import require
 
 ROOT = Path(skevgp.__file__).parents[1]
@@ -36,19 +36,6 @@ def test_a_missing_package_gets_the_pip_command(monkeypatch, name, message):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=message):
         require(name, "Simulating")
-
-
-@pytest.mark.parametrize(
-    "use",
-    [
-        lambda: make_dynamics("pendulum", 1, 1),
-        lambda: simulate("pendulum", [0.0, 0.0], [[0.0]]),
-    ],
-)
-def test_simulating_without_pinocchio_gives_the_pip_command(monkeypatch, use):
-    monkeypatch.setitem(sys.modules, "pinocchio", None)
-    with pytest.raises(ImportError, match=r"needs the optional package 'pin'.*pip install pin "):
-        use()
 
 
 def test_an_unknown_system_is_told_before_the_missing_package(monkeypatch):
@@ -85,8 +72,3 @@ def test_optional_packages_are_loaded_only_where_they_are_used(code):
 def test_public_names_are_listed():
     assert dir(skevgp) == sorted(skevgp.__all__)
     assert {"EVGPRegressor", "datasets", "features", "metrics", "plotting", "__version__"} <= set(dir(skevgp))
-
-
-def test_an_unknown_name_is_an_attribute_error():
-    with pytest.raises(AttributeError, match="module 'skevgp' has no attribute 'EVGPClassifier'"):
-        skevgp.EVGPClassifier  # noqa: B018

@@ -81,16 +81,15 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(data, sharing, include_no
     np.testing.assert_allclose(model.lower_bound_, bound, rtol=1e-6)
 
 
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
 @pytest.mark.parametrize(
     "options", [{}, {"solver__posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str
 )
-def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, sharing, options):
+def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, options):
     X, Y, _ = data
     unit = np.array([1.0, 100.0])
     prior = {"coef_prior": CoefPrior(mean=MEAN * unit[:, np.newaxis], scale=SCALE * unit[:, np.newaxis])}
     model = EVGPRegressor(
-        PolynomialFeatures(1), n_inducing=15, sharing=sharing, random_state=0, solver=LBFGS(tol=1.0), **prior
+        PolynomialFeatures(1), n_inducing=15, sharing="kernel", random_state=0, solver=LBFGS(tol=1.0), **prior
     )
     model.set_params(**options).fit(X, Y * unit)
     mean = np.mean(Y, axis=0) if "normalize_y" in options else np.zeros(2)

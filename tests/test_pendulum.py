@@ -2,13 +2,11 @@
 
 import numpy as np
 import pytest
-from sklearn.model_selection import GridSearchCV, GroupKFold
 
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForceGravity
 from skevgp.metrics import containing_ratios, prediction_error
-from skevgp.solvers import LBFGS, Adam
 
 
 @pytest.fixture(scope="module", params=[0, 3])
@@ -35,15 +33,6 @@ def test_inertia_force_gravity(data):
 
 
 @pytest.mark.long
-def test_the_papers_setup(data):
-    """Adam, diagonal posterior, inducing points per output; a sixteenth of the default steps."""
-    paper = {"solver": Adam(posterior="diagonal"), "sharing": "kernel", "max_iter": 1000, "random_state": 0}
-    model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, **paper)
-    assert error(model, data) <= 0.006
-    assert model.n_parameters_ == 123
-
-
-@pytest.mark.long
 def test_uncertainty_is_honest_with_noise():
     train = make_dynamics("pendulum", noise=0.01, random_state=0)
     test = make_dynamics("pendulum", random_state=1000)
@@ -63,22 +52,3 @@ def test_the_weights_are_physics():
     np.testing.assert_allclose(model.coef_[0], [1.0, 0.03, 0.0, 0.0], atol=0.03)
     np.testing.assert_allclose(model.coef_[1, [1, 2]], [1.0, 0.12], atol=0.03)
     assert -0.7 < model.coef_[1, 3] < -0.3
-
-
-@pytest.fixture(scope="module")
-def small():
-    return make_dynamics("pendulum", n_trajectories=12, n_steps=30, random_state=0)
-
-
-@pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
-@pytest.mark.long
-def test_grid_search_over_the_number_of_inducing_points(small):
-    search = GridSearchCV(
-        EVGPRegressor(InertiaForceGravity("pendulum"), random_state=0, solver=LBFGS(tol=1.0)),
-        {"n_inducing": [5, 10], "feature_map__known_scale": [0.1, 0.2]},
-        cv=GroupKFold(3),
-        n_jobs=2,
-    )
-    search.fit(small.data, small.target, groups=small.groups)
-    assert search.best_score_ > 0.999
-    assert search.best_params_["n_inducing"] in (5, 10)

@@ -6,8 +6,6 @@ import pytest
 from matplotlib import pyplot
 from matplotlib.colors import to_rgb
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.linear_model import LinearRegression
 from sklearn.metrics import make_scorer
 from sklearn.model_selection import learning_curve
@@ -36,23 +34,6 @@ def close_figures():
 @pytest.fixture
 def trend():
     return fitted(Y, PolynomialFeatures(1))
-
-
-class Witness(RegressorMixin, BaseEstimator):
-    """It writes down the numbers of its training rows, which are its input; clones write on the same list."""
-
-    def __init__(self, seen=None):
-        self.seen = seen
-
-    def __sklearn_clone__(self):
-        return self
-
-    def fit(self, X, y):
-        self.seen.append(X[:, 0].tolist())
-        return self
-
-    def predict(self, X):
-        return np.zeros((len(X), 2))
 
 
 def learning_curve_of(estimator=None, inputs=X, targets=Y, sizes=(10, 20, 30), **options):
@@ -91,17 +72,6 @@ def test_the_band_is_so_many_standard_deviations(n_std, label):
     assert drawn == label
 
 
-def test_inducing_points_are_crosses_on_the_lower_edge():
-    model = fitted()
-    display = PosteriorDisplay.from_estimator(model, X)
-    crosses = lines(display)["inducing points"]
-    assert_array_equal(crosses.get_xdata(), model.inducing_points_[:, 0])
-    assert crosses.get_marker() == "x"
-    display.figure_.draw_without_rendering()
-    on_screen = crosses.get_transform().transform(np.column_stack(crosses.get_data()))
-    assert display.ax_.transAxes.inverted().transform(on_screen)[:, 1] == pytest.approx(0.03)
-
-
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -113,22 +83,6 @@ def test_inducing_points_are_crosses_on_the_lower_edge():
 def test_training_data_that_do_not_fit_are_named(arguments, message):
     with pytest.raises(ValueError, match=message):
         PosteriorDisplay.from_estimator(fitted(), X, **arguments)
-
-
-def test_any_regressor_with_a_standard_deviation_works():
-    model = GaussianProcessRegressor(alpha=1.0, optimizer=None).fit(X, y)
-    display = PosteriorDisplay.from_estimator(model, X)
-    assert_array_equal(lines(display)["mean"].get_ydata(), model.predict(X))
-    assert set(lines(display)) == {"mean"}
-
-
-@pytest.mark.parametrize("output", [0, 1])
-def test_weights_of_one_output_are_shown_beside_their_prior(trend, output):
-    display = CoefficientDisplay.from_estimator(trend, output=output)
-    assert_array_equal(display.mean, trend.coef_[output])
-    assert_array_equal(display.std, trend.coef_std_[output])
-    assert_array_equal(display.prior_mean, trend.coef_prior_mean_[output])
-    assert_array_equal(display.prior_std, trend.coef_prior_scale_[output])
 
 
 @pytest.mark.parametrize(
@@ -145,11 +99,6 @@ def test_weights_of_one_output_are_shown_beside_their_prior(trend, output):
 def test_bars_that_are_shorter_than_their_symbol_stand_in_numbers(mean, std, text):
     display = CoefficientDisplay(["a"], *np.array([[mean], [std], [0.0], [1.0]])).plot()
     assert [shown.get_text() for shown in display.ax_.texts] == [text]
-
-
-def test_without_features_there_are_no_weights_to_show():
-    with pytest.raises(ValueError, match="no weights to show: it was fitted with feature_map=None"):
-        CoefficientDisplay.from_estimator(fitted())
 
 
 @pytest.mark.parametrize(
@@ -182,14 +131,6 @@ def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"Plotting needs the optional package 'matplotlib'.*pip install matplotlib"):
         display.plot()
-
-
-@pytest.mark.parametrize("output", [2, -3])
-def test_an_output_that_is_not_there_is_named(trend, output):
-    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
-        PosteriorDisplay.from_estimator(trend, X[:5], output=output)
-    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
-        CoefficientDisplay.from_estimator(trend, output=output)
 
 
 def test_the_curve_is_the_mean_of_runs_and_the_band_their_range():
@@ -230,20 +171,6 @@ def test_scores_are_those_of_scikit_learn_on_the_same_rows():
     assert display.ax_.get_ylabel() == "prediction error"
 
 
-def test_whole_groups_are_added_in_an_order_of_each_run():
-    seen = []
-    numbers, groups = np.arange(30.0)[:, np.newaxis], np.repeat(["c", "a", "b", "d"], [3, 7, 15, 5])
-    display = learning_curve_of(Witness(seen), numbers, sizes=[1, 2, 4], groups=groups, n_runs=3, random_state=0)
-    seen = np.reshape(np.array(seen, dtype=object), (3, 3))
-    for run in seen:
-        found = [groups[np.array(rows, dtype=int)] for rows in run]
-        assert [len(set(own)) for own in found] == [1, 2, 4]
-        assert all(len(own) == np.isin(groups, own).sum() for own in found)
-        assert set(run[0]) < set(run[1]) < set(run[2])
-    assert len({tuple(run[0]) for run in seen}) > 1
-    assert_array_equal(display.n_rows, [np.mean([len(rows) for rows in sizes]) for sizes in seen.T])
-
-
 @pytest.mark.parametrize(
     ("sizes", "problem", "message"),
     [
@@ -257,12 +184,3 @@ def test_whole_groups_are_added_in_an_order_of_each_run():
 def test_sizes_that_are_not_numbers_of_groups_are_named(sizes, problem, message):
     with pytest.raises(problem, match=message):
         learning_curve_of(sizes=sizes)
-
-
-def test_a_curve_needs_a_run_and_rows_of_one_length():
-    with pytest.raises(ValueError, match="n_runs must be at least 1; got 0"):
-        learning_curve_of(n_runs=0)
-    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
-        learning_curve_of(targets=Y[:5])
-    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
-        learning_curve_of(groups=np.zeros(5))

@@ -10,20 +10,13 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from skevgp.utils.monitor import Monitor, Progress, monitor_of
+from skevgp.utils.monitor import Monitor, Progress
 
 
 def heard():
     """A list, and a monitor that writes all that it is told into it."""
     told = []
     return told, Monitor(lambda *what: told.append(what))
-
-
-def test_an_iteration_is_told_with_its_number_and_loss():
-    told, monitor = heard()
-    monitor.iteration(1, 5.0)
-    monitor.iteration(2, 4.0)
-    assert [what[:2] for what in told] == [(1, 5.0), (2, 4.0)]
 
 
 def test_a_part_tells_in_the_units_and_numbers_of_the_whole():
@@ -60,19 +53,6 @@ def test_ctrl_c_in_one_thread_ends_the_others_at_their_next_iteration():
     for thread in threads:
         thread.join(60.0)
         assert not thread.is_alive()
-
-
-def test_a_listener_may_stop_the_fit():
-    def interrupt(number, loss, outputs):
-        if number == 3:
-            raise KeyboardInterrupt
-
-    monitor = Monitor(interrupt)
-    with monitor.keeping_the_best():
-        for number in range(1, 10):
-            monitor.iteration(number, 0.0)
-    assert number == 3
-    assert monitor.stopped
 
 
 # --- what the user sees --------------------------------------------------------------------------------------------
@@ -134,18 +114,6 @@ def fit(progress, clock, losses, seconds=1.0, about=""):
         monitor.iteration(number, loss)
 
 
-@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
-def test_verbose_2_prints_each_iteration(stream):
-    stream = stream()
-    progress = Progress(2, stream)
-    fit(progress, Clock(), [10.0, 20.0, 30.0])
-    progress.close()
-    lines = stream.getvalue().splitlines()
-    assert [line.split()[:4] for line in lines] == [
-        ["iteration", str(number), "bound", f"{-10.0 * number:.3f}"] for number in (1, 2, 3)
-    ]
-
-
 def test_on_a_terminal_tqdm_draws_one_line():
     pytest.importorskip("tqdm")
     clock, terminal = Clock(), Terminal()
@@ -194,31 +162,3 @@ def test_without_tqdm_there_is_a_line_each_ten_seconds_and_the_last(without_tqdm
     assert stream.getvalue().splitlines() == [
         f"all rows, iteration {number}, bound -1.000, {number} s" for number in (10, 20, 25)
     ]
-
-
-def test_the_part_of_the_fit_is_told():
-    clock, log = Clock(), io.StringIO()
-    monitor = Monitor(progress=Progress(1, log, clock)).seen_as(about="y[:, 2]").seen_as(about="50 of 90 rows")
-    clock.now += 10.0
-    monitor.iteration(3, 2.0)
-    clock.now += 10.0
-    monitor.silent().iteration(4, 2.0)
-    assert log.getvalue() == "y[:, 2], 50 of 90 rows, iteration 3, bound -2.000, 10 s\n"
-
-
-def test_a_callback_is_told_the_bound():
-    told = []
-    with monitor_of(0, lambda *what: told.append(what)) as monitor:
-        monitor.seen_as(outputs=range(0, 2)).iteration(4, -3.0)
-    assert told == [(4, 3.0, range(0, 2))]
-
-
-def test_a_fit_that_fails_ends_its_line(capsys):
-    def fit():
-        with monitor_of(1) as monitor:
-            monitor.iteration(1, 5.0)
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fit()
-    assert capsys.readouterr().out == "iteration 1, bound -5.000, 0 s\n"

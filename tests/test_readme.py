@@ -92,8 +92,3 @@ def test_there_is_one_command_line_for_each_job(name):
     assert len(commands) == 1
     assert "\n" not in commands[0]
     assert commands[0].startswith("python3 -m venv .venv && .venv/bin/pip install ")
-
-
-def test_links_and_pictures_exist():
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (Path(__file__).parents[1] / target).exists(), target

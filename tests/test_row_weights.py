@@ -5,7 +5,6 @@ import pytest
 from sklearn.base import clone
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
-from sklearn.linear_model import Ridge
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
@@ -96,21 +95,6 @@ def test_known_noise_is_the_alpha_of_scikit_learn():
         assert value_of(own) == pytest.approx(exact.log_marginal_likelihood(), rel=1e-8)
 
 
-def test_known_noise_is_worth_knowing():
-    """Half of the rows are far noisier: who knows it predicts better, and says how noisy the others are."""
-    rng = np.random.RandomState(1)
-    x = rng.uniform(-3.0, 3.0, (400, 1))
-    variance = np.where(rng.rand(400) < 0.5, 1.0, 400.0)
-    y = np.sin(2.0 * x[:, 0]) + 0.1 * np.sqrt(variance) * rng.randn(400)
-    grid = np.linspace(-3.0, 3.0, 50)[:, np.newaxis]
-    errors = []
-    for known in (None, variance):
-        model = evgp(n_inducing=20, max_iter=100).fit(x, y, relative_variance=known)
-        errors.append(np.sqrt(np.mean((model.predict(grid) - np.sin(2.0 * grid[:, 0])) ** 2)))
-    assert errors[1] < 0.5 * errors[0]
-    assert model.noise_variance_ == pytest.approx(0.01, rel=0.3)
-
-
 def test_the_likelihood_of_other_kernels_sees_the_weights_of_the_fit():
     exact = EGPRegressor(max_iter=20).fit(X, Y[:, 0], WEIGHTS, relative_variance=NOISE)
     found = exact.log_marginal_likelihood(exact.kernel_.theta)
@@ -154,16 +138,6 @@ def test_partial_fit_with_weights_is_one_pass(posterior):
     assert_same(at_once, repeated.partial_fit(X[rows], Y[rows], relative_variance=NOISE[rows]))
     begun = evgp(solver=LBFGS(posterior=posterior), max_iter=5).partial_fit(X[first], Y[first], NOISE[first])
     assert_same(begun, evgp(solver=LBFGS(posterior=posterior), max_iter=5).fit(X[first], Y[first], NOISE[first]))
-
-
-def test_partial_fit_from_the_prior_of_the_points_is_the_fit():
-    """With kernel, noise and points given, sums of parts are the sums of all."""
-    kernel = ConstantKernel(1.0, "fixed") * RBF(1.0, "fixed") + WhiteKernel(0.01, "fixed")
-    whole = at_fixed_points(kernel=kernel).fit(X, Y, NOISE, relative_variance=NOISE[::-1])
-    parts = at_fixed_points(kernel=kernel).fit(X[:30], Y[:30], NOISE[:30], relative_variance=NOISE[::-1][:30])
-    parts.partial_fit(X[30:], Y[30:], NOISE[30:], relative_variance=NOISE[::-1][30:])
-    assert_same(parts, whole)
-    assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
 
 
 @pytest.mark.long
@@ -256,28 +230,3 @@ def test_bad_weights(model, weights, message):
 def test_bad_variances(model, variance, message):
     with pytest.raises(ValueError, match=message):
         clone(model).fit(X, Y, relative_variance=variance)
-
-
-def test_bad_weights_leave_the_model_as_it_was():
-    model = evgp(max_iter=1).fit(X, Y)
-    before = model.predict(X_NEW)
-    for method in (model.fit, model.partial_fit):
-        with pytest.raises(ValueError, match="sample_weight"):
-            method(X, Y, np.zeros(N))
-    np.testing.assert_array_equal(model.predict(X_NEW), before)
-
-
-def test_a_residual_regressor_hands_weights_on():
-    weighted = ResidualRegressor(Ridge()).fit(X, Y, sample_weight=WEIGHTS)
-    np.testing.assert_allclose(weighted.predict(X), ResidualRegressor(Ridge()).fit(X[AGAIN], Y[AGAIN]).predict(X))
-
-
-def test_rows_that_are_all_noisy_are_not_far_from_their_prior():
-    """Their noise variance is σ² times a number: σ² is small, and y as it is."""
-    rng = np.random.RandomState(0)
-    X = rng.randn(60, 1)
-    y = np.sin(2.0 * X[:, 0]) + 0.1 * rng.randn(60)
-    found = EVGPRegressor(n_inducing=8, random_state=0).fit(X, y, relative_variance=np.full(60, 1e10))
-    expected = EVGPRegressor(n_inducing=8, random_state=0).fit(X, y)
-    np.testing.assert_allclose(1e10 * found.noise_variance_, expected.noise_variance_, rtol=1e-2)
-    np.testing.assert_allclose(found.predict(X), expected.predict(X), atol=1e-2)

@@ -5,7 +5,6 @@ from functools import partial
 import numpy as np
 import pytest
 import sklearn
-from scipy.stats import norm
 from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
@@ -17,7 +16,6 @@ from sklearn.model_selection import (
     GridSearchCV,
     GroupKFold,
     HalvingGridSearchCV,
-    KFold,
     cross_val_score,
     cross_validate,
 )
@@ -65,16 +63,8 @@ def test_a_score_is_minus_the_metric_of_mean_and_std(model):
     assert neg_crps(fitted, X, y) == pytest.approx(-crps(y, *fitted.predict(X, return_std=True)))
 
 
-def test_cross_validation_takes_several_at_once():
-    scoring = {"nlpd": neg_nlpd, "calibration": neg_calibration_error, "r2": "r2"}
-    found = cross_validate(SPARSE, X, y, cv=KFold(3), scoring=scoring, return_estimator=True, error_score="raise")
-    for fold, (_, test) in enumerate(KFold(3).split(X)):
-        assert found["test_nlpd"][fold] == pytest.approx(nlpd_of(found["estimator"][fold], X[test], y[test]))
-    assert (found["test_r2"] > 0.3).all()
-
-
 @pytest.mark.parametrize("search", [GridSearchCV, partial(HalvingGridSearchCV, random_state=1)], ids=["all", "halving"])
-@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
+@pytest.mark.parametrize("scorer", SCORERS[:1], ids=repr)
 def test_searches_choose_the_noise_that_is_there(search, scorer):
     """Of fixed ones; a score of means alone could not tell the largest from the true one."""
     kernels = [RBF(2.0) + WhiteKernel(noise, "fixed") for noise in (1e-4, 3.0, 3000.0)]
@@ -84,28 +74,12 @@ def test_searches_choose_the_noise_that_is_there(search, scorer):
     assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
 
 
-def test_a_scorer_says_how_it_was_made():
-    assert repr(neg_crps) == "make_std_scorer(crps, greater_is_better=False)"
-    scorer = make_std_scorer(norm.logpdf, where=1)
-    assert repr(scorer) == "make_std_scorer(logpdf, where=1)"
-    with pytest.raises(TypeError, match="score_func must be callable; got 'crps'"):
-        make_std_scorer("crps")
-
-
-def test_options_reach_the_metric():
-    def far(y_true, y_pred, std, k):
-        return float(np.mean(np.abs(y_true - y_pred) > k * std))
-
-    fitted = clone(SPARSE).fit(X, y)
-    shares = [make_std_scorer(far, k=k)(fitted, X, y) for k in (0.0, 1.0, 100.0)]
-    assert shares[0] == 1.0 > shares[1] > shares[2] == 0.0
-
-
 # --- what scikit-learn puts around a regressor -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("transformer", [StandardScaler(), MinMaxScaler((-1.0, 3.0)), None], ids=str)
-@pytest.mark.parametrize("targets", [y, Y, Y[:, :1]], ids=["one", "two", "column"])
+@pytest.mark.parametrize(
+    ("transformer", "targets"), [(StandardScaler(), y), (MinMaxScaler((-1.0, 3.0)), Y), (None, Y[:, :1])]
+)
 def test_where_y_is_scaled_std_is_scaled_back(transformer, targets):
     model = TransformedTargetRegressor(SPARSE, transformer=transformer).fit(X, targets)
     inner = model.transformer_.transform(targets.reshape(60, -1)).reshape(targets.shape)
@@ -135,18 +109,6 @@ def test_independent_models_of_outputs_are_put_side_by_side():
     assert neg_nlpd(model, X, Y) == pytest.approx(expected)
     nested = make_pipeline(PolynomialFeatures(2), TransformedTargetRegressor(model, transformer=StandardScaler()))
     assert np.isfinite(cross_val_score(nested, X, Y, scoring=neg_crps, cv=2, error_score="raise")).all()
-
-
-class Deaf(BayesianRidge):
-    """Takes any argument, and does nothing with it."""
-
-    def predict(self, X, **_):
-        return super().predict(X)
-
-
-def test_a_mean_alone_is_no_pair():
-    with pytest.raises(TypeError, match="returns no pair of mean and std"):
-        neg_crps(Deaf().fit(X, y), X[:2], y[:2])
 
 
 @pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)

@@ -1,7 +1,6 @@
 """Rows for each output, weights that outputs share, and correlated weights: against a dense Gaussian process."""
 
 import numpy as np
-import pandas as pd
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.base import BaseEstimator, TransformerMixin
@@ -175,52 +174,6 @@ def test_the_exact_gradient_is_that_of_finite_differences(data):
     assert relative_error(gradient, central_differences(lambda x: likelihood(x)[0], theta)) < 1e-6
 
 
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_an_output_with_rows_of_its_own_is_fitted_as_if_alone(data, kind):
-    X, Y, _, _, X_new = data
-    options = {"inducing_init": own_columns(X)[:8, 0], "sharing": "none"} if kind is EVGPRegressor else {}
-    kernel = ConstantKernel(1.0, "fixed") * RBF([1.0, 1.0], "fixed")
-    together = kind(
-        Rows(), kernel, kernel_map=FunctionTransformer(own_columns), noise=Gaussian(variance=0.1), max_iter=0, **options
-    ).fit(X, Y)
-    mean, std = together.predict(X_new, return_std=True)
-    for o in range(O):
-        alone = kind(
-            FunctionTransformer(lambda X, o=o: Rows().transform(X)[:, o]),
-            kernel,
-            kernel_map=FunctionTransformer(lambda X, o=o: own_columns(X)[:, o]),
-            noise=Gaussian(variance=0.1),
-            max_iter=0,
-            **options,
-        ).fit(X, Y[:, o])
-        own_mean, own_std = alone.predict(X_new, return_std=True)
-        assert_allclose(together.coef_[o], alone.coef_, rtol=1e-8)
-        assert_allclose(mean[:, o], own_mean, rtol=1e-8)
-        assert_allclose(std[:, o], own_std, rtol=1e-8)
-
-
-def test_samples_have_the_joint_covariance(data):
-    X, Y, Sigma, _, X_new = data
-    model = EVGPRegressor(
-        Rows(),
-        KERNEL,
-        kernel_map=FunctionTransformer(own_columns),
-        coef_prior=CoefPrior(shared=True, cov=Sigma),
-        noise=Gaussian(variance=0.3),
-        n_inducing=8,
-        max_iter=0,
-        random_state=0,
-    ).fit(X[:4], Y[:4])
-    mean, covariance = model.predict(X_new[:3], return_cov="joint")
-    samples = model.sample_y(X_new[:3], 20_000, random_state=0).reshape(3 * O, -1)
-    scale = np.sqrt(np.outer(np.diagonal(covariance), np.diagonal(covariance)))
-    assert_allclose(samples.mean(axis=1), mean.ravel(), atol=5.0 * np.sqrt(np.diagonal(covariance).max() / 20_000))
-    assert np.abs((np.cov(samples) - covariance) / scale).max() < 0.05
-    # Outputs do depend on each other.
-    across = covariance.reshape(3, O, 3, O)[:, 0, :, 1] / scale.reshape(3, O, 3, O)[:, 0, :, 1]
-    assert np.abs(across).max() > 0.1
-
-
 def test_dask_agrees(data):
     da = pytest.importorskip("dask.array")
     X, Y, Sigma, _, X_new = data
@@ -274,17 +227,6 @@ def test_of_a_union_all_parts_must_say_that_weights_are_shared(data, feature_map
     X, Y, *_ = data
     model = EGPRegressor(feature_map, max_iter=0).fit(X, Y)
     assert model.coef_.ndim == (1 if shared else 2)
-
-
-@pytest.mark.parametrize("around", [lambda union: union, lambda union: make_union(make_pipeline(union))])
-def test_priors_of_unions_in_a_frame_with_rows_for_each_output(data, around):
-    X, Y, Sigma, mean, _ = data
-    frame = pd.DataFrame(X, columns=[f"x{j}" for j in range(O + 1)])
-    rows = make_union(FunctionTransformer(), Opinionated(prior=(mean, Sigma)))
-    rows = make_pipeline(FunctionTransformer(lambda X: X.to_numpy()), around(rows))
-    model = EGPRegressor(rows, max_iter=0, coef_prior=CoefPrior(shared=True)).fit(frame, Y)
-    assert_allclose(model.coef_prior_scale_[-P:], np.sqrt(np.diagonal(Sigma)))
-    assert model.predict(frame).shape == Y.shape
 
 
 def test_a_weight_without_variance_keeps_its_mean(data):
@@ -371,19 +313,6 @@ def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
             model.partial_fit(X, Y)
 
 
-def test_the_joint_covariance_is_asked_for_by_name(data):
-    X, Y, _, _, X_new = data
-    model = EVGPRegressor(max_iter=0, n_inducing=5).fit(X, Y)
-    for word in ("all", np.array([1, 2])):
-        with pytest.raises(ValueError, match="return_cov must be False, True or 'joint'; got "):
-            model.predict(X_new, return_cov=word)
-    cov = model.predict(X_new, return_cov=True)[1]
-    joint = model.predict(X_new, return_cov="joint")[1].reshape(len(X_new), O, len(X_new), O)
-    for i in range(O):
-        for j in range(O):
-            np.testing.assert_array_equal(joint[:, i, :, j], cov[:, :, i] if i == j else 0.0)
-
-
 def test_shared_weights_with_known_noise_are_dense_ones(data):
     X, Y, Sigma, mean, X_new = data
     relative = np.random.RandomState(1).uniform(0.2, 5.0, N)
@@ -396,20 +325,3 @@ def test_shared_weights_with_known_noise_are_dense_ones(data):
         Z = model.inducing_points_ if model is sparse else None
         expected = dense(Rows().transform(X), own_columns(X), Y, mean, Sigma, Z, relative)
         check(model, expected, X_new, own_columns(X_new), Rows().transform(X_new))
-
-
-@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_a_row_that_counts_twice_is_there_twice(data, kind):
-    X, Y, Sigma, _, X_new = data
-    weights = np.arange(N) % 3
-    options = {
-        "kernel_map": FunctionTransformer(own_columns),
-        "coef_prior": CoefPrior(shared=True, cov=Sigma),
-        "max_iter": 100,
-    }
-    options |= {"tol": 1e3} if kind is EGPRegressor else {"solver": LBFGS(tol=1e3), "n_inducing": 9, "random_state": 0}
-    models = [kind(Rows(), **options) for _ in range(2)]
-    models[0].fit(X, Y, sample_weight=weights)
-    models[1].fit(np.repeat(X, weights, axis=0), np.repeat(Y, weights, axis=0))
-    for found, expected in zip(*(model.predict(X_new, return_std=True) for model in models), strict=True):
-        assert_allclose(found, expected, rtol=1e-7)

@@ -82,19 +82,6 @@ def test_lines_are_what_was_recorded_and_what_became_of_it(log):
                 assert_array_equal(values, raw[name][:, joint])
 
 
-@pytest.mark.parametrize("row", range(3), ids=ROWS)
-def test_no_line_reaches_across_a_gap(log, row):
-    ax = SignalsDisplay.from_log(log).axes_[row, 0]
-    gaps = [cut[:2] for cut in log.recordings[0].cuts if cut[2] == "gap"]
-    assert len(gaps) == 2
-    for line in ax.lines:
-        time, values = line.get_data()
-        whole = np.isfinite(time[1:]) & np.isfinite(time[:-1]) & np.isfinite(values[1:]) & np.isfinite(values[:-1])
-        for first, last in gaps:
-            middle = (first + last) / 2.0
-            assert not (whole & (time[:-1] < middle) & (time[1:] > middle)).any()
-
-
 def test_what_was_cut_is_coloured_by_its_reason(log):
     display = SignalsDisplay.from_log(log)
     cuts = log.recordings[0].cuts
@@ -105,14 +92,6 @@ def test_what_was_cut_is_coloured_by_its_reason(log):
         colours = {why: {span[2] for span, cut in zip(drawn, cuts, strict=True) if cut[2] == why} for *_, why in cuts}
         assert all(len(found) == 1 for found in colours.values())
         assert len(set.union(*colours.values())) == 4
-
-
-@pytest.mark.parametrize("joints", [1, -1, "elbow", ["elbow"], [1]], ids=str)
-def test_one_joint_is_drawn_alone(log, joints):
-    display = SignalsDisplay.from_log(log, joints=joints)
-    assert display.axes_.shape == (3, 1)
-    assert display.axes_[0, 0].get_title() == "elbow"
-    assert_array_equal(recorded(display.axes_[2, 0])[1], log.recordings[0].raw.torque[:, 1])
 
 
 @pytest.mark.parametrize(

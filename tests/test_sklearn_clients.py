@@ -5,12 +5,12 @@ import pandas as pd
 import polars as pl
 import pytest
 from matplotlib import pyplot
-from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.base import clone
 from sklearn.compose import make_column_transformer
 from sklearn.inspection import PartialDependenceDisplay
 from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import EVGPRegressor
 from skevgp.solvers import LBFGS
 
 pyplot.switch_backend("Agg")
@@ -37,48 +37,6 @@ def frame(package, rows=slice(None)):
 def close_figures():
     yield
     pyplot.close("all")
-
-
-# --- words, in frames ---------------------------------------------------------------------------------------------
-
-
-@each_frame
-def test_words_are_encoded_by_both_maps(package):
-    train, test = slice(0, 70), slice(70, N)
-    model = EVGPRegressor(WORDS, kernel_map=SEEN, n_inducing=20, solver=LBFGS(tol=0.1), random_state=0)
-    model.fit(frame(package, train), Y[train])
-    mean, std = model.predict(frame(package, test), return_std=True)
-    assert np.abs(mean - Y[test]).mean() < 0.2
-    assert (np.abs(mean - Y[test]) < 4 * std).mean() > 0.9
-    assert model.coef_names_.tolist()[:3] == [f"onehotencoder__kind_{kind}" for kind in KINDS]
-    jumps = model.coef_[1:3] - model.coef_[0]
-    np.testing.assert_allclose(jumps, [2.0, -1.0], atol=0.3)
-    said = str(model.summary())
-    assert "standardscaler__age" in said
-    assert "onehotencoder__kind_yew" in said
-
-
-class Witness(TransformerMixin, BaseEstimator):
-    """Remembers what it was given."""
-
-    seen = ()
-
-    def fit(self, X, y=None):
-        Witness.seen += (type(X),)
-        return self
-
-    def transform(self, X):
-        Witness.seen += (type(X),)
-        return np.asarray(X["age"], dtype=float).reshape(-1, 1)
-
-
-@each_frame
-@pytest.mark.parametrize("model", [FIXED, EGPRegressor(max_iter=0)], ids=lambda model: type(model).__name__)
-def test_frames_stay_frames_for_the_maps(package, model, monkeypatch):
-    monkeypatch.setattr(Witness, "seen", ())
-    m = clone(model).set_params(feature_map=Witness(), kernel_map=Witness()).fit(frame(package), Y)
-    m.predict(frame(package), return_std=True)
-    assert set(Witness.seen) == {FRAMES[package]}
 
 
 # --- frames as output ---------------------------------------------------------------------------------------------

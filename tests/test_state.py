@@ -56,17 +56,6 @@ def test_another_version_is_warned_of(estimator, monkeypatch):
     assert caught[0].filename == __file__
 
 
-class Derived(EVGPRegressor):
-    pass
-
-
-def test_classes_of_users_have_versions_of_their_own():
-    assert "_skevgp_version" not in Derived().__getstate__()
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        pickle.loads(pickle.dumps(Derived(n_inducing=3)))
-
-
 def test_a_robot_in_a_pickle_is_the_robot():
     robot = load_robot("acrobot")
     again = pickle.loads(pickle.dumps(NominalDynamics(robot)))

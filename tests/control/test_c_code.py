@@ -2,7 +2,6 @@ import ctypes
 import shutil
 import subprocess
 
-import casadi as ca
 import numpy as np
 import pytest
 from sklearn.pipeline import make_union
@@ -92,25 +91,6 @@ def test_the_noise_is_left_out_if_that_is_asked_for(exported):
     x = data(seed=1)[0][0]
     found = called(library, "arm", x, 3, "predict")
     np.testing.assert_allclose(found["variance"], predicted(model, x.reshape(1, -1), False)[1][0], rtol=1e-9)
-
-
-def test_casadi_loads_the_library(exported):
-    model, library = exported
-    x = data(seed=1)[0][0]
-    mean, _ = ca.external("arm", str(library))(x)
-    np.testing.assert_allclose(mean.full().ravel(), model.predict(x.reshape(1, -1))[0], rtol=1e-9)
-
-
-def test_the_header_says_what_is_what(tmp_path):
-    pandas = pytest.importorskip("pandas")
-    X, y = data()
-    model = sparse().fit(pandas.DataFrame(X, columns=["q", "v", "a*/", "u", "w"]), y)
-    _, header = model.to_c(tmp_path, include_noise=False)
-    text = header.read_text()
-    assert "q, v, a* /, u, w" in text
-    assert "without the noise of y" in text
-    assert f"CasADi {ca.CasadiMeta.version()}" in text
-    assert "int evgp_predict(const double *x, double *mean, double *variance);" in text
 
 
 @pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])

@@ -5,7 +5,6 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from sklearn.exceptions import NotFittedError
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor
@@ -60,15 +59,3 @@ def test_threads_may_share_it_and_it_can_be_pickled(model, data):
     for i, each in enumerate(found):
         for one, other in zip(each, expected[i // 30], strict=True):
             np.testing.assert_array_equal(one, other)
-
-
-def test_weights_of_another_fit_are_refused(data):
-    X, Y, X_new = data
-    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, **QUICK).fit(X, Y)
-    compiled, before = model.compile(), model.predict(X_new)
-    for other in (EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y), model.fit(2.0 * X, Y)):
-        with pytest.raises(ValueError, match="model of the same fit"):
-            compiled.update(other)
-    with pytest.raises(NotFittedError):
-        compiled.update(EVGPRegressor())
-    same([compiled.predict(X_new)], [before])

@@ -8,13 +8,10 @@ import polars
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.compose import ColumnTransformer
-from sklearn.exceptions import NotFittedError
-from sklearn.gaussian_process.kernels import Matern
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, StandardScaler
+from sklearn.preprocessing import FunctionTransformer
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.noise import Gaussian
 
 from .cases import N_OUTPUTS, QUICK, D
 
@@ -88,8 +85,9 @@ class Squashed(TransformerMixin, BaseEstimator):
 
 
 @pytest.mark.parametrize(("unit", "offset"), [(1e-6, 0.0), (1.0, 1e8), (1e7, 0.0), (1e-6, -3.0)])
-@pytest.mark.parametrize("frame", [None, pd.DataFrame, polars.DataFrame], ids=["array", "pandas", "polars"])
-@pytest.mark.parametrize("split", ["together", "in a pipeline", "of columns"])
+@pytest.mark.parametrize(
+    ("frame", "split"), [(None, "together"), (pd.DataFrame, "in a pipeline"), (polars.DataFrame, "of columns")]
+)
 def test_differences_take_steps_in_the_units_of_the_columns(data, unit, offset, frame, split):
     X, Y, X_new = data
     names = slice(0, 2) if frame is None else ["a", "b"]
@@ -107,34 +105,6 @@ def test_differences_take_steps_in_the_units_of_the_columns(data, unit, offset, 
     for ask in (EVGPRegressor.compile, lambda model: model.sample_functions(2, n_waves=20)):
         found, expected = (ask(each).value_and_jacobian(X_new)[1] for each in (model, exact))
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
-
-
-def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
-    X, Y, X_new = data
-    encoder = ColumnTransformer([("words", OneHotEncoder(), ["c"]), ("numbers", StandardScaler(), ["a", "b"])])
-
-    def frame_of(rows):
-        return pd.DataFrame(rows, columns=["a", "b"]).assign(c=np.where(rows[:, 0] > 0.5, "high", "low"))
-
-    model = EVGPRegressor(kernel_map=encoder, n_inducing=10, **QUICK).fit(frame_of(X), Y[:, 0])
-    _, std = model.predict(frame_of(X_new), return_std=True, include_noise=False)
-    expected = std**2 / model._posterior.predictor.signal
-    np.testing.assert_allclose(model.novelty(frame_of(X_new)), expected, rtol=1e-6, atol=1e-9)
-    many = model.novelty(frame_of(np.repeat(X_new, 1000, axis=0)))
-    np.testing.assert_allclose(many, np.repeat(expected, 1000), rtol=1e-6, atol=1e-9)
-    message = r"\['c'\] of X are not numbers.* derivatives"
-    for method in (model.jacobian, model.value_and_jacobian, model.predict_gradient):
-        with pytest.raises(ValueError, match=message):
-            method(frame_of(X_new))
-    for method in (model.compile, model.sample_functions):
-        with pytest.raises(ValueError, match=message):
-            method()
-    with pytest.raises(ValueError, match=message):
-        model.set_params(noise=Gaussian(inputs=0.1)).fit(frame_of(X), Y[:, 0])
-    numbers = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=10, **QUICK)
-    numbers.fit(pd.DataFrame(X, columns=["a", "c"]), Y[:, 0])
-    with pytest.raises(ValueError, match=message):
-        numbers.jacobian(frame_of(X_new)[["a", "c"]])
 
 
 def test_what_a_residual_regressor_says_is_of_the_sum(data):
@@ -155,19 +125,3 @@ def test_what_a_residual_regressor_says_is_of_the_sum(data):
     close(single.jacobian(X_new), differences(single.predict, X_new), 1e-6)
     for method in ("value_and_jacobian", "novelty"):
         assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), method)
-
-
-def test_what_cannot_be_is_refused_by_name(data):
-    X, Y, X_new = data
-    with pytest.raises(NotFittedError, match="not fitted"):
-        EVGPRegressor().jacobian(X)
-    model = EVGPRegressor(kernel=Matern(nu=0.5), n_inducing=10, **QUICK).fit(X, Y)
-    assert np.isfinite(model.jacobian(X_new)).all()
-    with pytest.raises(ValueError, match="At most one of return_std and return_cov"):
-        model.predict_gradient(X_new, return_std=True, return_cov=True)
-    with pytest.raises(ValueError, match="nu up to 1 has no gradient"):
-        model.predict_gradient(X_new, return_std=True)
-    with pytest.raises(ValueError, match="2 features"):
-        model.jacobian(X_new[:, :1])
-    with pytest.raises(ValueError, match="NaN"):
-        model.jacobian(np.full((1, D), np.nan))

@@ -8,7 +8,6 @@ from sklearn.gaussian_process.kernels import RBF, DotProduct, Matern, RationalQu
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
-from skevgp.kernels import FunctionKernel
 from skevgp.solvers import LBFGS
 
 from .cases import N_OUTPUTS, QUICK, D, own_features, quick
@@ -73,16 +72,6 @@ def test_the_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
     assert not np.array_equal(one(X_new), third(X_new))
 
 
-def test_what_cannot_be_is_refused_by_name(data):
-    X, Y, _ = data
-    model = EVGPRegressor(kernel=FunctionKernel(lambda X, Z: X @ Z.T), n_inducing=2, **QUICK).fit(X, Y)
-    with pytest.raises(ValueError, match="No functions can be drawn from a kernel with a Function"):
-        model.sample_functions()
-    for name in ("n", "n_waves"):
-        with pytest.raises(ValueError, match=name):
-            model.sample_functions(**{name: 0})
-
-
 # --- along a path ----------------------------------------------------------------------------------------------------
 
 FOLLOWED = {
@@ -118,15 +107,3 @@ def test_along_a_given_path_they_have_the_posteriors_joint_covariance(followed):
     # A function is one: back at a row it has the value that it had.
     assert np.abs(values[:, 3] - values[:, 0]).max() < 1e-5 * size.max()
     assert np.abs(values[:, 4] - values[:, 1]).max() < 1e-2 * size.max()
-
-
-def test_rows_that_the_points_know_leave_nothing_to_draw():
-    rng = np.random.RandomState(0)
-    X = rng.uniform(-2.0, 2.0, (30, 1))
-    model = EVGPRegressor(inducing_init=X, max_iter=0).fit(X, np.sin(X[:, 0]))
-    step = model._posterior.functions().draw(50, 30, rng)
-    for row in X:
-        values = step(np.repeat(row[np.newaxis], 50, axis=0))
-        assert np.isfinite(values).all()
-        mean, std = model.predict(row[np.newaxis], return_std=True, include_noise=False)
-        assert (np.abs(values - mean) < 6.0 * std + 1e-6).all()

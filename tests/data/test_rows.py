@@ -79,22 +79,8 @@ def test_a_block_is_of_prepared_inputs_features_and_some_residuals():
     np.testing.assert_array_equal(block_of(raw, (Identity(),), halved).residuals, 0.5 * Y[:4])
 
 
-def test_moments_are_of_inputs_and_residuals_in_internal_units():
-    own = rows()
-    assert len(own) == own.inputs.n == 400
-    np.testing.assert_allclose(own.inputs.mean, X.mean(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(own.residuals.variance, 0.25 * Y.var(axis=0), rtol=1e-12)
-    np.testing.assert_allclose(own.scatter(), 0.25 * Y.var(axis=0), rtol=1e-12)
-
-
 def test_the_scatter_of_what_does_not_vary_is_1():
     np.testing.assert_array_equal(rows(np.full((400, 2), 7.0)).scatter(), 1.0)
-
-
-def test_a_subset_has_a_share_of_the_share():
-    part = rows(share=0.5).subset(np.arange(20, 30), 0.1)
-    assert (len(part), part.share) == (10, 0.05)
-    np.testing.assert_allclose(part.blocks(Identity(), 6).linear.HH[0], H[20:30].T @ H[20:30], rtol=1e-12)
 
 
 def test_a_sample_is_all_rows_or_some_in_their_order():

@@ -34,16 +34,6 @@ def test_commands_equal_the_stored_ones_step_by_step(stored):
         assert_allclose(controller.integral, stored["smooth_I"][:, step], rtol=0, atol=1e-9)
 
 
-def test_clamped_commands_equal_the_stored_ones(stored):
-    effort, Z = stored["effort_limit"], stored["step_Z"]
-    before, after = Z[:, :-1].reshape(-1, 14), Z[:, 1:].reshape(-1, 14)
-    U = stored["step_U"].reshape(-1, 1, 7)
-    assert (np.abs(U) > effort).any()
-    ends, acted = simulate("iiwa14", before, U, return_inputs=True)
-    assert_array_equal(acted[:, 0], stored["step_U_acted"].reshape(-1, 7))
-    assert_allclose(ends[:, 1], after, rtol=0, atol=1e-8)
-
-
 @pytest.mark.parametrize("robot", ["iiwa14", "ur5", "panda", "kinova", "double_pendulum", "talos_left_arm"])
 def test_a_robot_arrives_at_its_target(robot):
     n = load_robot(robot).nv
@@ -79,22 +69,6 @@ def test_bad_arguments_of_a_controller_are_named(arguments, message):
 @pytest.fixture
 def ur5():
     return ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=1.0)
-
-
-@pytest.mark.parametrize(("steps", "next_step"), [([3], 0), ([0, 2], 1), ([0, 1, 1], 2)])
-def test_steps_that_do_not_follow_one_another_are_refused(ur5, steps, next_step):
-    *before, last = steps
-    for step in before:
-        ur5(step, np.zeros((1, 12)))
-    with pytest.raises(ValueError, match=f"follow one another from 0; got {last}, expected 0 or {next_step}"):
-        ur5(last, np.zeros((1, 12)))
-
-
-@pytest.mark.parametrize("shape", [(14,), (3, 14), (2, 12)])
-def test_states_of_another_shape_are_refused(shape):
-    controller = ComputedTorqueController("iiwa14", np.zeros((2, 7)), np.ones((2, 7)), duration=1.0)
-    with pytest.raises(ValueError, match=r"must fit q0, of shape \(2, 7\)"):
-        controller(0, np.zeros(shape))
 
 
 @pytest.mark.parametrize(

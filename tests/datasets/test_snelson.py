@@ -62,14 +62,6 @@ def serve(tmp_path, monkeypatch):
     return serve
 
 
-@pytest.fixture
-def offline(monkeypatch):
-    def refuse(*_arguments, **_options):
-        raise AssertionError("the network was asked")
-
-    monkeypatch.setattr(snelson, "urlopen", refuse)
-
-
 def put(folder, ending="", end="\n", **changed):
     folder.mkdir(parents=True, exist_ok=True)
     for name, values in {**FAKE, **changed}.items():
@@ -87,14 +79,6 @@ def test_the_target_is_the_papers(fetch, serve):
     assert "6 y + 3 x" in toy.DESCR
 
 
-def test_a_second_call_does_not_download(fetch, serve, home):
-    path = serve(archive(GOOD))
-    first = fetch()
-    path.unlink()
-    assert_array_equal(fetch(download_if_missing=False).target, first.target)
-    assert sorted(file.name for file in (home / "SPGP_dist").iterdir()) == sorted(FAKE)
-
-
 def test_a_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
     put(home / "SPGP_dist")
     (home / "SPGP_dist" / "test_inputs").unlink()
@@ -102,19 +86,6 @@ def test_a_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
         fetch(download_if_missing=False)
     serve(archive(GOOD))
     assert_array_equal(fetch().test_data, TEST[:, np.newaxis])
-
-
-def test_without_permission_nothing_is_downloaded(offline, fetch, home):
-    with pytest.raises(OSError, match=rf"neither in {re.escape(str(home))} nor in .*SPGP_dist.*train_inputs.*http"):
-        fetch(download_if_missing=False)
-
-
-def test_wrong_numbers_in_a_folder_are_named(offline, fetch, home):
-    put(home, ".dat", train_outputs=2.0 * Y)
-    found = sha256((2.0 * Y).tobytes()).hexdigest()
-    expected = sha256(Y.tobytes()).hexdigest()
-    with pytest.raises(OSError, match=rf"train_outputs\.dat .*checksum is {found}, expected {expected}"):
-        fetch()
 
 
 @pytest.mark.parametrize(

@@ -100,38 +100,6 @@ def test_figures_of_the_prose_are_those_of_the_results(page, words, report, line
 
 # --- the tools themselves -----------------------------------------------------------------------------------------
 
-SMALL = """# Page
-
-```python
-x = 2
-print(x, 0.5)
-```
-
-```text
-2 0.50
-```
-
-Words between, so that this is no output:
-
-```text
-else
-```
-
-```python
-print(1 / 0)
-```
-"""
-
-
-def test_an_error_in_a_page_names_its_line(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(SMALL)
-    found = blocks.run(page, tmp_path)
-    assert next(found)[1] == "2 0.5\n"
-    with pytest.raises(ZeroDivisionError) as caught:
-        next(found)
-    assert caught.traceback[-1].lineno + 1 == 19
-
 
 @pytest.mark.parametrize(
     ("printed", "said", "same"),
@@ -150,12 +118,3 @@ def test_an_error_in_a_page_names_its_line(tmp_path):
 )
 def test_numbers_are_compared_up_to_their_digits(printed, said, same):
     assert (blocks.differences(printed, said) == []) == same
-
-
-def test_tables_have_the_csvs_numbers():
-    parts = comparison.parts()
-    for row in comparison.rows_of(comparison.RESULTS / "against_peers.csv"):
-        assert row["peer"] in parts["peers"]
-    gpr = [row for row in comparison.rows_of(comparison.RESULTS / "against_gpr.csv") if row["model"] == "GPR"]
-    assert comparison.short(max(float(row["memory_mb"]) for row in gpr)) in parts["exact"].replace("*", "")
-    assert "scikit-learn" in parts["packages"]

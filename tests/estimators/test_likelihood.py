@@ -104,11 +104,3 @@ def test_a_theta_that_does_not_fit_is_an_error():
             one.log_marginal_likelihood([0.0, wrong, 0.0])
     with pytest.raises(ValueError, match="theta must be real numbers"):
         one.log_marginal_likelihood(["a", "b", "c"])
-
-
-def test_a_kernel_that_overflows_is_infinitely_unlikely():
-    model = start(DotProduct(1.0) * DotProduct(1.0))
-    assert model.log_marginal_likelihood([0.0, 230.0, 230.0]) == -np.inf
-    value, gradient = model.log_marginal_likelihood([0.0, 230.0, 230.0], eval_gradient=True)
-    assert value == -np.inf
-    np.testing.assert_array_equal(gradient, np.zeros(3))

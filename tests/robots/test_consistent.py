@@ -49,7 +49,7 @@ def by_cholesky_factors(mean, covariance, seed):
     )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_start_of_a_local_solver_gets_nearer(seed):
     mean, covariance = one_link(seed)
     assert physical_consistency(mean)[0] < 0.0
@@ -78,8 +78,7 @@ def test_the_margin_is_kept_and_a_wider_one_costs_more():
 # --- what the data know --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
-@pytest.mark.parametrize("kind", ["plain", "stiff", "flat", "pinned"])
+@pytest.mark.parametrize(("kind", "scale"), [("plain", 1e-6), ("stiff", 1.0), ("flat", 1e4), ("pinned", 1e-6)])
 def test_scales_do_not_matter_however_far_apart_deviations_are(kind, scale):
     deviations = np.ones(60)
     deviations[:20] = {"stiff": 1e-8, "flat": 1e4}.get(kind, 1.0)

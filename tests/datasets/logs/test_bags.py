@@ -1,12 +1,11 @@
 import shutil
 import struct
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from skevgp.datasets import load_log
@@ -45,22 +44,6 @@ def states(start=START, names=("a", "b"), velocity=True):
             START + t + late,
             state(start + t if start else 0, list(names), q[row], dq[row] if velocity else (), current[row]),
         )
-
-
-def trajectory(effort=True, start=0):
-    q, dq, ddq, current = motion(T)
-    point = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
-    points = [
-        point(
-            q[row],
-            dq[row],
-            ddq[row],
-            current[row] if effort else np.empty(0),
-            stamp(t, "builtin_interfaces/msg/Duration"),
-        )
-        for row, t in enumerate(NS.tolist())
-    ]
-    return START, TYPES[TRAJECTORY](header(start), ["a", "b"], points)
 
 
 def write(folder, topics, plugin=StoragePlugin.MCAP):
@@ -109,32 +92,6 @@ def test_recordings_are_read_with_and_without_their_metadata(tmp_path, plugin, w
     assert log.joint_names == ["a", "b"]
 
 
-@pytest.mark.parametrize(
-    ("mode", "plugin"),
-    [
-        (CompressionMode.STORAGE, StoragePlugin.MCAP),
-        (CompressionMode.FILE, StoragePlugin.SQLITE3),
-        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
-    ],
-    ids=["chunks", "file", "messages"],
-)
-def test_compressed_recordings_are_read(tmp_path, mode, plugin):
-    writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
-    writer.set_compression(mode, CompressionFormat.ZSTD)
-    with writer:
-        connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
-        for received, message in states():
-            writer.write(connection, received, STORE.serialize_cdr(message, STATES))
-    assert_recorded(load_log(tmp_path / "bag"))
-
-
-def test_a_trajectory_brings_its_accelerations(tmp_path):
-    log = load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory()])}))
-    assert_recorded(log)
-    assert_allclose(log.recordings[0].raw.acceleration, motion(T)[2], rtol=1e-15)
-    assert_allclose(log.data[:, 4:], motion(log.time + T[0])[2], atol=0.01)
-
-
 def test_joints_are_chosen_and_ordered_by_name(tmp_path):
     file = write_states(tmp_path / "bag")
     log, other = load_log(file), load_log(file, joints=["b", "a"])
@@ -164,21 +121,6 @@ def test_one_of_several_topics_is_chosen(tmp_path):
 def test_what_does_not_fit_a_recording_is_told_with_its_name(arguments, message):
     with pytest.raises(ValueError, match=f"ur10.db3: {message}"):
         load_log(UR10, **arguments)
-
-
-@pytest.mark.parametrize(
-    ("messages", "message"),
-    [
-        ([(START, state(START, ["a"], [1.0], [1.0]))], "no message has a value of the effort"),
-        ([(START, state(START, ["a"], [], [], [1.0]))], "no message has a value of the position"),
-        ([(START, state(START, ["a", "b"], [1.0, 1.0], [1.0], [1.0, 1.0]))], "has 1 values of velocity for 2 names"),
-        ([(START, state(START, ["a"], [1.0], [1.0], [1.0]))], "it has 1 rows, and not two different times"),
-        ([], "the topic '/joint_states' has no messages"),
-    ],
-)
-def test_missing_signals_are_told(tmp_path, messages, message):
-    with pytest.raises(ValueError, match=message):
-        load_log(write(tmp_path / "bag", {"/joint_states": (STATES, messages)}))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.9], ids=str)
@@ -212,12 +154,6 @@ def test_a_database_with_a_page_in_two_places_raises(tmp_path):
     file.write_bytes(data)
     with pytest.raises(ValueError, match=r"log.db3: it cannot be read as .* SQLite finds it damaged: "):
         load_log(file)
-
-
-def test_without_rosbags_the_pip_command_is_told(monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
-        load_log(UR10)
 
 
 def spoilt_states(rows, **fields):
@@ -255,16 +191,3 @@ def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_
     assert load_log(file, keep=slice(8, None)).recordings[0].n_incomplete == 0
     if field == "velocity":
         assert load_log(file, velocity="derive").recordings[0].raw.velocity is None
-
-
-def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
-    file = write(tmp_path / "one", spoilt_states([4], name=["a", "a"]))
-    with pytest.raises(ValueError, match="row 4 names the joint 'a' twice, so that its values are not known; say by"):
-        load_log(file)
-    assert load_log(file, keep=slice(5, None)).joint_names == ["a", "b"]
-    every = write(tmp_path / "every", spoilt_states(range(len(T)), name=["a", "a"]))
-    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
-        load_log(every)
-    first = write(tmp_path / "first", spoilt_states([0, 1], name=["a", "a"]))
-    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
-        load_log(first)

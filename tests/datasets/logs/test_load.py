@@ -6,7 +6,6 @@ from skevgp.datasets import load_log
 
 from .cases import BY_NUMBER, irregular_times, table_of, write_table
 
-KEYS = {"data", "target", "groups", "pieces", "time", "recordings", "joint_names", "feature_names", "target_names"}
 T = irregular_times(6.0)
 
 
@@ -17,51 +16,12 @@ def files(tmp_path):
     return [write_table(tmp_path / name, table_of(t)) for name, t in zip(names, (T, T[:375] + 100.0), strict=True)]
 
 
-def test_the_bunch_has_what_is_documented(files):
-    log = load_log(files[0], columns=BY_NUMBER)
-    assert set(log) == KEYS | {"filenames", "DESCR"}
-    n = len(log.data)
-    assert log.data.shape == (n, 6)
-    assert log.target.shape == (n, 2)
-    assert log.groups.shape == log.pieces.shape == log.time.shape == (n,)
-    assert log.joint_names == ["q1", "q2"]
-    assert log.feature_names == ["q1", "q2", "dq1/dt", "dq2/dt", "d2q1/dt2", "d2q2/dt2"]
-    assert log.target_names == ["u_q1", "u_q2"]
-    assert log.filenames == [str(files[0])]
-    (recording,) = log.recordings
-    kept = recording.processed.why == ""
-    assert_array_equal(recording.processed.acceleration[kept], log.data[:, 4:])
-    assert_array_equal(recording.processed.torque[kept], log.target)
-    assert recording.start == pytest.approx(T[0])
-
-
 @pytest.mark.parametrize("gains", [3.0, [3.0, -2.0]], ids=str)
 def test_torques_are_gains_times_currents(files, gains):
     plain, log = (load_log(files[0], columns=BY_NUMBER, gains=given) for given in (1.0, gains))
     assert_allclose(log.target, plain.target * gains, rtol=1e-12)
     assert_allclose(log.recordings[0].raw.torque, plain.recordings[0].raw.torque * gains, rtol=1e-12)
     assert_array_equal(log.data, plain.data)
-
-
-@pytest.mark.parametrize(
-    ("keep", "rows"),
-    [
-        (slice(100, 500), slice(100, 500)),
-        (slice(None, -200), slice(None, -200)),
-        ((1.0, None), T - T[0] >= 1.0),
-        ((1.0, 4.5), (T - T[0] >= 1.0) & (T - T[0] <= 4.5)),
-        ((None, 4.5), T - T[0] <= 4.5),
-    ],
-)
-def test_only_what_is_kept_is_read(tmp_path, files, keep, rows):
-    table = table_of(T)
-    inside = np.zeros(len(T), dtype=bool)
-    inside[rows] = True
-    table[~inside, 1:] = np.nan
-    log = load_log(write_table(tmp_path / "spoilt.csv", table), columns=BY_NUMBER, keep=keep)
-    alone = load_log(write_table(tmp_path / "alone.csv", table[inside]), columns=BY_NUMBER)
-    assert_allclose(log.data, alone.data, atol=1e-9)
-    assert_allclose(log.time, alone.time + T[inside][0] - T[0], atol=1e-9)
 
 
 def test_the_description_tells_what_was_done(files):
@@ -112,13 +72,6 @@ def test_the_description_tells_what_was_done(files):
 def test_bad_values_are_named(files, arguments, message):
     with pytest.raises(ValueError, match=message):
         load_log(files[0], **{"columns": BY_NUMBER, **arguments})
-
-
-def test_files_must_have_the_same_joints(files):
-    write_table(files[1], table_of(T)[:, [0, 1, 4, 6]], ["t", "q_1", "dq_1", "i_1"])
-    columns = {"time": "t", "position": "q_*", "velocity": "dq_*", "current": "i_*"}
-    with pytest.raises(ValueError, match=r"second.csv: it has 1 joints; expected 2: \['q1', 'q2'\]"):
-        load_log(files, columns=columns)
 
 
 def test_a_file_that_is_not_there_is_an_os_error(tmp_path):

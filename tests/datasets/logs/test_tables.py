@@ -40,14 +40,6 @@ def test_columns_by_name_are_columns_by_number(file, expected, columns):
     assert_equal(load_log(file, columns=columns), expected)
 
 
-@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
-@pytest.mark.parametrize("header", [HEADER, None], ids=["header", "no header"])
-@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.TXT"])
-def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
-    file = write_table(tmp_path / name, TABLE, header, delimiter)
-    assert_equal(load_log(file, columns=BY_NUMBER), expected)
-
-
 @pytest.mark.parametrize(
     "beginning",
     [
@@ -62,15 +54,6 @@ def test_headers_are_found(tmp_path, expected, beginning):
     file = tmp_path / "log.csv"
     file.write_text(beginning + body, encoding="utf-8")
     assert_equal(load_log(file, columns=BY_NAME), expected)
-
-
-@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
-def test_times_have_a_unit(tmp_path, expected, unit, seconds):
-    table = TABLE.copy()
-    table[:, 0] /= seconds
-    log = load_log(write_table(tmp_path / "log.csv", table), columns=BY_NUMBER, time_unit=unit)
-    np.testing.assert_allclose(log.data, expected.data, atol=1e-8)
-    assert log.recordings[0].start == pytest.approx(expected.recordings[0].start)
 
 
 @pytest.mark.parametrize(
@@ -105,30 +88,6 @@ def test_missing_columns_are_named_with_the_file(file, columns, message):
 def test_wrong_column_maps_are_errors(file, columns, message):
     with pytest.raises(ValueError, match=message):
         load_log(file, columns=columns)
-
-
-@pytest.mark.parametrize(
-    ("content", "message"),
-    [
-        (b"", "it is empty"),
-        (b"# only a comment\n", "it is empty"),
-        (b"t,q,u\n", "it has no rows"),
-        (b"t,q,u\n0,1,2\n1,,2\n2,3,4\n", "row 1 lacks the position of joint 'q1'. Leave it out by keep"),
-        (b"t,q,u\n0,1,2\n1,word,2\n2,3,4\n", r"row 1 lacks the position .*'word' in column 1 \(q\) is no number"),
-        (b"t,q,u\n0,1,2\n1,2\n2,3,4\n", "row 1 lacks the effort .*it has 2 cells, and column 2 is read"),
-        (b"t,q,u\n0,1,2\n1,nan,2\n2,3,4\n", "row 1 lacks the position"),
-        (b"t,q,u\n0,,2\n1,,2\n2,,4\n", "none of its 3 rows is complete: row 0 lacks the position"),
-        (b"t,q,u\n0,,2\n1,,2\n2,3,4\n", "2 of its 3 rows are incomplete: row 0 lacks the position"),
-        (b"t;q;u\n0,1;1;2\n", r"row 0 has '0,1' in column 0 \(t\), and decimal='.'. Pass decimal=\",\""),
-        (b"t;q;u\n0;1.234,5;2\n", r"row 0 has '1.234,5' in column 1 \(q\).* without separators of thousands"),
-        (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
-    ],
-)
-def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
-    file = tmp_path / "bad.csv"
-    file.write_bytes(content)
-    with pytest.raises(ValueError, match=f"bad.csv: {message}"):
-        load_log(file, columns={"time": 0, "position": 1, "effort": 2})
 
 
 @pytest.mark.parametrize(
@@ -181,11 +140,3 @@ def test_broken_compression_is_told_with_the_name(tmp_path, spoil):
     file.write_bytes(spoil(gzip.compress(b"0,1,2\n" * 1000)))
     with pytest.raises(ValueError, match="bad.csv.gz: it is no text, or its compression is broken"):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2})
-
-
-@pytest.mark.parametrize("title", ["Recorded by robot 7 on Monday", "Robot 7, Monday", "sep=,"])
-def test_a_title_before_the_table_is_passed_over(tmp_path, expected, title):
-    body = write_table(tmp_path / "body.csv", TABLE).read_text()
-    file = tmp_path / "log.csv"
-    file.write_text(f"{title}\n{body}")
-    assert_equal(load_log(file, columns=BY_NAME), expected)
