@@ -47,6 +47,9 @@ def test_shapes_are_those_of_scikit_learns_gaussian_process(model, y):
 ENCODE = make_column_transformer((OneHotEncoder(drop="if_binary"), ["kind"]))
 
 
+SCALE = make_column_transformer((StandardScaler(), ["a", "b"]))
+
+
 def with_words(rows):
     """Columns of a frame: those of the rows, and in words whether the second is positive."""
     return {"a": rows[:, 0], "kind": np.where(rows[:, 1] > 0, "up", "down"), "b": rows[:, 1]}
@@ -68,6 +71,35 @@ def test_without_a_kernel_map_the_columns_must_be_numbers(model, feature_map, fr
     message = r"The columns \['kind'\] of X are not numbers, but with kernel_map=None .*: give a kernel_map"
     with pytest.raises(ValueError, match=message):
         fresh(model, feature_map=feature_map).fit(frame_of(with_words(X)), Y)
+
+
+@pytest.mark.parametrize(
+    ("y", "message"),
+    [
+        (Y[:-1], "inconsistent numbers of samples"),
+        (np.where(Y > 0, Y, np.nan), "Input y contains NaN"),
+        (np.where(Y > 0, "up", "down"), "y must be real numbers"),
+        (None, "requires y to be passed, but the target y is None"),
+        (1e200 * Y, "y must not exceed 1e\\+100 in size"),
+    ],
+    ids=["too few", "NaN", "words", "none", "too large"],
+)
+def test_targets_beside_words_are_checked(y, message, frame_of):
+    frame = frame_of(with_words(X))
+    m = fresh(MODELS[0], feature_map=ENCODE, kernel_map=SCALE).fit(frame, Y)
+    for method in (m.fit, m.partial_fit):
+        with pytest.raises(ValueError, match=message):
+            method(frame, y)
+
+
+def test_a_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
+    columns = with_words(X)
+    m = fresh(MODELS[0], feature_map=ENCODE, kernel_map=SCALE).fit(frame_of(columns), Y)
+    with pytest.raises(ValueError, match=r"X is empty: its shape is \(0, 3\)"):
+        m.predict(frame_of({name: column[:0] for name, column in columns.items()}))
+    columns.pop("b")
+    with pytest.raises(ValueError, match="Feature names seen at fit time, yet now missing"):
+        m.predict(frame_of(columns))
 
 
 # --- files --------------------------------------------------------------------------------------------------------

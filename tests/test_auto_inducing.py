@@ -7,7 +7,7 @@ import pytest
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EVGPRegressor
-from skevgp.solvers import LBFGS
+from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (150, 2))
@@ -49,6 +49,12 @@ def test_other_values_are_refused(wrong):
     named = "max_inducing" if "solver" in wrong else next(iter(wrong))
     with pytest.raises((ValueError, TypeError), match=named):
         model(**wrong).fit(X, Y)
+
+
+@pytest.mark.parametrize("solver", ["adam", Adam()])
+def test_adam_is_told_a_number(solver):
+    with pytest.raises(ValueError, match=r'n_inducing="auto" needs solver="lbfgs"'):
+        model(solver=solver).fit(X, Y)
 
 
 def test_a_warm_start_has_no_more_points_than_it_may():

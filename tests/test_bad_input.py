@@ -10,7 +10,7 @@ from scipy import sparse
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics, ResidualRegressor
 from skevgp.features import InertiaForce
 
 RNG = np.random.RandomState(0)
@@ -191,6 +191,23 @@ BAD = {
         "contains NaN",
     ),
 }
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
+    spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
+    message = rf"^{spread} must not exceed 1e\+130 in size; "
+    model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)
+    with pytest.raises(ValueError, match=message):
+        model.fit(1e12 * X, 1e-110 * Y)
+    assert np.isfinite(model.fit(1e12 * X, 1e-80 * Y).predict(1e12 * X, return_std=True)).all()
+
+
+@pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
+def test_targets_whose_weighted_squares_overflow_are_refused(kind):
+    message = r"^√\(sample_weight / relative_variance\) times y must not exceed 1e\+130 in size"
+    with pytest.raises(ValueError, match=message):
+        kind().fit(X, 1e98 * Y, **EXTREME)
 
 
 @pytest.mark.filterwarnings("ignore:Feature names only support names that are all strings")

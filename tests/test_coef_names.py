@@ -36,6 +36,13 @@ def test_a_map_that_does_not_say_has_numbers(estimator, feature_map):
     assert estimator.set_params(feature_map=feature_map).fit(X, Y).coef_names_.tolist() == ["h0", "h1"]
 
 
+@each_estimator
+def test_without_features_there_are_none(estimator):
+    m = estimator.set_params(feature_map=None).fit(X, Y)
+    with pytest.raises(AttributeError, match="coef_names_ only after a fit with a feature_map"):
+        m.coef_names_  # noqa: B018
+
+
 def test_of_a_robot_they_are_its_own():
     state = RNG.uniform(-1.0, 1.0, (30, 3))
     m = EVGPRegressor(InertiaForceGravity("pendulum"), max_iter=0, n_inducing=5).fit(state, state[:, :2])

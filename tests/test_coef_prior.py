@@ -111,6 +111,16 @@ def test_a_table_of_another_shape_is_named(name, shape):
         resolve(FunctionTransformer(), **{name: np.ones(shape)})
 
 
+def test_one_output_does_not_take_a_row_of_another_width():
+    with pytest.raises(ValueError, match=r"mean of CoefPrior must be .* \(1, 3\), or \(3,\) .*; got the shape \(2,\)"):
+        resolve(FunctionTransformer(), mean=[1.0, 2.0], targets=TARGETS[:, :1])
+
+
+def test_a_negative_scale_is_an_error():
+    with pytest.raises(ValueError, match=r"scale of CoefPrior must not be negative; its smallest value is -2\.0"):
+        resolve(FunctionTransformer(), scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
+
+
 @pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("value", [np.nan, np.inf, [[0.0, 0.0, 0.0], [0.0, np.nan, 0.0]]])
 def test_values_must_be_finite(name, value):
@@ -137,6 +147,11 @@ def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
     union = make_union(Opinionated(np.zeros((2, 2)), np.ones((2, 2))), FunctionTransformer())
     with pytest.raises(ValueError, match=r"\(2, 3\), .*; got \[\(2, 2\), \(2, 2\)\]"):
         resolve(union)
+
+
+def test_the_width_of_the_target_must_fit_the_robot():
+    with pytest.raises(ValueError, match="y has 1 columns, but InertiaForce"):
+        resolve(InertiaForce("pendulum"), targets=TARGETS[:, :1])
 
 
 def test_a_column_transformer_keeps_the_prior_of_its_parts():

@@ -50,6 +50,12 @@ def test_a_folder_is_named_and_not_what_would_have_been_beside_it(name, model, t
     assert list(tmp_path.iterdir()) == [tmp_path / name]
 
 
+def test_a_folder_that_is_not_there_is_told_by_the_path_that_was_given(model, tmp_path):
+    path = tmp_path / "none" / "model.skevgp"
+    with pytest.raises(FileNotFoundError, match=rf"No such file or directory: '{path}'$"):
+        save(model, path)
+
+
 def test_a_pipe_stays_one(tmp_path):
     path = tmp_path / "pipe"
     os.mkfifo(path)

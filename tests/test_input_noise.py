@@ -4,6 +4,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.impute import SimpleImputer
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
 from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
@@ -85,6 +86,16 @@ def test_what_cannot_be_is_refused_by_name(options, message):
     X = np.random.RandomState(0).randn(30, 2)
     with pytest.raises((ValueError, TypeError), match=message):
         EVGPRegressor(**{"n_inducing": 5, "max_iter": 3, "solver": LBFGS(tol=1e6), **options}).fit(X, X[:, 0])
+
+
+def test_values_that_are_missing_have_no_slopes():
+    X = pd.DataFrame(np.random.RandomState(0).randn(30, 2), columns=["a", "b"])
+    y = X["a"].copy()
+    X.loc[3, "b"] = np.nan
+    with pytest.raises(ValueError, match="none of them missing"):
+        EVGPRegressor(
+            kernel_map=SimpleImputer(), n_inducing=5, max_iter=3, solver=LBFGS(tol=1e6), noise=Gaussian(inputs=0.1)
+        ).fit(X, y)
 
 
 def test_changes_of_noisy_columns_are_noisy_by_these_too():

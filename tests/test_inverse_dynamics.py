@@ -5,6 +5,7 @@ import pinocchio
 import pytest
 from numpy.testing import assert_allclose
 from sklearn.exceptions import ConvergenceWarning
+from sklearn.preprocessing import StandardScaler
 
 from skevgp import InverseDynamics
 from skevgp.datasets import load_robot, perturb_robot
@@ -195,6 +196,11 @@ def test_the_speed_at_which_friction_has_a_sign_is_found_from_several_trajectori
     assert (np.array(velocity(arm.groups).stiction_velocity) > 0.04).all()
     assert velocity(None).stiction_velocity == 0.01
     assert velocity(arm.groups, stiction_velocity=None).stiction_velocity == 0.01
+
+
+def test_other_transformers_are_no_robots():
+    with pytest.raises(TypeError, match="robot must be a name"):
+        InverseDynamics(StandardScaler()).fit(np.zeros((5, 3)), np.zeros(5))
 
 
 def test_bad_payloads_are_named(arm, rigid):

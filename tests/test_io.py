@@ -15,10 +15,11 @@ import pytest
 import skops.io
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.stats import randint
 from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.exceptions import NotFittedError
-from sklearn.model_selection import GridSearchCV, GroupKFold
+from sklearn.model_selection import GridSearchCV, GroupKFold, RandomizedSearchCV
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.pipeline import Pipeline, make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
@@ -93,6 +94,13 @@ _OF_SCIKIT_LEARN = {
     "outputs": MultiOutputRegressor(evgp()),
     "range": evgp(sharing=[range(2)]),
 }
+
+
+def test_of_a_search_that_cannot_be_saved_the_best_model_is_advised(path):
+    search = RandomizedSearchCV(evgp(), {"n_inducing": randint(3, 6)}, n_iter=1, cv=2, random_state=0).fit(X, Y)
+    with pytest.raises(ValueError, match=r"cannot be saved.*Save its best_estimator_"):
+        save(search, path)
+    save(search.best_estimator_, path)
 
 
 @pytest.mark.parametrize("name", _OF_SCIKIT_LEARN)
@@ -221,6 +229,22 @@ def write_content(path, content, **about):
     versions = {**json.loads(members_of(path)["skevgp.json"]), **about}
     skops.io.dump(content, path)
     write_members(path, {**members_of(path), "skevgp.json": json.dumps(versions)})
+
+
+def test_files_of_others_are_refused(path):
+    save(fitted("plain"), path)
+    write_members(path, {**members_of(path), "more": bytes(2**27)}, zipfile.ZIP_DEFLATED)
+    with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 1344"):
+        load(path)
+    write_members(path, {"model.json": "{}"})
+    with pytest.raises(ValueError, match=r"model.skevgp' .*of skevgp 0\.1, which this version does not read"):
+        load(path)
+    skops.io.dump(fitted("plain"), path)
+    with pytest.raises(ValueError, match=r"model.skevgp' .*is not a file of skevgp\.io\.save"):
+        load(path)
+    path.write_text("no model")
+    with pytest.raises(ValueError, match=r"model.skevgp' cannot be loaded: File is not a zip file\.$"):
+        load(path)
 
 
 @pytest.mark.parametrize(

@@ -12,6 +12,8 @@ from sklearn.utils._param_validation import InvalidParameterError
 from sklearn.utils.validation import check_is_fitted
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp.datasets import make_toy
+from skevgp.noise import Gaussian
 from skevgp.plotting import CoefficientDisplay
 
 RNG = np.random.RandomState(0)
@@ -72,6 +74,15 @@ def test_what_needs_a_fit_says_so():
             call()
 
 
+def test_the_prior_refuses_what_a_fit_would():
+    with pytest.raises(ValueError, match="NaN"):
+        EGPRegressor().predict([[np.nan]])
+    with pytest.raises(ValueError, match="length_scale|columns"):
+        EGPRegressor(kernel=BARE).predict(X[:, :1])
+    with pytest.raises(ValueError, match=r"number of targets seen in `y`.*Got 2 != 1"):
+        EGPRegressor(n_targets=1).fit(X, Y)
+
+
 # --- known noise --------------------------------------------------------------------------------------------------
 
 
@@ -87,6 +98,12 @@ def test_with_alpha_and_no_optimizer_it_is_scikit_learns_model(y, alpha):
     np.testing.assert_allclose(std**2, expected_std**2 + alpha, atol=1e-8)
     np.testing.assert_allclose(ours.predict(X_NEW, True, include_noise=False)[1], expected_std, atol=1e-6)
     assert ours.log_marginal_likelihood_value_ == pytest.approx(theirs.log_marginal_likelihood_value_, abs=1e-4)
+
+
+@pytest.mark.parametrize("arguments", [{"noise": Gaussian(variance=0.1)}, {"kernel": RBF() + WhiteKernel()}], ids=str)
+def test_noise_is_known_or_learned(arguments):
+    with pytest.raises(ValueError, match=r"alpha=0\.1 is the noise"):
+        EGPRegressor(alpha=0.1, **arguments).fit(X, Y)
 
 
 @pytest.mark.parametrize("alpha", [0.0, -1.0, np.full(30, 0.1)], ids=str)
@@ -146,6 +163,14 @@ def test_an_optimizer_that_returns_nonsense_is_refused():
             EGPRegressor(optimizer=lambda objective, theta, bounds, answer=answer: (answer, 0.0)).fit(X, Y[:, 0])
 
 
+def test_an_optimizer_that_asks_for_nonsense_is_told_so():
+    def asks(objective, theta, bounds):
+        return objective(np.stack([theta, theta]))
+
+    with pytest.raises(ValueError, match=r"theta must be 4 numbers; got an array of shape \(2, 4\)"):
+        EGPRegressor(optimizer=asks).fit(X, Y[:, 0])
+
+
 def test_ctrl_c_keeps_the_best_that_an_optimizer_of_ones_own_has_seen():
     def interrupted(objective, theta, bounds):
         for shift in (0.0, 0.2, 5.0):
@@ -190,3 +215,10 @@ def test_theta_of_the_kernel_as_given(kernel):
 def test_parameters_are_checked_before_a_fit_too(parameters, named):
     with pytest.raises(InvalidParameterError, match=f"'{named}' parameter"):
         EGPRegressor(**parameters).predict([[0.0, 1.0]], return_std=True)
+
+
+@pytest.mark.parametrize("rubbish", [None, (1.0, 2.0, 3.0), ("a", "b"), np.zeros(7)], ids=str)
+def test_what_an_optimizer_returns_is_named(rubbish):
+    X, y = make_toy(20, random_state=0, return_X_y=True)
+    with pytest.raises(ValueError, match="optimizer must return 3 finite numbers and their value; got"):
+        EGPRegressor(optimizer=lambda objective, theta, bounds: rubbish).fit(X, y)

@@ -7,7 +7,7 @@ import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import InverseDynamics
-from skevgp.features import RigidBodyRegressor
+from skevgp.features import NominalDynamics, RigidBodyRegressor
 from skevgp.identification.likely_causes import likely_causes
 from skevgp.robots import RigidBody
 
@@ -124,3 +124,12 @@ def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(fra
         InverseDynamics("ur5").fit(other, y)
     with pytest.raises(ValueError, match=r"columns of y must be in the robot's order.*got \['elbow_joint'"):
         InverseDynamics("ur5").fit(X, frame_of({name: arm.y[:, UR5.index(name)] for name in by_name}))
+
+
+def test_the_columns_of_each_joint_side_by_side_are_refused(frame_of):
+    side_by_side = [f"{joint}/{signal}" for joint in UR5 for signal in ("q", "dq", "u")]
+    frame = frame_of({name: np.zeros(2) for name in side_by_side})
+    with pytest.raises(ValueError, match="by their names they are those of the joints"):
+        RigidBodyRegressor("ur5").fit(frame)
+    ordered = [f"{joint}/{signal}" for signal in ("q", "dq", "u") for joint in UR5]
+    assert NominalDynamics("ur5").fit_transform(frame_of({name: np.zeros(2) for name in ordered})).shape == (2, 6)

@@ -144,9 +144,20 @@ def test_a_negative_standard_deviation_is_an_error(metric):
         metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])
 
 
+def test_std_norm_of_negative_values_is_an_error():
+    with pytest.raises(ValueError, match=r"std must not be negative; its smallest value is -0\.5"):
+        std_norm([1.0, -0.5])
+
+
 def test_the_density_needs_a_positive_standard_deviation():
     with pytest.raises(ValueError, match=r"std must be above 0; its smallest value is 0\.0"):
         negative_log_predictive_density([0.0], [0.0], [0.0])
+
+
+@pytest.mark.parametrize("metric", OF_PREDICTIONS)
+def test_no_rows_are_an_error(metric):
+    with pytest.raises(ValueError, match="minimum of 1 is required"):
+        metric(*arguments(metric, y=[], mean=[], std=[]))
 
 
 @pytest.mark.parametrize("k", [-1, [1, np.nan], [1, None]])

@@ -11,6 +11,14 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 
+def test_numbers_whose_squares_overflow_are_refused():
+    X = np.ones((3, 1))
+    with pytest.raises(ValueError, match=r"y must not exceed 1e\+100 in size; its largest value is 1e\+200"):
+        EVGPRegressor().fit(X, [1.0, 2.0, 1e200])
+    with pytest.raises(ValueError, match="X must not exceed"):
+        EVGPRegressor().fit(1e200 * X, [1.0, 2.0, 3.0])
+
+
 def test_rows_on_top_of_each_other_count_as_one_place():
     X = np.repeat(np.arange(4.0), 10)[:, np.newaxis]
     y = X[:, 0] + 0.1 * np.random.RandomState(0).randn(40)

@@ -125,6 +125,11 @@ def test_groups_of_a_wrong_length_are_refused(groups):
         fitted(groups)
 
 
+def test_labels_are_one_for_each_row():
+    with pytest.raises(ValueError, match="groups must be one label for each row"):
+        fitted([[1], [1, 2]] * 1000)
+
+
 @pytest.mark.parametrize("noise_cv", [1, 0, -3, True, 2.0, "10"])
 def test_a_wrong_number_of_folds_is_refused(noise_cv):
     with pytest.raises(ValueError, match="The 'noise_cv' parameter of EVGPRegressor must be"):

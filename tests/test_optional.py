@@ -72,3 +72,13 @@ def test_optional_packages_are_loaded_only_where_they_are_used(code):
 def test_public_names_are_listed():
     assert dir(skevgp) == sorted(skevgp.__all__)
     assert {"EVGPRegressor", "datasets", "features", "metrics", "plotting", "__version__"} <= set(dir(skevgp))
+
+
+def test_an_unknown_name_is_an_attribute_error():
+    with pytest.raises(AttributeError, match="module 'skevgp' has no attribute 'EVGPClassifier'"):
+        skevgp.EVGPClassifier  # noqa: B018
+
+
+def test_an_unknown_name_cannot_be_imported():
+    with pytest.raises(ImportError, match="cannot import name 'EVGPClassifier'"):
+        from skevgp import EVGPClassifier  # noqa: F401

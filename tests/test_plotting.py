@@ -101,6 +101,11 @@ def test_bars_that_are_shorter_than_their_symbol_stand_in_numbers(mean, std, tex
     assert [shown.get_text() for shown in display.ax_.texts] == [text]
 
 
+def test_without_features_there_are_no_weights_to_show():
+    with pytest.raises(ValueError, match="no weights to show: it was fitted with feature_map=None"):
+        CoefficientDisplay.from_estimator(fitted())
+
+
 @pytest.mark.parametrize(
     "draw",
     [
@@ -155,6 +160,11 @@ def test_axes_are_logarithmic_where_scores_are_positive_or_as_told(lowest, log_s
         assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
 
 
+def test_scores_that_have_no_logarithm_are_named():
+    with pytest.raises(ValueError, match=r"log_scale=True needs positive scores; the smallest is -1\.0"):
+        LearningCurveDisplay(np.array([10, 40]), np.array([[2.0], [-1.0]])).plot(log_scale=True)
+
+
 def test_scores_are_those_of_scikit_learn_on_the_same_rows():
     orders = [np.argsort(rng.permutation(30)) for rng in [np.random.RandomState(3)] for _ in range(2)]
     sizes, _, expected = learning_curve(
@@ -184,3 +194,12 @@ def test_scores_are_those_of_scikit_learn_on_the_same_rows():
 def test_sizes_that_are_not_numbers_of_groups_are_named(sizes, problem, message):
     with pytest.raises(problem, match=message):
         learning_curve_of(sizes=sizes)
+
+
+def test_a_curve_needs_a_run_and_rows_of_one_length():
+    with pytest.raises(ValueError, match="n_runs must be at least 1; got 0"):
+        learning_curve_of(n_runs=0)
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        learning_curve_of(targets=Y[:5])
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        learning_curve_of(groups=np.zeros(5))

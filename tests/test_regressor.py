@@ -47,6 +47,11 @@ def test_shapes_of_attributes(y, outputs, sharing):
     assert m.loss_curve_.shape == (m.n_iter_,)
 
 
+def test_a_number_of_points_is_no_truth_value():
+    with pytest.raises(TypeError, match="n_inducing must be an integer; got True"):
+        EVGPRegressor(n_inducing=True).fit(np.eye(4), np.arange(4.0))
+
+
 def test_noise_is_included_unless_told_otherwise():
     m = model(solver=LBFGS(tol=1e9)).fit(X, Y)
     _, with_noise = m.predict(X_NEW, return_std=True)
@@ -95,6 +100,12 @@ def test_natural_gradients_and_lbfgs_agree_at_the_optimum():
     np.testing.assert_allclose((natural.coef_ - lbfgs.coef_) / lbfgs.coef_std_, 0.0, atol=0.2)
     np.testing.assert_allclose(natural.coef_std_, lbfgs.coef_std_, rtol=0.1)
     np.testing.assert_allclose(natural.noise_variance_, lbfgs.noise_variance_, rtol=0.05)
+
+
+def test_natural_gradients_are_of_the_full_posterior():
+    m = model(solver=Adam(natural_gradient=True, posterior="diagonal"))
+    with pytest.raises(ValueError, match=r'natural_gradient=True of Adam needs posterior="full"; got posterior='):
+        m.fit(X, Y)
 
 
 @pytest.mark.parametrize(

@@ -3,7 +3,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import sklearn
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, RegressorMixin, clone
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.metrics import r2_score
@@ -32,6 +32,21 @@ def routing():
         yield
 
 
+class Recorder(RegressorMixin, BaseEstimator):
+    """Keeps what it is given."""
+
+    def fit(self, X, y, sample_weight=None):
+        self.fit_given_ = X, y, sample_weight
+        return self
+
+    def partial_fit(self, X, y, sample_weight=None):
+        return self.fit(X, y, sample_weight)
+
+    def predict(self, X, **given):
+        self.predict_given_ = X, given
+        return np.zeros(len(X))
+
+
 # --- what it learns and predicts ----------------------------------------------------------------------------------
 
 
@@ -53,6 +68,14 @@ def test_the_base_columns_are_chosen_by_index_or_name(base):
     # A linear regression learns the same sum whatever is taken away before.
     direct = LinearRegression().fit(X, Y).predict(X_NEW)
     np.testing.assert_allclose(m.predict(pd.DataFrame(X_NEW, columns=NAMES)), direct, atol=1e-12)
+
+
+def test_base_columns_of_a_frame_must_be_finite_numbers(frame_of):
+    m = ResidualRegressor(Recorder(), base="angle")
+    with pytest.raises(ValueError, match="Column 0 of X, a base, must be real numbers"):
+        m.fit(frame_of({"angle": ["left"] * 60}), Y[:, 0])
+    with pytest.raises(ValueError, match="base columns of X must be finite; they contain NaN or infinity"):
+        m.fit(frame_of({"angle": np.full(60, np.nan)}), Y[:, 0])
 
 
 @pytest.mark.parametrize(("y", "base"), TARGETS[::2], ids=["1-D", "(n, 2)"])
@@ -127,6 +150,17 @@ def test_weights_are_routed_through_a_cross_validation(routing):
 def test_a_base_that_is_not_in_x_is_refused(base, message):
     with pytest.raises(ValueError, match=message):
         ResidualRegressor(LinearRegression(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y)
+
+
+def test_names_need_a_data_frame():
+    with pytest.raises(ValueError, match=r"must name columns of X; its columns' names are \[\]"):
+        ResidualRegressor(LinearRegression(), base=["angle", "speed"]).fit(X, Y)
+
+
+def test_more_outputs_than_columns_are_refused():
+    with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
+        ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
+    assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
 
 
 @pytest.mark.parametrize("method", ["fit", "partial_fit"])

@@ -104,3 +104,13 @@ def test_states_times_and_names_are_chosen(ahead):
 def test_what_does_not_fit_is_named(ahead, arguments, message):
     with pytest.raises(ValueError, match=message):
         RolloutDisplay.from_rollout(ahead, **arguments)
+
+
+def test_an_initial_state_that_is_not_there_is_named(batch):
+    with pytest.raises(ValueError, match="index=3 must be that of one of 3 initial states"):
+        RolloutDisplay.from_rollout(batch, index=3)
+
+
+def test_another_number_of_axes_is_named(ahead):
+    with pytest.raises(ValueError, match="axes must be one for each of the 2 states drawn; got 1"):
+        RolloutDisplay.from_rollout(ahead, axes=pyplot.subplots()[1])

@@ -5,9 +5,11 @@ from functools import partial
 import numpy as np
 import pytest
 import sklearn
+from scipy.stats import norm
 from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
+from sklearn.ensemble import BaggingRegressor
 from sklearn.experimental import enable_halving_search_cv  # noqa: F401
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
@@ -74,6 +76,14 @@ def test_searches_choose_the_noise_that_is_there(search, scorer):
     assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
 
 
+def test_a_scorer_says_how_it_was_made():
+    assert repr(neg_crps) == "make_std_scorer(crps, greater_is_better=False)"
+    scorer = make_std_scorer(norm.logpdf, where=1)
+    assert repr(scorer) == "make_std_scorer(logpdf, where=1)"
+    with pytest.raises(TypeError, match="score_func must be callable; got 'crps'"):
+        make_std_scorer("crps")
+
+
 # --- what scikit-learn puts around a regressor -------------------------------------------------------------------
 
 
@@ -109,6 +119,24 @@ def test_independent_models_of_outputs_are_put_side_by_side():
     assert neg_nlpd(model, X, Y) == pytest.approx(expected)
     nested = make_pipeline(PolynomialFeatures(2), TransformedTargetRegressor(model, transformer=StandardScaler()))
     assert np.isfinite(cross_val_score(nested, X, Y, scoring=neg_crps, cv=2, error_score="raise")).all()
+
+
+class Deaf(BayesianRidge):
+    """Takes any argument, and does nothing with it."""
+
+    def predict(self, X, **_):
+        return super().predict(X)
+
+
+def test_a_mean_alone_is_no_pair():
+    with pytest.raises(TypeError, match="returns no pair of mean and std"):
+        neg_crps(Deaf().fit(X, y), X[:2], y[:2])
+
+
+def test_what_knows_no_return_std_says_so():
+    model = BaggingRegressor(BayesianRidge(), n_estimators=2).fit(X, y)
+    with pytest.raises(TypeError, match="BaggingRegressor.predict takes no return_std"):
+        neg_crps(model, X, y)
 
 
 @pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)

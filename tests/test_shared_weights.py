@@ -313,6 +313,19 @@ def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
             model.partial_fit(X, Y)
 
 
+def test_the_joint_covariance_is_asked_for_by_name(data):
+    X, Y, _, _, X_new = data
+    model = EVGPRegressor(max_iter=0, n_inducing=5).fit(X, Y)
+    for word in ("all", np.array([1, 2])):
+        with pytest.raises(ValueError, match="return_cov must be False, True or 'joint'; got "):
+            model.predict(X_new, return_cov=word)
+    cov = model.predict(X_new, return_cov=True)[1]
+    joint = model.predict(X_new, return_cov="joint")[1].reshape(len(X_new), O, len(X_new), O)
+    for i in range(O):
+        for j in range(O):
+            np.testing.assert_array_equal(joint[:, i, :, j], cov[:, :, i] if i == j else 0.0)
+
+
 def test_shared_weights_with_known_noise_are_dense_ones(data):
     X, Y, Sigma, mean, X_new = data
     relative = np.random.RandomState(1).uniform(0.2, 5.0, N)

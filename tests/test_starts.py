@@ -136,6 +136,12 @@ def test_targets_far_from_their_prior_mean_are_told(sharing):
         assert wide.score(X, Y + 1e6) > 0.99
 
 
+def test_targets_whose_squares_vanish_are_refused():
+    with pytest.raises(ValueError, match=r"y must be 0 or exceed 1e-140 in size; a column's largest value is 1.*e-150"):
+        model().fit(X, 1e-150 * Y)
+    assert model().fit(X, np.zeros(len(X))).predict(X) == pytest.approx(np.zeros(len(X)))
+
+
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
     """From a low first noise alone, such fits end on a plateau on which the kernel explains every row by itself."""

@@ -98,3 +98,11 @@ def test_a_name_that_is_taken_in_c_is_refused(name, tmp_path):
     with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
         fitted(sparse()).to_c(tmp_path, name)
     assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_that_is_not_there_is_told(tmp_path):
+    model = fitted(sparse())
+    with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):
+        model.to_c(tmp_path / "missing" / "model.c")
+    with pytest.raises(ValueError, match=r"there is no folder .*missing"):
+        model.to_c(tmp_path / "missing")

@@ -1,6 +1,9 @@
+import sys
+
 import numpy as np
 import pytest
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, TransformerMixin, clone
+from sklearn.preprocessing import QuantileTransformer
 
 from skevgp import ResidualRegressor
 from skevgp.control.casadi import Deviations
@@ -61,6 +64,16 @@ def test_a_residual_model_adds_its_base_columns(base):
     assert_same(evaluated(function, X[:5], model.to_casadi_parameters()), model, X[:5], include_noise=False)
 
 
+@pytest.mark.parametrize("method", ["to_casadi", "to_c"])
+def test_without_casadi_there_is_the_pip_command(method, monkeypatch, tmp_path):
+    model = fitted(sparse())
+    monkeypatch.setitem(sys.modules, "casadi", None)
+    message = r"The export to CasADi and C needs the optional package 'casadi'.*pip install casadi .*'\.\[casadi\]'"
+    with pytest.raises(ImportError, match=message):
+        getattr(model, method)(*([tmp_path] if method == "to_c" else []))
+    assert len(model.to_casadi_parameters())
+
+
 # --- errors ----------------------------------------------------------------------------------------------------------
 
 
@@ -73,6 +86,36 @@ def test_a_name_that_casadi_refuses_is_told(name):
 def test_a_kernel_that_cannot_be_exported_is_named():
     model = fitted(sparse(kernel=FunctionKernel(lambda X, Z: X @ Z.T)))
     with pytest.raises(ValueError, match=r"The kernel Function\(.*These can be exported"):
+        model.to_casadi()
+
+
+@pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
+def test_a_map_that_cannot_be_exported_is_named(argument):
+    model = fitted(sparse(**{argument: QuantileTransformer(n_quantiles=10)}))
+    with pytest.raises(TypeError, match=rf"{argument}: QuantileTransformer.*These can be exported: AngleEncoder"):
+        model.to_casadi()
+
+
+class Wrong(TransformerMixin, BaseEstimator):
+    """Its expression is not what it does."""
+
+    def __init__(self, result="short"):
+        self.result = result
+
+    def fit(self, X, y=None):
+        return self
+
+    def transform(self, X):
+        return X.copy()
+
+    def to_casadi(self, x):
+        return {"short": x[:2], "row": x.T, "list": [x, x], "array": np.ones(5)}[self.result]
+
+
+@pytest.mark.parametrize("result", ["short", "row", "list", "array"])
+def test_an_expression_of_another_shape_is_an_error(result):
+    model = fitted(sparse(kernel_map=Wrong(result)))
+    with pytest.raises(ValueError, match=r"kernel_map: to_casadi must return an MX of shape \(5, 1\)"):
         model.to_casadi()
 
 

@@ -9,9 +9,10 @@ import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.compose import ColumnTransformer
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer
+from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, StandardScaler
 
 from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.noise import Gaussian
 
 from .cases import N_OUTPUTS, QUICK, D
 
@@ -107,6 +108,34 @@ def test_differences_take_steps_in_the_units_of_the_columns(data, unit, offset, 
         np.testing.assert_allclose(found, expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
 
 
+def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
+    X, Y, X_new = data
+    encoder = ColumnTransformer([("words", OneHotEncoder(), ["c"]), ("numbers", StandardScaler(), ["a", "b"])])
+
+    def frame_of(rows):
+        return pd.DataFrame(rows, columns=["a", "b"]).assign(c=np.where(rows[:, 0] > 0.5, "high", "low"))
+
+    model = EVGPRegressor(kernel_map=encoder, n_inducing=10, **QUICK).fit(frame_of(X), Y[:, 0])
+    _, std = model.predict(frame_of(X_new), return_std=True, include_noise=False)
+    expected = std**2 / model._posterior.predictor.signal
+    np.testing.assert_allclose(model.novelty(frame_of(X_new)), expected, rtol=1e-6, atol=1e-9)
+    many = model.novelty(frame_of(np.repeat(X_new, 1000, axis=0)))
+    np.testing.assert_allclose(many, np.repeat(expected, 1000), rtol=1e-6, atol=1e-9)
+    message = r"\['c'\] of X are not numbers.* derivatives"
+    for method in (model.jacobian, model.value_and_jacobian, model.predict_gradient):
+        with pytest.raises(ValueError, match=message):
+            method(frame_of(X_new))
+    for method in (model.compile, model.sample_functions):
+        with pytest.raises(ValueError, match=message):
+            method()
+    with pytest.raises(ValueError, match=message):
+        model.set_params(noise=Gaussian(inputs=0.1)).fit(frame_of(X), Y[:, 0])
+    numbers = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=10, **QUICK)
+    numbers.fit(pd.DataFrame(X, columns=["a", "c"]), Y[:, 0])
+    with pytest.raises(ValueError, match=message):
+        numbers.jacobian(frame_of(X_new)[["a", "c"]])
+
+
 def test_what_a_residual_regressor_says_is_of_the_sum(data):
     X, Y, X_new = data
     model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0])
@@ -125,3 +154,13 @@ def test_what_a_residual_regressor_says_is_of_the_sum(data):
     close(single.jacobian(X_new), differences(single.predict, X_new), 1e-6)
     for method in ("value_and_jacobian", "novelty"):
         assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), method)
+
+
+def test_derivatives_are_not_for_dask_arrays(data):
+    da = pytest.importorskip("dask.array")
+    X, Y, _ = data
+    model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
+    with pytest.raises(ValueError, match="not for Dask arrays"):
+        model.jacobian(da.from_array(X))
+    with pytest.raises(ValueError, match="novelty needs rows in memory"):
+        model.novelty(da.from_array(X))

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 from scipy.stats import kstest, norm
 from sklearn.base import BaseEstimator
+from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
@@ -173,3 +175,18 @@ def test_feedback_is_in_the_derivative(sparse):
 def test_what_cannot_be_is_refused_by_name(sparse, arguments, options, message, method):
     with pytest.raises(ValueError, match=message):
         rollout(sparse, *arguments, **{"method": method, **options})
+
+
+def test_regressors_that_will_not_do_are_named(data, inputs):
+    with pytest.raises(NotFittedError):
+        rollout(EVGPRegressor(), Z0, inputs)
+    with pytest.raises(TypeError, match=r"LinearRegression.predict has no return_std"):
+        rollout(LinearRegression().fit(*data), Z0, inputs)
+
+
+def test_a_system_that_runs_away_is_named(data):
+    X, _ = data
+    model = EVGPRegressor(FunctionTransformer(), n_inducing=5, **QUICK).fit(X, 1e3 * X[:, :2])
+    for method in ("sample", "mean", "linearized"):
+        with pytest.raises(ValueError, match="States grow beyond 1e.100 at step"):
+            rollout(model, Z0, np.zeros((60, 1)), method=method, n_samples=3, random_state=0)

@@ -88,6 +88,12 @@ def test_another_number_of_rows_is_an_error(function):
         apply_map(returning(function), X, "feature_map")
 
 
+@pytest.mark.parametrize("function", [lambda X: X[:, 0], lambda X: X[:, :, np.newaxis, np.newaxis], lambda X: 1.0])
+def test_a_result_of_other_dimensions_is_an_error(function):
+    with pytest.raises(ValueError, match=r"kernel_map=.* must return one row per row of X"):
+        apply_map(returning(function), X, "kernel_map")
+
+
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_a_result_that_is_not_finite_is_an_error(value):
     with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity"):
@@ -99,6 +105,11 @@ def test_a_map_that_changes_its_width_is_an_error(monkeypatch):
     widths = iter([2, 1])
     with pytest.raises(ValueError, match="same number of columns for all rows; it returned 2 and 1"):
         apply_map(returning(lambda X: X[:, : next(widths)]), np.ones((6, 3)), "feature_map")
+
+
+def test_a_map_that_returns_words_is_an_error():
+    with pytest.raises(ValueError, match="What feature_map=.* returns must be real numbers"):
+        apply_map(returning(lambda X: np.full(X.shape, "a")), np.ones((2, 2)), "feature_map")
 
 
 def test_a_map_that_cannot_be_cloned_is_named():
@@ -138,3 +149,9 @@ def test_a_union_may_have_rows_for_each_output(around, weights, rows):
     own = own * (3.0 if weights else 1.0)
     expected = [np.hstack([own[:, j], scaled, first]) for j in range(2)]
     assert_array_equal(apply_map(fitted, rows, "feature_map"), np.stack(expected, axis=1))
+
+
+def test_parts_of_a_union_agree_on_the_number_of_outputs():
+    union = make_union(FunctionTransformer(per_output), FunctionTransformer(lambda X: per_output(X)[:, [0, 1, 0]]))
+    with pytest.raises(ValueError, match=r"different numbers of outputs: \[2, 3\]"):
+        apply_map(union.fit(X), X, "feature_map")

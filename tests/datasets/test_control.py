@@ -71,6 +71,50 @@ def ur5():
     return ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=1.0)
 
 
+@pytest.mark.parametrize(("steps", "next_step"), [([3], 0), ([0, 2], 1), ([0, 1, 1], 2)])
+def test_steps_that_do_not_follow_one_another_are_refused(ur5, steps, next_step):
+    *before, last = steps
+    for step in before:
+        ur5(step, np.zeros((1, 12)))
+    with pytest.raises(ValueError, match=f"follow one another from 0; got {last}, expected 0 or {next_step}"):
+        ur5(last, np.zeros((1, 12)))
+
+
+@pytest.mark.parametrize(("step", "error"), [(-1, ValueError), (0.0, TypeError), ("0", TypeError)])
+def test_what_is_no_step_is_refused(ur5, step, error):
+    with pytest.raises(error, match="step must be"):
+        ur5(step, np.zeros((1, 12)))
+
+
+def test_the_number_of_trajectories_stays(ur5):
+    ur5(0, np.zeros((2, 12)))
+    with pytest.raises(ValueError, match="There were 2 trajectories in step 0; got 3"):
+        ur5(1, np.zeros((3, 12)))
+
+
+def test_a_refused_call_changes_nothing(ur5):
+    Z = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 1, 12))
+    ur5(0, Z[0])
+    with pytest.raises(ValueError, match="must fit q0"):
+        ur5(1, np.zeros((1, 10)))
+    torque = ur5(1, Z[1])
+    ur5(0, Z[0])
+    assert_array_equal(ur5(1, Z[1]), torque)
+
+
+@pytest.mark.parametrize(("Z", "message"), [([[np.nan] * 12], "Z must be finite"), ([["a"] * 12], "Z must be real")])
+def test_states_that_are_no_numbers_are_refused(ur5, Z, message):
+    with pytest.raises(ValueError, match=message):
+        ur5(0, Z)
+
+
+@pytest.mark.parametrize("shape", [(14,), (3, 14), (2, 12)])
+def test_states_of_another_shape_are_refused(shape):
+    controller = ComputedTorqueController("iiwa14", np.zeros((2, 7)), np.ones((2, 7)), duration=1.0)
+    with pytest.raises(ValueError, match=r"must fit q0, of shape \(2, 7\)"):
+        controller(0, np.zeros(shape))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

@@ -77,6 +77,21 @@ def test_bad_values_are_named(arguments, message):
         make_dynamics(**{"system": "pendulum"} | arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"system": 3}, "must be a name .*; got 3"),
+        ({"n_trajectories": 2.0}, "n_trajectories must be an integer; got 2.0"),
+        ({"n_steps": True}, "n_steps must be an integer; got True"),
+        ({"dt": "0.03"}, "dt must be a number; got '0.03'"),
+        ({"noise": [0.1]}, r"noise must be a number; got \[0.1\]"),
+    ],
+)
+def test_bad_types_are_named(arguments, message):
+    with pytest.raises(TypeError, match=message):
+        make_dynamics(**{"system": "pendulum"} | arguments)
+
+
 def test_iiwa14_has_the_size_of_the_paper():
     assert make_dynamics("iiwa14", n_steps=1, duration=1.5).trajectories.shape == (465, 2, 14)
     assert make_dynamics("iiwa14", n_trajectories=1).data.shape == (50, 21)
@@ -105,6 +120,15 @@ def test_a_joint_without_motor_is_swung_at_random():
     assert_allclose(first.max(axis=0), [2.5, -2.5, 0.5, 0.5], atol=0.05)
     assert 0.1 < dynamics.data[:, -1].std() < 1.0
     assert "random inputs from random states" in dynamics.DESCR
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "joint"),
+    [("panda", {"dt": 0.1}, "finger"), ("so100", {"dt": 0.1}, "gripper"), ("panda", {"duration": 0.2}, "finger")],
+)
+def test_moves_that_run_away_are_an_error(name, arguments, joint):
+    with pytest.raises(ValueError, match=rf"run away in step \d+, at .*{joint}.*unstable at this dt of .*Lower dt"):
+        make_dynamics(name, 10, 50, random_state=0, **arguments)
 
 
 @pytest.mark.long

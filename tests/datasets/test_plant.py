@@ -46,6 +46,11 @@ def test_the_implicit_method_agrees_with_the_explicit_one():
     assert_allclose(plant.advance(z, u, 0.03, stiff=True), plant.advance(z, u, 0.03, stiff=False), rtol=0, atol=1e-7)
 
 
+def test_a_motion_too_fast_for_the_step_ends_in_an_error():
+    with pytest.raises(ValueError, match="integration of 'pendulum' over 0.03 s failed: it needs more than 600 steps"):
+        simulate("pendulum", [3.0, 1e6], np.zeros((1, 1)))
+
+
 def test_no_step_takes_for_ever(monkeypatch):
     monkeypatch.setattr(plant_module, "_MOST_ALLOWED", 700)
     with pytest.raises(ValueError, match="'pendulum' over 1e[+]308 s failed: it needs more than 700 steps"):

@@ -158,6 +158,28 @@ def test_an_integration_that_gives_up_is_an_error():
         simulate("pendulum", [1.0, 1e200], ZEROS)
 
 
+@pytest.mark.parametrize("system", ["cartpole", "acrobot"])
+def test_states_whose_accelerations_overflow_are_refused(system):
+    with pytest.raises(ValueError, match="accelerations of .* overflow"), np.errstate(all="ignore"):
+        simulate(system, [0.3, 0.3, 1e200, 1e200], np.zeros((1, 1)))
+
+
+@pytest.mark.parametrize("dt", ["a", None, [0.1, 0.2], True])
+def test_a_step_that_is_no_number_is_named(dt):
+    with pytest.raises(TypeError, match="dt must be a number"):
+        simulate("pendulum", [0.0, 0.0], np.zeros((1, 1)), dt=dt)
+
+
+def test_complex_states_are_refused():
+    with pytest.raises(ValueError, match="z0 must be real numbers"):
+        simulate("pendulum", [0.0, 1j], np.zeros((1, 1)))
+
+
+def test_no_trajectory_is_an_error():
+    with pytest.raises(ValueError, match="and some rows"):
+        simulate("pendulum", np.zeros((0, 2)), np.zeros((0, 3, 1)))
+
+
 def test_a_controller_sees_each_state_once():
     z0, seen = np.array([[0.3, 0.0], [0.1, 0.2]]), []
 
@@ -169,6 +191,25 @@ def test_a_controller_sees_each_state_once():
     assert [step for step, _ in seen] == [0, 1, 2, 3]
     assert_array_equal(np.stack([states for _, states in seen], axis=1), Z[:, :-1])
     assert_array_equal(U, -0.5 * Z[:, :-1, 1:])
+
+
+@pytest.mark.parametrize(
+    ("answer", "message"),
+    [
+        (np.zeros(2), r"must return finite inputs of shape \(2, 1\); got the shape \(2,\) in step 0"),
+        (np.zeros((1, 1)), r"shape \(2, 1\); got the shape \(1, 1\)"),
+        ([[0.0], [np.nan]], "got NaN or infinity in step 0"),
+        ([[0.0], [1j]], "inputs must be real numbers"),
+    ],
+)
+def test_what_a_controller_returns_is_checked(answer, message):
+    with pytest.raises(ValueError, match=message):
+        simulate("pendulum", np.zeros((2, 2)), lambda step, Z: answer, n_steps=1)
+
+
+def test_a_number_of_steps_is_for_controllers():
+    with pytest.raises(ValueError, match="n_steps is for a controller.*Got 3"):
+        simulate("pendulum", [0.0, 0.0], ZEROS, n_steps=3)
 
 
 @pytest.mark.long

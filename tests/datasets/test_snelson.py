@@ -16,6 +16,9 @@ X, Y, TEST = np.array([2.5, 0.25, 1.0]), np.array([-1.0, 0.125, 3.0]), np.array(
 FAKE = {"train_inputs": X, "train_outputs": Y, "test_inputs": TEST}
 
 
+TRUE_CHECKSUMS = snelson._CHECKSUMS
+
+
 def text(values, end="\n"):
     return "".join(f"  {value:.7e}{end}" for value in values).encode()
 
@@ -62,6 +65,14 @@ def serve(tmp_path, monkeypatch):
     return serve
 
 
+@pytest.fixture
+def offline(monkeypatch):
+    def refuse(*_arguments, **_options):
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(snelson, "urlopen", refuse)
+
+
 def put(folder, ending="", end="\n", **changed):
     folder.mkdir(parents=True, exist_ok=True)
     for name, values in {**FAKE, **changed}.items():
@@ -86,6 +97,26 @@ def test_a_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
         fetch(download_if_missing=False)
     serve(archive(GOOD))
     assert_array_equal(fetch().test_data, TEST[:, np.newaxis])
+
+
+def test_without_permission_nothing_is_downloaded(offline, fetch, home):
+    with pytest.raises(OSError, match=rf"neither in {re.escape(str(home))} nor in .*SPGP_dist.*train_inputs.*http"):
+        fetch(download_if_missing=False)
+
+
+def test_wrong_numbers_in_a_folder_are_named(offline, fetch, home):
+    put(home, ".dat", train_outputs=2.0 * Y)
+    found = sha256((2.0 * Y).tobytes()).hexdigest()
+    expected = sha256(Y.tobytes()).hexdigest()
+    with pytest.raises(OSError, match=rf"train_outputs\.dat .*checksum is {found}, expected {expected}"):
+        fetch()
+
+
+def test_a_file_without_numbers_is_named(offline, fetch, home):
+    put(home)
+    (home / "test_inputs").write_text("<html>moved</html>")
+    with pytest.raises(OSError, match="test_inputs .* is not a list of numbers"):
+        fetch()
 
 
 @pytest.mark.parametrize(
@@ -141,6 +172,13 @@ def test_a_server_that_stumbles_is_asked_again(server, home):
     assert server.calls == 3
 
 
+def test_a_server_that_fails_is_told(server, home):
+    server.failures = 9
+    with pytest.raises(OSError, match=r"fetched from http://127.0.0.1:\d+/SPGP_dist.tgz \(HTTP Error 503.*data_home"):
+        fetch_snelson(home, n_retries=1, delay=0.0)
+    assert server.calls == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "error", "message"),
     [
@@ -153,3 +191,11 @@ def test_a_server_that_stumbles_is_asked_again(server, home):
 def test_bad_arguments_are_named(arguments, error, message):
     with pytest.raises(error, match=message):
         fetch_snelson(**arguments)
+
+
+def test_other_numbers_in_the_same_files_are_not_snelsons(monkeypatch, offline, fetch, home):
+    """Against the checksums of the true files, which are not ours to ship."""
+    monkeypatch.setattr(snelson, "_CHECKSUMS", TRUE_CHECKSUMS)
+    put(home, ".dat")
+    with pytest.raises(OSError, match=r"train_inputs\.dat .*are not Snelson's.*expected 8b1ccec3"):
+        fetch()

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from autograd import grad
 from scipy.stats import norm
+from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import BayesianMLPRegressor
 from skevgp.estimators.bnn import VariationalNetwork, _EarlyStopping
@@ -246,6 +247,12 @@ def test_held_out_rows_are_not_learned_from(monkeypatch):
     m = model(early_stopping=True, validation_fraction=0.25, max_iter=3, batch_size=7).fit(X, Y)
     assert (len(learned), len(scored), len(learned & scored)) == (90, 30, 0)
     assert len(m.loss_curve_) == len(m.validation_scores_) == 3
+
+
+def test_a_loss_that_does_not_stay_finite_is_told(monkeypatch):
+    monkeypatch.setattr(VariationalNetwork, "loss_and_gradient", lambda self, theta, *_: (np.nan, theta))
+    with pytest.warns(ConvergenceWarning, match="did not stay finite"):
+        model().fit(X, Y)
 
 
 # --- nasty data --------------------------------------------------------------------------------------------------

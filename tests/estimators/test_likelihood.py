@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, ExpSineSquared, Matern, RationalQuadratic
 from sklearn.preprocessing import PolynomialFeatures
@@ -92,6 +93,15 @@ def test_the_gradient_of_the_likelihood_is_the_numerical_one(scale):
     expected = numerical_gradient(model.log_marginal_likelihood, theta)
     np.testing.assert_allclose(gradient, expected, rtol=1e-5, atol=1e-4)
     assert model.log_marginal_likelihood(model.kernel_.theta) == pytest.approx(model.log_marginal_likelihood_value_)
+
+
+def test_without_theta_it_is_the_fitted_value():
+    model = start()
+    assert model.log_marginal_likelihood() == model.log_marginal_likelihood_value_
+    with pytest.raises(ValueError, match="Gradient can only be evaluated for theta!=None"):
+        model.log_marginal_likelihood(eval_gradient=True)
+    with pytest.raises(NotFittedError):
+        EGPRegressor().log_marginal_likelihood()
 
 
 def test_a_theta_that_does_not_fit_is_an_error():

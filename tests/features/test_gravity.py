@@ -129,6 +129,12 @@ def test_links_that_are_none_list_the_links(links):
         LinkGravity("iiwa14", links=links).fit(rows("iiwa14"))
 
 
+@pytest.mark.parametrize("links", [["q2", 1], np.array([1, 1])])
+def test_a_link_named_twice_is_an_error(links):
+    with pytest.raises(ValueError, match=r"links=\[.*1.*\] must not name a link twice"):
+        LinkGravity("iiwa14", links=links).fit(rows("iiwa14"))
+
+
 @pytest.mark.parametrize(
     ("parameters", "message"),
     [

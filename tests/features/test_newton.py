@@ -147,6 +147,12 @@ def test_a_bad_parameter_is_named(parameters, message):
         InertiaForceGravity("acrobot", **parameters).coef_prior(4)
 
 
+@pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
+def test_a_parameter_that_is_no_number_is_named(parameter):
+    with pytest.raises(ValueError, match=f"'{parameter}' parameter .* Got 'much'"):
+        InertiaForce("pendulum", **{parameter: "much"}).coef_prior(2)
+
+
 @pytest.mark.parametrize("feature_map", MAPS)
 def test_a_wrong_number_of_columns_is_an_error(feature_map):
     message = rf"X has 4 columns, but {feature_map.__name__} of the robot 'pendulum' needs 3: \['q', 'dq/dt', 'u_q'\]"

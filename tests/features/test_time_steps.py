@@ -201,6 +201,20 @@ def test_the_step_must_be_the_last_column(kind, columns):
         ANY[kind]("pendulum", dt="column").fit(pd.DataFrame(np.abs(rows("pendulum")), columns=columns))
 
 
+@any_map
+def test_any_other_word_is_an_error(kind):
+    with pytest.raises(ValueError, match="The 'dt' parameter of .* must be .*'column'.* Got 'row' instead"):
+        ({**ANY, "gravity": LinkGravity}[kind]("pendulum", dt="row")).fit(rows("pendulum"))
+
+
+def test_the_step_of_gravity_is_that_of_the_map_around_it():
+    X = rows("acrobot")
+    with pytest.raises(ValueError, match=r"gravity=LinkGravity\(dt='column'\) must leave dt to InertiaForceGravity"):
+        InertiaForceGravity("acrobot", dt="column", gravity=LinkGravity(dt="column")).fit(X)
+    levers = InertiaForceGravity("acrobot", dt="column", gravity=LinkGravity(axes="x")).fit_transform(X)
+    assert_array_equal(levers[:, 9:], LinkGravity("acrobot", axes="x", dt="column").fit_transform(X))
+
+
 # --- models of logs ------------------------------------------------------------------------------------------------
 
 # Of dq/dt' = dq/dt + Δt (4 u - 0.4 dq/dt - 19.62 sin q): weights of Δt q, Δt q̇, Δt u and Δt sin q.

@@ -67,6 +67,11 @@ def test_functions_that_do_not_work_say_why(kernel, message):
         fitted(kernel)
 
 
+def test_the_exact_gp_is_told_of_numbers_that_are_not_finite():
+    with pytest.raises(ValueError, match="returned numbers that are not finite"):
+        FunctionKernel(lambda X, Z: X @ Z.T * np.nan)(X)
+
+
 def kinked(X, Z, scale=1.0):
     return anp.exp(-anp.sqrt(anp.sum((X[:, None, :] - Z[None, :, :]) ** 2, axis=2)) / scale)
 

@@ -62,6 +62,14 @@ def test_a_centre_far_away_costs_no_digits(kernel):
     np.testing.assert_allclose(function(row)[0].full().ravel(), numeric(row)[0], rtol=1e-10)
 
 
+@pytest.mark.parametrize(
+    "kernel", [sk.RBF(1.0) + FunctionKernel(lambda X, Z, a=1.0: a * X @ Z.T), FunctionKernel(lambda X, Z: X @ Z.T)]
+)
+def test_a_function_kernel_cannot_be_exported(kernel):
+    with pytest.raises(ValueError, match=r"The kernel Function\(.*These can be exported: ConstantKernel"):
+        symbolic(kernel)
+
+
 @pytest.mark.parametrize("nu", [0.7, 30.5])
 def test_a_matern_with_bessel_functions_cannot_be_exported(nu):
     with pytest.raises(ValueError, match=rf"Matern\(nu={nu}\) cannot be written in CasADi.*half-integer"):

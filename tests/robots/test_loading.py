@@ -61,6 +61,25 @@ def test_an_unknown_name_gets_close_ones_and_all(name, close):
         load_robot(name)
 
 
+@pytest.fixture
+def without_collection(monkeypatch):
+    def missing(name):
+        raise importlib.metadata.PackageNotFoundError(name)
+
+    monkeypatch.setattr(importlib.metadata, "files", missing)
+    monkeypatch.setattr(loading.sys, "prefix", "/nowhere")
+    loading._collection.cache_clear()
+    yield
+    loading._collection.cache_clear()
+
+
+def test_without_the_collection_the_systems_are_left_and_the_error_says_how_to_get_more(without_collection):
+    assert list_robots() == sorted(SYSTEMS)
+    assert load_robot("acrobot").nv == 2
+    with pytest.raises(ValueError, match=r"pip install example-robot-data brings more"):
+        load_robot("panda")
+
+
 def test_a_collection_without_a_list_of_files_is_found_by_its_place(monkeypatch, tmp_path, chain):
     folder = tmp_path / "share" / "example-robot-data" / "robots" / "chain_description"
     folder.mkdir(parents=True)
@@ -138,6 +157,17 @@ def test_a_file_that_is_not_there_is_an_error(path):
         load_robot(path)
 
 
+@pytest.mark.parametrize("kind", [str, Path])
+def test_a_folder_is_told_apart(tmp_path, kind):
+    with pytest.raises(ValueError, match=r"is a folder; a robot is one URDF file"):
+        load_robot(kind(tmp_path))
+
+
+def test_no_name_is_no_folder():
+    with pytest.raises(ValueError, match="Unknown robot ''"):
+        load_robot("")
+
+
 def test_a_name_as_a_path_gets_a_hint():
     with pytest.raises(ValueError, match=r"no file 'panda'; a robot's name must be a string, not a path"):
         load_robot(Path("panda"))
@@ -163,6 +193,17 @@ def test_a_screw_joint_is_refused():
     model.addJoint(0, pinocchio.JointModelHX(0.1), pinocchio.SE3.Identity(), "screw")
     with pytest.raises(ValueError, match=r"joint 'screw'.*revolute or prismatic"):
         load_robot(model)
+
+
+def test_a_model_without_joints_is_refused():
+    with pytest.raises(ValueError, match="has no joint that moves"):
+        load_robot(pinocchio.Model())
+
+
+@pytest.mark.parametrize("robot", [3, None, ["ur5"], object()])
+def test_what_is_no_robot_is_a_type_error(robot):
+    with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF file"):
+        load_robot(robot)
 
 
 @pytest.mark.parametrize("axis", [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.6, 0.80001], [0.0, 0.0, np.nan]])

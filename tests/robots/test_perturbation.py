@@ -35,3 +35,14 @@ def test_an_inertia_stays_one_that_a_body_can_have():
 def test_a_scale_out_of_range_is_named(scale):
     with pytest.raises(ValueError, match="scale must be .*; got"):
         perturb_robot("acrobot", scale)
+
+
+@pytest.mark.parametrize("scale", ["much", None, True, [0.1]])
+def test_a_scale_that_is_no_number_is_named(scale):
+    with pytest.raises(TypeError, match="scale must be a number; got"):
+        perturb_robot("acrobot", scale)
+
+
+def test_an_unknown_robot_gets_close_matches():
+    with pytest.raises(ValueError, match="Unknown robot 'acrobat'.*Did you mean 'acrobot'"):
+        perturb_robot("acrobat")

@@ -189,6 +189,18 @@ def test_what_is_no_urdf_is_named(content, message, tmp_path):
     assert not target.exists()
 
 
+def test_a_file_without_joints_that_move_is_named(tmp_path):
+    (tmp_path / "stone.urdf").write_text('<robot name="stone"><link name="a"/></robot>')
+    with pytest.raises(ValueError, match=r"stone\.urdf' has no joint that moves"):
+        write_urdf(tmp_path / "stone.urdf", tmp_path / "new.urdf", np.ones((1, 10)))
+
+
+@pytest.mark.parametrize("source", ["acrobot", load_robot("ur10"), 3], ids=["system", "model", "number"])
+def test_a_robot_without_a_file_is_named(source, tmp_path):
+    with pytest.raises(ValueError, match="source must be a URDF file, or the name of a robot that has one; got"):
+        write_urdf(source, tmp_path / "new.urdf", np.ones((2, 10)))
+
+
 @pytest.mark.parametrize(
     ("changed", "message"),
     [

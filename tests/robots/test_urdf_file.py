@@ -113,6 +113,19 @@ def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
         load(ARM.replace(old, new, 1))
 
 
+def test_links_in_a_circle_are_told(load):
+    """Pinocchio leaves them out, and makes a robot of the rest."""
+    with pytest.raises(ValueError, match=r"it has links in a circle: \['c', 'd'\]"):
+        load(robot("abcd", joint("a", "b"), joint("c", "d"), joint("d", "c")))
+
+
+def test_a_joint_without_limits_is_told(load):
+    text = robot("ab", joint("a", "b")).replace('<limit effort="1" velocity="1"/>', "")
+    with pytest.raises(ValueError, match="the joint 'to_b' has no <limit>, which a revolute one needs"):
+        load(text)
+    assert load(text.replace("revolute", "continuous")).nv == 1
+
+
 def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
     """Pinocchio goes from joint to joint by recursion: one of 5000 ends the interpreter."""
 
@@ -184,3 +197,12 @@ def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     assert model.inertias[1].mass == 1.5
     with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
         load(text.format(joint("b", "c")))
+
+
+@pytest.mark.parametrize("masses", [(2, -2), (2, -2, 3), (-0.5, 2), (2, -2.5, 3), (0.3, -0.1, -0.2)])
+def test_negative_masses_that_pinocchio_cannot_add_are_refused(load, masses):
+    """It divides by the sum after each link, and by some 1e-16 in place of a sum of 0."""
+    bodies = "".join(BODY.format(link, mass) for link, mass in zip("bcd", masses, strict=False))
+    welds = "".join(joint("b", link, "fixed") for link, _ in zip("cd", masses[1:], strict=False))
+    with pytest.raises(ValueError, match=r"the link '.' has <mass value=\"-.*first of them, 'b', which is"):
+        load(f'<robot name="r"><link name="a"/>{bodies}{joint("a", "b")}{welds}</robot>')

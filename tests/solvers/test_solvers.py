@@ -72,6 +72,11 @@ def test_an_option_out_of_range_is_named(solver, error, message):
         model(solver=solver).fit(X, Y)
 
 
+def test_natural_gradients_need_the_full_posterior():
+    with pytest.raises(ValueError, match=r'natural_gradient=True of Adam needs posterior="full"; got posterior='):
+        model(solver=Adam(natural_gradient=True, posterior="diagonal")).fit(X, Y)
+
+
 # --- subclasses ----------------------------------------------------------------------------------------------------
 
 

@@ -1,5 +1,6 @@
 import shutil
 import struct
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,28 @@ def test_what_does_not_fit_a_recording_is_told_with_its_name(arguments, message)
         load_log(UR10, **arguments)
 
 
+def test_a_recording_without_joint_states_lists_its_topics(tmp_path):
+    text = TYPES["std_msgs/msg/String"]
+    file = write(tmp_path / "bag", {"/said": ("std_msgs/msg/String", [(START, text("q"))])})
+    with pytest.raises(ValueError, match=r"no topic has messages of .*JointTrajectory; it has \{'/said': 'std_msgs/ms"):
+        load_log(file)
+
+
+@pytest.mark.parametrize(
+    ("messages", "message"),
+    [
+        ([(START, state(START, ["a"], [1.0], [1.0]))], "no message has a value of the effort"),
+        ([(START, state(START, ["a"], [], [], [1.0]))], "no message has a value of the position"),
+        ([(START, state(START, ["a", "b"], [1.0, 1.0], [1.0], [1.0, 1.0]))], "has 1 values of velocity for 2 names"),
+        ([(START, state(START, ["a"], [1.0], [1.0], [1.0]))], "it has 1 rows, and not two different times"),
+        ([], "the topic '/joint_states' has no messages"),
+    ],
+)
+def test_missing_signals_are_told(tmp_path, messages, message):
+    with pytest.raises(ValueError, match=message):
+        load_log(write(tmp_path / "bag", {"/joint_states": (STATES, messages)}))
+
+
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.9], ids=str)
 @pytest.mark.parametrize("plugin", list(StoragePlugin), ids=str)
 def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
@@ -154,6 +177,27 @@ def test_a_database_with_a_page_in_two_places_raises(tmp_path):
     file.write_bytes(data)
     with pytest.raises(ValueError, match=r"log.db3: it cannot be read as .* SQLite finds it damaged: "):
         load_log(file)
+
+
+@pytest.mark.parametrize("name", ["log.db3", "log.mcap"])
+def test_a_missing_recording_raises_and_is_not_created(tmp_path, name):
+    with pytest.raises(ValueError, match=f"{name}: it cannot be read as a rosbag2 recording .FileNotFoundError"):
+        load_log(tmp_path / name)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):
+    with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
+        connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
+        writer.write(connection, START, b"\x00\x01\x00\x00" + b"\xff" * 40)
+    with pytest.raises(ValueError, match="bag.mcap: it cannot be read as a rosbag2 recording"):
+        load_log(tmp_path / "bag" / "bag.mcap")
+
+
+def test_without_rosbags_the_pip_command_is_told(monkeypatch):
+    monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
+    with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
+        load_log(UR10)
 
 
 def spoilt_states(rows, **fields):
@@ -191,3 +235,41 @@ def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_
     assert load_log(file, keep=slice(8, None)).recordings[0].n_incomplete == 0
     if field == "velocity":
         assert load_log(file, velocity="derive").recordings[0].raw.velocity is None
+
+
+def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
+    file = write(tmp_path / "one", spoilt_states([4], name=["a", "a"]))
+    with pytest.raises(ValueError, match="row 4 names the joint 'a' twice, so that its values are not known; say by"):
+        load_log(file)
+    assert load_log(file, keep=slice(5, None)).joint_names == ["a", "b"]
+    every = write(tmp_path / "every", spoilt_states(range(len(T)), name=["a", "a"]))
+    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
+        load_log(every)
+    first = write(tmp_path / "first", spoilt_states([0, 1], name=["a", "a"]))
+    with pytest.raises(ValueError, match="row 0 names the joint 'a' twice, so that its values are not known"):
+        load_log(first)
+
+
+def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
+    fields = {"position": [0.0, 0.0, 1.0], "velocity": [0.0, 0.0, 0.0], "effort": [0.0, 0.0, 2.0]}
+    file = write(tmp_path / "hand", spoilt_states(range(len(T)), name=["finger", "finger", "a"], **fields))
+    raw = load_log(file, joints=["a"], rest_velocity=0.0).recordings[0].raw
+    assert_allclose(raw.position, 1.0)
+    with pytest.raises(ValueError, match="names the joint 'finger' twice"):
+        load_log(file, joints=["finger"])
+
+
+def test_a_message_that_names_few_joints_between_others_is_an_error(tmp_path):
+    fields = {"name": ["a"], "position": [1.0], "velocity": [1.0], "effort": [1.0]}
+    with pytest.raises(ValueError, match=r"messages are of different joints, .*: \[\('a',\), \('a', 'b'\)\]"):
+        load_log(write(tmp_path / "bag", spoilt_states([7], **fields)))
+
+
+@pytest.mark.parametrize("first", [range(0), range(3)], ids=["in all messages", "after messages without velocity"])
+def test_a_velocity_that_one_joint_never_has_is_told_with_its_name(tmp_path, first):
+    topics = spoilt_states(first, velocity=[])
+    for row, (_, message) in enumerate(topics["/joint_states"][1]):
+        if row not in first:
+            message.velocity = np.array([message.velocity[0], np.nan])
+    with pytest.raises(ValueError, match="the velocity of joint 'b' is not finite in any row kept: the driver may nev"):
+        load_log(write(tmp_path / "bag", topics))

@@ -75,6 +75,12 @@ def test_a_joint_with_limits_is_not_unwrapped(load):
     assert "jump" in {why for *_, why in recording.cuts}
 
 
+@pytest.mark.parametrize(("wrap", "error"), [("yes", ValueError), (0.0, ValueError), (None, TypeError)])
+def test_invalid_wrap_raises(load, wrap, error):
+    with pytest.raises(error, match="wrap must be"):
+        load(Q, DQ, wrap=wrap)
+
+
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.sampled_from([0.002, 0.01, 0.05]), st.sampled_from([0.01, 1.0, 57.3, 1000.0]))
 def test_smooth_motion_with_noise_and_resolution_is_no_jump(seed, step, unit):

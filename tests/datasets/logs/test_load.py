@@ -74,7 +74,52 @@ def test_bad_values_are_named(files, arguments, message):
         load_log(files[0], **{"columns": BY_NUMBER, **arguments})
 
 
+@pytest.mark.parametrize("keep", [(1.0, 2.0), [None], slice(0, 9)], ids=str)
+def test_of_several_files_keep_is_a_list(files, keep):
+    with pytest.raises(ValueError, match="keep must be a list with one for each of the 2 files; got"):
+        load_log(files, columns=BY_NUMBER, keep=keep)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"dt": "fast"}, "dt must be a number; got 'fast'"), ({"keep": ("1", 2.0)}, "keep must be a number; got '1'")],
+)
+def test_bad_types_are_named(files, arguments, message):
+    with pytest.raises(TypeError, match=message):
+        load_log(files[0], columns=BY_NUMBER, **arguments)
+
+
+def test_files_must_have_the_same_joints(files):
+    write_table(files[1], table_of(T)[:, [0, 1, 4, 6]], ["t", "q_1", "dq_1", "i_1"])
+    columns = {"time": "t", "position": "q_*", "velocity": "dq_*", "current": "i_*"}
+    with pytest.raises(ValueError, match=r"second.csv: it has 1 joints; expected 2: \['q1', 'q2'\]"):
+        load_log(files, columns=columns)
+
+
+def test_there_must_be_a_file():
+    with pytest.raises(ValueError, match="path must be a file or several; got none"):
+        load_log([])
+
+
 def test_a_file_that_is_not_there_is_an_os_error(tmp_path):
     for name in ("no.csv", "no.csv.gz"):
         with pytest.raises(FileNotFoundError, match=name):
             load_log(tmp_path / name, columns=BY_NUMBER)
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("log.pkl", r"its name must end in one of .csv, .*, .mcap\."), ("log.bag", "Convert it with: rosbags-convert")],
+)
+def test_other_kinds_of_files_are_refused(tmp_path, name, message):
+    (tmp_path / name).write_bytes(b"")
+    with pytest.raises(ValueError, match=f"{name}: .*{message}"):
+        load_log(tmp_path / name)
+
+
+def test_signals_that_overflow_are_named(tmp_path):
+    table = table_of(irregular_times(3.0))
+    table[100, 6] = 1e308  # a position would be cut out as a jump
+    path = write_table(tmp_path / "log.csv", table)
+    with pytest.raises(ValueError, match=r"log\.csv: its \w+ overflows when it is filtered and differentiated"):
+        load_log(path, columns=BY_NUMBER)

@@ -91,6 +91,64 @@ def test_wrong_column_maps_are_errors(file, columns, message):
 
 
 @pytest.mark.parametrize(
+    ("columns", "message"),
+    [
+        (["t", "q"], "columns must be a dict .* got \\['t', 'q'\\]"),
+        ({**BY_NUMBER, "time": 0.0}, r"columns\['time'\] must be an integer; got 0.0"),
+    ],
+)
+def test_column_maps_of_wrong_types_are_errors(file, columns, message):
+    with pytest.raises(TypeError, match=message):
+        load_log(file, columns=columns)
+
+
+def test_names_need_a_header(tmp_path):
+    with pytest.raises(ValueError, match=r"asks for 't', but there is no header: give numbers, from 0"):
+        load_log(write_table(tmp_path / "log.csv", TABLE, None), columns=BY_NAME)
+
+
+@pytest.mark.parametrize(
+    ("quote", "message"),
+    [("", r"row 1 lacks the position .*'a{79} in column 1 \(q\) is no number"), ('"', "it is no text, .*field limit")],
+)
+def test_a_cell_of_a_million_letters_is_named(tmp_path, quote, message):
+    file = tmp_path / "log.csv"
+    file.write_text(f"t,q,u\n0,1,2\n1,{quote}{'a' * 10**6}{quote},2\n2,3,4\n")
+    with pytest.raises(ValueError, match=f"log.csv: {message}"):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
+def test_a_name_of_two_columns_is_an_error(tmp_path):
+    file = write_table(tmp_path / "log.csv", TABLE, ["t", "t", *HEADER[2:]])
+    with pytest.raises(ValueError, match="asks for 't', but several columns have this name"):
+        load_log(file, columns={**BY_NUMBER, "time": "t"})
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "it is empty"),
+        (b"# only a comment\n", "it is empty"),
+        (b"t,q,u\n", "it has no rows"),
+        (b"t,q,u\n0,1,2\n1,,2\n2,3,4\n", "row 1 lacks the position of joint 'q1'. Leave it out by keep"),
+        (b"t,q,u\n0,1,2\n1,word,2\n2,3,4\n", r"row 1 lacks the position .*'word' in column 1 \(q\) is no number"),
+        (b"t,q,u\n0,1,2\n1,2\n2,3,4\n", "row 1 lacks the effort .*it has 2 cells, and column 2 is read"),
+        (b"t,q,u\n0,1,2\n1,nan,2\n2,3,4\n", "row 1 lacks the position"),
+        (b"t,q,u\n0,,2\n1,,2\n2,,4\n", "none of its 3 rows is complete: row 0 lacks the position"),
+        (b"t,q,u\n0,,2\n1,,2\n2,3,4\n", "2 of its 3 rows are incomplete: row 0 lacks the position"),
+        (b"t;q;u\n0,1;1;2\n", r"row 0 has '0,1' in column 0 \(t\), and decimal='.'. Pass decimal=\",\""),
+        (b"t;q;u\n0;1.234,5;2\n", r"row 0 has '1.234,5' in column 1 \(q\).* without separators of thousands"),
+        (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
+    ],
+)
+def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
+    file = tmp_path / "bad.csv"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=f"bad.csv: {message}"):
+        load_log(file, columns={"time": 0, "position": 1, "effort": 2})
+
+
+@pytest.mark.parametrize(
     ("text", "message"),
     [
         ("t;q;u\n0,5;1.5;2\n", r"row 0 has '1.5' in column 1 \(q\), and decimal=','. Pass decimal=\"\.\""),
@@ -102,6 +160,12 @@ def test_points_among_decimal_commas_are_errors(tmp_path, text, message):
     file.write_text(text)
     with pytest.raises(ValueError, match=message):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2}, decimal=",")
+
+
+@pytest.mark.parametrize("decimal", ["", ";", ".,", None, 0])
+def test_decimal_must_be_a_point_or_a_comma(file, decimal):
+    with pytest.raises(ValueError, match=r"decimal must be '\.' or ','; got"):
+        load_log(file, columns=BY_NUMBER, decimal=decimal)
 
 
 @pytest.mark.parametrize("delimiter", [";", "\t", " ", '","'])

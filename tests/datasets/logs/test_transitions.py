@@ -60,6 +60,19 @@ def test_there_is_no_transition_across_a_gap(load, stride):
     assert len(found.data) == (399 // stride) + (len(t) - 401) // stride
 
 
+def test_velocities_must_be_recorded(load):
+    log = load(table_of(T), columns={"time": 0, "position": [1, 2], "effort": [6, 7]})
+    with pytest.raises(ValueError, match="0.csv: there are no recorded velocities"):
+        log_transitions(log)
+
+
+def test_some_transition_must_remain(load):
+    with pytest.raises(
+        ValueError, match="No 1001 rows follow each other without a gap, jump or rest: lower stride=1000"
+    ):
+        log_transitions(load(table_of(T)), stride=1000)
+
+
 def test_wrong_arguments_are_named(load):
     log = load(table_of(T))
     with pytest.raises(ValueError, match="stride must be at least 1; got 0"):
