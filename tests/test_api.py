@@ -92,7 +92,7 @@ def test_targets_beside_words_are_checked(y, message, frame_of):
             method(frame, y)
 
 
-def test_a_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
+def test_frame_of_words_must_have_rows_and_the_columns_of_the_fit(frame_of):
     columns = with_words(X)
     m = fresh(MODELS[0], feature_map=ENCODE, kernel_map=SCALE).fit(frame_of(columns), Y)
     with pytest.raises(ValueError, match=r"X is empty: its shape is \(0, 3\)"):
@@ -122,7 +122,7 @@ SAVED = [
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("model", SAVED, ids=str)
 @pytest.mark.parametrize("used", [False, True], ids=["fresh", "used"])
-def test_a_model_from_a_skops_file_is_the_model(model, used):
+def test_model_from_a_skops_file_is_the_model(model, used):
     fitted = clone(model).fit(X, Y)
     if used:
         fitted.predict(X_NEW, return_std=True)
@@ -140,7 +140,7 @@ def test_a_model_from_a_skops_file_is_the_model(model, used):
 
 
 @pytest.mark.parametrize("estimator", [EVGPRegressor, EGPRegressor])
-def test_a_kernel_as_the_first_argument_is_sent_to_kernel(estimator):
+def test_kernel_as_the_first_argument_is_sent_to_kernel(estimator):
     # As in scikit-learn's GaussianProcessRegressor, whose first argument it is.
     with pytest.raises(TypeError, match=r"feature_map=RBF\(length_scale=2\) is a kernel: give it as kernel="):
         estimator(RBF(2.0)).fit(X, Y)

@@ -19,19 +19,19 @@ def model(**arguments):
     return EVGPRegressor(**{"n_inducing": "auto", "sharing": "all", "random_state": 0} | arguments)
 
 
-def test_what_the_features_explain_needs_no_points():
+def test_few_points_if_features_explain_targets():
     m = model(feature_map=PolynomialFeatures(1)).fit(X, Y[:, 0])
     assert len(m.inducing_points_) == 10
 
 
 @pytest.mark.filterwarnings("ignore:The noise explains everything:sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("most", [1, 10])
-def test_there_are_no_more_points_than_allowed(most):
+def test_max_inducing_is_respected(most):
     m = model(solver=LBFGS(max_inducing=most, tol=1.0), max_iter=50).fit(X, Y[:, 1])
     assert len(m.inducing_points_) == most
 
 
-def test_who_looks_on_is_told_how_many_points_there_are(capsys):
+def test_progress_shows_number_of_inducing_points(capsys):
     model(verbose=1, max_iter=30, solver=LBFGS(tol=1.0)).fit(X, Y[:, 1])
     assert re.match(r"\d+ points, all rows, iteration ", capsys.readouterr().out.splitlines()[-1])
 
@@ -45,7 +45,7 @@ def test_who_looks_on_is_told_how_many_points_there_are(capsys):
         {"solver": LBFGS(max_inducing=None)},
     ],
 )
-def test_other_values_are_refused(wrong):
+def test_other_values_raise(wrong):
     named = "max_inducing" if "solver" in wrong else next(iter(wrong))
     with pytest.raises((ValueError, TypeError), match=named):
         model(**wrong).fit(X, Y)
@@ -57,7 +57,7 @@ def test_adam_is_told_a_number(solver):
         model(solver=solver).fit(X, Y)
 
 
-def test_a_warm_start_has_no_more_points_than_it_may():
+def test_warm_start_has_no_more_points_than_it_may():
     m = EVGPRegressor(n_inducing="auto", warm_start=True, random_state=0)
     X = np.random.RandomState(0).uniform(-3.0, 3.0, (200, 2))
     y = np.sin(2.0 * X[:, 0]) * np.cos(X[:, 1]) + 0.1 * X[:, 1]

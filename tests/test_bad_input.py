@@ -194,7 +194,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(kind):
+def test_features_that_dwarf_the_targets_beyond_what_doubles_square_raise(kind):
     spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
     message = rf"^{spread} must not exceed 1e\+130 in size; "
     model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)
@@ -204,7 +204,7 @@ def test_features_that_dwarf_the_targets_beyond_what_doubles_square_are_refused(
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_targets_whose_weighted_squares_overflow_are_refused(kind):
+def test_targets_whose_weighted_squares_overflow_raise(kind):
     message = r"^√\(sample_weight / relative_variance\) times y must not exceed 1e\+130 in size"
     with pytest.raises(ValueError, match=message):
         kind().fit(X, 1e98 * Y, **EXTREME)
@@ -214,7 +214,7 @@ def test_targets_whose_weighted_squares_overflow_are_refused(kind):
 @pytest.mark.parametrize(
     ("name", "bad"), crossed(BAD, ["NaN", "y with NaN", "y nearly 0", "y masked", "no rows", "nullable pandas"])
 )
-def test_bad_rows_raise_in_fit(name, bad):
+def test_invalid_rows_raise_in_fit(name, bad):
     estimator, (rows, y, kind, message) = clone(ESTIMATORS[name]), BAD[bad]
     if isinstance(estimator, ResidualRegressor):
         if bad == "y nearly 0":
@@ -230,7 +230,7 @@ def test_bad_rows_raise_in_fit(name, bad):
 @pytest.mark.parametrize(
     ("name", "bad"), crossed([bad for bad in BAD if not bad.startswith(("y", "no y"))], ["infinity", "words"])
 )
-def test_bad_rows_raise_in_predict(name, bad):
+def test_invalid_rows_raise_in_predict(name, bad):
     estimator, (rows, _, kind, message) = clone(ESTIMATORS[name]), BAD[bad]
     if isinstance(rows, pl.DataFrame):
         estimator.fit(pl.DataFrame(X, schema=rows.columns), Y)

@@ -27,7 +27,7 @@ def shares(display, y=Y, mean=MEAN, std=STD):
     return containing_ratios(y, mean, std, k=norm.ppf(0.5 + display.nominal[1:-1] / 2))
 
 
-def test_the_curve_is_the_share_of_values_inside():
+def test_curve_is_the_share_of_values_inside():
     display = CalibrationDisplay.from_predictions(Y, MEAN, STD)
     assert display.observed.shape == (1, 101)
     assert_allclose(display.observed[0, 1:-1], shares(display), rtol=1e-12)
@@ -67,6 +67,6 @@ def test_on_shared_axes_the_band_is_of_the_fewest_values(first):
         ({"n_levels": 2.5}, TypeError, "n_levels"),
     ],
 )
-def test_wrong_options_are_named(options, error, message):
+def test_invalid_options_raise(options, error, message):
     with pytest.raises(error, match=message):
         CalibrationDisplay.from_predictions(Y, MEAN, STD, **options)

@@ -50,26 +50,26 @@ def test_auto_asks_the_map(feature_map):
     assert_array_equal(scale, expected_scale)
 
 
-def test_a_map_without_an_opinion_gets_a_wide_prior():
+def test_map_without_an_opinion_gets_a_wide_prior():
     polynomials = PolynomialFeatures(2)
     mean, scale = resolve(polynomials)
     assert_array_equal(mean, np.zeros((2, 10)))
     assert_allclose(scale, wide(polynomials.transform(X)))
 
 
-def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
+def test_target_and_a_feature_of_zeros_get_a_finite_scale():
     nothing = FunctionTransformer(np.zeros_like)
     assert_array_equal(resolve(nothing, targets=np.zeros((20, 1)))[1], [[10.0, 10.0, 10.0]])
 
 
-def test_a_union_concatenates():
+def test_union_concatenates():
     polynomials = PolynomialFeatures(2)
     mean, scale = resolve(make_union(InertiaForce("pendulum"), polynomials))
     assert_array_equal(mean, np.hstack([IF_MEAN, np.zeros((2, 10))]))
     assert_allclose(scale, np.hstack([IF_SCALE, wide(polynomials.fit_transform(X))]))
 
 
-def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
+def test_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
     names = ["theta", "dtheta/dt", "u"]
     frame = frame_of({"kind": ["x", "y"] * 10} | dict(zip(names, X.T, strict=True)))
     scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
@@ -80,7 +80,7 @@ def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of
     assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 
 
-def test_the_weights_of_a_union_are_divided_out():
+def test_weights_of_a_union_are_divided_out():
     union = FeatureUnion(
         [("physics", InertiaForce("pendulum")), ("x", "passthrough")], transformer_weights={"physics": 4.0, "x": 0.5}
     )
@@ -97,7 +97,7 @@ def test_unions_and_pipelines_nest():
     assert_allclose(scale, np.hstack([wide(polynomials), wide(polynomials), IF_SCALE]))
 
 
-def test_a_number_fills_the_table():
+def test_number_fills_the_table():
     mean, scale = resolve(FunctionTransformer(), mean=2, scale=0.5)
     assert_array_equal(mean, np.full((2, 3), 2.0))
     assert_array_equal(scale, np.full((2, 3), 0.5))
@@ -106,7 +106,7 @@ def test_a_number_fills_the_table():
 
 @pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("shape", [(3,), (2,), (1, 3), (2, 1), (3, 2), (2, 3, 1)])
-def test_a_table_of_another_shape_is_named(name, shape):
+def test_table_of_another_shape_raises(name, shape):
     with pytest.raises(ValueError, match=rf"{name} of CoefPrior must be .* \(2, 3\); got the shape \({shape[0]},"):
         resolve(FunctionTransformer(), **{name: np.ones(shape)})
 
@@ -116,7 +116,7 @@ def test_one_output_does_not_take_a_row_of_another_width():
         resolve(FunctionTransformer(), mean=[1.0, 2.0], targets=TARGETS[:, :1])
 
 
-def test_a_negative_scale_is_an_error():
+def test_negative_scale_raises():
     with pytest.raises(ValueError, match=r"scale of CoefPrior must not be negative; its smallest value is -2\.0"):
         resolve(FunctionTransformer(), scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
 
@@ -138,23 +138,23 @@ def test_values_must_be_finite(name, value):
         (0.0, 1.0),
     ],
 )
-def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
+def test_map_whose_prior_has_another_shape_raises(mean, scale):
     with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.* = \(2, 3\), .*; got "):
         resolve(Opinionated(mean, scale))
 
 
-def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
+def test_part_of_a_union_whose_prior_has_another_width_raises():
     union = make_union(Opinionated(np.zeros((2, 2)), np.ones((2, 2))), FunctionTransformer())
     with pytest.raises(ValueError, match=r"\(2, 3\), .*; got \[\(2, 2\), \(2, 2\)\]"):
         resolve(union)
 
 
-def test_the_width_of_the_target_must_fit_the_robot():
+def test_width_of_the_target_must_fit_the_robot():
     with pytest.raises(ValueError, match="y has 1 columns, but InertiaForce"):
         resolve(InertiaForce("pendulum"), targets=TARGETS[:, :1])
 
 
-def test_a_column_transformer_keeps_the_prior_of_its_parts():
+def test_column_transformer_keeps_the_prior_of_its_parts():
     columns = make_column_transformer(
         (PolynomialFeatures(1), [0]), (InertiaForce("pendulum"), [0, 1, 2]), ("drop", [1]), ("passthrough", [2])
     )
@@ -166,7 +166,7 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
 
 
 @pytest.mark.parametrize("prior", [None, np.ones((2, 3))])
-def test_a_prior_that_is_not_two_arrays_is_an_error(prior):
+def test_prior_that_is_not_two_arrays_raises(prior):
     class Broken(Opinionated):
         def coef_prior(self, n_outputs):
             return prior

@@ -66,7 +66,7 @@ def asked(model):
 
 @of_fits
 @pytest.mark.parametrize("name", ["groups", "shared weights", "exact", "residual"])
-def test_one_model_in_many_threads_says_what_it_says_in_one(name, tmp_path):
+def test_predictions_from_many_threads_agree(name, tmp_path):
     """The first time that something is asked, too: copies have computed nothing yet."""
     model = clone((THREADED | OTHERS)[name]).fit(X, Y)
     if hasattr(model, "partial_fit") and name != "network":

@@ -21,7 +21,7 @@ both = pytest.mark.parametrize(
 
 @both
 @pytest.mark.parametrize("constant", [0.0, 1.0, -7.0, 1e-12, 1e12, 1e20])
-def test_the_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, constant):
+def test_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, constant):
     y = np.full(5, constant)
     mean, std = model.fit(X[:5], y).predict(np.vstack([X[:5], [[1e9, 1e9]]]), return_std=True)
     assert_allclose(mean, constant)
@@ -32,7 +32,7 @@ def test_the_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, const
 
 
 @both
-def test_the_std_is_above_the_rounding_of_y_where_y_is_tiny_against_its_mean(model):
+def test_std_is_above_the_rounding_of_y_where_y_is_tiny_against_its_mean(model):
     y = 1e6 + 1e-7 * WAVE
     mean, std = model.fit(X, y).predict(X, return_std=True)
     assert (std > np.spacing(1e6)).all()
@@ -41,7 +41,7 @@ def test_the_std_is_above_the_rounding_of_y_where_y_is_tiny_against_its_mean(mod
 
 @pytest.mark.parametrize("sharing", ["auto", "kernel"])
 @pytest.mark.parametrize("normalize_y", [True, False])
-def test_a_locked_joint_among_others_costs_nothing(sharing, normalize_y):
+def test_constant_output_does_not_affect_others(sharing, normalize_y):
     """Warnings are errors here; the other output is as well predicted as alone."""
     Y = np.column_stack([WAVE, np.full(100, 0.3)])
     model = EVGPRegressor(normalize_y=normalize_y, n_inducing=15, sharing=sharing, random_state=0)

@@ -52,7 +52,7 @@ def test_std_covariance_and_samples_agree(model, include_noise):
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("include_noise", [True, False])
 @pytest.mark.parametrize("name", ["exact, shared weights", "sparse, shared weights"])
-def test_the_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noise):
+def test_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noise):
     regressor, y = MODELS[name]
     regressor.fit(X, y)
     _, std = regressor.predict(X_NEW, return_std=True, include_noise=include_noise)

@@ -36,12 +36,12 @@ def qualified_name(thing):
 
 
 @pytest.mark.parametrize("thing", CLASSES + FUNCTIONS, ids=qualified_name)
-def test_a_public_docstring_is_numpydocs(thing):
+def test_public_docstring_is_numpydocs(thing):
     assert not [error for error in errors_of(thing) if error[0] not in IGNORED]
 
 
 @pytest.mark.parametrize("thing", METHODS, ids=qualified_name)
-def test_a_methods_docstring_is_numpydocs(thing):
+def test_methods_docstring_is_numpydocs(thing):
     """Its example may be that of its class."""
     assert not [error for error in errors_of(thing) if error[0] not in IGNORED | {"EX01"}]
 
@@ -51,7 +51,7 @@ def errors_of(thing):
 
 
 @pytest.mark.parametrize("method", list(filter(inspect.ismethod, METHODS)), ids=qualified_name)
-def test_what_a_class_method_returns_is_documented(method):
+def test_class_method_returns_are_documented(method):
     """Which numpydoc leaves out."""
     returned = NumpyDocString(inspect.getdoc(method))["Returns"]
     assert returned

@@ -29,7 +29,7 @@ def fixed(noise=0.01, **arguments):
 # --- agreement with other models ----------------------------------------------------------------------------------
 
 
-def test_it_ends_where_the_sparse_model_whose_inducing_points_are_the_rows_ends():
+def test_exact_fit_equals_sparse_fit_with_all_points():
     exact = EGPRegressor(TREND, tol=1e-4).fit(X, Y[:, 0])
     sparse = EVGPRegressor(TREND, inducing_init=X, solver=LBFGS(tol=1e-4), noise_cv=None).fit(X, Y[:, 0])
     assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=0.01)
@@ -113,12 +113,12 @@ def test_vague_weights_need_as_many_rows():
 
 
 @pytest.mark.parametrize("scale", [np.nan, -np.inf, -1.0])
-def test_other_scales_are_refused(scale):
+def test_other_scales_raise(scale):
     with pytest.raises(ValueError, match="scale of CoefPrior must"):
         EGPRegressor(TREND, coef_prior=CoefPrior(scale=scale)).fit(X, Y)
 
 
-def test_the_sparse_model_refuses_vague_weights():
+def test_sparse_model_refuses_vague_weights():
     with pytest.raises(ValueError, match="scale=?.* of CoefPrior.* must be finite|scale of CoefPrior must be finite"):
         EVGPRegressor(TREND, coef_prior=CoefPrior(scale=np.inf)).fit(X, Y)
 
@@ -126,7 +126,7 @@ def test_the_sparse_model_refuses_vague_weights():
 # --- learning -----------------------------------------------------------------------------------------------------
 
 
-def test_it_learns_and_its_likelihood_ends_at_minus_the_loss():
+def test_loss_curve_ends_at_likelihood():
     m = EGPRegressor(TREND).fit(X, Y)
     assert (
         m.score(X_NEW, np.column_stack([np.sin(2 * X_NEW[:, 0]) + X_NEW[:, 1], 3 * np.cos(X_NEW[:, 1]) * X_NEW[:, 0]]))
@@ -153,7 +153,7 @@ def test_restarts_keep_the_likeliest_and_repeat():
 
 
 @pytest.mark.parametrize(("n", "noise"), [(40, 1e-9), (80, 0.0)])
-def test_a_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
+def test_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
     """On any processor: the fit's quality must not hang on rounding."""
     x, x_new = np.linspace(-2, 2, n)[:, np.newaxis], np.linspace(-1.99, 1.99, 333)[:, np.newaxis]
     m = EGPRegressor().fit(x, np.sin(3 * x[:, 0]) + noise * np.random.RandomState(0).randn(n))
@@ -164,7 +164,7 @@ def test_a_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_a_fixed_noise_that_vanishes_does_not_raise():
+def test_fixed_noise_that_vanishes_does_not_raise():
     kernel = RBF(5.0) + WhiteKernel(1e-30, "fixed")
     m = EGPRegressor(kernel=kernel, max_iter=20).fit(np.vstack([X, X]), np.vstack([Y, Y]))
     assert np.isfinite(m.predict(X_NEW)).all()
@@ -173,12 +173,12 @@ def test_a_fixed_noise_that_vanishes_does_not_raise():
 # --- scikit-learn's conventions -----------------------------------------------------------------------------------
 
 
-def test_the_noise_starts_in_one_place():
+def test_noise_starts_in_one_place():
     with pytest.raises(ValueError, match="either from variance=0.1 of Gaussian or from the WhiteKernel"):
         EGPRegressor(kernel=RBF() + WhiteKernel(), noise=Gaussian(variance=0.1)).fit(X, Y)
 
 
-def test_dask_arrays_are_refused():
+def test_dask_arrays_raise():
     with pytest.raises(TypeError, match="use EVGPRegressor"):
         EGPRegressor().fit(da.from_array(X), Y)
 

@@ -20,7 +20,7 @@ def variance_by_inputs(model, X, Y, covariance):
     return look_at_slopes(model._posterior, data, X, covariance)[0]
 
 
-def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
+def test_input_noise_of_linear_function():
     """There ∂g Σ ∂gᵀ is the same of all rows, and σ² what it leaves of the noise."""
     rng = np.random.RandomState(0)
     x = rng.uniform(-1.0, 1.0, (3000, 2))
@@ -37,7 +37,7 @@ def test_of_a_linear_function_the_whole_noise_is_divided_as_it_is():
     np.testing.assert_allclose(variance_by_inputs(found, X, y, covariance), by_inputs, rtol=0.15)
 
 
-def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
+def test_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
     monkeypatch.setattr("skevgp.fitting.noisy_inputs._ROWS_AT_ONCE", 7)
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (40, 2))
@@ -50,7 +50,7 @@ def test_the_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
 
 
 @pytest.mark.parametrize("sharing", ["all", "none", "kernel"])
-def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
+def test_input_noise_with_frames_weights_and_partial_fit(sharing):
     rng = np.random.RandomState(0)
     X = rng.uniform(-1.0, 1.0, (80, 2))
     Y = np.column_stack([np.sin(3.0 * X[:, 0]), X[:, 1]]) + 0.02 * rng.randn(80, 2)
@@ -82,7 +82,7 @@ def test_several_outputs_frames_weights_and_rows_that_come_later(sharing):
         ({"noise": Gaussian(inputs=0.1), "solver": "adam"}, 'inputs of Gaussian noise needs solver="lbfgs"'),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(options, message):
+def test_invalid_arguments_raise(options, message):
     X = np.random.RandomState(0).randn(30, 2)
     with pytest.raises((ValueError, TypeError), match=message):
         EVGPRegressor(**{"n_inducing": 5, "max_iter": 3, "solver": LBFGS(tol=1e6), **options}).fit(X, X[:, 0])

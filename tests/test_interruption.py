@@ -104,7 +104,7 @@ def _fit(model, n):
     ],
     ids=["predict", "partial_fit", "particles", "linearised", "jacobian", "sample_y"],
 )
-def test_what_is_done_with_a_model_ends_at_once_and_leaves_it_as_it_was(use):
+def test_interrupted_methods_keep_model(use):
     model = pickle.loads(pickle.dumps(fitted("lbfgs")[0]))
     before = predictions(model)
     other = pickle.loads(pickle.dumps(model))

@@ -82,7 +82,7 @@ def gear(X):
 
 
 @pytest.mark.long
-def test_a_joints_own_columns_tell_what_physics_missed():
+def test_joints_own_columns_tell_what_physics_missed():
     arm = Arm(missed=gear)
     truth = arm.torque(arm.new)
 
@@ -106,7 +106,7 @@ def carrying(arm, model, seed, gains=1.0, mass=2.0):
     return model.estimate_payload(X, clean + 0.02 * clean.std(axis=0) * rng.normal(size=clean.shape)), body
 
 
-def test_a_payload_lies_in_its_interval(arm, rigid):
+def test_payload_lies_in_its_interval(arm, rigid):
     payload, body = carrying(arm, rigid, 0)
     assert payload.mass_interval[0] < 2.0 < payload.mass_interval[1]
     assert payload.mass_std < 0.2
@@ -116,7 +116,7 @@ def test_a_payload_lies_in_its_interval(arm, rigid):
     assert abs(nothing.mass) < 0.1
 
 
-def test_the_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
+def test_model_that_was_found_moves_like_the_robot(arm, rigid, tmp_path):
     truth = arm.torque(arm.new)
     q, v, a = np.split(arm.new, 3, axis=1)
 
@@ -147,7 +147,7 @@ def with_masses(arm, factor):
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.1])
-def test_masses_that_are_placeholders_are_told(factor):
+def test_masses_that_are_placeholders_warn(factor):
     arm = Arm()
     with pytest.warns(ConvergenceWarning, match="far from what torques say"):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
@@ -168,7 +168,7 @@ def test_torques_that_are_the_models_own(scale, n_inducing):
     assert np.isfinite(model.coef_).all()
 
 
-def test_bad_input_is_named(arm):
+def test_invalid_input_raises(arm):
     model = InverseDynamics("ur5", n_inducing=0)
     with pytest.raises(ValueError, match="X has 12 columns.*needs 18"):
         model.fit(arm.X[:, :12], arm.y)
@@ -185,7 +185,7 @@ def test_bad_input_is_named(arm):
     assert not hasattr(model, "coef_")
 
 
-def test_the_speed_at_which_friction_has_a_sign_is_found_from_several_trajectories():
+def test_speed_at_which_friction_has_a_sign_is_found_from_several_trajectories():
     arm = Arm("acrobot", noise=0.01)
     blurred = np.tanh(arm.X[:, 2:4] / 0.1) - np.tanh(arm.X[:, 2:4] / 0.01)
     y = arm.y + arm.coulomb * blurred
@@ -203,7 +203,7 @@ def test_other_transformers_are_no_robots():
         InverseDynamics(StandardScaler()).fit(np.zeros((5, 3)), np.zeros(5))
 
 
-def test_bad_payloads_are_named(arm, rigid):
+def test_invalid_payloads_raise(arm, rigid):
     with pytest.raises(ValueError, match="y has 2 columns"):
         rigid.estimate_payload(arm.X, arm.y[:, :2])
     with pytest.raises(ValueError, match="link=6"):

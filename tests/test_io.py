@@ -96,7 +96,7 @@ _OF_SCIKIT_LEARN = {
 }
 
 
-def test_of_a_search_that_cannot_be_saved_the_best_model_is_advised(path):
+def test_unsavable_search_advises_best_estimator(path):
     search = RandomizedSearchCV(evgp(), {"n_inducing": randint(3, 6)}, n_iter=1, cv=2, random_state=0).fit(X, Y)
     with pytest.raises(ValueError, match=r"cannot be saved.*Save its best_estimator_"):
         save(search, path)
@@ -162,7 +162,7 @@ def test_without_pinocchio_a_robot_gets_the_pip_command(path, monkeypatch):
 @pytest.mark.parametrize(
     "model", [EVGPRegressor(), EGPRegressor(), make_pipeline(StandardScaler(), EGPRegressor())], ids=str
 )
-def test_an_unfitted_model_is_not_saved(path, model):
+def test_unfitted_model_is_not_saved(path, model):
     if isinstance(model, Pipeline):
         model[0].fit(X)
     with pytest.raises(NotFittedError):
@@ -231,7 +231,7 @@ def write_content(path, content, **about):
     write_members(path, {**members_of(path), "skevgp.json": json.dumps(versions)})
 
 
-def test_files_of_others_are_refused(path):
+def test_files_of_others_raise(path):
     save(fitted("plain"), path)
     write_members(path, {**members_of(path), "more": bytes(2**27)}, zipfile.ZIP_DEFLATED)
     with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 1344"):

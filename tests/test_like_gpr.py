@@ -44,7 +44,7 @@ def test_before_a_fit_it_predicts_what_scikit_learns_model_does(kernel, n_target
     assert vars(ours) == vars(clone(ours))
 
 
-def test_the_posterior_of_a_kernel_as_given_is_its_prior_given_the_data():
+def test_posterior_of_a_kernel_as_given_is_its_prior_given_the_data():
     model = EGPRegressor(kernel=KERNEL, alpha=0.01, optimizer=None)
     joint = model.predict(np.vstack([X, X_NEW]), return_cov=True, include_noise=False)[1]
     K, K_new, K_both = joint[:30, :30] + 0.01 * np.eye(30), joint[30:, 30:], joint[:30, 30:]
@@ -53,7 +53,7 @@ def test_the_posterior_of_a_kernel_as_given_is_its_prior_given_the_data():
     np.testing.assert_allclose(cov, K_new - K_both.T @ np.linalg.solve(K, K_both), atol=1e-10)
 
 
-def test_what_needs_a_fit_says_so():
+def test_unfitted_methods_raise():
     model = EGPRegressor(TREND)
     assert not model.__sklearn_is_fitted__()
     check_is_fitted(model)  # as of scikit-learn's: it needs none to predict
@@ -74,7 +74,7 @@ def test_what_needs_a_fit_says_so():
             call()
 
 
-def test_the_prior_refuses_what_a_fit_would():
+def test_prior_refuses_what_a_fit_would():
     with pytest.raises(ValueError, match="NaN"):
         EGPRegressor().predict([[np.nan]])
     with pytest.raises(ValueError, match="length_scale|columns"):
@@ -115,7 +115,7 @@ def test_alpha_is_a_number_above_0(alpha):
 # --- optimizers ---------------------------------------------------------------------------------------------------
 
 
-def test_an_optimizer_of_ones_own_finds_what_lbfgs_does():
+def test_optimizer_of_user_finds_what_lbfgs_does():
     seen = []
 
     def global_search(objective, theta, bounds):
@@ -138,7 +138,7 @@ def test_an_optimizer_of_ones_own_finds_what_lbfgs_does():
 
 
 @pytest.mark.parametrize("feature_map", [None, TREND], ids=str)
-def test_its_objective_is_minus_the_likelihood_with_its_gradient(feature_map):
+def test_optimizer_objective_is_negative_likelihood(feature_map):
     told = []
 
     def look(objective, theta, bounds):
@@ -157,13 +157,13 @@ def test_its_objective_is_minus_the_likelihood_with_its_gradient(feature_map):
     assert max(-value for value, *_ in told) == pytest.approx(model.log_marginal_likelihood_value_, rel=1e-12)
 
 
-def test_an_optimizer_that_returns_nonsense_is_refused():
+def test_optimizer_that_returns_nonsense_raises():
     for answer in (np.zeros(1), np.full(4, np.nan)):
         with pytest.raises(ValueError, match="optimizer must return 4 finite numbers"):
             EGPRegressor(optimizer=lambda objective, theta, bounds, answer=answer: (answer, 0.0)).fit(X, Y[:, 0])
 
 
-def test_an_optimizer_that_asks_for_nonsense_is_told_so():
+def test_optimizer_that_asks_for_nonsense_is_told_so():
     def asks(objective, theta, bounds):
         return objective(np.stack([theta, theta]))
 
@@ -171,7 +171,7 @@ def test_an_optimizer_that_asks_for_nonsense_is_told_so():
         EGPRegressor(optimizer=asks).fit(X, Y[:, 0])
 
 
-def test_ctrl_c_keeps_the_best_that_an_optimizer_of_ones_own_has_seen():
+def test_ctrl_c_keeps_the_best_that_an_optimizer_of_user_has_seen():
     def interrupted(objective, theta, bounds):
         for shift in (0.0, 0.2, 5.0):
             objective(theta + shift)
@@ -218,7 +218,7 @@ def test_parameters_are_checked_before_a_fit_too(parameters, named):
 
 
 @pytest.mark.parametrize("rubbish", [None, (1.0, 2.0, 3.0), ("a", "b"), np.zeros(7)], ids=str)
-def test_what_an_optimizer_returns_is_named(rubbish):
+def test_invalid_optimizer_result_raises(rubbish):
     X, y = make_toy(20, random_state=0, return_X_y=True)
     with pytest.raises(ValueError, match="optimizer must return 3 finite numbers and their value; got"):
         EGPRegressor(optimizer=lambda objective, theta, bounds: rubbish).fit(X, y)

@@ -56,7 +56,7 @@ def test_columns_in_another_order_are_named_in_their_order(what, masses):
 
 @pytest.mark.long
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
-def test_the_order_of_more_joints_is_searched_step_by_step(robot):
+def test_order_of_more_joints_is_searched_step_by_step(robot):
     arm = Arm(robot, noise=NOISE)
     order = np.random.default_rng(0).permutation(arm.nominal.nv)
     columns = [arm.nominal.names[1 + joint] for joint in order.tolist()]
@@ -91,7 +91,7 @@ def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robo
 @pytest.mark.parametrize(
     "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.long) for robot in ("ur5", "iiwa14"))]
 )
-def test_where_columns_are_right_no_other_cause_is_named(robot):
+def test_right_columns_give_no_cause(robot):
     """However little torques are explained."""
     arm, rng = Arm(robot, noise=NOISE), np.random.default_rng(0)
     scale, n = arm.y.std(axis=0), arm.nominal.nv
@@ -114,7 +114,7 @@ UR5 = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_join
 NAMES = [f"{signal}/{joint}" for signal in ("position", "velocity", "acceleration") for joint in UR5]
 
 
-def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(frame_of):
+def test_frame_whose_names_say_that_joints_are_in_another_order_raises(frame_of):
     arm = Arm(noise=NOISE)
     X, y = frame_of(dict(zip(NAMES, arm.X.T, strict=True))), frame_of(dict(zip(UR5, arm.y.T, strict=True)))
     assert warning_of("ur5", X, y) == ""
@@ -126,7 +126,7 @@ def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(fra
         InverseDynamics("ur5").fit(X, frame_of({name: arm.y[:, UR5.index(name)] for name in by_name}))
 
 
-def test_the_columns_of_each_joint_side_by_side_are_refused(frame_of):
+def test_columns_of_each_joint_side_by_side_raise(frame_of):
     side_by_side = [f"{joint}/{signal}" for joint in UR5 for signal in ("q", "dq", "u")]
     frame = frame_of({name: np.zeros(2) for name in side_by_side})
     with pytest.raises(ValueError, match="by their names they are those of the joints"):

@@ -31,7 +31,7 @@ def test_jitter_is_relative_to_the_diagonal():
     np.testing.assert_allclose(np.diag(L) ** 2, 1.01 * np.diag(A), rtol=1e-14)
 
 
-def test_a_jitter_above_the_most_is_not_tried():
+def test_jitter_above_the_most_is_not_tried():
     indefinite = np.array([[1.0, 1.0 + 1e-6], [1.0 + 1e-6, 1.0]])
     assert np.isfinite(jittered_cholesky(indefinite)).all()
     with pytest.raises(NotPositiveDefiniteError, match="with a relative jitter of 1e-08"):
@@ -56,7 +56,7 @@ def test_hopeless_matrices_raise_a_named_error(bad):
 
 
 @pytest.mark.parametrize("lengthscale", [0.05, 0.3, 1.0])
-def test_the_inverse_has_a_small_left_residual_however_ill_conditioned_the_factor(lengthscale):
+def test_inverse_has_a_small_left_residual_however_ill_conditioned_the_factor(lengthscale):
     """Higham 2002, section 14.2: |X L - I| <= c n u |X| |L|, entry by entry; here with the product's own rounding."""
     x = np.linspace(0.0, 1.0, 60)
     L = jittered_cholesky(np.exp(-0.5 * ((x[:, np.newaxis] - x) / lengthscale) ** 2), 1e-12)
@@ -71,7 +71,7 @@ def test_the_inverse_has_a_small_left_residual_however_ill_conditioned_the_facto
     ).all()
 
 
-def test_the_factors_pull_back_agrees_with_autograd():
+def test_factors_pull_back_agrees_with_autograd():
     A, weights = positive_definite(4), np.tril(np.random.RandomState(1).randn(4, 4))
     expected = grad(lambda A: anp.sum(weights * anp.linalg.cholesky(0.5 * (A + A.T))))(A)
     L = np.linalg.cholesky(A)
@@ -98,7 +98,7 @@ def test_products_with_a_lower_triangle(shape, order):
 
 
 @pytest.mark.parametrize("m", [0, 1, 47, 48, 49, 130])
-def test_a_triangular_product_leaves_out_nothing_but_zeros(m):
+def test_triangular_product_leaves_out_nothing_but_zeros(m):
     rng = np.random.RandomState(m)
     L, B, out = np.tril(rng.randn(m, m)), rng.randn(m, 5), np.full((m + 2, 5), np.nan)
     found = triangular_product(L, B, out[:m])
@@ -109,7 +109,7 @@ def test_a_triangular_product_leaves_out_nothing_but_zeros(m):
 
 
 @pytest.mark.parametrize(("n", "k"), [(60, 7), (60, 1), (1, 3), (5, 0), (0, 3), (0, 1)])
-def test_a_solve_has_a_small_residual_however_ill_conditioned_the_factor(n, k):
+def test_solve_has_a_small_residual_however_ill_conditioned_the_factor(n, k):
     """Within |L| |X| row by row, and in the place of B (Higham 2002, theorem 8.5)."""
     x = np.linspace(0.0, 1.0, n)
     L = jittered_cholesky(np.exp(-0.5 * np.subtract.outer(x, x) ** 2), 1e-12)

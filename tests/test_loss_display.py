@@ -26,7 +26,7 @@ def sparse():
     return EVGPRegressor(n_inducing=8, noise_cv=None, random_state=0).fit(X, y)
 
 
-def test_the_line_is_minus_the_loss(sparse):
+def test_line_is_minus_the_loss(sparse):
     display = LossDisplay.from_estimator(sparse, label="m", color="black")
     assert_array_equal(display.line_.get_ydata(), -sparse.loss_curve_)
     assert_array_equal(display.line_.get_xdata(), np.arange(1, sparse.n_iter_ + 1))
@@ -34,7 +34,7 @@ def test_the_line_is_minus_the_loss(sparse):
     assert display.ax_.get_ylabel() == "lower bound (nats)"
 
 
-def test_what_has_no_iterations_is_an_error():
+def test_model_without_iterations_raises():
     with pytest.raises(ValueError, match="EVGPRegressor has no iterations to show"):
         LossDisplay.from_estimator(EVGPRegressor(n_inducing=8, max_iter=0, random_state=0).fit(X, y))
     with pytest.raises(NotFittedError):

@@ -33,7 +33,7 @@ def iterations(monitor, clock, most=100, seconds=1.0):
     return n
 
 
-def test_a_part_of_the_fit_ends_with_its_share_of_the_time_and_the_others_go_on():
+def test_part_of_the_fit_ends_with_its_share_of_the_time_and_the_others_go_on():
     clock = Clock()
     monitor = Monitor(max_time=30.0, clock=clock)
     first = monitor.with_time(1.0 / 3.0)
@@ -59,7 +59,7 @@ def test_when_it_is_over_the_best_so_far_is_kept(sharing, n_jobs):
 
 
 @pytest.mark.parametrize("max_time", [0, -1.0, "10"])
-def test_no_time_is_refused(max_time):
+def test_no_time_raises(max_time):
     with pytest.raises((ValueError, TypeError), match="max_time of LBFGS must be"):
         EVGPRegressor(solver=LBFGS(max_time=max_time)).fit(X, Y)
     with pytest.raises(ValueError, match="The 'max_time' parameter of EGPRegressor must be"):

@@ -44,11 +44,11 @@ def test_ratios_by_hand():
     assert_array_equal(ratios, [0.5, 0.75, 0.75])
 
 
-def test_one_two_and_three_deviations_are_what_the_paper_has():
+def test_containing_ratios_default_widths():
     assert_array_equal(containing_ratios([0.5, 1.5, 2.5, 3.5, 4.5], np.zeros(5), np.ones(5)), [0.2, 0.4, 0.6])
 
 
-def test_the_edge_of_the_interval_is_inside():
+def test_edge_of_the_interval_is_inside():
     assert_array_equal(containing_ratios([2.0], [0.0], [1.0], k=[1.9, 2.0]), [0.0, 1.0])
 
 
@@ -65,7 +65,7 @@ def test_gaussian_errors_fall_into_the_intervals_of_the_normal_distribution():
 
 
 @pytest.mark.parametrize(("y", "mean", "std"), [(0.3, 0.0, 1.0), (-7.0, 1.0, 0.5), (2.0, 2.0, 3.0)])
-def test_the_crps_is_its_integral(y, mean, std):
+def test_crps_is_its_integral(y, mean, std):
     def below(x):
         return norm.cdf(x, mean, std) ** 2
 
@@ -76,11 +76,11 @@ def test_the_crps_is_its_integral(y, mean, std):
     assert crps([y], [mean], [std]) == pytest.approx(expected, rel=1e-7)
 
 
-def test_the_crps_without_uncertainty_is_the_error():
+def test_crps_without_uncertainty_is_the_error():
     assert crps([1.0, -2.0, 3.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1e-320]) == pytest.approx(5.0 / 3.0)
 
 
-def test_the_calibration_error_by_hand():
+def test_calibration_error_by_hand():
     """One value, at the end of the interval of probability p: the area is that of two triangles."""
     for p in (0.0, 0.3, 0.5, 1.0):
         expected = 0.5 * p**2 + 0.5 * (1.0 - p) ** 2
@@ -90,7 +90,7 @@ def test_the_calibration_error_by_hand():
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(0.0, 0.5), (1.0, 0.0), (1e9, 0.5)])
-def test_the_calibration_error_of_gaussian_errors(factor, expected):
+def test_calibration_error_of_gaussian_errors(factor, expected):
     errors = RNG.standard_normal(40_000)
     assert calibration_error(errors, np.zeros_like(errors), np.full_like(errors, factor)) == pytest.approx(
         expected, abs=0.005
@@ -112,14 +112,14 @@ def test_scorers_are_scores_of_which_more_is_better():
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_another_number_of_rows_is_an_error(metric):
+def test_another_number_of_rows_raises(metric):
     with pytest.raises(ValueError, match="inconsistent numbers of samples"):
         metric(*arguments(metric, mean=MEAN[:-1]))
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
 @pytest.mark.parametrize("mean", [MEAN[:, :1], MEAN[:, 0]])
-def test_another_number_of_outputs_is_an_error(metric, mean):
+def test_another_number_of_outputs_raises(metric, mean):
     with pytest.raises(ValueError, match=r"same number of outputs; got .*'y_true': 3, 'y_pred': 1"):
         metric(*arguments(metric, mean=mean))
 
@@ -127,35 +127,35 @@ def test_another_number_of_outputs_is_an_error(metric, mean):
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
 @pytest.mark.parametrize(("name", "argument"), [("y_true", "y"), ("y_pred", "mean")])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_value_that_is_not_finite_is_named(metric, name, argument, value):
+def test_value_that_is_not_finite_raises(metric, name, argument, value):
     with pytest.raises(ValueError, match=rf"Input {name} contains"):
         metric(*arguments(metric, **{argument: np.add(Y, [0.0, 0.0, value])}))
 
 
 @pytest.mark.parametrize("metric", OF_STD)
-def test_a_standard_deviation_that_is_not_finite_is_named(metric):
+def test_standard_deviation_that_is_not_finite_raises(metric):
     with pytest.raises(ValueError, match="Input std contains NaN"):
         metric(Y, MEAN, np.full_like(STD, np.nan))
 
 
 @pytest.mark.parametrize("metric", OF_STD)
-def test_a_negative_standard_deviation_is_an_error(metric):
+def test_negative_standard_deviation_raises(metric):
     with pytest.raises(ValueError, match=r"std must .*smallest value is -0\.5"):
         metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])
 
 
-def test_std_norm_of_negative_values_is_an_error():
+def test_std_norm_of_negative_values_raises():
     with pytest.raises(ValueError, match=r"std must not be negative; its smallest value is -0\.5"):
         std_norm([1.0, -0.5])
 
 
-def test_the_density_needs_a_positive_standard_deviation():
+def test_density_needs_a_positive_standard_deviation():
     with pytest.raises(ValueError, match=r"std must be above 0; its smallest value is 0\.0"):
         negative_log_predictive_density([0.0], [0.0], [0.0])
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_no_rows_are_an_error(metric):
+def test_no_rows_raise(metric):
     with pytest.raises(ValueError, match="minimum of 1 is required"):
         metric(*arguments(metric, y=[], mean=[], std=[]))
 

@@ -11,7 +11,7 @@ from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
 
 
-def test_numbers_whose_squares_overflow_are_refused():
+def test_numbers_whose_squares_overflow_raise():
     X = np.ones((3, 1))
     with pytest.raises(ValueError, match=r"y must not exceed 1e\+100 in size; its largest value is 1e\+200"):
         EVGPRegressor().fit(X, [1.0, 2.0, 1e200])
@@ -28,7 +28,7 @@ def test_rows_on_top_of_each_other_count_as_one_place():
 
 
 @pytest.mark.parametrize("constant", [0.1, 0.3, 1e8 + 0.1])
-def test_a_constant_column_may_move_a_little_afterwards(constant):
+def test_constant_column_may_move_a_little_afterwards(constant):
     """The mean of equal numbers rounds; the column must not end with a lengthscale of 1e-17."""
     rng = np.random.RandomState(0)
     X = np.column_stack([rng.uniform(-2, 2, 1000), np.full(1000, constant)])
@@ -67,7 +67,7 @@ GOOD = np.random.RandomState(0).randn(20, 3)
         (np.array([["a"], ["b"]]), np.ones(2), "X must be real numbers: could not convert"),
     ],
 )
-def test_bad_data(X, y, message):
+def test_invalid_data(X, y, message):
     with pytest.raises(ValueError, match=message):
         EVGPRegressor().fit(X, y)
 
@@ -110,7 +110,7 @@ def test_bad_data(X, y, message):
         ({"feature_map": InertiaForce("pendulum")}, "y has 1 columns, but .* predicts 2 states"),
     ],
 )
-def test_bad_arguments(arguments, message):
+def test_invalid_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         EVGPRegressor(**arguments).fit(GOOD, GOOD[:, 0])
 

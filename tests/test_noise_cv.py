@@ -50,7 +50,7 @@ def nlpd(m, X, Y):
 
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
-def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
+def test_bound_of_data_without_noise_keeps_its_digits(posterior):
     """Taken from sums over the rows, where digits cancel, it was off by 0.02 nats here, and by 50 at less noise."""
     x = np.linspace(0.0, 1.0, 200)[:, np.newaxis]
     y = 3.0 + 2.0 * x[:, 0]
@@ -62,7 +62,7 @@ def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
     assert m.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-3)
 
 
-def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrated_against_the_others():
+def test_calibration_of_independent_outputs():
     """What suits each given the others as fitted, suits none once all have moved: a noise 1e5 times too large."""
     rng = np.random.RandomState(0)
 
@@ -77,7 +77,7 @@ def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrate
     assert nlpd(calibrated, X_new, Y_new) < nlpd(plain, X_new, Y_new) + 1.0
 
 
-def test_what_the_user_fixes_stays():
+def test_fixed_noise_and_signal_are_kept():
     kernel = ConstantKernel() * RBF([1.0, 1.0]) + WhiteKernel(0.3, "fixed")
     plain, noise_fixed = (fitted(None, kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))
     np.testing.assert_allclose(noise_fixed.noise_variance_, 0.3)
@@ -120,7 +120,7 @@ def test_labels_may_be_anything(groups):
 
 
 @pytest.mark.parametrize("groups", [GROUPS[:-1], np.column_stack([GROUPS, GROUPS]), 3, "words"])
-def test_groups_of_a_wrong_length_are_refused(groups):
+def test_groups_of_a_wrong_length_raise(groups):
     with pytest.raises(ValueError, match=r"groups must have the shape \(n_samples,\) = \(2000,\); got \("):
         fitted(groups)
 
@@ -131,7 +131,7 @@ def test_labels_are_one_for_each_row():
 
 
 @pytest.mark.parametrize("noise_cv", [1, 0, -3, True, 2.0, "10"])
-def test_a_wrong_number_of_folds_is_refused(noise_cv):
+def test_invalid_number_of_folds_raises(noise_cv):
     with pytest.raises(ValueError, match="The 'noise_cv' parameter of EVGPRegressor must be"):
         fitted(noise_cv=noise_cv)
 
@@ -198,14 +198,14 @@ def _sorted_by_y():
     ],
     ids=["groups", "sorted by y", "not calibrated", "shuffled", "independent", "sorted"],
 )
-def test_others_are_not(fit):
+def test_unrelated_rows_do_not_warn(fit):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DependentRowsWarning)
         fit()
 
 
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_the_signal_falls_if_it_does_not_hold_for_other_groups(seed):
+def test_signal_falls_if_it_does_not_hold_for_other_groups(seed):
     """Groups overlap, and each has a phase of its own."""
     rng = np.random.RandomState(seed)
     groups = np.repeat(np.arange(12), 25)

@@ -21,7 +21,7 @@ def model(points):
     )
 
 
-def test_an_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
+def test_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
     X, Y = rows(60)
     found = model(X[:12]).fit(X[:40], Y[:40])
     before = found.lower_bound_

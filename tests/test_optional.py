@@ -20,7 +20,7 @@ def packages_loaded_by(code):
     return set(json.loads(done.stdout))
 
 
-def test_require_imports_what_is_there():
+def test_require_imports_package():
     assert require("matplotlib.colors", "Plotting") is sys.modules["matplotlib.colors"]
 
 
@@ -32,13 +32,13 @@ def test_require_imports_what_is_there():
         ("rosbags", r"Simulating needs .* 'rosbags'.*pip install rosbags .*pip install '\.\[logs\]'"),
     ],
 )
-def test_a_missing_package_gets_the_pip_command(monkeypatch, name, message):
+def test_missing_package_gets_the_pip_command(monkeypatch, name, message):
     monkeypatch.setitem(sys.modules, name, None)
     with pytest.raises(ImportError, match=message):
         require(name, "Simulating")
 
 
-def test_an_unknown_system_is_told_before_the_missing_package(monkeypatch):
+def test_unknown_system_is_told_before_the_missing_package(monkeypatch):
     monkeypatch.setitem(sys.modules, "pinocchio", None)
     with pytest.raises(ValueError, match="Unknown robot"):
         make_dynamics("robot")
@@ -74,11 +74,11 @@ def test_public_names_are_listed():
     assert {"EVGPRegressor", "datasets", "features", "metrics", "plotting", "__version__"} <= set(dir(skevgp))
 
 
-def test_an_unknown_name_is_an_attribute_error():
+def test_unknown_name_is_an_attribute_error():
     with pytest.raises(AttributeError, match="module 'skevgp' has no attribute 'EVGPClassifier'"):
         skevgp.EVGPClassifier  # noqa: B018
 
 
-def test_an_unknown_name_cannot_be_imported():
+def test_unknown_name_cannot_be_imported():
     with pytest.raises(ImportError, match="cannot import name 'EVGPClassifier'"):
         from skevgp import EVGPClassifier  # noqa: F401

@@ -84,7 +84,7 @@ def test_inducing_points_at_all_rows_give_the_exact_gp(data, sharing, include_no
 @pytest.mark.parametrize(
     "options", [{}, {"solver__posterior": "diagonal"}, {"noise_cv": 5}, {"normalize_y": True}], ids=str
 )
-def test_the_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, options):
+def test_exact_likelihood_of_what_was_fitted_lies_between_the_bounds(data, options):
     X, Y, _ = data
     unit = np.array([1.0, 100.0])
     prior = {"coef_prior": CoefPrior(mean=MEAN * unit[:, np.newaxis], scale=SCALE * unit[:, np.newaxis])}
@@ -109,7 +109,7 @@ def drawn(X, noise):
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-8])
-def test_the_upper_bound_comes_down_to_the_likelihood_as_points_are_added(data, noise):
+def test_upper_bound_comes_down_to_the_likelihood_as_points_are_added(data, noise):
     X, Y = data[0], drawn(data[0], noise)
     kernel = fixed_kernel() + WhiteKernel(noise, "fixed")
     likelihood = GaussianProcessRegressor(fixed_kernel(), alpha=noise, optimizer=None).fit(X, Y[:, 0])
@@ -121,7 +121,7 @@ def test_the_upper_bound_comes_down_to_the_likelihood_as_points_are_added(data, 
     assert upper[-1] == pytest.approx(likelihood.log_marginal_likelihood_value_, abs=0.1)
 
 
-def test_a_vague_prior_gives_generalised_least_squares(data):
+def test_vague_prior_gives_generalised_least_squares(data):
     X, Y, _ = data
     H = PolynomialFeatures(1).fit_transform(X)
     model = EVGPRegressor(

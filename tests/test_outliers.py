@@ -37,7 +37,7 @@ VARIANTS = {
 
 
 @pytest.mark.parametrize("parameters", VARIANTS.values(), ids=VARIANTS)
-def test_few_wrong_rows_do_not_rule_the_fit(parameters):
+def test_outliers_do_not_change_fit(parameters):
     robust = evgp(**parameters).fit(X, WRONG)
     clean = evgp(**{**parameters, "noise": "gaussian"})
     clean.fit(X, Y)
@@ -67,7 +67,7 @@ def test_weights_are_in_the_users_order_and_none_are_of_rows_that_do_not_count()
     np.testing.assert_allclose(weighted.predict(GRID), repeated.predict(GRID), rtol=1e-7, atol=1e-9)
 
 
-def test_where_it_cannot_be_it_is_refused():
+def test_student_t_with_other_solvers_raises():
     with pytest.raises(ValueError, match='noise=.student-t. needs solver="lbfgs".*got solver=.adam'):
         evgp(solver="adam").fit(X, Y)
     with pytest.raises(ValueError, match='noise=.student-t. needs solver="lbfgs"'):
@@ -81,7 +81,7 @@ def test_where_it_cannot_be_it_is_refused():
     np.testing.assert_array_equal(model.predict(GRID), before)
 
 
-def test_dask_arrays_are_refused():
+def test_dask_arrays_raise():
     da = pytest.importorskip("dask.array")
     with pytest.raises(ValueError, match="rows in memory or in a file.*Array"):
         evgp().fit(da.from_array(X), da.from_array(Y))

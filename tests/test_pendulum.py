@@ -45,7 +45,7 @@ def test_uncertainty_is_honest_with_noise():
 
 
 @pytest.mark.long
-def test_the_weights_are_physics():
+def test_weights_are_physics():
     train = make_dynamics("pendulum", random_state=0)
     model = EVGPRegressor(InertiaForceGravity("pendulum"), n_inducing=10, random_state=0).fit(train.data, train.target)
     # q' = q + dt dq; dq' = dq + dt/J u - dt g/l sin q, to first order, minus what the GP takes over.

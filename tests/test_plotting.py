@@ -55,7 +55,7 @@ def band(display):
     return np.array(edges).T, area.get_label()
 
 
-def test_the_line_is_the_predicted_mean():
+def test_line_is_the_predicted_mean():
     model = fitted()
     display = PosteriorDisplay.from_estimator(model, X, label="EVGP")
     line = lines(display)["EVGP"]
@@ -64,7 +64,7 @@ def test_the_line_is_the_predicted_mean():
 
 
 @pytest.mark.parametrize(("n_std", "label"), [(2.0, "±2 std"), (0.5, "±0.5 std")])
-def test_the_band_is_so_many_standard_deviations(n_std, label):
+def test_band_is_so_many_standard_deviations(n_std, label):
     model = fitted()
     mean, std = model.predict(X, return_std=True)
     edges, drawn = band(PosteriorDisplay.from_estimator(model, X, n_std=n_std))
@@ -80,7 +80,7 @@ def test_the_band_is_so_many_standard_deviations(n_std, label):
         ({"x_train": X[:4, 0], "y_train": y}, "inconsistent numbers of samples"),
     ],
 )
-def test_training_data_that_do_not_fit_are_named(arguments, message):
+def test_training_data_that_do_not_fit_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         PosteriorDisplay.from_estimator(fitted(), X, **arguments)
 
@@ -96,7 +96,7 @@ def test_training_data_that_do_not_fit_are_named(arguments, message):
         (2.0, 0.0, "2.000 ± 0"),
     ],
 )
-def test_bars_that_are_shorter_than_their_symbol_stand_in_numbers(mean, std, text):
+def test_short_bars_are_annotated(mean, std, text):
     display = CoefficientDisplay(["a"], *np.array([[mean], [std], [0.0], [1.0]])).plot()
     assert [shown.get_text() for shown in display.ax_.texts] == [text]
 
@@ -138,7 +138,7 @@ def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
         display.plot()
 
 
-def test_the_curve_is_the_mean_of_runs_and_the_band_their_range():
+def test_curve_is_the_mean_of_runs_and_the_band_their_range():
     scores = np.array([[4.0, 8.0, 6.0], [1.0, np.nan, 3.0]])
     display = LearningCurveDisplay(np.array([10, 40]), scores).plot(label="EVGP", color="#D55E00")
     line = lines(display)["EVGP"]
@@ -160,7 +160,7 @@ def test_axes_are_logarithmic_where_scores_are_positive_or_as_told(lowest, log_s
         assert [label.get_text() for label in axes.get_xticklabels()] == ["10", "40"]
 
 
-def test_scores_that_have_no_logarithm_are_named():
+def test_scores_that_have_no_logarithm_raise():
     with pytest.raises(ValueError, match=r"log_scale=True needs positive scores; the smallest is -1\.0"):
         LearningCurveDisplay(np.array([10, 40]), np.array([[2.0], [-1.0]])).plot(log_scale=True)
 
@@ -191,12 +191,12 @@ def test_scores_are_those_of_scikit_learn_on_the_same_rows():
         ([5, 0.5], TypeError, r"sizes\[0\] must be an integer; got 5\.0"),
     ],
 )
-def test_sizes_that_are_not_numbers_of_groups_are_named(sizes, problem, message):
+def test_sizes_that_are_not_numbers_of_groups_raise(sizes, problem, message):
     with pytest.raises(problem, match=message):
         learning_curve_of(sizes=sizes)
 
 
-def test_a_curve_needs_a_run_and_rows_of_one_length():
+def test_curve_needs_a_run_and_rows_of_one_length():
     with pytest.raises(ValueError, match="n_runs must be at least 1; got 0"):
         learning_curve_of(n_runs=0)
     with pytest.raises(ValueError, match="inconsistent numbers of samples"):

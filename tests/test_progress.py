@@ -19,7 +19,7 @@ def heard():
     return told, Monitor(lambda *what: told.append(what))
 
 
-def test_a_part_tells_in_the_units_and_numbers_of_the_whole():
+def test_part_tells_in_the_units_and_numbers_of_the_whole():
     told, monitor = heard()
     monitor.seen_as(100, 2.0, 7.0, range(1, 3)).iteration(3, 5.0)
     assert told == [(103, 2.0 * 5.0 + 7.0, range(1, 3))]

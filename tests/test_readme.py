@@ -18,7 +18,7 @@ SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 @pytest.mark.long
-def test_the_toy_and_the_pendulum_run():
+def test_toy_and_the_pendulum_run():
     for snippet in SNIPPETS[:2]:
         names = {}
         exec(snippet, names)
@@ -36,7 +36,7 @@ def test_any_robot_runs():
 
 
 @pytest.mark.long
-def test_a_real_arm_runs(tmp_path, monkeypatch, capsys):
+def test_real_arm_runs(tmp_path, monkeypatch, capsys):
     """On logs of a simulated one."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(urdf_path("ur10"), "arm.urdf")

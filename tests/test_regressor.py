@@ -47,7 +47,7 @@ def test_shapes_of_attributes(y, outputs, sharing):
     assert m.loss_curve_.shape == (m.n_iter_,)
 
 
-def test_a_number_of_points_is_no_truth_value():
+def test_number_of_points_is_no_truth_value():
     with pytest.raises(TypeError, match="n_inducing must be an integer; got True"):
         EVGPRegressor(n_inducing=True).fit(np.eye(4), np.arange(4.0))
 
@@ -62,7 +62,7 @@ def test_noise_is_included_unless_told_otherwise():
 # --- learning ----------------------------------------------------------------------------------------------------
 
 
-def test_the_bound_rises_and_ends_at_minus_the_loss():
+def test_bound_rises_and_ends_at_minus_the_loss():
     m = model(inducing_init="k-means", noise_cv=None).fit(X, Y)
     assert (np.diff(m.loss_curve_) <= 0).all()
     assert m.lower_bound_ == pytest.approx(-m.loss_curve_[-1], rel=1e-9)
@@ -147,7 +147,7 @@ def test_units_do_not_matter():
 # --- explicit features -------------------------------------------------------------------------------------------
 
 
-def test_a_scale_of_zero_keeps_a_weight_at_its_mean():
+def test_scale_of_zero_keeps_a_weight_at_its_mean():
     m = model(
         feature_map=PolynomialFeatures(1),
         coef_prior=CoefPrior(mean=[1.0, 2.0, 3.0], scale=[1.0, 0.0, 1.0]),
@@ -161,7 +161,7 @@ def test_a_scale_of_zero_keeps_a_weight_at_its_mean():
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
-def test_a_fixed_weight_works_with_all_solvers(solver, posterior):
+def test_fixed_weight_works_with_all_solvers(solver, posterior):
     m = model(feature_map=PolynomialFeatures(1), coef_prior=CoefPrior(scale=0.0, mean=1.0), solver=solver)
     m.set_params(max_iter=20, solver=LBFGS(tol=1e9)).fit(X, Y[:, 0])
     np.testing.assert_array_equal(m.coef_, 1.0)
@@ -252,7 +252,7 @@ def test_forgetting_weighs_earlier_rows_as_fewer():
 
 
 @pytest.mark.parametrize("factor", [-1.0, 0.0, 2.0, np.nan, "a", None])
-def test_a_fitted_model_refuses_a_wrong_forgetting_factor(factor):
+def test_fitted_model_refuses_a_wrong_forgetting_factor(factor):
     m = model(max_iter=0).fit(X, Y)
     expected = m.predict(X_NEW)
     with pytest.raises((ValueError, TypeError), match="forgetting_factor must be"):
@@ -311,7 +311,7 @@ def test_ctrl_c_keeps_the_best_parameters_and_warns(sharing, solver):
 # --- changed parameters, failed fits, threads --------------------------------------------------------------------
 
 
-def test_a_failed_refit_leaves_the_model_as_it_was():
+def test_failed_refit_leaves_the_model_as_it_was():
     m = model(feature_map=PolynomialFeatures(1), max_iter=0).fit(X, Y)
     before = m.predict(X_NEW)
     m.set_params(
@@ -333,7 +333,7 @@ def test_adam_that_diverges_says_so_and_ends_no_lower_than_it_started(learning_r
 
 
 @pytest.mark.parametrize("solver", [LBFGS(), Adam(batch_size=32)], ids=str)
-def test_a_real_ctrl_c_stops_all_outputs_and_keeps_them(solver):
+def test_real_ctrl_c_stops_all_outputs_and_keeps_them(solver):
     """With outputs in threads of their own, the signal reaches the main thread only."""
     sent = []
     # A run in the background of a shell ignores SIGINT.

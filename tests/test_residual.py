@@ -52,7 +52,7 @@ class Recorder(RegressorMixin, BaseEstimator):
 
 @pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
 @pytest.mark.parametrize("regressor", [LinearRegression(), evgp(), GaussianProcessRegressor(optimizer=None)], ids=str)
-def test_it_is_the_regressor_of_the_change_plus_the_base(regressor, y, base):
+def test_prediction_is_base_plus_change(regressor, y, base):
     change = clone(regressor).fit(X, y - X[:, base].reshape(y.shape)).predict(X_NEW)
     m = ResidualRegressor(regressor).fit(X, y)
     np.testing.assert_array_equal(m.predict(X_NEW), change + X_NEW[:, base].reshape(change.shape))
@@ -60,7 +60,7 @@ def test_it_is_the_regressor_of_the_change_plus_the_base(regressor, y, base):
 
 
 @pytest.mark.parametrize("base", [[2, 0], np.array([2, 0]), [-1, -3], ["force", "angle"], np.array(["force", "angle"])])
-def test_the_base_columns_are_chosen_by_index_or_name(base):
+def test_base_columns_are_chosen_by_index_or_name(base):
     frame = pd.DataFrame(X, columns=NAMES)
     m = ResidualRegressor(LinearRegression(), base=base).fit(frame, Y)
     np.testing.assert_array_equal(m.base_, [2, 0])
@@ -101,7 +101,7 @@ def test_dask_arrays_stay_where_they_are(method, y, base):
 
 @pytest.mark.parametrize("asked", ["return_std", "return_cov"])
 @pytest.mark.parametrize("routed", [False, True])
-def test_the_spread_passes_through_pipelines_around_and_inside(asked, routed):
+def test_spread_passes_through_pipelines_around_and_inside(asked, routed):
     scale, shift = StandardScaler().fit(X), evgp()
     Z, Z_new = scale.transform(X), scale.transform(X_NEW)
     mean, spread = shift.fit(Z, Y - Z[:, :2]).predict(Z_new, **{asked: True})
@@ -147,7 +147,7 @@ def test_weights_are_routed_through_a_cross_validation(routing):
         ({}, "base={} must be one index or name"),
     ],
 )
-def test_a_base_that_is_not_in_x_is_refused(base, message):
+def test_base_that_is_not_in_x_raises(base, message):
     with pytest.raises(ValueError, match=message):
         ResidualRegressor(LinearRegression(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y)
 
@@ -157,14 +157,14 @@ def test_names_need_a_data_frame():
         ResidualRegressor(LinearRegression(), base=["angle", "speed"]).fit(X, Y)
 
 
-def test_more_outputs_than_columns_are_refused():
+def test_more_outputs_than_columns_raise():
     with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
         ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
     assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
 
 
 @pytest.mark.parametrize("method", ["fit", "partial_fit"])
-def test_a_fit_that_fails_leaves_the_model_as_it_was(method):
+def test_fit_that_fails_leaves_the_model_as_it_was(method):
     m = ResidualRegressor(evgp()).fit(X, Y)
     before = m.predict(X_NEW)
     with pytest.raises(ValueError, match="features|columns|base"):

@@ -101,16 +101,16 @@ def test_states_times_and_names_are_chosen(ahead):
         ({"n_samples": -1}, "n_samples must be at least 0"),
     ],
 )
-def test_what_does_not_fit_is_named(ahead, arguments, message):
+def test_mismatched_arguments_raise(ahead, arguments, message):
     with pytest.raises(ValueError, match=message):
         RolloutDisplay.from_rollout(ahead, **arguments)
 
 
-def test_an_initial_state_that_is_not_there_is_named(batch):
+def test_initial_state_missing_raises(batch):
     with pytest.raises(ValueError, match="index=3 must be that of one of 3 initial states"):
         RolloutDisplay.from_rollout(batch, index=3)
 
 
-def test_another_number_of_axes_is_named(ahead):
+def test_another_number_of_axes_raises(ahead):
     with pytest.raises(ValueError, match="axes must be one for each of the 2 states drawn; got 1"):
         RolloutDisplay.from_rollout(ahead, axes=pyplot.subplots()[1])

@@ -70,7 +70,7 @@ def test_weights_of_0_and_2_are_rows_removed_and_repeated(model):
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_a_variance_that_all_rows_have_is_only_a_unit(kind):
+def test_variance_that_all_rows_have_is_only_a_unit(kind):
     """Far beyond what the least noise in units of the targets would allow."""
     rng = np.random.RandomState(0)
     rows = rng.randn(40, 2)
@@ -95,7 +95,7 @@ def test_known_noise_is_the_alpha_of_scikit_learn():
         assert value_of(own) == pytest.approx(exact.log_marginal_likelihood(), rel=1e-8)
 
 
-def test_the_likelihood_of_other_kernels_sees_the_weights_of_the_fit():
+def test_likelihood_of_other_kernels_sees_the_weights_of_the_fit():
     exact = EGPRegressor(max_iter=20).fit(X, Y[:, 0], WEIGHTS, relative_variance=NOISE)
     found = exact.log_marginal_likelihood(exact.kernel_.theta)
     assert found == pytest.approx(exact.log_marginal_likelihood_value_, rel=1e-8)
@@ -211,7 +211,7 @@ EACH = {"EVGP": evgp(max_iter=1), "EGP": EGPRegressor(max_iter=1), "network": Ba
     ],
     ids=range(8),
 )
-def test_bad_weights(model, weights, message):
+def test_invalid_weights(model, weights, message):
     with pytest.raises(ValueError, match=message):
         clone(model).fit(X, Y, sample_weight=weights)
 
@@ -227,6 +227,6 @@ def test_bad_weights(model, weights, message):
     ],
     ids=range(4),
 )
-def test_bad_variances(model, variance, message):
+def test_invalid_variances(model, variance, message):
     with pytest.raises(ValueError, match=message):
         clone(model).fit(X, Y, relative_variance=variance)

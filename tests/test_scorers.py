@@ -59,7 +59,7 @@ def nlpd_of(model, inputs=X, targets=y):
     ],
     ids=str,
 )
-def test_a_score_is_minus_the_metric_of_mean_and_std(model):
+def test_score_is_minus_the_metric_of_mean_and_std(model):
     fitted = clone(model).fit(X, y)
     assert neg_nlpd(fitted, X, y) == pytest.approx(nlpd_of(fitted))
     assert neg_crps(fitted, X, y) == pytest.approx(-crps(y, *fitted.predict(X, return_std=True)))
@@ -76,7 +76,7 @@ def test_searches_choose_the_noise_that_is_there(search, scorer):
     assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
 
 
-def test_a_scorer_says_how_it_was_made():
+def test_scorer_says_how_it_was_made():
     assert repr(neg_crps) == "make_std_scorer(crps, greater_is_better=False)"
     scorer = make_std_scorer(norm.logpdf, where=1)
     assert repr(scorer) == "make_std_scorer(logpdf, where=1)"
@@ -90,7 +90,7 @@ def test_a_scorer_says_how_it_was_made():
 @pytest.mark.parametrize(
     ("transformer", "targets"), [(StandardScaler(), y), (MinMaxScaler((-1.0, 3.0)), Y), (None, Y[:, :1])]
 )
-def test_where_y_is_scaled_std_is_scaled_back(transformer, targets):
+def test_scaled_target_scales_std(transformer, targets):
     model = TransformedTargetRegressor(SPARSE, transformer=transformer).fit(X, targets)
     inner = model.transformer_.transform(targets.reshape(60, -1)).reshape(targets.shape)
     step = np.diff(targets.reshape(60, -1)[:2], axis=0) / np.diff(inner.reshape(60, -1)[:2], axis=0)
@@ -107,7 +107,7 @@ def test_where_y_is_scaled_std_is_scaled_back(transformer, targets):
     ],
     ids=str,
 )
-def test_where_y_is_bent_there_is_no_std_of_y(options):
+def test_nonlinear_target_transformer_raises(options):
     model = TransformedTargetRegressor(SPARSE, **options).fit(X, Y)
     with pytest.raises(TypeError, match=r"(?s)A TransformedTargetRegressor with .* has no standard deviation of y"):
         neg_nlpd(model, X, Y)
@@ -128,19 +128,19 @@ class Deaf(BayesianRidge):
         return super().predict(X)
 
 
-def test_a_mean_alone_is_no_pair():
+def test_predict_without_std_raises():
     with pytest.raises(TypeError, match="returns no pair of mean and std"):
         neg_crps(Deaf().fit(X, y), X[:2], y[:2])
 
 
-def test_what_knows_no_return_std_says_so():
+def test_regressor_without_return_std_raises():
     model = BaggingRegressor(BayesianRidge(), n_estimators=2).fit(X, y)
     with pytest.raises(TypeError, match="BaggingRegressor.predict takes no return_std"):
         neg_crps(model, X, y)
 
 
 @pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)
-def test_what_says_no_std_is_an_error_that_says_so(model):
+def test_scorer_without_std_raises(model):
     with pytest.raises(TypeError, match=rf"{type(model).__name__}.predict takes no return_std"):
         neg_nlpd(model.fit(X, Y), X, Y)
 

@@ -130,7 +130,7 @@ def test_shared_weights_are_dense_ones(data, sharing, per_output):
 
 
 @pytest.mark.parametrize("sharing", ["none", "kernel", "all"])
-def test_the_gradient_is_that_of_finite_differences(data, sharing):
+def test_gradient_is_that_of_finite_differences(data, sharing):
     X, Y, Sigma, _, _ = data
     found = []
 
@@ -157,7 +157,7 @@ def test_the_gradient_is_that_of_finite_differences(data, sharing):
     assert max(found) < 1e-5
 
 
-def test_the_exact_gradient_is_that_of_finite_differences(data):
+def test_exact_gradient_is_that_of_finite_differences(data):
     X, Y, Sigma, mean, _ = data
     rows = RawRows(own_columns(X), Rows().transform(X), Y / Y.std(axis=0))
     roots = np.repeat(np.linalg.cholesky(Sigma)[np.newaxis], O, axis=0)
@@ -197,7 +197,7 @@ def test_dask_agrees(data):
         assert_allclose(own, other, rtol=1e-8)
 
 
-def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
+def test_map_may_say_that_weights_are_shared_and_how_they_vary(data):
     X, Y, Sigma, mean, X_new = data
     options = {"kernel_map": FunctionTransformer(own_columns), "max_iter": 0, "noise": Gaussian(variance=0.3)}
     told = EGPRegressor(Opinionated(prior=(mean, Sigma), share_coef=True), KERNEL, **options).fit(X, Y)
@@ -223,13 +223,13 @@ def test_a_map_may_say_that_weights_are_shared_and_how_they_vary(data):
     ],
     ids=["last step", "first step", "union", "union of both", "columns", "columns of both", "none"],
 )
-def test_of_a_union_all_parts_must_say_that_weights_are_shared(data, feature_map, shared):
+def test_shared_weights_of_unions(data, feature_map, shared):
     X, Y, *_ = data
     model = EGPRegressor(feature_map, max_iter=0).fit(X, Y)
     assert model.coef_.ndim == (1 if shared else 2)
 
 
-def test_a_weight_without_variance_keeps_its_mean(data):
+def test_weight_without_variance_keeps_its_mean(data):
     X, Y, Sigma, mean, _ = data
     Sigma = Sigma.copy()
     Sigma[1], Sigma[:, 1] = 0.0, 0.0
@@ -285,7 +285,7 @@ def _not_symmetric(Sigma):
         ({"sharing": "kernel", "solver": "adam"}, 'sharing="kernel" of outputs with rows of their own needs'),
     ],
 )
-def test_what_cannot_be_is_refused_by_name(data, options, message):
+def test_invalid_arguments_raise(data, options, message):
     X, Y, _, _, _ = data
     with pytest.raises((ValueError, TypeError), match=f"(?s){message}"):
         EVGPRegressor(
@@ -294,14 +294,14 @@ def test_what_cannot_be_is_refused_by_name(data, options, message):
 
 
 @pytest.mark.parametrize("name", ["kernel_map", "feature_map"])
-def test_rows_for_other_outputs_than_those_of_y_are_refused(data, name):
+def test_rows_for_other_outputs_than_those_of_y_raise(data, name):
     X, Y, _, _, _ = data
     with pytest.raises(ValueError, match=rf"{name}=.* returns a row for each of 3 outputs, but y has 2"):
         EVGPRegressor(**{name: FunctionTransformer(own_columns)}).fit(X, Y[:, :2])
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
+def test_map_that_changes_between_fit_and_predict_raises(data, kind):
     X, Y, _, _, X_new = data
     model = kind(Rows(), max_iter=0).fit(X, Y)
     model.feature_map_.width = 3
@@ -313,7 +313,7 @@ def test_a_map_that_changes_between_fit_and_predict_is_named(data, kind):
             model.partial_fit(X, Y)
 
 
-def test_the_joint_covariance_is_asked_for_by_name(data):
+def test_joint_covariance_is_asked_for_by_name(data):
     X, Y, _, _, X_new = data
     model = EVGPRegressor(max_iter=0, n_inducing=5).fit(X, Y)
     for word in ("all", np.array([1, 2])):

@@ -44,12 +44,12 @@ def assert_same(one, other, X_NEW=X_NEW):
     ],
     ids=str,
 )
-def test_the_same_groups_are_the_same_fit(sharing, other, feature_map):
+def test_same_groups_are_the_same_fit(sharing, other, feature_map):
     """However they are written down; "all" and "none" are groups too."""
     assert_same(*(model(sharing=own, feature_map=feature_map).fit(X, Y) for own in (sharing, other)))
 
 
-def test_what_a_model_tells_is_in_the_order_of_the_outputs():
+def test_attributes_are_in_order_of_outputs():
     fit = model(sharing=GROUPS, feature_map=PolynomialFeatures(1)).fit(X, Y)
     parts = [(own, model(feature_map=PolynomialFeatures(1)).fit(X, Y[:, own])) for own in GROUPS]
     assert fit.inducing_points_.shape == (4, 10, 4)
@@ -71,7 +71,7 @@ def test_what_a_model_tells_is_in_the_order_of_the_outputs():
 
 
 @pytest.mark.parametrize("sharing", [[[0, 1]], [[0, 1, 2], [3, 4]], [["a"], [1, 2, 3]], [0, 1, 2, 3]], ids=str)
-def test_what_is_no_partition_is_named(sharing):
+def test_invalid_partition_raises(sharing):
     fit = model().fit(X, Y)
     with pytest.raises(ValueError, match=r"sharing=\[.*must be 'all', 'kernel', 'none', 'auto' or a partition"):
         fit.set_params(sharing=sharing).fit(X, Y)

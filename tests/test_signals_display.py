@@ -82,7 +82,7 @@ def test_lines_are_what_was_recorded_and_what_became_of_it(log):
                 assert_array_equal(values, raw[name][:, joint])
 
 
-def test_what_was_cut_is_coloured_by_its_reason(log):
+def test_removed_rows_are_coloured_by_reason(log):
     display = SignalsDisplay.from_log(log)
     cuts = log.recordings[0].cuts
     assert {why for *_, why in cuts} == {"gap", "edge", "rest", "too short"}
@@ -104,12 +104,12 @@ def test_what_was_cut_is_coloured_by_its_reason(log):
         ({"axes": np.empty(3, dtype=object)}, r"axes must be of shape \(3, 2\), a column for each joint; got \(3,\)"),
     ],
 )
-def test_bad_values_are_named(log, arguments, message):
+def test_invalid_values_raise(log, arguments, message):
     with pytest.raises(ValueError, match=message):
         SignalsDisplay.from_log(log, **arguments)
 
 
-def test_without_matplotlib_the_pip_command_is_told(log, monkeypatch):
+def test_without_matplotlib_the_pip_command_raises(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match="pip install matplotlib"):
         SignalsDisplay.from_log(log)

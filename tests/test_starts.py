@@ -74,7 +74,7 @@ def test_ctrl_c_ends_the_restarts_with_the_best_so_far():
 # --- inducing_init -----------------------------------------------------------------------------------------------
 
 
-def test_placing_points_anew_finds_the_columns_that_matter():
+def test_replacing_points_finds_relevant_columns():
     """Among ten columns the target knows one: clusters spread over all of them, the learned kernel does not."""
     rng = np.random.RandomState(0)
     x = rng.uniform(-3.0, 3.0, (400, 10))
@@ -106,7 +106,7 @@ def test_given_points_replace_n_inducing_and_stay_without_iterations():
         ("random", "'inducing_init' parameter"),
     ],
 )
-def test_bad_inducing_points(init, message):
+def test_invalid_inducing_points(init, message):
     with pytest.raises(ValueError, match=message):
         model(inducing_init=init).fit(X, Y)
 
@@ -114,7 +114,7 @@ def test_bad_inducing_points(init, message):
 # --- what a fit says when it ends badly --------------------------------------------------------------------------
 
 
-def test_noise_that_explains_what_a_kernel_could_is_told():
+def test_noise_that_explains_what_a_kernel_could_warns():
     """One inducing point cannot follow forty waves, whatever the start."""
     x = np.linspace(0, 1, 2000)[:, np.newaxis]
     y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(2000)])
@@ -124,7 +124,7 @@ def test_noise_that_explains_what_a_kernel_could_is_told():
 
 @pytest.mark.long
 @pytest.mark.parametrize("sharing", ["all", "none"])
-def test_targets_far_from_their_prior_mean_are_told(sharing):
+def test_targets_far_from_their_prior_mean_warn(sharing):
     with pytest.warns(ConvergenceWarning, match=r"more than 10000 times its scatter .* Set normalize_y=True"):
         model(sharing=sharing).fit(X, Y + [0.0, 1e6])
     with pytest.warns(ConvergenceWarning, match="raise the scale of coef_prior"):
@@ -136,7 +136,7 @@ def test_targets_far_from_their_prior_mean_are_told(sharing):
         assert wide.score(X, Y + 1e6) > 0.99
 
 
-def test_targets_whose_squares_vanish_are_refused():
+def test_targets_whose_squares_vanish_raise():
     with pytest.raises(ValueError, match=r"y must be 0 or exceed 1e-140 in size; a column's largest value is 1.*e-150"):
         model().fit(X, 1e-150 * Y)
     assert model().fit(X, np.zeros(len(X))).predict(X) == pytest.approx(np.zeros(len(X)))
@@ -155,7 +155,7 @@ def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
 
 
 @pytest.mark.parametrize("make", [EGPRegressor, lambda: EVGPRegressor(n_inducing=30, noise_cv=None, random_state=0)])
-def test_a_polynomial_asks_for_a_signal_far_above_its_scatter(make):
+def test_polynomial_asks_for_a_signal_far_above_its_scatter(make):
     """A cubic is a long lengthscale and a high signal; a limit of ten times the scatter costs ten nats and more."""
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (60, 2))

@@ -33,7 +33,7 @@ each = pytest.mark.parametrize("estimator", ESTIMATORS, ids=lambda own: type(own
 
 
 @each
-def test_the_version_is_in_the_state_and_not_in_the_estimator(estimator):
+def test_version_is_in_the_state_and_not_in_the_estimator(estimator):
     assert estimator.__getstate__()["_skevgp_version"] == __version__
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -56,7 +56,7 @@ def test_another_version_is_warned_of(estimator, monkeypatch):
     assert caught[0].filename == __file__
 
 
-def test_a_robot_in_a_pickle_is_the_robot():
+def test_robot_in_a_pickle_is_the_robot():
     robot = load_robot("acrobot")
     again = pickle.loads(pickle.dumps(NominalDynamics(robot)))
     assert again.robot == robot

@@ -33,7 +33,7 @@ def numbers(frame, part, output=None):
 
 
 @both
-def test_the_frame_holds_what_the_attributes_hold(model):
+def test_summary_frame_equals_attributes(model):
     m = fitted(model)
     frame = m.summary().to_frame()
     for output in (0, 1):
@@ -101,7 +101,7 @@ class Balanced(HTMLParser):
 
 
 @both
-def test_a_notebook_shows_the_diagram_and_below_what_was_learned(model):
+def test_html_shows_diagram_and_summary(model):
     unfitted = clone(model)
     m = fitted(model)
     for page in (m._repr_html_(), m._repr_mimebundle_()["text/html"]):

@@ -86,7 +86,7 @@ def exported(tmp_path_factory):
     return model, compiled(model.to_c(tmp_path_factory.mktemp("c"), "arm", include_noise=False)[0])
 
 
-def test_the_noise_is_left_out_if_that_is_asked_for(exported):
+def test_noise_is_left_out_if_that_is_asked_for(exported):
     model, library = exported
     x = data(seed=1)[0][0]
     found = called(library, "arm", x, 3, "predict")
@@ -94,13 +94,13 @@ def test_the_noise_is_left_out_if_that_is_asked_for(exported):
 
 
 @pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])
-def test_a_name_that_is_taken_in_c_is_refused(name, tmp_path):
+def test_name_that_is_taken_in_c_raises(name, tmp_path):
     with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
         fitted(sparse()).to_c(tmp_path, name)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path):
+def test_folder_missing_raises(tmp_path):
     model = fitted(sparse())
     with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):
         model.to_c(tmp_path / "missing" / "model.c")

@@ -25,7 +25,7 @@ def assert_same(found, model, X, include_noise=True):
 
 
 @each_model
-def test_the_function_predicts(model):
+def test_function_predicts(model):
     model = fitted(clone(model))
     X, _ = data(seed=1)
     for include_noise in (True, False):
@@ -33,7 +33,7 @@ def test_the_function_predicts(model):
 
 
 @each_model
-def test_the_function_of_parameters_predicts(model):
+def test_function_of_parameters_predicts(model):
     model = fitted(clone(model))
     X, _ = data(seed=1)
     found = evaluated(model.to_casadi(parametric=True), X[:5], model.to_casadi_parameters())
@@ -55,7 +55,7 @@ def test_jacobians_are_those_of_predict(model):
 
 
 @pytest.mark.parametrize("base", [None, [3, 1, -1]])
-def test_a_residual_model_adds_its_base_columns(base):
+def test_residual_model_adds_its_base_columns(base):
     X, y = data()
     model = ResidualRegressor(sparse(POLYNOMIAL), base=base).fit(X, y + X[:, [0, 1, 2] if base is None else base])
     assert_same(evaluated(model.to_casadi("sum"), X[:5]), model, X[:5])
@@ -78,19 +78,19 @@ def test_without_casadi_there_is_the_pip_command(method, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["two words", "1st", "", "a__b", None, 3])
-def test_a_name_that_casadi_refuses_is_told(name):
+def test_name_that_casadi_refuses_raises(name):
     with pytest.raises(ValueError, match=r"name must be letters, digits and single underscores.*got"):
         fitted(sparse()).to_casadi(name)
 
 
-def test_a_kernel_that_cannot_be_exported_is_named():
+def test_kernel_that_cannot_be_exported_raises():
     model = fitted(sparse(kernel=FunctionKernel(lambda X, Z: X @ Z.T)))
     with pytest.raises(ValueError, match=r"The kernel Function\(.*These can be exported"):
         model.to_casadi()
 
 
 @pytest.mark.parametrize("argument", ["feature_map", "kernel_map"])
-def test_a_map_that_cannot_be_exported_is_named(argument):
+def test_map_that_cannot_be_exported_raises(argument):
     model = fitted(sparse(**{argument: QuantileTransformer(n_quantiles=10)}))
     with pytest.raises(TypeError, match=rf"{argument}: QuantileTransformer.*These can be exported: AngleEncoder"):
         model.to_casadi()
@@ -113,7 +113,7 @@ class Wrong(TransformerMixin, BaseEstimator):
 
 
 @pytest.mark.parametrize("result", ["short", "row", "list", "array"])
-def test_an_expression_of_another_shape_is_an_error(result):
+def test_expression_of_another_shape_raises(result):
     model = fitted(sparse(kernel_map=Wrong(result)))
     with pytest.raises(ValueError, match=r"kernel_map: to_casadi must return an MX of shape \(5, 1\)"):
         model.to_casadi()

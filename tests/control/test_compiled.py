@@ -20,7 +20,7 @@ def same(found, expected):
 
 
 @pytest.mark.parametrize("include_noise", [True, False])
-def test_it_says_what_the_estimator_says(model, data, include_noise):
+def test_compiled_model_predicts_like_estimator(model, data, include_noise):
     X, options = data[2], {"return_std": True, "include_noise": include_noise}
     compiled = model.compile(include_noise)
     mean, std = model.predict(X, **options)
@@ -37,7 +37,7 @@ def test_it_says_what_the_estimator_says(model, data, include_noise):
 
 
 @pytest.mark.parametrize("n_inducing", [15, 100])
-def test_it_is_frozen_until_it_is_told_of_new_weights(data, n_inducing):
+def test_compiled_model_updates_on_request(data, n_inducing):
     """With points at all rows the fit is exact, and an update makes it a sparse one."""
     X, Y, X_new = data
     model = EVGPRegressor(PolynomialFeatures(1), n_inducing=n_inducing, **QUICK).fit(X[:100], Y[:100])

@@ -47,7 +47,7 @@ def test_jacobians_agree_with_differences_of_predictions(model, data, include_no
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
 
 
-def test_the_covariance_of_a_gradient_is_that_of_differences(model, data):
+def test_covariance_of_a_gradient_is_that_of_differences(model, data):
     X, h = data[2], 1e-2
     gradient, cov = model.predict_gradient(X, return_cov=True)
     np.testing.assert_array_equal(gradient, model.jacobian(X))
@@ -136,7 +136,7 @@ def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
         numbers.jacobian(frame_of(X_new)[["a", "c"]])
 
 
-def test_what_a_residual_regressor_says_is_of_the_sum(data):
+def test_residual_regressor_jacobian_includes_base(data):
     X, Y, X_new = data
     model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0])
     model.fit(X, Y)

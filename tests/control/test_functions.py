@@ -16,7 +16,7 @@ from .test_derivatives import close, differences
 N, N_PATHS = 1500, 20_000
 
 
-def test_they_have_the_posteriors_mean_and_covariance(model, data):
+def test_functions_have_posterior_mean_and_covariance(model, data):
     X = data[2]
     values = model.sample_functions(N, n_waves=1500)(X)
     assert values.shape == (N, len(X), N_OUTPUTS)
@@ -37,7 +37,7 @@ def test_they_have_the_posteriors_mean_and_covariance(model, data):
     [Matern([1.0, 1.0], nu=1.5), Matern([1.0, 1.0], nu=2.5), RationalQuadratic(1.0, 1.0), RBF([1.0, 1.0])],
     ids=["matern 3/2", "matern 5/2", "rational quadratic", "rbf"],
 )
-def test_the_variance_between_points_is_right_for_rough_functions_too(kernel):
+def test_variance_between_points_is_right_for_rough_functions_too(kernel):
     """What inducing points leave of a fitted kernel is far out in its spectrum."""
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (150, 2))
@@ -63,7 +63,7 @@ def test_jacobians_agree_with_differences(model, data):
         np.testing.assert_allclose(one[1], jacobian[2], rtol=1e-9, atol=1e-9)
 
 
-def test_the_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
+def test_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
     X, Y, X_new = data
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
     one, other, third = (model.sample_functions(2, random_state=seed, n_waves=50) for seed in (0, 0, 1))

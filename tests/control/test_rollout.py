@@ -71,7 +71,7 @@ def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, 
         assert kstest(found.samples[:, 0, state], norm(mean[0, state], std[0, state]).cdf).statistic < 1.95 / 100.0
 
 
-def test_the_mean_is_fed_back(model, inputs):
+def test_mean_is_fed_back(model, inputs):
     found = rollout(model, Z0, inputs, method="mean")
     z = Z0
     for t, u in enumerate(inputs):
@@ -84,7 +84,7 @@ def test_the_mean_is_fed_back(model, inputs):
 
 
 @pytest.mark.parametrize("process_noise", ["learned", "none"])
-def test_the_linearised_covariance_goes_through_the_derivatives(sparse, inputs, process_noise):
+def test_linearised_covariance_goes_through_the_derivatives(sparse, inputs, process_noise):
     found = rollout(sparse, Z0, inputs, method="linearized", process_noise=process_noise)
     z, Sigma = Z0, np.zeros((2, 2))
     for t, u in enumerate(inputs):
@@ -114,7 +114,7 @@ class _Hidden(BaseEstimator):
         return self.regressor.predict(X, return_std=return_std)
 
 
-def test_samples_of_one_function_spread_as_the_linearised_model_of_one_function(data, inputs):
+def test_function_samples_agree_with_linearisation(data, inputs):
     """Of a system that is linear and known but for its weights, errors add up from step to step, and do not average."""
     X, y = data
     kernel = ConstantKernel(1e-10, "fixed") * RBF(1.0, "fixed")
@@ -172,19 +172,19 @@ def test_feedback_is_in_the_derivative(sparse):
     ],
 )
 @pytest.mark.parametrize("method", ["sample", "mean"])
-def test_what_cannot_be_is_refused_by_name(sparse, arguments, options, message, method):
+def test_invalid_arguments_raise(sparse, arguments, options, message, method):
     with pytest.raises(ValueError, match=message):
         rollout(sparse, *arguments, **{"method": method, **options})
 
 
-def test_regressors_that_will_not_do_are_named(data, inputs):
+def test_regressors_that_will_not_do_raise(data, inputs):
     with pytest.raises(NotFittedError):
         rollout(EVGPRegressor(), Z0, inputs)
     with pytest.raises(TypeError, match=r"LinearRegression.predict has no return_std"):
         rollout(LinearRegression().fit(*data), Z0, inputs)
 
 
-def test_a_system_that_runs_away_is_named(data):
+def test_system_that_runs_away_raises(data):
     X, _ = data
     model = EVGPRegressor(FunctionTransformer(), n_inducing=5, **QUICK).fit(X, 1e3 * X[:, :2])
     for method in ("sample", "mean", "linearized"):

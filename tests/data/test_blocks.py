@@ -26,7 +26,7 @@ def blocks(made=None, n_inducing=6, **options):
     return LocalBlocks(make, 50, n_inducing, **{"size": 7, **options})
 
 
-def test_the_sums_that_depend_on_no_parameter():
+def test_sums_that_depend_on_no_parameter():
     sums = LinearSums.of_block(block())
     assert sums.n_rows == 50
     for found, expected in [(sums.HH[0], H.T @ H), (sums.HR, H.T @ R), (sums.RR, np.sum(R**2, axis=0))]:
@@ -34,7 +34,7 @@ def test_the_sums_that_depend_on_no_parameter():
 
 
 @pytest.mark.parametrize("n_inducing", [0, 1, 10, 100, 1000, 10**6])
-def test_a_block_fits_a_cache_and_is_worth_a_call(n_inducing):
+def test_block_fits_a_cache_and_is_worth_a_call(n_inducing):
     assert 512 <= block_rows(n_inducing) <= 8192
     assert block_rows(n_inducing) * n_inducing <= max(2**16, 512 * n_inducing)
 
@@ -49,7 +49,7 @@ def test_blocks_cover_all_rows_once(n_inducing):
     assert own.linear.n_rows == n
 
 
-def test_the_order_of_a_sum_is_that_of_the_rows():
+def test_order_of_a_sum_is_that_of_the_rows():
     assert blocks(size=1).sum(lambda own: [float(own.linear[0, 0])]) == H[:, 0].tolist()
     n = 1000  # more blocks than groups
     own = LocalBlocks(lambda rows: Block(None, np.full((1, 1), rows.start), 0), n, 6, size=1)
@@ -65,7 +65,7 @@ def test_blocks_that_memory_allows_are_made_once():
     assert own[0] is own[0]
 
 
-def test_the_first_pass_leaves_something_for_the_second_only_where_all_of_it_fits():
+def test_first_pass_leaves_something_for_the_second_only_where_all_of_it_fits():
     enough = 16 * 1000 * 50 / KEEP_BYTES
     for options, may_keep in [
         ({}, True),

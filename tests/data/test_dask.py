@@ -123,7 +123,7 @@ def test_nothing_of_the_size_of_the_data_reaches_the_client(monkeypatch):
     assert fitted.predict(big).npartitions == 4
 
 
-def test_a_worker_that_dies_does_not_change_the_result(cluster):
+def test_worker_that_dies_does_not_change_the_result(cluster):
     """Its partitions are made again on the other; sums keep their order, so even the bits are the same."""
     expected = model(max_iter=40).fit(*chunked(X, Y))
     pids, seen = list(distributed.default_client().run(os.getpid).values()), []
@@ -159,12 +159,12 @@ def test_forgetting_score_and_warm_start(cluster):
         (lambda: da.empty((0, 2)), lambda: Y, "empty"),
     ],
 )
-def test_bad_chunks_are_named(bad_X, bad_y, message):
+def test_invalid_chunks_raise(bad_X, bad_y, message):
     with pytest.raises(ValueError, match=message):
         model().fit(bad_X(), bad_y())
 
 
-def test_what_needs_all_rows_at_once_says_so():
+def test_options_without_dask_raise():
     fitted = model().fit(X, Y)
     (rows,) = chunked(X_NEW, rows=(20, 30))
     with pytest.raises(ValueError, match="return_cov.*Dask"):

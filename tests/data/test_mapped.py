@@ -37,7 +37,7 @@ def mapped(feature_map=None, kernel_map=None, X=X, y=Y):
 
 @pytest.mark.parametrize("rows", [slice(3, 7), np.array([9, 0, 9])], ids=str)
 @pytest.mark.parametrize("kept", [True, False])
-def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
+def test_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
     if not kept:
         monkeypatch.setattr("skevgp.data.maps.MAPPED_BYTES", 0)
     scaler, trend = StandardScaler().fit(X), PolynomialFeatures(1).fit(X)
@@ -47,7 +47,7 @@ def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeyp
     np.testing.assert_array_equal(raw.targets, Y[rows])
 
 
-def test_what_fits_is_mapped_once_and_what_does_not_at_each_pass(monkeypatch):
+def test_maps_are_cached_if_memory_allows(monkeypatch):
     own = mapped(kept := Counting())
     for _ in range(3):
         own(slice(0, 400))
@@ -78,7 +78,7 @@ def in_pieces(monkeypatch):
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
-def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver):
+def test_recomputed_maps_agree(request, sharing, solver):
     expected = model(sharing=sharing, solver=solver).fit(X, Y)
     request.getfixturevalue("in_pieces")
     pieces = model(sharing=sharing, solver=solver).fit(X, Y)
@@ -88,14 +88,14 @@ def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver
     assert pieces.lower_bound_ == pytest.approx(expected.lower_bound_, rel=1e-4 if atol else 1e-8)
 
 
-def test_a_map_whose_width_changes_from_piece_to_piece_is_named(in_pieces, monkeypatch):
+def test_map_whose_width_changes_from_piece_to_piece_raises(in_pieces, monkeypatch):
     monkeypatch.setattr("skevgp.data.maps.MAP_ROWS", 70)
     widening = FunctionTransformer(lambda rows: np.ones((len(rows), 1 if len(rows) == 70 else 2)))
     with pytest.raises(ValueError, match=r"same number of columns for all rows; they returned \(2, 1\) and \(2, 2\)"):
         model(feature_map=widening, kernel_map=None).fit(X, Y)
 
 
-def test_pieces_in_threads_have_the_same_bits(in_pieces):
+def test_pieces_in_threads_have_same_bits(in_pieces):
     fits = [model(n_jobs=n_jobs).fit(X, Y) for n_jobs in (1, 2, 3)]
     for other in fits[1:]:
         np.testing.assert_array_equal(other.predict(X_NEW), fits[0].predict(X_NEW))

@@ -47,7 +47,7 @@ def blocks_of_four(monkeypatch):
     monkeypatch.setattr(_maps, "MAP_ROWS", 4)
 
 
-def test_a_clone_is_fitted_and_the_original_left_alone():
+def test_clone_is_fitted_and_the_original_left_alone():
     scaler = StandardScaler()
     fitted = fit_map(scaler, X, Y, "kernel_map")
     assert_array_equal(fitted.mean_, X.mean(axis=0))
@@ -57,62 +57,62 @@ def test_a_clone_is_fitted_and_the_original_left_alone():
 
 @pytest.mark.parametrize("name", ["feature_map", "kernel_map"])
 @pytest.mark.parametrize("no_map", ["physics", 3, LinearRegression(), StandardScaler, np.sin])
-def test_what_is_no_transformer_is_a_type_error(name, no_map):
+def test_invalid_transformer_raises(name, no_map):
     with pytest.raises(TypeError, match=f"{name} must be None or a transformer instance with fit and transform; got"):
         fit_map(no_map, X, Y, name)
 
 
 @pytest.mark.parametrize("name", ["feature_map", "kernel_map"])
 @pytest.mark.parametrize("kernel", [RBF(2.0), ConstantKernel() * RBF(), FunctionKernel(lambda X, Z: X @ Z.T)], ids=str)
-def test_a_kernel_in_place_of_a_map_is_sent_where_it_belongs(name, kernel):
+def test_kernel_in_place_of_a_map_is_sent_where_it_belongs(name, kernel):
     with pytest.raises(TypeError, match=f"^{re.escape(f'{name}={kernel!r} is a kernel: give it as kernel=.')}$"):
         fit_map(kernel, X, Y, name)
 
 
-def test_a_sparse_result_becomes_dense():
+def test_sparse_result_becomes_dense():
     values = apply_map(returning(csr_array), X, "feature_map")
     assert isinstance(values, np.ndarray)
     assert_array_equal(values, X)
 
 
 @pytest.mark.usefixtures("blocks_of_four")
-def test_a_map_sees_blocks_of_rows():
+def test_map_sees_blocks_of_rows():
     recorder = identity()
     assert_array_equal(apply_map(recorder, X, "feature_map"), X)
     assert [len(block) for block in recorder.seen_] == [4, 4, 2]
 
 
 @pytest.mark.parametrize("function", [lambda X: X[:-1], lambda X: np.vstack([X, X]), lambda X: X[:1]])
-def test_another_number_of_rows_is_an_error(function):
+def test_another_number_of_rows_raises(function):
     with pytest.raises(ValueError, match=r"feature_map=.* must return one row per row of X; for 10 rows it returned"):
         apply_map(returning(function), X, "feature_map")
 
 
 @pytest.mark.parametrize("function", [lambda X: X[:, 0], lambda X: X[:, :, np.newaxis, np.newaxis], lambda X: 1.0])
-def test_a_result_of_other_dimensions_is_an_error(function):
+def test_result_of_other_dimensions_raises(function):
     with pytest.raises(ValueError, match=r"kernel_map=.* must return one row per row of X"):
         apply_map(returning(function), X, "kernel_map")
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_a_result_that_is_not_finite_is_an_error(value):
+def test_result_that_is_not_finite_raises(value):
     with pytest.raises(ValueError, match=r"kernel_map=.* returned NaN or infinity"):
         apply_map(returning(lambda X: np.add(X, [0.0, 0.0, value])), X, "kernel_map")
 
 
-def test_a_map_that_changes_its_width_is_an_error(monkeypatch):
+def test_map_that_changes_its_width_raises(monkeypatch):
     monkeypatch.setattr("skevgp.data.maps.MAP_ROWS", 3)
     widths = iter([2, 1])
     with pytest.raises(ValueError, match="same number of columns for all rows; it returned 2 and 1"):
         apply_map(returning(lambda X: X[:, : next(widths)]), np.ones((6, 3)), "feature_map")
 
 
-def test_a_map_that_returns_words_is_an_error():
+def test_map_that_returns_words_raises():
     with pytest.raises(ValueError, match="What feature_map=.* returns must be real numbers"):
         apply_map(returning(lambda X: np.full(X.shape, "a")), np.ones((2, 2)), "feature_map")
 
 
-def test_a_map_that_cannot_be_cloned_is_named():
+def test_map_that_cannot_be_cloned_raises():
     class Plain:
         def fit(self, X, y=None):
             return self
@@ -141,7 +141,7 @@ def per_output(X):
     ],
     ids=["union", "weights", "pipeline", "nested"],
 )
-def test_a_union_may_have_rows_for_each_output(around, weights, rows):
+def test_union_may_have_rows_for_each_output(around, weights, rows):
     one_hot = FunctionTransformer(lambda X: csr_array(np.asarray(X)[:, :1]))
     parts = [("own", FunctionTransformer(per_output)), ("all", StandardScaler()), ("sparse", one_hot), ("no", "drop")]
     fitted = fit_map(around(FeatureUnion(parts, transformer_weights=weights)), rows, Y[: len(rows)], "feature_map")

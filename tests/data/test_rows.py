@@ -70,7 +70,7 @@ def rows(targets=Y, **options):
     return Rows(LocalSource.holding(RawRows(X, H, targets)), halved, **options)
 
 
-def test_a_block_is_of_prepared_inputs_features_and_some_residuals():
+def test_block_is_of_prepared_inputs_features_and_some_residuals():
     raw = LocalSource.holding(RawRows(X, H, Y)).take(np.arange(4))
     block = block_of(raw, (Identity(),), halved, slice(1, 2))
     np.testing.assert_array_equal(block.prepared, X[:4])
@@ -79,11 +79,11 @@ def test_a_block_is_of_prepared_inputs_features_and_some_residuals():
     np.testing.assert_array_equal(block_of(raw, (Identity(),), halved).residuals, 0.5 * Y[:4])
 
 
-def test_the_scatter_of_what_does_not_vary_is_1():
+def test_scatter_of_what_does_not_vary_is_1():
     np.testing.assert_array_equal(rows(np.full((400, 2), 7.0)).scatter(), 1.0)
 
 
-def test_a_sample_is_all_rows_or_some_in_their_order():
+def test_sample_is_all_rows_or_some_in_their_order():
     rng = np.random.RandomState(0)
     state = rng.get_state()[1].tolist()
     np.testing.assert_array_equal(rows().sample(400, rng).inputs, X)

@@ -51,7 +51,7 @@ def test_few_parts_are_under_way_at_once(threads):
         assert len(taken) <= done + 4
 
 
-def test_an_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
+def test_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
     seen = []
 
     def fails(part):
@@ -79,7 +79,7 @@ def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     assert numbers_of_threads() == before
 
 
-def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
+def test_nested_thread_limits_are_released_once():
     """Whichever came first."""
     second_is_in, first_is_out = Event(), Event()
 
@@ -106,7 +106,7 @@ def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
 
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_fits_have_the_same_bits_in_any_thread():
+def test_fits_have_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
     rng = np.random.RandomState(0)
     rows = rng.randn(12_000, 4)

@@ -27,7 +27,7 @@ def test_few_rows_are_ordered_and_equal_ones_joined():
     np.testing.assert_array_equal(seen(Chosen.of(X[order], Y[order]), X[order], Y[order]), rows)
 
 
-def test_the_first_of_rows_that_were_joined_is_named_and_each_finds_its_own():
+def test_first_of_rows_that_were_joined_is_named_and_each_finds_its_own():
     once = Chosen.of(X, Y)
     for index, position in enumerate(once.positions):
         same = np.flatnonzero((np.hstack([X, Y]) == np.hstack([X, Y])[position]).all(axis=1))
@@ -61,7 +61,7 @@ def test_many_rows_and_new_ones_stay_in_their_order(ordered, monkeypatch):
     np.testing.assert_array_equal(chosen.as_given(chosen.counts)[counts > 0], counts[counts > 0])
 
 
-def test_a_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
+def test_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
     zeros = np.array([[0.0], [-0.0], [1.0]])
     assert Chosen.of(zeros, np.array([-0.0, 0.0, 0.0])).n_rows == 2
     frame = pd.DataFrame({"x": [1.0, 0.0, 1.0, 1.0], "word": ["a", "b", "a", "b"]})

@@ -13,14 +13,14 @@ def stored():
     return np.load(Path(__file__).parents[1] / "data" / "iiwa14_computed_torque.npz")
 
 
-def test_a_reference_starts_and_ends_at_rest():
+def test_reference_starts_and_ends_at_rest():
     q, v, a = quintic_reference([0.2, -1.0], [1.0, 2.0], 1.5, [-1.0, 0.0, 1.5, 2.0])
     assert_allclose(q, [[0.2, -1.0], [0.2, -1.0], [1.0, 2.0], [1.0, 2.0]], rtol=1e-15)
     assert_array_equal(v, np.zeros((4, 2)))
     assert_array_equal(a, np.zeros((4, 2)))
 
 
-def test_the_reference_equals_the_stored_one(stored):
+def test_reference_equals_the_stored_one(stored):
     q, v, a = quintic_reference(stored["q0"], stored["q1"], 1.0, 0.03 * np.arange(50))
     assert_allclose(np.concatenate([q, v], axis=-1), stored["smooth_Zd"], rtol=0, atol=1e-12)
     assert_allclose(a, stored["smooth_Ad"], rtol=0, atol=1e-11)
@@ -35,7 +35,7 @@ def test_commands_equal_the_stored_ones_step_by_step(stored):
 
 
 @pytest.mark.parametrize("robot", ["iiwa14", "ur5", "panda", "kinova", "double_pendulum", "talos_left_arm"])
-def test_a_robot_arrives_at_its_target(robot):
+def test_robot_arrives_at_its_target(robot):
     n = load_robot(robot).nv
     q0, q1 = np.zeros((2, n)), np.array([[0.02], [-0.02]]) * np.ones(n)
     controller = ComputedTorqueController(robot, q0, q1, duration=0.3)
@@ -61,7 +61,7 @@ ZERO, ONE = np.zeros(7), np.ones(7)
         ({"kd": 67.0}, r"kd must be below 2 / dt = 66.6667.*got 67.0"),
     ],
 )
-def test_bad_arguments_of_a_controller_are_named(arguments, message):
+def test_invalid_arguments_of_a_controller_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         ComputedTorqueController(**{"robot": "iiwa14", "q0": ZERO, "q1": ONE, "duration": 1.0} | arguments)
 
@@ -72,7 +72,7 @@ def ur5():
 
 
 @pytest.mark.parametrize(("steps", "next_step"), [([3], 0), ([0, 2], 1), ([0, 1, 1], 2)])
-def test_steps_that_do_not_follow_one_another_are_refused(ur5, steps, next_step):
+def test_steps_that_do_not_follow_one_another_raise(ur5, steps, next_step):
     *before, last = steps
     for step in before:
         ur5(step, np.zeros((1, 12)))
@@ -81,18 +81,18 @@ def test_steps_that_do_not_follow_one_another_are_refused(ur5, steps, next_step)
 
 
 @pytest.mark.parametrize(("step", "error"), [(-1, ValueError), (0.0, TypeError), ("0", TypeError)])
-def test_what_is_no_step_is_refused(ur5, step, error):
+def test_invalid_step_raises(ur5, step, error):
     with pytest.raises(error, match="step must be"):
         ur5(step, np.zeros((1, 12)))
 
 
-def test_the_number_of_trajectories_stays(ur5):
+def test_number_of_trajectories_stays(ur5):
     ur5(0, np.zeros((2, 12)))
     with pytest.raises(ValueError, match="There were 2 trajectories in step 0; got 3"):
         ur5(1, np.zeros((3, 12)))
 
 
-def test_a_refused_call_changes_nothing(ur5):
+def test_refused_call_changes_nothing(ur5):
     Z = np.random.default_rng(0).uniform(-0.1, 0.1, (2, 1, 12))
     ur5(0, Z[0])
     with pytest.raises(ValueError, match="must fit q0"):
@@ -103,13 +103,13 @@ def test_a_refused_call_changes_nothing(ur5):
 
 
 @pytest.mark.parametrize(("Z", "message"), [([[np.nan] * 12], "Z must be finite"), ([["a"] * 12], "Z must be real")])
-def test_states_that_are_no_numbers_are_refused(ur5, Z, message):
+def test_states_that_are_no_numbers_raise(ur5, Z, message):
     with pytest.raises(ValueError, match=message):
         ur5(0, Z)
 
 
 @pytest.mark.parametrize("shape", [(14,), (3, 14), (2, 12)])
-def test_states_of_another_shape_are_refused(shape):
+def test_states_of_another_shape_raise(shape):
     controller = ComputedTorqueController("iiwa14", np.zeros((2, 7)), np.ones((2, 7)), duration=1.0)
     with pytest.raises(ValueError, match=r"must fit q0, of shape \(2, 7\)"):
         controller(0, np.zeros(shape))
@@ -124,6 +124,6 @@ def test_states_of_another_shape_are_refused(shape):
         (([0.0], [1.0], 1.0, np.inf), "times must be finite"),
     ],
 )
-def test_bad_arguments_of_a_reference_are_named(arguments, message):
+def test_invalid_arguments_of_a_reference_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         quintic_reference(*arguments)

@@ -25,7 +25,7 @@ def states(dynamics):
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_a_target_is_the_next_row_of_its_trajectory(name):
+def test_target_is_the_next_row_of_its_trajectory(name):
     dynamics = make_dynamics(name, 3, 4, random_state=0)
     same_trajectory = dynamics.groups[1:] == dynamics.groups[:-1]
     assert_array_equal(states(dynamics)[1:][same_trajectory], dynamics.target[:-1][same_trajectory])
@@ -41,7 +41,7 @@ def test_initial_states_fill_the_range_of_the_paper(name):
     assert (first.min(axis=0) < 0).all()
 
 
-def test_the_same_random_state_gives_the_same_bits():
+def test_same_random_state_gives_same_bits():
     first, second = (make_dynamics("acrobot", 2, 3, noise=0.1, input_noise=0.1, random_state=7) for _ in range(2))
     assert_array_equal(first.data, second.data)
     assert_array_equal(first.target, second.target)
@@ -72,7 +72,7 @@ def test_noise_is_a_fraction_of_each_targets_scatter():
         ({"input_noise": np.nan}, "input_noise must be finite and at least 0.0; got nan"),
     ],
 )
-def test_bad_values_are_named(arguments, message):
+def test_invalid_values_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         make_dynamics(**{"system": "pendulum"} | arguments)
 
@@ -87,7 +87,7 @@ def test_bad_values_are_named(arguments, message):
         ({"noise": [0.1]}, r"noise must be a number; got \[0.1\]"),
     ],
 )
-def test_bad_types_are_named(arguments, message):
+def test_invalid_types_raise(arguments, message):
     with pytest.raises(TypeError, match=message):
         make_dynamics(**{"system": "pendulum"} | arguments)
 
@@ -110,7 +110,7 @@ def test_iiwa14_starts_at_rest_and_tracks_its_target(robot):
     assert np.abs(dynamics.trajectories[:, -1, :7] - q1).max() < 0.05
 
 
-def test_a_joint_without_motor_is_swung_at_random():
+def test_joint_without_motor_is_swung_at_random():
     model = load_robot("acrobot")
     model.name = "mine"
     model.lowerPositionLimit, model.upperPositionLimit = np.array([2.0, -9.0]), np.array([2.5, 1.0])
@@ -126,13 +126,13 @@ def test_a_joint_without_motor_is_swung_at_random():
     ("name", "arguments", "joint"),
     [("panda", {"dt": 0.1}, "finger"), ("so100", {"dt": 0.1}, "gripper"), ("panda", {"duration": 0.2}, "finger")],
 )
-def test_moves_that_run_away_are_an_error(name, arguments, joint):
+def test_moves_that_run_away_raise(name, arguments, joint):
     with pytest.raises(ValueError, match=rf"run away in step \d+, at .*{joint}.*unstable at this dt of .*Lower dt"):
         make_dynamics(name, 10, 50, random_state=0, **arguments)
 
 
 @pytest.mark.long
-def test_the_number_of_jobs_does_not_change_a_bit():
+def test_number_of_jobs_does_not_change_a_bit():
     one, two = (make_dynamics("iiwa14", 65, 2, random_state=0, n_jobs=jobs) for jobs in (1, 2))
     assert_array_equal(one.data, two.data)
     assert_array_equal(one.target, two.target)

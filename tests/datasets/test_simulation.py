@@ -148,39 +148,39 @@ ZEROS = np.zeros((3, 1))
         (("pendulm", [0.0, 0.0], ZEROS), "Did you mean 'pendulum'"),
     ],
 )
-def test_bad_arguments_are_named(arguments, message):
+def test_invalid_arguments_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         simulate(*arguments)
 
 
-def test_an_integration_that_gives_up_is_an_error():
+def test_integration_that_gives_up_raises():
     with np.errstate(all="ignore"), pytest.raises(ValueError, match="'pendulum' overflow|failed in step 0"):
         simulate("pendulum", [1.0, 1e200], ZEROS)
 
 
 @pytest.mark.parametrize("system", ["cartpole", "acrobot"])
-def test_states_whose_accelerations_overflow_are_refused(system):
+def test_states_whose_accelerations_overflow_raise(system):
     with pytest.raises(ValueError, match="accelerations of .* overflow"), np.errstate(all="ignore"):
         simulate(system, [0.3, 0.3, 1e200, 1e200], np.zeros((1, 1)))
 
 
 @pytest.mark.parametrize("dt", ["a", None, [0.1, 0.2], True])
-def test_a_step_that_is_no_number_is_named(dt):
+def test_step_that_is_no_number_raises(dt):
     with pytest.raises(TypeError, match="dt must be a number"):
         simulate("pendulum", [0.0, 0.0], np.zeros((1, 1)), dt=dt)
 
 
-def test_complex_states_are_refused():
+def test_complex_states_raise():
     with pytest.raises(ValueError, match="z0 must be real numbers"):
         simulate("pendulum", [0.0, 1j], np.zeros((1, 1)))
 
 
-def test_no_trajectory_is_an_error():
+def test_no_trajectory_raises():
     with pytest.raises(ValueError, match="and some rows"):
         simulate("pendulum", np.zeros((0, 2)), np.zeros((0, 3, 1)))
 
 
-def test_a_controller_sees_each_state_once():
+def test_controller_sees_each_state_once():
     z0, seen = np.array([[0.3, 0.0], [0.1, 0.2]]), []
 
     def brake(step, Z):
@@ -202,18 +202,18 @@ def test_a_controller_sees_each_state_once():
         ([[0.0], [1j]], "inputs must be real numbers"),
     ],
 )
-def test_what_a_controller_returns_is_checked(answer, message):
+def test_invalid_controller_output_raises(answer, message):
     with pytest.raises(ValueError, match=message):
         simulate("pendulum", np.zeros((2, 2)), lambda step, Z: answer, n_steps=1)
 
 
-def test_a_number_of_steps_is_for_controllers():
+def test_number_of_steps_is_for_controllers():
     with pytest.raises(ValueError, match="n_steps is for a controller.*Got 3"):
         simulate("pendulum", [0.0, 0.0], ZEROS, n_steps=3)
 
 
 @pytest.mark.long
-def test_the_number_of_jobs_does_not_change_a_bit():
+def test_number_of_jobs_does_not_change_a_bit():
     rng = np.random.default_rng(0)
     z0, U = rng.uniform(-1.0, 1.0, (130, 4)), rng.standard_normal((130, 2, 1))
     assert_array_equal(simulate("acrobot", z0, U, n_jobs=2), simulate("acrobot", z0, U, n_jobs=1))
@@ -246,7 +246,7 @@ def test_one_step_of_any_robot_equals_plain_pinocchio(name):
 
 
 @pytest.mark.parametrize("dt", [0.01, 0.06])
-def test_a_controller_of_another_step_is_refused(dt):
+def test_controller_of_another_step_raises(dt):
     controller = ComputedTorqueController("ur5", np.zeros(6), np.ones(6), duration=1.0, dt=0.03)
     with pytest.raises(ValueError, match=rf"dt must be that of the controller, 0.03; got {dt}"):
         simulate("ur5", np.zeros(12), controller, dt, n_steps=2)

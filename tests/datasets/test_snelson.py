@@ -79,7 +79,7 @@ def put(folder, ending="", end="\n", **changed):
         (folder / f"{name}{ending}").write_bytes(text(values, end))
 
 
-def test_the_target_is_the_papers(fetch, serve):
+def test_target_is_the_papers(fetch, serve):
     serve(archive(GOOD))
     toy = fetch()
     assert set(toy) == {"data", "target", "test_data", "feature_names", "target_names", "DESCR"}
@@ -90,7 +90,7 @@ def test_the_target_is_the_papers(fetch, serve):
     assert "6 y + 3 x" in toy.DESCR
 
 
-def test_a_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
+def test_folder_that_lacks_a_file_is_not_enough(serve, fetch, home):
     put(home / "SPGP_dist")
     (home / "SPGP_dist" / "test_inputs").unlink()
     with pytest.raises(OSError, match="download_if_missing is False"):
@@ -104,7 +104,7 @@ def test_without_permission_nothing_is_downloaded(offline, fetch, home):
         fetch(download_if_missing=False)
 
 
-def test_wrong_numbers_in_a_folder_are_named(offline, fetch, home):
+def test_invalid_numbers_in_a_folder_raise(offline, fetch, home):
     put(home, ".dat", train_outputs=2.0 * Y)
     found = sha256((2.0 * Y).tobytes()).hexdigest()
     expected = sha256(Y.tobytes()).hexdigest()
@@ -112,7 +112,7 @@ def test_wrong_numbers_in_a_folder_are_named(offline, fetch, home):
         fetch()
 
 
-def test_a_file_without_numbers_is_named(offline, fetch, home):
+def test_file_without_numbers_raises(offline, fetch, home):
     put(home)
     (home / "test_inputs").write_text("<html>moved</html>")
     with pytest.raises(OSError, match="test_inputs .* is not a list of numbers"):
@@ -133,7 +133,7 @@ def test_a_file_without_numbers_is_named(offline, fetch, home):
     ],
     ids=["page", "truncated", "not compressed", "wrong", "no numbers", "missing", "elsewhere", "empty"],
 )
-def test_a_bad_archive_is_told_and_leaves_nothing(fetch, serve, home, content, reason):
+def test_invalid_archive_is_told_and_leaves_nothing(fetch, serve, home, content, reason):
     path = serve(content)
     with pytest.raises(OSError, match=rf"could not be fetched from {re.escape(path.as_uri())} \(.*{reason}.*data_home"):
         fetch()
@@ -165,14 +165,14 @@ def server(monkeypatch):
         thread.join()
 
 
-def test_a_server_that_stumbles_is_asked_again(server, home):
+def test_server_that_stumbles_is_asked_again(server, home):
     server.failures = 2
     assert_array_equal(fetch_snelson(home, n_retries=2, delay=0.0).target, 6.0 * Y + 3.0 * X)
     fetch_snelson(home)
     assert server.calls == 3
 
 
-def test_a_server_that_fails_is_told(server, home):
+def test_server_that_fails_raises(server, home):
     server.failures = 9
     with pytest.raises(OSError, match=r"fetched from http://127.0.0.1:\d+/SPGP_dist.tgz \(HTTP Error 503.*data_home"):
         fetch_snelson(home, n_retries=1, delay=0.0)
@@ -188,7 +188,7 @@ def test_a_server_that_fails_is_told(server, home):
         ({"data_home": 3}, ValueError, "data_home"),
     ],
 )
-def test_bad_arguments_are_named(arguments, error, message):
+def test_invalid_arguments_raise(arguments, error, message):
     with pytest.raises(error, match=message):
         fetch_snelson(**arguments)
 

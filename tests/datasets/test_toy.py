@@ -4,7 +4,7 @@ import pytest
 from skevgp.datasets import make_toy
 
 
-def test_the_default_is_as_large_as_snelsons_data():
+def test_default_is_as_large_as_snelsons_data():
     toy = make_toy(random_state=0)
     assert set(toy) == {"data", "target", "mean", "feature_names", "target_names", "DESCR"}
     assert toy.data.shape == (200, 1)
@@ -13,7 +13,7 @@ def test_the_default_is_as_large_as_snelsons_data():
     assert "200 points" in toy.DESCR
 
 
-def test_the_mean_is_waves_on_a_line_of_slope_three():
+def test_mean_is_waves_on_a_line_of_slope_three():
     """Between the waves, and at both ends, the line is left."""
     toy = make_toy(n_samples=20_000, noise=0.0, random_state=0)
     x, waves = toy.data[:, 0], toy.target - 3.0 * toy.data[:, 0]
@@ -32,6 +32,6 @@ def test_the_mean_is_waves_on_a_line_of_slope_three():
         ({"noise": "loud"}, TypeError, "noise must be a number; got 'loud'"),
     ],
 )
-def test_bad_arguments_are_named(arguments, error, message):
+def test_invalid_arguments_raise(arguments, error, message):
     with pytest.raises(error, match=message):
         make_toy(**arguments)

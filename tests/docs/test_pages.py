@@ -30,7 +30,7 @@ def name_of(page):
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
-def test_a_page_runs_and_prints_what_it_says(page, tmp_path):
+def test_page_runs_and_prints_what_it_says(page, tmp_path):
     with warnings.catch_warnings():  # a page may silence one
         for block, printed in blocks.run(page, tmp_path):
             assert not blocks.differences(printed, block.output or ""), f"{page.name}:{block.line}"

@@ -70,7 +70,7 @@ def test_loss_and_gradient_agree_with_autograd(network, scales):
 
 
 @pytest.mark.parametrize("network", NETWORKS, ids=lambda network: str(network.sizes))
-def test_the_loss_is_what_brute_force_over_weights_gives(network):
+def test_loss_is_what_brute_force_over_weights_gives(network):
     """E_q[log q(w) - log p(w)] / N - E_q[log p(y | w)] per row, all by drawing weights."""
     theta, X, Y, _ = case(network)
     rng, n_draws = np.random.default_rng(1), 20_000
@@ -111,7 +111,7 @@ def test_parameters_are_counted_as_in_the_papers_table_4(sizes, count):
 
 
 @pytest.mark.parametrize("network", NETWORKS, ids=lambda network: str(network.sizes))
-def test_a_row_that_counts_twice_is_there_twice(network):
+def test_weight_two_equals_repeated_row(network):
     theta, X, Y, draws = case(network)
     counts = np.array([1, 2, 1, 3, 1, 1, 2, 1])
     again, weights = np.repeat(np.arange(8), counts), counts / counts.mean()
@@ -196,7 +196,7 @@ def test_without_hidden_layers_means_are_the_exact_posteriors_and_variances_the_
         np.testing.assert_allclose(fit.coefs_std_[0][:, o], np.diag(precision) ** -0.5, rtol=1e-3)
 
 
-def test_the_noise_is_what_the_fit_leaves_over_and_is_unsure_of(linear):
+def test_noise_is_mean_squared_error_and_variance(linear):
     x, y, fit = linear
     left_over = y - fit.intercepts_[0] - (x - fit.X_mean_) @ fit.coefs_[0]
     unsure = (x - fit.X_mean_) ** 2 @ fit.coefs_std_[0] ** 2
@@ -226,7 +226,7 @@ def test_loss_and_predictions_are_those_of_weights_drawn_from_the_attributes():
 # --- learning ----------------------------------------------------------------------------------------------------
 
 
-def test_a_warm_start_goes_on_where_the_last_fit_ended():
+def test_warm_start_goes_on_where_the_last_fit_ended():
     m = model(warm_start=True, batch_size=120, max_iter=300).fit(X, Y)
     last = m.loss_curve_[-1]
     assert m.fit(X, Y).loss_curve_[0] < last + 0.5 < model().fit(X, Y).loss_curve_[0]
@@ -249,7 +249,7 @@ def test_held_out_rows_are_not_learned_from(monkeypatch):
     assert len(m.loss_curve_) == len(m.validation_scores_) == 3
 
 
-def test_a_loss_that_does_not_stay_finite_is_told(monkeypatch):
+def test_loss_that_does_not_stay_finite_warns(monkeypatch):
     monkeypatch.setattr(VariationalNetwork, "loss_and_gradient", lambda self, theta, *_: (np.nan, theta))
     with pytest.warns(ConvergenceWarning, match="did not stay finite"):
         model().fit(X, Y)
@@ -281,7 +281,7 @@ def test_a_loss_that_does_not_stay_finite_is_told(monkeypatch):
     ],
     ids=str,
 )
-def test_bad_arguments_are_named(arguments, message):
+def test_invalid_arguments_raise(arguments, message):
     with pytest.raises(ValueError, match=message):
         model(**arguments).fit(X, Y)
 
@@ -296,6 +296,6 @@ def test_bad_arguments_are_named(arguments, message):
         (np.ones((5, 1)), np.ones(4), "inconsistent"),
     ],
 )
-def test_bad_data_are_named(x, y, message):
+def test_invalid_data_raise(x, y, message):
     with pytest.raises(ValueError, match=message):
         model().fit(x, y)

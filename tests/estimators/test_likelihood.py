@@ -55,7 +55,7 @@ def numerical_gradient(function, theta):
 
 
 @pytest.mark.parametrize("name", KERNELS)
-def test_the_likelihood_is_scikit_learns(name):
+def test_likelihood_is_scikit_learns(name):
     model = start(kernel=KERNELS[name])
     oracle = GaussianProcessRegressor(model.kernel_, alpha=model.noise_variance_, optimizer=None).fit(X, Y[:, 0])
     for theta in (model.kernel_.theta, elsewhere(model), elsewhere(model, 1)):
@@ -86,7 +86,7 @@ def test_with_features_the_likelihood_is_the_dense_one():
 
 
 @pytest.mark.parametrize("scale", [2.0, np.inf])
-def test_the_gradient_of_the_likelihood_is_the_numerical_one(scale):
+def test_gradient_of_the_likelihood_is_the_numerical_one(scale):
     model = start(feature_map=TREND, coef_prior=CoefPrior(scale=scale), y=100.0 * Y[:, 0])
     theta = elsewhere(model)
     _, gradient = model.log_marginal_likelihood(theta, eval_gradient=True)
@@ -104,7 +104,7 @@ def test_without_theta_it_is_the_fitted_value():
         EGPRegressor().log_marginal_likelihood()
 
 
-def test_a_theta_that_does_not_fit_is_an_error():
+def test_theta_that_does_not_fit_raises():
     one, two = start(), start(y=Y)
     for model, theta in [(one, [0.0]), (one, np.zeros((1, 3))), (two, np.zeros(3)), (two, np.zeros((3, 3)))]:
         with pytest.raises(ValueError, match="theta must be of shape"):

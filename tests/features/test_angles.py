@@ -68,7 +68,7 @@ def test_data_frames_choose_angles_by_their_columns_and_name_the_result():
 
 
 @pytest.mark.parametrize("angles", [["x"], [0], ["dtheta/dt"], [3], ["u_x"], [4], ["elbow"], [7], [-4], [True], [1.0]])
-def test_an_angle_that_is_no_revolute_position_lists_those_that_are(angles):
+def test_angle_that_is_no_revolute_position_lists_those_that_are(angles):
     message = r"angles=.* must be .* of revolute joints of the robot 'cartpole': \{1: 'theta'\}"
     with pytest.raises(ValueError, match=message):
         AngleEncoder("cartpole", angles=angles).fit(rows(5))
@@ -89,18 +89,18 @@ def test_angles_must_be_a_sequence(angles):
 
 
 @pytest.mark.parametrize("angles", [[0, 0], ["q1", "q1"], ["q1", 0]])
-def test_an_angle_named_twice_is_an_error(angles):
+def test_angle_named_twice_raises(angles):
     with pytest.raises(ValueError, match=r"angles=.* must not name a column twice"):
         AngleEncoder("acrobot", angles=angles).fit(rows(5))
 
 
 @pytest.mark.parametrize("robot", ["acrobot", "cartpole"])
-def test_the_inverse_gives_the_rows_back(robot):
+def test_inverse_gives_the_rows_back(robot):
     encoder = AngleEncoder(robot).fit(rows(5))
     assert_allclose(encoder.inverse_transform(encoder.transform(rows(5))), rows(5), rtol=1e-14, atol=1e-14)
 
 
-def test_the_inverse_gives_angles_above_minus_pi_and_up_to_pi():
+def test_inverse_gives_angles_above_minus_pi_and_up_to_pi():
     encoder = AngleEncoder(angles=[0]).fit([[0.0, 0.0]])
     X = np.array([[4.0, 9.0], [-4.0, -9.0], [np.pi, 0.0], [-np.pi, 0.0], [0.0, 1.0]])
     expected = [[4.0 - 2 * np.pi, 9.0], [2 * np.pi - 4.0, -9.0], [np.pi, 0.0], [np.pi, 0.0], [0.0, 1.0]]
@@ -109,13 +109,13 @@ def test_the_inverse_gives_angles_above_minus_pi_and_up_to_pi():
 
 
 @pytest.mark.parametrize("n_columns", [5, 8])
-def test_the_inverse_of_another_width_is_an_error(n_columns):
+def test_inverse_of_another_width_raises(n_columns):
     encoder = AngleEncoder("acrobot").fit(rows(5))
     with pytest.raises(ValueError, match=rf"X has {n_columns} columns, but AngleEncoder made 7: \['sin\(q1\)'"):
         encoder.inverse_transform(rows(n_columns))
 
 
-def test_a_pipeline_scales_what_was_encoded_and_inverts_it():
+def test_pipeline_scales_what_was_encoded_and_inverts_it():
     pipeline = make_pipeline(AngleEncoder("acrobot"), StandardScaler()).fit(rows(5))
     expected = StandardScaler().fit_transform(encoded(rows(5), {0, 1}))
     assert_allclose(pipeline.transform(rows(5)), expected, rtol=1e-14)

@@ -130,7 +130,7 @@ def test_links_that_are_none_list_the_links(links):
 
 
 @pytest.mark.parametrize("links", [["q2", 1], np.array([1, 1])])
-def test_a_link_named_twice_is_an_error(links):
+def test_link_named_twice_raises(links):
     with pytest.raises(ValueError, match=r"links=\[.*1.*\] must not name a link twice"):
         LinkGravity("iiwa14", links=links).fit(rows("iiwa14"))
 
@@ -147,7 +147,7 @@ def test_a_link_named_twice_is_an_error(links):
     ],
 )
 @pytest.mark.parametrize("robot", ["iiwa14", None])
-def test_a_bad_parameter_is_named(parameters, message, robot):
+def test_invalid_parameter_raises(parameters, message, robot):
     with pytest.raises(ValueError, match=message):
         LinkGravity(robot, **parameters).fit(rows("iiwa14"))
 
@@ -158,7 +158,7 @@ def test_without_pinocchio_the_message_says_how_to_get_it(monkeypatch):
         LinkGravity("pendulum").fit(rows("pendulum"))
 
 
-def test_a_fitted_map_needs_no_pinocchio(monkeypatch):
+def test_fitted_map_needs_no_pinocchio(monkeypatch):
     X = rows("ur5")
     features = LinkGravity("ur5").fit(X)
     expected, stored = features.transform(X), pickle.dumps(features)
@@ -182,7 +182,7 @@ def test_features_of_a_data_frame_are_named_after_its_columns():
 
 
 @pytest.mark.parametrize("robot", ["iiwa14", LIFT, load_robot("ur5"), None], ids=["name", "table", "model", "none"])
-def test_a_pickled_or_cloned_map_works_the_same(robot):
+def test_pickled_or_cloned_map_works_the_same(robot):
     X = rows("iiwa14" if robot is None else robot)
     features = LinkGravity(robot, axes="x").fit(X)
     expected = features.transform(X)
@@ -193,7 +193,7 @@ def test_a_pickled_or_cloned_map_works_the_same(robot):
 
 
 @pytest.mark.parametrize("fitted", [False, True])
-def test_the_prior_knows_which_joints_bear_a_link(fitted):
+def test_prior_knows_which_joints_bear_a_link(fitted):
     features = LinkGravity("iiwa14", axes="x", links=["q1", "q3", "q7"], unknown_scale=2.0, free_scale=0.5)
     if fitted:
         features.fit(rows("iiwa14"))
@@ -210,7 +210,7 @@ def test_outputs_choose_states():
     assert_array_equal(scale, [[1, 1, 1, 1], [0, 0, 0, 0]])
 
 
-def test_a_union_is_inertia_force_gravity_in_two_parts():
+def test_union_is_inertia_force_gravity_in_two_parts():
     X, y = rows("iiwa14", 30), np.random.default_rng(1).normal(size=(30, 14))
     parts = [("inertia", InertiaForce("iiwa14")), ("gravity", LinkGravity("iiwa14", links=range(1, 7)))]
     union, whole = FeatureUnion(parts), InertiaForceGravity("iiwa14")

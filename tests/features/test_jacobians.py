@@ -76,7 +76,7 @@ def test_each_term_by_itself(robot, term):
     ],
     ids=str,
 )
-def test_what_is_chosen_of_a_map_is_what_is_differentiated(features):
+def test_jacobian_of_chosen_features(features):
     check(features, rows(features.robot))
 
 
@@ -126,7 +126,7 @@ def test_gravity_is_pinocchios_derivative_of_the_torque_of_a_unit_mass(robot):
 
 
 @pytest.mark.parametrize("kind", MAPS)
-def test_it_is_validated_as_transform_is(kind):
+def test_jacobian_validates_input(kind):
     X = rows("cartpole")
     with pytest.raises(NotFittedError):
         MAPS[kind]("cartpole").jacobian(X)
@@ -140,7 +140,7 @@ def test_it_is_validated_as_transform_is(kind):
 
 @pytest.mark.parametrize("kind", MAPS)
 @pytest.mark.parametrize("robot", ["iiwa14", "acrobot", None])
-def test_a_single_row_gives_the_same_as_many_and_so_does_a_pickled_map(robot, kind):
+def test_single_row_gives_the_same_as_many_and_so_does_a_pickled_map(robot, kind):
     X = rows(robot, 30)
     features = MAPS[kind](robot).fit(X)
     expected = features.jacobian(X)
@@ -148,7 +148,7 @@ def test_a_single_row_gives_the_same_as_many_and_so_does_a_pickled_map(robot, ki
     assert_array_equal(pickle.loads(pickle.dumps(features)).jacobian(X), expected)
 
 
-def test_dynamics_that_overflow_are_an_error():
+def test_dynamics_that_overflow_raise():
     features = NominalDynamics("acrobot").fit(rows("acrobot"))
     x = np.array([[0.1, 0.2, 1e90, 1e90, 1e99]]) * 1e99 ** np.array([0, 0, 1, 1, 1])
     with pytest.raises(ValueError, match="The dynamics of the robot 'acrobot' are not finite"):

@@ -68,14 +68,14 @@ def test_gravity_adds_the_sine_of_each_angle_against_the_vertical(name, angles):
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-def test_the_prior_mean_of_inertia_force_is_that_of_the_paper(name):
+def test_prior_mean_of_inertia_force_is_that_of_the_paper(name):
     features = InertiaForce(name, dt=DT, inverse_inertia=2.0)
     mean, _ = features.coef_prior(len(IF_MEANS[name]))
     assert_allclose(mean, IF_MEANS[name], rtol=1e-15)
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-def test_the_prior_mean_with_gravity_is_that_of_the_paper(name):
+def test_prior_mean_with_gravity_is_that_of_the_paper(name):
     features = InertiaForceGravity(name, dt=DT, inverse_inertia=[2.0], gravity_gain=GAIN[name])
     mean, _ = features.coef_prior(len(IFG_MEANS[name]))
     assert_allclose(mean, IFG_MEANS[name], rtol=1e-15)
@@ -96,7 +96,7 @@ def test_known_unknown_and_free_entries_have_their_own_scales(name):
     assert_array_equal(scale, scales(IFG_ROLES[name], 0.01, 5.0, 0.5))
 
 
-def test_a_free_scale_of_zero_pins_the_zeros():
+def test_free_scale_of_zero_pins_the_zeros():
     mean, scale = InertiaForceGravity("acrobot", free_scale=0.0, gravity_gain=1.0, inverse_inertia=1.0).coef_prior(4)
     assert_array_equal(scale == 0, mean == 0)
 
@@ -124,7 +124,7 @@ def test_outputs_that_are_no_states_list_the_states(outputs):
         (["q"], 2, r"y has 2 columns.* predicts 1 states: \['q'\]"),
     ],
 )
-def test_a_target_of_another_width_is_an_error(outputs, n_outputs, message):
+def test_target_of_another_width_raises(outputs, n_outputs, message):
     with pytest.raises(ValueError, match=message):
         InertiaForce("pendulum", outputs=outputs).coef_prior(n_outputs)
 
@@ -142,26 +142,26 @@ def test_a_target_of_another_width_is_an_error(outputs, n_outputs, message):
         ({"gravity_gain": [1.0, 2.0, 3.0]}, "gravity_gain must be a finite number or 2 of them"),
     ],
 )
-def test_a_bad_parameter_is_named(parameters, message):
+def test_invalid_parameter_raises(parameters, message):
     with pytest.raises(ValueError, match=message):
         InertiaForceGravity("acrobot", **parameters).coef_prior(4)
 
 
 @pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
-def test_a_parameter_that_is_no_number_is_named(parameter):
+def test_parameter_that_is_no_number_raises(parameter):
     with pytest.raises(ValueError, match=f"'{parameter}' parameter .* Got 'much'"):
         InertiaForce("pendulum", **{parameter: "much"}).coef_prior(2)
 
 
 @pytest.mark.parametrize("feature_map", MAPS)
-def test_a_wrong_number_of_columns_is_an_error(feature_map):
+def test_invalid_number_of_columns_raises(feature_map):
     message = rf"X has 4 columns, but {feature_map.__name__} of the robot 'pendulum' needs 3: \['q', 'dq/dt', 'u_q'\]"
     with pytest.raises(ValueError, match=message):
         feature_map("pendulum").fit(np.zeros((2, 4)))
 
 
 @pytest.mark.parametrize("feature_map", MAPS)
-def test_an_unknown_robot_lists_the_known_ones(feature_map):
+def test_unknown_robot_lists_the_known_ones(feature_map):
     with pytest.raises(
         ValueError,
         match=r"Unknown robot 'carpole'.*Did you mean 'cartpole'.*'acrobot', 'cartpole', .*'iiwa14', 'pendulum'",
@@ -197,7 +197,7 @@ def arm_rows(robot="iiwa14", n_rows=5):
     return np.random.default_rng(0).normal(size=(n_rows, layout_of(robot).n_columns))
 
 
-def test_an_arm_gets_both_levers_of_the_links_that_gravity_turns():
+def test_arm_gets_both_levers_of_the_links_that_gravity_turns():
     X = arm_rows()
     features = InertiaForceGravity("iiwa14").fit(X)
     levers = [f"gravity(q{link}, u_{axis})" for link in range(2, 8) for axis in "xy"]
@@ -206,7 +206,7 @@ def test_an_arm_gets_both_levers_of_the_links_that_gravity_turns():
 
 
 @pytest.mark.parametrize(("roll", "n_terms"), [(np.pi / 2, 0), (1.5707, 0), (1.5, 2)])
-def test_an_axis_that_a_file_rounds_to_the_vertical_counts_as_vertical(roll, n_terms):
+def test_axis_that_a_file_rounds_to_the_vertical_counts_as_vertical(roll, n_terms):
     turntable = System("turntable", links=(Link("q", "revolute", (0.0, 1.0, 0.0), mass=1.0, rpy=(roll, 0.0, 0.0)),))
     assert InertiaForceGravity(turntable).fit_transform(rows("pendulum")).shape == (5, 3 + n_terms)
 
@@ -221,7 +221,7 @@ def test_without_gravity_nothing_is_added():
 
 
 @pytest.mark.parametrize("fitted", [False, True])
-def test_the_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_link(fitted):
+def test_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_link(fitted):
     features = InertiaForceGravity("iiwa14", gravity_gain=2.0, unknown_scale=3.0, free_scale=0.5)
     if fitted:
         features.fit(arm_rows())
@@ -253,12 +253,12 @@ def test_levers_can_be_asked_for_and_have_their_own_scales():
     assert levers.robot is None  # the user's own is not touched
 
 
-def test_the_levers_of_another_robot_must_fit():
+def test_levers_of_another_robot_must_fit():
     with pytest.raises(ValueError, match="X has 21 columns, but LinkGravity of the robot 'ur5' needs 18"):
         InertiaForceGravity("iiwa14", gravity=LinkGravity("ur5")).fit(arm_rows())
 
 
 @pytest.mark.parametrize("gravity", ["sine", InertiaForce("iiwa14")])
-def test_gravity_that_is_not_link_gravity_is_named(gravity):
+def test_gravity_that_is_not_link_gravity_raises(gravity):
     with pytest.raises(ValueError, match="'gravity' parameter .* must be an instance of .*LinkGravity' or None"):
         InertiaForceGravity("iiwa14", gravity=gravity).fit(arm_rows())

@@ -56,7 +56,7 @@ def union(robot, nominal):
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("term", TERMS)
-def test_a_term_is_what_pinocchio_says_row_by_row(robot, term):
+def test_term_is_what_pinocchio_says_row_by_row(robot, term):
     X = rows(robot)
     expected = by_pinocchio(robot, term, X)
     features = NominalDynamics(robot, terms=[term]).fit_transform(X)
@@ -107,7 +107,7 @@ def test_terms_come_in_the_order_given():
 
 @pytest.mark.parametrize("robot", ROBOTS)
 @pytest.mark.parametrize("terms", [TERMS, ["acceleration"]])
-def test_the_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, terms):
+def test_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, terms):
     X, n = rows(robot), layout_of(robot).n_joints
     features = union(robot, NominalDynamics(robot, terms=terms))
     H = features.fit_transform(X)
@@ -117,7 +117,7 @@ def test_the_prior_mean_beside_inertia_force_is_eulers_step_of_the_model(robot, 
     assert_allclose(H @ mean.T, X[:, : 2 * n] + DT * step, rtol=1e-9, atol=1e-10 * np.abs(step).max())
 
 
-def test_the_prior_mean_is_what_a_short_step_does():
+def test_prior_mean_is_what_a_short_step_does():
     dt, X = 1e-4, rows("acrobot")
     features = FeatureUnion([("if", InertiaForce("acrobot", dt=dt)), ("nominal", NominalDynamics("acrobot", dt=dt))])
     H = features.fit_transform(X)
@@ -140,7 +140,7 @@ def test_the_prior_mean_is_what_a_short_step_does():
         (["input", "gravity"], ["....", "....", "k.tt", ".ktt"]),
     ],
 )
-def test_the_prior_knows_which_acceleration_moves_which_velocity(terms, roles):
+def test_prior_knows_which_acceleration_moves_which_velocity(terms, roles):
     features = NominalDynamics("acrobot", terms=terms, dt=0.1, known_scale=0.5, unknown_scale=7.0, free_scale=2.0)
     mean, scale = features.coef_prior(4)
     assert_allclose(mean, [[0.1 if role == "k" else 0.0 for role in row] for row in roles])
@@ -178,21 +178,21 @@ def test_unknown_terms_list_the_known_ones(terms):
         NominalDynamics("acrobot", terms=terms).coef_prior(4)
 
 
-def test_a_term_alone_is_no_sequence():
+def test_term_alone_is_no_sequence():
     with pytest.raises(
         ValueError, match="The 'terms' parameter of NominalDynamics must be an array-like. Got 'gravity'"
     ):
         NominalDynamics("acrobot", terms="gravity").fit(rows("acrobot"))
 
 
-def test_a_model_of_another_size_is_an_error():
+def test_model_of_another_size_raises():
     with pytest.raises(ValueError, match=r"X has 5 columns, but NominalDynamics of the robot 'iiwa14' needs 21: \['"):
         NominalDynamics(load_robot("iiwa14")).fit(rows("acrobot"))
 
 
 @pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
 @pytest.mark.parametrize("value", [-1.0, np.inf, np.nan, "much"])
-def test_a_bad_parameter_is_named(parameter, value):
+def test_invalid_parameter_raises(parameter, value):
     with pytest.raises(ValueError, match=f"The '{parameter}' parameter of NominalDynamics must be"):
         NominalDynamics("acrobot", **{parameter: value}).coef_prior(4)
 
@@ -208,26 +208,26 @@ def planar_arm(*masses):
     )
 
 
-def test_a_link_without_mass_at_the_tip_is_an_error_that_names_its_joint():
+def test_link_without_mass_at_the_tip_is_an_error_that_names_its_joint():
     with pytest.raises(ValueError, match=r"of the robot 'arm' are not finite: its joints \['q1', 'q2'\] move no mass"):
         NominalDynamics(planar_arm(1.0, 0.0, 0.0)).fit(np.zeros((2, 9)))
 
 
-def test_a_link_without_mass_in_the_middle_matters_in_singular_positions_only():
+def test_link_without_mass_in_the_middle_matters_in_singular_positions_only():
     features = NominalDynamics(planar_arm(0.0, 1.0)).fit(np.zeros((2, 6)))
     assert np.isfinite(features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0]])).all()
     with pytest.raises(ValueError, match=r"not finite: its mass matrix is singular at q = \[0\.5, 0\.0\]"):
         features.transform([[0.0, 1.0, 0.0, 0.0, 1.0, 1.0], [0.5, 0.0, 0.0, 0.0, 1.0, 1.0]])
 
 
-def test_velocities_whose_squares_overflow_are_an_error():
+def test_velocities_whose_squares_overflow_raise():
     features = NominalDynamics("acrobot").fit(rows("acrobot"))
     with pytest.raises(ValueError, match="is singular at .* or q̇ or u is too large there"):
         features.transform([[0.1, 0.2, 1e200, 1e200, 0.0]])
 
 
 @pytest.mark.parametrize("robot", ["acrobot", get_system("acrobot"), load_robot("acrobot"), None])
-def test_a_pickled_map_works_the_same(robot):
+def test_pickled_map_works_the_same(robot):
     X = rows("acrobot")
     features = NominalDynamics(robot, terms=TERMS).fit(X)
     features.transform(X)
@@ -241,7 +241,7 @@ def error(model, data):
 
 @pytest.mark.filterwarnings("ignore:The bound was still rising")
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
-def test_a_wrong_model_and_encoded_angles_help_the_regressor():
+def test_invalid_model_and_encoded_angles_help_the_regressor():
     errors = []
     for seed in (0, 200):
         data = [make_dynamics("acrobot", n_trajectories=n, n_steps=40, random_state=seed + n) for n in (16, 20)]
@@ -261,7 +261,7 @@ def test_a_wrong_model_and_encoded_angles_help_the_regressor():
 # --- what a fitted map knows of the robot --------------------------------------------------------------------------
 
 
-def test_a_fitted_map_does_not_follow_the_users_model():
+def test_fitted_map_does_not_follow_the_users_model():
     model = load_robot("acrobot")
     X = np.random.default_rng(0).normal(size=(3, 5))
     fitted = NominalDynamics(model, terms=["acceleration", "gravity", "input"]).fit(X)

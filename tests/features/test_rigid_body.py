@@ -62,7 +62,7 @@ def test_jacobian_is_the_derivative(robot):
         assert_allclose(found[..., column], expected, rtol=1e-6, atol=1e-6 * np.abs(found).max())
 
 
-def test_the_priors_covariance_is_that_of_small_errors_of_mass_centre_and_shape():
+def test_priors_covariance_is_that_of_small_errors_of_mass_centre_and_shape():
     model = load_robot("ur5")
     body = RigidBodyRegressor("ur5", mass_scale=1e-3, com_scale=1e-3, inertia_scale=0.0, friction=[])
     _, covariance = body.coef_prior(6)
@@ -105,7 +105,7 @@ def test_names_and_order_of_columns():
         RigidBodyRegressor("pendulum").fit([[0.1, 0.2]])
 
 
-def test_bad_arguments_are_named():
+def test_invalid_arguments_raise():
     with pytest.raises(ValueError, match="y has 3 columns.*torques of its 1 joints"):
         RigidBodyRegressor("pendulum").coef_prior(3)
     for name in ("stiction_velocity", "mass_scale", "com_scale", "inertia_scale", "friction_scale"):

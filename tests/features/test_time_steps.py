@@ -53,7 +53,7 @@ def kept(kind, robot):
 
 @each_map
 @pytest.mark.parametrize("robot", ["cartpole", "acrobot", "iiwa14"])
-def test_the_state_stays_and_features_are_multiplied_by_the_step_of_their_row(kind, robot):
+def test_state_stays_and_features_are_multiplied_by_the_step_of_their_row(kind, robot):
     X, n_kept = rows(robot), kept(kind, robot)
     _, features = of_constant(kind, robot, X, 0.03)
     found = MAPS[kind](robot, dt="column").fit_transform(X)
@@ -133,7 +133,7 @@ def covariances(features, H, n_states):
 @each_map
 @pytest.mark.parametrize("robot", ["pendulum", "cartpole", "acrobot", "iiwa14"])
 @pytest.mark.parametrize("dt", [0.002, 0.03, 0.2])
-def test_the_prior_covariance_is_that_of_003_seconds_and_grows_with_the_step(robot, kind, dt):
+def test_prior_covariance_is_that_of_003_seconds_and_grows_with_the_step(robot, kind, dt):
     X, n_states = rows(robot), 2 * layout_of(robot).n_joints
     X[:, -1] = dt
     expected = (dt / 0.03) ** 2 * covariances(*of_constant(kind, robot, X, 0.03), n_states)
@@ -170,7 +170,7 @@ def test_weights_are_those_of_a_second():
 
 @any_map
 @pytest.mark.parametrize("bad", [0.0, -0.01, np.nan, np.inf, -np.inf])
-def test_a_step_that_is_none_is_named(kind, bad):
+def test_step_that_is_none_raises(kind, bad):
     X = rows("pendulum")
     features = ANY[kind]("pendulum", dt="column").fit(X)
     X[3, -1] = bad
@@ -182,7 +182,7 @@ def test_a_step_that_is_none_is_named(kind, bad):
 
 
 @any_map
-def test_a_wrong_width_says_what_the_last_column_is(kind):
+def test_invalid_width_says_what_the_last_column_is(kind):
     X = rows("pendulum")
     message = r"X has 3 columns, but .* needs 4: \['q', 'dq/dt', 'u_q', 'dt'\]; the last one, dt, is the time step"
     with pytest.raises(ValueError, match=message):
@@ -196,18 +196,18 @@ def test_a_wrong_width_says_what_the_last_column_is(kind):
 
 @any_map
 @pytest.mark.parametrize("columns", [["dt", "q", "dq/dt", "u_q"], ["a", "dt", "b", "c"]])
-def test_the_step_must_be_the_last_column(kind, columns):
+def test_step_must_be_the_last_column(kind, columns):
     with pytest.raises(ValueError, match=r"in the robot's order \['q', 'dq/dt', 'u_q', 'dt'\]; got \["):
         ANY[kind]("pendulum", dt="column").fit(pd.DataFrame(np.abs(rows("pendulum")), columns=columns))
 
 
 @any_map
-def test_any_other_word_is_an_error(kind):
+def test_any_other_word_raises(kind):
     with pytest.raises(ValueError, match="The 'dt' parameter of .* must be .*'column'.* Got 'row' instead"):
         ({**ANY, "gravity": LinkGravity}[kind]("pendulum", dt="row")).fit(rows("pendulum"))
 
 
-def test_the_step_of_gravity_is_that_of_the_map_around_it():
+def test_step_of_gravity_is_that_of_the_map_around_it():
     X = rows("acrobot")
     with pytest.raises(ValueError, match=r"gravity=LinkGravity\(dt='column'\) must leave dt to InertiaForceGravity"):
         InertiaForceGravity("acrobot", dt="column", gravity=LinkGravity(dt="column")).fit(X)

@@ -59,7 +59,7 @@ def test_random_folds_are_of_nearly_equal_length(n_rows, n_folds, found):
     assert all(len(fold.predicted) == len(fold.rows) for fold in folds)
 
 
-def test_of_many_rows_some_are_predicted_from_all():
+def test_many_rows_are_subsampled():
     n_rows = 10 * PREDICTED_ROWS
     for folds in (random_folds(n_rows, 4, rng()), folds_in_order(np.arange(n_rows)[::-1], 4, rng())):
         assert_parts(folds, n_rows)
@@ -127,7 +127,7 @@ GRID = np.stack(np.meshgrid(np.arange(30.0), np.arange(30.0)), axis=-1).reshape(
         *("correlated", "backwards", "powers", "a grid", "all the same"),
     ],
 )
-def test_a_path_is_no_sorted_table(inputs, expected):
+def test_path_is_no_sorted_table(inputs, expected):
     order = rng().permutation(len(inputs))
     kept = np.empty_like(inputs)
     kept[order] = inputs
@@ -271,7 +271,7 @@ def test_correlated_weights_and_weights_that_outputs_share(family, shared, joint
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-8])
-def test_a_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
+def test_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
     """Its sums over the other folds, as differences from those of all rows, would be rounding errors."""
     model, rows, table = problem(n=200)
     rows.features[:, 0] *= np.where(np.arange(200) < 40, 1e3, 1e-6)
@@ -336,7 +336,7 @@ def test_nowhere_near_is_better(family, shared):
 
 @pytest.mark.parametrize("fixed", [False, True])
 @pytest.mark.parametrize(("first", "lowest"), [(None, 0.5), (1e-7, 0.1)])
-def test_the_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):
+def test_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):
     model, rows, table, values = small()
     table = table.changed("signal", fixed=True) if fixed else table
     values = values if first is None else values | {"noise": np.full(2, first)}

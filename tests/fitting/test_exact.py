@@ -48,7 +48,7 @@ def test_features_that_rows_cannot_tell_apart_are_refused_if_nothing_is_known_of
     assert np.isfinite(fitted(H=twice, vague=[[True, False], [False, True]]).log_marginal_likelihood)
 
 
-def test_all_is_well_or_it_says_why():
+def test_convergence_warnings_of_exact_fit():
     assert fitted(max_iter=200).messages == ()
     (message,) = fitted(max_iter=1, tol=1e-9).messages
     assert "likelihood was still rising after max_iter=1" in message

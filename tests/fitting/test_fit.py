@@ -30,7 +30,7 @@ def started(model, **options):
 
 
 @pytest.mark.parametrize("sharing", SHARING)
-def test_the_predictor_is_of_all_outputs_in_the_users_units(sharing):
+def test_predictor_is_of_all_outputs_in_the_users_units(sharing):
     done = fitted(sharing=sharing, max_iter=50)
     predictor = done.predictor()
     mean, variance = predictor.predict(X, H, return_variance=True)
@@ -42,7 +42,7 @@ def test_the_predictor_is_of_all_outputs_in_the_users_units(sharing):
 
 
 @pytest.mark.parametrize("sharing", SHARING)
-def test_the_bound_is_summed_and_of_the_users_targets(sharing):
+def test_bound_is_summed_and_of_the_users_targets(sharing):
     """In units a hundred times as small, the density of each row and output is a hundredth."""
     done, scaled = (
         fitted(sharing=sharing, H=NO_FEATURES, Y=factor * Y, kernel=factor**2 * RBF([1.0, 1.0]), max_iter=0)
@@ -92,7 +92,7 @@ def sampled(monkeypatch, **changes):
     return model_of(n_inducing=5, **changes)
 
 
-def test_a_fit_that_begins_with_samples_ends_with_all_rows(monkeypatch):
+def test_fit_that_begins_with_samples_ends_with_all_rows(monkeypatch):
     model = model_of(n_inducing=5, max_iter=200)
     plain = finished(model, search.search(model))
     model = sampled(monkeypatch, max_iter=200)
@@ -139,7 +139,7 @@ def growing(most=1000, first=8, **changes):
     return model_of(placement=Placement("k-means", first, most), **changes)
 
 
-def test_few_points_do_not_hide_what_there_is_to_learn(monkeypatch):
+def test_number_of_points_grows_from_few(monkeypatch):
     """Of a fast wave, ten and fifteen points show nothing: to them it is noise."""
     rng = np.random.RandomState(0)
     x = np.sort(rng.uniform(0.0, 6.0, (200, 1)), axis=0)
@@ -153,7 +153,7 @@ def test_few_points_do_not_hide_what_there_is_to_learn(monkeypatch):
     assert found.values["noise"] > 0.9 * model.scatter
 
 
-def test_the_exact_model_of_a_sample_knows_what_other_values_miss():
+def test_exact_sample_start_is_better():
     model = growing()
     unhindered = exact_model_of_sample(model, 60, 2e-4)
     by_chance, first = -0.5 * (2 + 2 * O) / (N * O), model.table.values_at_start()

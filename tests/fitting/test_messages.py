@@ -24,20 +24,20 @@ def white(inputs, targets, kernel, *hyperparameters):
 
 
 @pytest.mark.parametrize(("length_scale", "expected"), [(1e-4, True), (1e-2, True), (0.05, False), (1.0, False)])
-def test_a_kernel_to_which_neighbours_are_strangers_is_white(length_scale, expected):
+def test_short_length_scale_is_white(length_scale, expected):
     assert white(LINE, WAVE, RBF(length_scale)) is expected
     # Other outputs may be noise.
     assert white(LINE, np.hstack([NOISE, WAVE]), RBF(length_scale)) is expected
 
 
-def test_where_neighbours_are_not_alike_white_noise_is_the_answer():
+def test_dissimilar_neighbours_are_white_noise():
     for columns in (1, 3, 20):
         rng = np.random.RandomState(0)
         inputs, targets = rng.randn(200, columns), rng.randn(200, 3)
         assert not white(inputs, targets, RBF(1e-4))
 
 
-def test_what_noise_explains_is_told_where_neighbours_are_alike():
+def test_noise_warning_for_similar_neighbours():
     rows = identity_rows(LINE, np.hstack([WAVE, NOISE]))
     scatter = rows.scatter()
     assert "of 1 of 2 outputs" in nothing_learned(scatter, rows)
@@ -54,7 +54,7 @@ MODELS = {
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
-def test_a_fit_that_ends_with_white_noise_says_so(model):
+def test_fit_that_ends_with_white_noise_says_so(model):
     with pytest.warns(ConvergenceWarning, match=r"neighbouring rows are (alike|strangers)"):
         model(kernel=RBF(1e-4)).fit(LINE, WAVE[:, 0])
 
@@ -66,7 +66,7 @@ def test_a_fit_that_ends_with_white_noise_says_so(model):
     [lambda X: np.sin(5 * X[:, 0]), lambda X: X.sum(axis=1), lambda X: np.random.RandomState(1).randn(len(X))],
     ids=["one column", "line", "noise"],
 )
-def test_a_fit_that_has_learned_what_there_is_says_nothing(columns, target):
+def test_fit_that_has_learned_what_there_is_says_nothing(columns, target):
     X = np.random.RandomState(0).randn(150, columns)
     for model in (EGPRegressor(), EVGPRegressor(n_inducing=30, random_state=0), EGPRegressor(PolynomialFeatures(1))):
         with warnings.catch_warnings(record=True) as told:

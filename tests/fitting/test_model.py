@@ -72,7 +72,7 @@ def test_groups_are_models_of_their_outputs():
     ],
     ids=str,
 )
-def test_a_partition_has_one_order(sharing, n_outputs, partition):
+def test_partition_has_one_order(sharing, n_outputs, partition):
     assert partition_of(sharing, n_outputs) == partition
 
 
@@ -80,7 +80,7 @@ def test_a_partition_has_one_order(sharing, n_outputs, partition):
 
 
 @pytest.mark.parametrize("sharing", SHARING)
-def test_what_the_user_says_is_in_his_units(sharing):
+def test_starting_values_are_in_user_units(sharing):
     kernel = ConstantKernel(5.0, (1.0, 20.0)) * RBF([0.7, 0.9]) + WhiteKernel(0.3, (0.1, 1.0))
     unit = units_of().target_unit
     tables = [model.table for model in models(sharing=sharing, kernel=kernel)]
@@ -113,7 +113,7 @@ TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np
     ],
     ids=["all", "kernel", "rounding", "given", "too few", "diagonal", "all but one", "next to the rows", "a sample's"],
 )
-def test_points_that_are_all_rows_stay(changes, stay):
+def test_points_at_all_rows_are_kept(changes, stay):
     """There the bound is the likelihood, and no other places are better. Rows that differ by rounding only are one.
 
     Of more rows than a sample has nobody has looked whether they are all.
@@ -132,7 +132,7 @@ def test_points_that_are_all_rows_stay(changes, stay):
 
 
 @pytest.mark.parametrize("sharing", SHARING)
-def test_a_fit_goes_on_where_another_ended(sharing):
+def test_fit_goes_on_where_another_ended(sharing):
     first = fitted(sharing=sharing)
     for model, before in zip(models(previous=first, sharing=sharing), first.models, strict=True):
         for name, value in before.values.items():
@@ -140,7 +140,7 @@ def test_a_fit_goes_on_where_another_ended(sharing):
 
 
 @pytest.mark.parametrize("why", ["nothing before", "other sharing", "one output"])
-def test_a_fit_that_cannot_go_on_starts_cold(why):
+def test_fit_that_cannot_go_on_starts_cold(why):
     first = fitted(sharing="kernel")
     changes = {
         "nothing before": {},
@@ -153,7 +153,7 @@ def test_a_fit_that_cannot_go_on_starts_cold(why):
 # --- what a search asks -----------------------------------------------------------------------------------------------
 
 
-def test_where_features_may_hide_the_noise_it_is_known_which_suits_them(monkeypatch):
+def test_noise_start_with_many_features(monkeypatch):
     """With the signal at its lower limit, 1e-8 of the unit; if it is fixed, that depends on where the kernel ends."""
     monkeypatch.setattr("skevgp.fitting.model.may_hide_noise", lambda prior, n_rows: True)
     model = model_of()

@@ -36,7 +36,7 @@ def test_no_turn_lowers_the_bound(changes):
         fit = further
 
 
-def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
+def test_bound_of_doubted_rows_has_the_evidence_of_their_scales():
     """With q(τ) at its optimum the terms with τ are the evidence: the bound from matrices, less what stands for it."""
     model = wrong_at_three()
     rows = model.rows
@@ -54,7 +54,7 @@ def test_the_bound_of_doubted_rows_has_the_evidence_of_their_scales():
     assert found - 0.5 * O * statistics.log_variance == pytest.approx(expected, rel=1e-3)
 
 
-def test_the_variance_of_clean_rows_is_theirs():
+def test_variance_of_clean_rows_is_theirs():
     rng = np.random.RandomState(0)
     errors = rng.randn(4000, 2) * [1.0, 10.0]
     bad = rng.rand(4000) < 0.05

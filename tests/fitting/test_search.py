@@ -83,14 +83,14 @@ GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}
 # --- other starts -----------------------------------------------------------------------------------------------------
 
 
-def test_a_good_fit_is_left_alone():
+def test_good_fit_is_left_alone():
     made, best = drive(model(), (5.0, GOOD))
     assert [start.until for start in made] == [1000]
     np.testing.assert_allclose(made[0].values["hyperparameters"], [2.0, 3.0])
     assert best.bound == 5.0
 
 
-def test_a_collapsed_fit_starts_again_elsewhere_until_one_learns():
+def test_collapsed_fit_starts_again_elsewhere_until_one_learns():
     made, best = drive(model(), (5.0, COLLAPSED), (4.0, COLLAPSED), (9.0, GOOD))
     np.testing.assert_allclose([start.values["hyperparameters"] for start in made], [[2.0, 3.0], [1.0, 1.5], [4.0, 6]])
     np.testing.assert_allclose([start.values["noise"] for start in made], [[1e-4] * 2, [1e-4] * 2, [1e-2] * 2])
@@ -106,7 +106,7 @@ def test_other_starts_need_a_noise_that_moves(changes):
     assert len(drive(model(**changes), (5.0, COLLAPSED))[0]) == 1
 
 
-def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
+def test_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
     """One of two outputs is enough; a limit of the user's has none beyond."""
     at_limit, inside = {"signal": [1.0, 1e3], "n_iter": 50}, {"signal": [1.0, 900.0], "n_iter": 50}
     wide = table(widest_signal=1e5)
@@ -125,7 +125,7 @@ def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
 # --- fits below the features alone ------------------------------------------------------------------------------------
 
 
-def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
+def test_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
     below = {"alone": FeaturesAlone(6.0)}
     assert len(drive(model(**below), (5.0, GOOD), (8.0, GOOD))[0]) == 2
     assert len(drive(model(**below), (5.0, UNFINISHED))[0]) == 1
@@ -156,7 +156,7 @@ def test_restarts_are_drawn_and_the_best_of_all_is_kept():
     assert best.bound == 8.0
 
 
-def test_of_equal_fits_the_later_is_kept_and_any_is_better_than_none():
+def test_later_of_equal_fits_is_kept():
     first, second = Fit({}, 1.0), Fit({}, 1.0)
     assert better(first, second) is second
     assert better(None, Fit({}, -np.inf)).bound == -np.inf
@@ -184,7 +184,7 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
 # --- samples of the rows ----------------------------------------------------------------------------------------------
 
 
-def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
+def test_fit_climbs_from_sample_to_sample_to_all_rows():
     each = [(5.0, UNFINISHED), (4.0, UNFINISHED), (6.0, GOOD), (4.5, GOOD), (3.0, UNFINISHED), (2.0, GOOD)]
     made, best = drive(model(samples=(1000, 4000), place=place), *each)
     # Two noises, points placed again and the old ones; then the better on more rows, and on all.
@@ -199,7 +199,7 @@ def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
     assert (best.bound, best.n_rows) == (2.0, None)
 
 
-def test_what_collapses_on_all_rows_only_starts_again_there():
+def test_collapse_on_all_rows_restarts():
     own = model(rules=replace(OWN, other_starts=(), much_noise=None), samples=(1000,))
     made, best = drive(own, (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
     assert [start.n_rows for start in made] == [1000, None, None]

@@ -51,7 +51,7 @@ def test_kernels_that_stay_where_they_start_are_shared(changes):
     assert found(**waves([0.5, 3.0]), **changes) == [[0, 1]]
 
 
-def test_a_fit_with_found_groups_is_the_fit_with_these_given():
+def test_fit_with_found_groups_is_the_fit_with_these_given():
     data = waves([0.5, 3.0, 0.5])
     auto = fitted(**AUTO, **data)
     assert auto.outputs == [[0, 2], [1]]

@@ -30,7 +30,7 @@ def test_neighbours_of_a_smooth_function_are_alike_and_of_noise_are_not(scale):
     ],
     ids=["no opinion", "in the user's units", "outside of the limits"],
 )
-def test_a_start_is_the_users_within_limits(start, first, lower, upper, widest):
+def test_start_is_the_users_within_limits(start, first, lower, upper, widest):
     own = parameter_of(start, "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0, 9.0)
     assert (own.lower, own.upper, own.widest) == ([lower], [upper], widest)
     table = ParameterTable([own])
@@ -60,7 +60,7 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
 # --- there and back between the user's units and the internal ones ---------------------------------------------------
 
 
-def test_the_features_leave_as_little_as_they_can_at_the_reference():
+def test_features_leave_as_little_as_they_can_at_the_reference():
     """Least squares of y on them, the priors being wide."""
     fitted = np.linalg.lstsq(H, Y, rcond=None)[0]
     left = np.sqrt(np.mean((Y - H @ fitted) ** 2, axis=0))

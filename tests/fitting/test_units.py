@@ -40,7 +40,7 @@ def test_powers_of_a_column_far_from_zero_explain_what_the_column_does(scale):
     assert np.abs(w[:, 2]).max() <= 1e-12
 
 
-def test_a_decomposition_that_does_not_converge_is_tried_by_another_method(monkeypatch):
+def test_decomposition_that_does_not_converge_is_tried_by_another_method(monkeypatch):
     rng = np.random.RandomState(0)
     H = rng.randn(60, 3)
     H = np.column_stack([H, H[:, 0] + 1e-9 * rng.randn(60)])
@@ -71,7 +71,7 @@ def test_a_decomposition_that_does_not_converge_is_tried_by_another_method(monke
         (1e-12, [0.0, 0.0], 5.0, 1e-12, False),
     ],
 )
-def test_the_unit_is_above_the_rounding_of_the_target_and_1_of_a_constant(
+def test_unit_is_above_the_rounding_of_the_target_and_1_of_a_constant(
     left_over, targets, from_features, unit, constant
 ):
     moments = Moments.of(np.array(targets)[:, np.newaxis])
@@ -101,7 +101,7 @@ def evidence_of(asked, peaks, plateau=0.0):
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_the_likeliest_noise_is_found_beyond_where_the_evidence_is_flat(shared):
+def test_likeliest_noise_is_found_beyond_where_the_evidence_is_flat(shared):
     peaks, asked = np.array([3e-2, 3e-2 if shared else 5.0]), []
     least, highest = np.full(2, 1e-14), np.full(2, 1e2)
     value, noise = noise_of_most_evidence(evidence_of(asked, peaks, -20.0), least, highest, shared)

@@ -11,7 +11,7 @@ def test_independent_rows_are_worth_one_each():
 
 
 @pytest.mark.parametrize("factor", [0.5, 0.9])
-def test_an_autoregressive_process_has_its_known_time(factor):
+def test_autoregressive_process_has_its_known_time(factor):
     rng, errors = np.random.default_rng(0), np.zeros(100_000)
     for row in range(1, len(errors)):
         errors[row] = factor * errors[row - 1] + rng.normal()

@@ -18,7 +18,7 @@ def test_at_rest_friction_is_uniform_and_at_speed_it_is_known():
 
 
 @pytest.mark.parametrize("velocity", [0.005, 0.02, 0.1])
-def test_the_velocity_is_found_too(velocity):
+def test_velocity_is_found_too(velocity):
     found = likeliest_noise(*drawn(velocity=velocity), coulomb=2.0, velocity=0.01, least=1e-9)
     assert found.velocity == pytest.approx(velocity, rel=0.1)
     assert found.variance == pytest.approx(0.01, rel=0.2)
@@ -37,7 +37,7 @@ def test_noise_of_few_rows_that_move_is_larger_than_the_mean_square_of_all(coulo
 
 
 @pytest.mark.parametrize("velocity", [0.005, 0.03, 0.1])
-def test_the_velocity_of_mean_friction_is_found_from_what_another_one_leaves(velocity):
+def test_velocity_of_mean_friction_is_found_from_what_another_one_leaves(velocity):
     rng = np.random.default_rng(0)
     speed = 0.3 * rng.normal(size=5000)
     torque = 2.0 * np.tanh(speed / velocity) + 0.5 * speed + 0.1 * rng.normal(size=5000)

@@ -30,7 +30,7 @@ def test_sums_add_side_by_side():
         (Product((DotProduct(), Sum((RBF, DotProduct())), Constant())), (as_they_are, CentredSquares(), no_columns)),
     ],
 )
-def test_parts_share_what_is_the_same(covariance, preparations):
+def test_sums_share_prepared_rows(covariance, preparations):
     assert covariance.preparations == preparations
     centred = covariance.centred(CENTRE)
     assert {CentredSquares((3.0, -2.0))} | set(preparations) - {CentredSquares()} == set(centred.preparations)

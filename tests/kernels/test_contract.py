@@ -107,7 +107,7 @@ STATIONARY = [name for name, kernel in KERNELS.items() if kernel.is_stationary()
 
 
 @pytest.mark.parametrize("name", STATIONARY)
-def test_a_covariance_of_differences_keeps_its_digits_far_from_zero(name):
+def test_covariance_of_differences_keeps_its_digits_far_from_zero(name):
     """Shifted by 1e8, exactly: told of the centre, values and gradients are those near 0."""
     near, hyperparameters = parsed(KERNELS[name])
     shift = np.array([2.0**27, -(2.0**27)])
@@ -188,7 +188,7 @@ def test_slopes_agree_with_differences_of_the_scikit_learn_kernel(name, centre):
 
 
 @pytest.mark.parametrize("name", NO_GRADIENT)
-def test_functions_that_have_no_gradient_are_named(name):
+def test_functions_that_have_no_gradient_raise(name):
     covariance, hyperparameters = parsed(KERNELS[name])
     with pytest.raises(ValueError, match="Matern kernel with nu up to 1 has no gradient"):
         covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))
@@ -198,7 +198,7 @@ def test_functions_that_have_no_gradient_are_named(name):
 
 
 @pytest.mark.parametrize("name", KERNELS)
-def test_a_kernel_comes_back_from_its_covariance(name):
+def test_kernel_comes_back_from_its_covariance(name):
     kernel = sk.ConstantKernel(2.0) * KERNELS[name]
     spec = parse_kernel(kernel, 2)
     shape, signal = spec.starts.hyperparameters, spec.starts.signal
@@ -209,7 +209,7 @@ def test_a_kernel_comes_back_from_its_covariance(name):
 
 
 @pytest.mark.parametrize("name", REGISTERED)
-def test_the_expression_in_casadi_is_the_covariance(name):
+def test_expression_in_casadi_is_the_covariance(name):
     covariance, hyperparameters = parsed(REGISTERED[name], CENTRE)
     casadi = pytest.importorskip("casadi")
     x = casadi.MX.sym("x", 2)
@@ -227,7 +227,7 @@ def test_the_expression_in_casadi_is_the_covariance(name):
 
 
 @pytest.mark.parametrize("name", REGISTERED)
-def test_the_mean_product_of_random_functions_is_the_covariance(name):
+def test_mean_product_of_random_functions_is_the_covariance(name):
     d, size = 1 if name in OF_ONE_COLUMN else 2, 40_000
     rows, kernel = X[:10, :d], REGISTERED[name]
     spec = parse_kernel(sk.ConstantKernel() * kernel, d)

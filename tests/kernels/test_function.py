@@ -21,7 +21,7 @@ def fitted(kernel, **arguments):
     return EVGPRegressor(kernel=kernel, n_inducing=8, random_state=0, **arguments).fit(X, Y)
 
 
-def test_a_function_of_the_users_for_the_diagonal_is_used():
+def test_function_of_the_users_for_the_diagonal_is_used():
     def diagonal(X, lengthscale=1.0, weight=0.5):
         return 1.0 + weight * anp.sum(X**2, axis=1)
 
@@ -35,7 +35,7 @@ def test_a_function_of_the_users_for_the_diagonal_is_used():
         fitted(FunctionKernel(smooth, diagonal=wrong))
 
 
-def test_a_function_without_hyperparameters():
+def test_function_without_hyperparameters():
     model = fitted(lambda X, Z: anp.exp(-anp.sum((X[:, None] - Z[None]) ** 2, axis=2)), solver=LBFGS(tol=1.0))
     assert repr(model.kernel_.k2) == "FunctionKernel(<lambda>)"
     assert model.n_parameters_ == 2 + 8 * 2 + 8 + 8 * 9 // 2
@@ -67,7 +67,7 @@ def test_functions_that_do_not_work_say_why(kernel, message):
         fitted(kernel)
 
 
-def test_the_exact_gp_is_told_of_numbers_that_are_not_finite():
+def test_exact_gp_is_told_of_numbers_that_are_not_finite():
     with pytest.raises(ValueError, match="returned numbers that are not finite"):
         FunctionKernel(lambda X, Z: X @ Z.T * np.nan)(X)
 
@@ -76,12 +76,12 @@ def kinked(X, Z, scale=1.0):
     return anp.exp(-anp.sqrt(anp.sum((X[:, None, :] - Z[None, :, :]) ** 2, axis=2)) / scale)
 
 
-def test_a_function_without_a_gradient_at_distance_zero_is_named():
+def test_function_without_a_gradient_at_distance_zero_raises():
     with pytest.raises(ValueError, match=r"gradient is not finite where x = x'"):
         EVGPRegressor(kernel=kinked, n_inducing=5, random_state=0).fit(X, Y)
 
 
-def test_a_function_that_autograd_knows_no_forward_derivative_of_is_named():
+def test_function_that_autograd_knows_no_forward_derivative_of_raises():
     def traced_backwards_only(X, Z):
         import autograd.numpy as anp
         from autograd.extend import defvjp, primitive

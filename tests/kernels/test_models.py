@@ -52,7 +52,7 @@ def test_gradient_of_the_bound_agrees_with_finite_differences(name, shared):
     assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start(), 1e-5)) < 1e-5
 
 
-def test_the_value_of_a_bound_that_depends_on_the_diagonal():
+def test_value_of_a_bound_that_depends_on_the_diagonal():
     """Titsias 2009, eq. 9, written down from matrices, for a covariance that is not stationary."""
     kernel = KERNELS["nested"]
     model, rows, table = model_with(kernel)

@@ -69,7 +69,7 @@ def test_trees_are_read(kernel, tree, covariance):
     assert len(spec.starts.hyperparameters.value) == covariance.n_hyperparameters
 
 
-def test_the_outer_constant_is_the_signal_variance():
+def test_outer_constant_is_the_signal_variance():
     assert parse_kernel((9.0 * RBF()) * 4.0, 2).starts.signal.value == 4.0
     assert parse_kernel(9.0 * RBF() * DotProduct(), 2).starts.signal.value == 9.0
     assert parse_kernel(RBF() + 1.0, 2).starts.signal.value is None
@@ -88,7 +88,7 @@ def test_the_outer_constant_is_the_signal_variance():
         (type("Own", (RBF,), {})(), "Own"),
     ],
 )
-def test_what_does_not_work_is_named_with_what_does(kernel, named):
+def test_unsupported_kernel_raises(kernel, named):
     with pytest.raises(ValueError, match=rf"{named} does not work in this place.* These work: ConstantKernel, "):
         parse_kernel(kernel, 2)
 
@@ -102,7 +102,7 @@ def test_noise_is_one_term_of_several(kernel):
 
 
 @pytest.mark.parametrize("kernel", ["rbf", RBF, 1.0])
-def test_what_is_not_a_kernel_is_a_type_error(kernel):
+def test_invalid_kernel_type_raises(kernel):
     with pytest.raises(TypeError, match="kernel must be a kernel of"):
         EVGPRegressor(kernel=kernel).fit(X, X[:, 0])
 
@@ -128,7 +128,7 @@ def test_what_is_not_a_kernel_is_a_type_error(kernel):
         (ExpSineSquared(1.0, 1.0, (1.0, 2.0), (0.0, 2.0)), "periodicity_bounds must be above 0"),
     ],
 )
-def test_values_and_bounds_out_of_range_are_named(kernel, message):
+def test_values_and_bounds_out_of_range_raise(kernel, message):
     with pytest.raises(ValueError, match=message):
         parse_kernel(kernel, 2)
 
@@ -161,7 +161,7 @@ BOUNDS = (0.5, 8.0)
     ],
     ids=str,
 )
-def test_what_is_at_a_users_bound_is_named_as_in_the_users_kernel(kernel, at_bounds):
+def test_parameter_at_bound_is_named(kernel, at_bounds):
     spec = parse_kernel(kernel, 2)
     # Where the user lets them start.
     signal, noise = (
@@ -183,7 +183,7 @@ def warnings_of(model, X, y):
 
 @pytest.mark.parametrize("regressor", [skevgp.EGPRegressor, EVGPRegressor])
 @pytest.mark.parametrize("kernel", [RBF(1.0, (1e-5, 1e-3)), WhiteKernel(1.0, (1e-5, 1e-3)) + RBF(1.0, (1e3, 1e5))])
-def test_who_ends_at_a_bound_is_warned_in_scikit_learns_words(regressor, kernel):
+def test_parameter_at_bound_warns_like_sklearn(regressor, kernel):
     rows = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
     y = (rows * np.sin(rows))[:, 0]
     expected = warnings_of(GaussianProcessRegressor(kernel), rows, y)

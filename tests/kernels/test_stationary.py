@@ -20,7 +20,7 @@ from skevgp.kernels.stationary import (
 from .cases import X, Z, pulled_back, random_bars
 
 
-def test_a_profile_of_the_general_class_is_the_squared_exponential():
+def test_profile_of_the_general_class_is_the_squared_exponential():
     hyperparameters = np.log([0.8, 1.4])
     special, general = SquaredExponential(2), Stationary(Exponential(), 2)
     bars = random_bars(7, 40)
@@ -49,7 +49,7 @@ def test_length_scales_must_fit_the_columns():
     ("nu", "message"),
     [(-1.0, "nu must be above 0"), (np.nan, "nu must be above 0"), (1000.0, "at most 150, or inf; got 1000.0")],
 )
-def test_a_nu_out_of_range_is_named(nu, message):
+def test_nu_out_of_range_raises(nu, message):
     with pytest.raises(ValueError, match=message):
         parse_kernel(sk.Matern(nu=nu), 2)
 
@@ -80,7 +80,7 @@ def test_derivatives_agree_with_finite_differences(profile, parameters):
 
 
 @pytest.mark.parametrize(("special", "nu"), [(Matern12(), 0.5), (Matern32(), 1.5), (Matern52(), 2.5)])
-def test_the_general_matern_has_the_special_ones(special, nu):
+def test_general_matern_has_the_special_ones(special, nu):
     E, none = -np.geomspace(1e-4, 5.0, 20), np.empty(0)
     general = Matern(nu)
     np.testing.assert_allclose(general.value(E, none), special.value(E, none), rtol=1e-12)

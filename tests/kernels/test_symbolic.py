@@ -38,7 +38,7 @@ def symbolic(kernel, points=Z, centre=None):
 
 
 @pytest.mark.parametrize("kernel", [*EXPORTED.values(), ROUGH], ids=[*EXPORTED, "rough"])
-def test_where_x_is_an_inducing_point_derivatives_are_finite_and_right(kernel):
+def test_derivatives_at_inducing_point(kernel):
     function, numeric = symbolic(kernel)
     x = ca.MX.sym("x", 2)
     cross, _ = function(x)
@@ -55,7 +55,7 @@ def test_where_x_is_an_inducing_point_derivatives_are_finite_and_right(kernel):
 
 
 @pytest.mark.parametrize("kernel", [sk.RBF(1.0), sk.Matern(1.0, nu=1.5), sk.RationalQuadratic()], ids=repr)
-def test_a_centre_far_away_costs_no_digits(kernel):
+def test_centre_far_away_costs_no_digits(kernel):
     far = np.array([1e8, -3e7])
     function, numeric = symbolic(kernel, Z + far, centre=far)
     row = X[0] + far
@@ -65,12 +65,12 @@ def test_a_centre_far_away_costs_no_digits(kernel):
 @pytest.mark.parametrize(
     "kernel", [sk.RBF(1.0) + FunctionKernel(lambda X, Z, a=1.0: a * X @ Z.T), FunctionKernel(lambda X, Z: X @ Z.T)]
 )
-def test_a_function_kernel_cannot_be_exported(kernel):
+def test_function_kernel_cannot_be_exported(kernel):
     with pytest.raises(ValueError, match=r"The kernel Function\(.*These can be exported: ConstantKernel"):
         symbolic(kernel)
 
 
 @pytest.mark.parametrize("nu", [0.7, 30.5])
-def test_a_matern_with_bessel_functions_cannot_be_exported(nu):
+def test_matern_with_bessel_functions_cannot_be_exported(nu):
     with pytest.raises(ValueError, match=rf"Matern\(nu={nu}\) cannot be written in CasADi.*half-integer"):
         symbolic(sk.Matern(1.0, nu=nu))

@@ -44,7 +44,7 @@ def test_their_mean_product_is_the_covariance(name, centre):
     ("kernel", "name"),
     [(FunctionKernel(lambda X, Z: X @ Z.T), "Function"), (sk.ExpSineSquared(1.0, 9.0), "ExpSineSquared of 2 columns")],
 )
-def test_kernels_of_which_none_can_be_drawn_are_named(kernel, name):
+def test_kernels_of_which_none_can_be_drawn_raise(kernel, name):
     with pytest.raises(ValueError, match=f"No functions can be drawn from a kernel with a {name}"):
         drawn(kernel)
     with pytest.raises(ValueError, match="No functions can be drawn"):

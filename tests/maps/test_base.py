@@ -81,7 +81,7 @@ def test_differences_are_close_to_the_derivative():
 
 
 @pytest.mark.parametrize("shape", [(200, 10), (200, 10, 4), (100, 10, 5)])
-def test_a_jacobian_of_another_shape_is_an_error(shape, monkeypatch):
+def test_jacobian_of_another_shape_raises(shape, monkeypatch):
     monkeypatch.setattr(WithJacobian, "jacobian", lambda self, X: np.zeros(shape))
     with pytest.raises(ValueError, match=r"jacobian of WithJacobian\(\) must return \(n_samples, n_features_out, "):
         as_map(fitted(WithJacobian())).jacobian(rows())
@@ -117,14 +117,14 @@ class DoubledOwn(Doubled, WithJacobian):
 
 
 @pytest.mark.parametrize("kind", [DoubledScaler, DoubledEncoder, FurtherEncoder, DoubledOwn])
-def test_a_class_below_a_known_one_is_known_by_what_it_does(kind):
+def test_subclass_with_own_transform_is_unknown(kind):
     X, transformer = rows(), fitted(kind())
     direct, expected = as_map(transformer), differences(transformer.transform, X)
     assert_array_equal(direct.value(X), transformer.transform(X))
     assert_allclose(direct.jacobian(X), expected, rtol=0.0, atol=1e-6 * np.abs(expected).max())
 
 
-def test_a_class_below_a_known_one_that_changes_no_number_stays_known():
+def test_unchanged_subclass_is_known():
     class Renamed(AngleEncoder):
         pass
 
@@ -147,7 +147,7 @@ def test_maps_fitted_to_data_frames_take_arrays_without_a_warning(transformer, f
 # --- adapters --------------------------------------------------------------------------------------------------------
 
 
-def test_an_adapter_says_what_it_knows_and_leaves_the_rest_to_the_transformer(monkeypatch):
+def test_adapter_falls_back_to_transformer(monkeypatch):
     monkeypatch.setattr("skevgp.maps.base.ADAPTERS", dict(ADAPTERS))
 
     @adapts(Counted)

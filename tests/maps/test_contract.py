@@ -264,20 +264,20 @@ def test_every_adapter_has_a_case():
     assert set(ADAPTERS) - tried == {RobotTransformer}  # whose subclasses are there
 
 
-def test_the_value_is_that_of_transform(name, transformer):
+def test_value_is_that_of_transform(name, transformer):
     X = rows_of(name)
     rounded = name.startswith(("pca", "svd", "pipeline", "union", "columns", "own", "rows"))
     for some in (X, X[:1]):
         close(as_map(transformer).value(some), transformer.transform(some), 1e-12 if rounded else 0.0)
 
 
-def test_the_jacobian_is_the_derivative_of_transform(name, transformer):
+def test_jacobian_is_the_derivative_of_transform(name, transformer):
     n_rows = 1000 if CASES[name][1] <= 6 else 60
     X = rows_of(name, n_rows, seed=2)
     close(as_map(transformer, example=X).jacobian(X), differences(transformer.transform, X), 1e-6)
 
 
-def test_the_chain_rule_is_the_product(name, transformer):
+def test_chain_rule_is_the_product(name, transformer):
     X, own = rows_of(name, 7), as_map(transformer)
     inner = np.random.default_rng(2).normal(size=(7, X.shape[1], 3))
     jacobian = own.jacobian(X)
@@ -285,7 +285,7 @@ def test_the_chain_rule_is_the_product(name, transformer):
     close(own.chain(X, inner), expected, 1e-7 if name in BY_DIFFERENCES else 1e-12)
 
 
-def test_the_expression_is_the_function_and_its_derivative(name, transformer):
+def test_expression_is_the_function_and_its_derivative(name, transformer):
     X = rows_of(name, 5, seed=3)
     x, own = ca.MX.sym("x", X.shape[1]), as_map(transformer)
     if name in WITHOUT_EXPRESSION:
@@ -309,7 +309,7 @@ def test_the_expression_is_the_function_and_its_derivative(name, transformer):
         close(found[-1].full(), own_slopes, 1e-7 if name in BY_DIFFERENCES else 1e-9)
 
 
-def test_it_can_be_pickled_and_changes_no_row(name, transformer):
+def test_adapter_pickles_and_keeps_rows(name, transformer):
     X = rows_of(name, 9)
     own = as_map(transformer)
     before = own.value(X).copy(), own.jacobian(X)

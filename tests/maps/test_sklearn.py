@@ -45,7 +45,7 @@ class PerOutput(TransformerMixin, BaseEstimator):
         return [ca.sin(x[1:]), ca.cos(x[:-1]), x[1:] * x[:-1]]
 
 
-def test_a_union_of_rows_for_each_output_and_rows_for_all():
+def test_union_of_rows_for_each_output_and_rows_for_all():
     union, X = FeatureUnion([("all", AngleEncoder("acrobot")), ("each", PerOutput())]), rows()
     for _, part in union.transformer_list:
         part.fit(X)
@@ -115,7 +115,7 @@ def test_columns_of_a_data_frame_are_found(columns):
     np.testing.assert_allclose(found.full().ravel(), fitted.transform(frame[:1])[0], rtol=1e-12)
 
 
-def test_a_polynomial_is_exact_where_a_column_is_zero():
+def test_polynomial_is_exact_where_a_column_is_zero():
     """No logarithms of powers."""
     fitted = PolynomialFeatures(2).fit(rows()[:, :2])
     x, (row,) = expressions(fitted, 2)

@@ -122,7 +122,7 @@ def evidence(rows, prior, output, noise):
 
 @pytest.mark.parametrize("p", [0, 3])
 @pytest.mark.parametrize("trace", [0.0, 7.0])
-def test_the_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p, trace):
+def test_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p, trace):
     """Less what the prior of f costs."""
     model, rows, _ = problem(p=p)
     noise, traces = np.array([0.3, 2.0]), np.array([trace, 2.0 * trace])
@@ -131,7 +131,7 @@ def test_the_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p,
     np.testing.assert_allclose(bounds, expected, rtol=1e-10)
 
 
-def test_weights_that_outputs_share_are_known_where_rounding_hides_what_the_points_leave_of_them():
+def test_shared_weights_with_singular_precision():
     """The feature lies in the span of the points, with 1e16 times the noise: I + Σ(F - EᵀD⁻¹E) is not positive."""
     model, rows, table = problem(p=1)
     values = table.values_at_start() | {"noise": np.full(2, 1e-16)}
@@ -146,7 +146,7 @@ def test_weights_that_outputs_share_are_known_where_rounding_hides_what_the_poin
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_noise_far_below_the_signal_costs_no_digits(family):
+def test_noise_far_below_the_signal_costs_no_digits(family):
     """1e8 in variance: e is summed row by row."""
     model, rows, table = problem(family)
     values = table.values_at_start() | {"noise": np.full(2, 1e-8)}
@@ -157,7 +157,7 @@ def test_a_noise_far_below_the_signal_costs_no_digits(family):
     assert relative_error(gradient, grad(loss)(small.start())) < 1e-5
 
 
-def test_a_precision_that_rounding_made_negative_counts_as_that_of_the_prior():
+def test_negative_precision_becomes_prior_precision():
     """q of independent values: B is no less than I."""
     own = Whitening.of(SquaredExponential(1), np.ones(1), np.linspace(0, 1e-4, 4)[:, np.newaxis])
     B = np.diag([1.0, -3e30, 2.0, 1.0, -5.0])
@@ -201,7 +201,7 @@ def test_with_points_at_all_rows_the_gradient_is_that_of_the_bound_whatever_a_ji
     assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start())) < 1e-5
 
 
-def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
+def test_gradient_includes_jitter():
     """Three points on a line, of a linear kernel: K is singular, and a diagonal q's bound has the logarithm of what a
     jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
     x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
@@ -217,7 +217,7 @@ def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
     assert 9 * objective(start)[1][0] == pytest.approx(slope, abs=0.1)
 
 
-def test_a_jitter_is_known_from_the_factor():
+def test_jitter_is_known_from_the_factor():
     model, _, values = on_rows()
     (whitening,) = model.whitenings(values)
     assert whitening.jitter() == 0.0
@@ -262,7 +262,7 @@ def longdouble_upper_bound(model, rows, values):
 
 
 @pytest.mark.parametrize("m", [6, 40])
-def test_a_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
+def test_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
     model, rows, table = problem(m=m, d=1 if m == 6 else 3, n=120)
     values = table.values_at_start() | {
         "noise": np.full(2, 1e-8),
@@ -283,7 +283,7 @@ def test_errors_of_the_upper_bound_are_summed_row_by_row():
 
 @pytest.mark.parametrize("from_rows", [True, False])
 @pytest.mark.parametrize("weights_are_shared", [False, True])
-def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(weights_are_shared, from_rows):
+def test_loss_of_suboptimal_mean_is_known(weights_are_shared, from_rows):
     """The bound is quadratic in the mean."""
     model, rows, table = problem(shared=False)
     alike = {name: getattr(model.prior, name)[:1].repeat(2, axis=0) for name in ("mean", "scale", "reference")}
@@ -307,7 +307,7 @@ def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(
     assert value + lost_by_rounding(bounds, left) == pytest.approx(best, rel=1e-9)
 
 
-def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
+def test_upper_bound_corrects_suboptimal_mean(monkeypatch):
     """Means that something moved: the sum of squares that they leave is not the least, which the bound is made of."""
     model, rows, table = problem()
     values = table.values_at_start()

@@ -44,7 +44,7 @@ def covariances(family, values, L_inv):
 
 @pytest.mark.parametrize("shared", SHARED)
 @pytest.mark.parametrize("kind", [DiagonalFamily, FullFamily])
-def test_a_family_that_gradients_move_starts_at_the_best_q(kind, shared):
+def test_family_that_gradients_move_starts_at_the_best_q(kind, shared):
     family, groups, optima, L_inv = started(kind, shared)
     values = table_of(family).values_at_start()
     for mean, best in zip(family.means(values), optima, strict=True):
@@ -62,7 +62,7 @@ def test_a_family_that_gradients_move_starts_at_the_best_q(kind, shared):
             np.testing.assert_allclose(T @ S @ T.T, np.diag(1.0 / np.diag(precision)), atol=1e-10)
 
 
-def test_the_mean_is_moved_in_the_units_one_says():
+def test_mean_is_moved_in_the_units_one_says():
     family, *_ = started(FullFamily)
     unit = 0.5 + np.arange(O * SIZE, dtype=float).reshape(O, SIZE)
     table = ParameterTable(family.parameters(unit))
@@ -81,7 +81,7 @@ def away(family, seed=1):
 
 @pytest.mark.parametrize("shared", SHARED)
 @pytest.mark.parametrize("kind", [DiagonalFamily, FullFamily])
-def test_the_spreads_terms_are_traces_and_a_determinant(kind, shared):
+def test_spreads_terms_are_traces_and_a_determinant(kind, shared):
     """½ [Tr((I + σ⁻² PᵀP) S) - log |S|], written down."""
     family, groups, _, L_inv = started(kind, shared)
     table, flat = away(family)
@@ -149,7 +149,7 @@ def test_steps_shorten_with_adams_but_not_to_nothing(share, rate):
 
 
 @pytest.mark.parametrize("shared", SHARED)
-def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
+def test_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
     """Hensman et al. 2013: from anywhere to the optimum in one step; then the gradient is the collapsed bound's."""
     model, rows, table = problem("full", shared)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 17), natural_rates=(1.0, 1.0))
@@ -171,7 +171,7 @@ def test_a_natural_gradient_of_length_1_on_all_rows_is_the_closed_form(shared):
         np.testing.assert_allclose(root.T @ root, best.root_inv.T @ best.root_inv, rtol=1e-8, atol=1e-8)
 
 
-def test_a_natural_gradient_goes_a_share_of_the_way():
+def test_natural_gradient_goes_a_share_of_the_way():
     """Of the way in natural parameters, from where q is to the optimum for the rows at hand."""
     model, rows, table = problem("full")
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 60), natural_rates=(0.25, 0.25))

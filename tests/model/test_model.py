@@ -31,7 +31,7 @@ def started(family="full", shared=True, **sizes):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_a_group_has_what_belongs_to_its_outputs(shared):
+def test_group_has_what_belongs_to_its_outputs(shared):
     model, rows, values, blocks = started(shared=shared)
     groups = list(model.groups_on(values, blocks))
     assert [group.outputs for group in groups] == list(model.groups)
@@ -45,7 +45,7 @@ def test_a_group_has_what_belongs_to_its_outputs(shared):
         np.testing.assert_allclose(group.statistics.RR, np.sum(rows.residuals[:, group.outputs] ** 2, axis=0))
 
 
-def test_a_group_costs_a_pass_when_it_is_asked_for():
+def test_group_costs_a_pass_when_it_is_asked_for():
     model, _, values, blocks = started(shared=False)
     groups = model.groups_on(values, blocks)
     assert blocks.count == 0
@@ -69,7 +69,7 @@ def test_sums_of_rows_that_came_later_are_those_of_all():
     assert relative_error(*means) < 1e-9
 
 
-def test_the_jitter_is_the_models():
+def test_jitter_is_the_models():
     model, _, values, blocks = started()
     values = values | {"inducing_points": np.repeat(values["inducing_points"][:, :3], 2, axis=1)}
     factors = [

@@ -146,7 +146,7 @@ def test_elbo_agrees_with_the_papers_formula_in_plain_autograd(family, shared):
     assert relative_error(gradient, grad(loss)(x)) < 1e-9
 
 
-def test_a_mini_batch_weighs_the_data_terms_by_N():
+def test_mini_batch_weighs_the_data_terms_by_N():
     """The paper's appendix C: the mean over all batches of an epoch is the loss of all rows."""
     model, rows, table = problem(n=60)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 60))

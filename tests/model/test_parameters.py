@@ -48,7 +48,7 @@ def test_warm_starts_take_over_only_what_fits():
 
 
 @pytest.mark.parametrize(("signal", "upper"), [(9.0, 10.0), (10.0, 1e3), (50.0, 1e3), (5e3, 1e3)])
-def test_a_start_at_an_upper_limit_or_above_has_the_widest(signal, upper):
+def test_start_at_an_upper_limit_or_above_has_the_widest(signal, upper):
     first = ParameterTable([Parameter("signal", np.ones(2), "log", 1e-3, 10.0, widest=1e3)])
     np.testing.assert_allclose(first.limits()[1], np.log([10.0, 10.0]))
     np.testing.assert_allclose(first["signal"].value_limits(), [[1e-3, 1e3]] * 2)
@@ -57,7 +57,7 @@ def test_a_start_at_an_upper_limit_or_above_has_the_widest(signal, upper):
     np.testing.assert_allclose(again.values_at_start()["signal"], [1.0, min(signal, upper)])
 
 
-def test_only_what_is_held_gets_its_widest_limit():
+def test_widest_limits_of_active_bounds():
     two = ParameterTable(
         [Parameter(name, np.ones(1), "log", 1e-3, 10.0, widest=1e3) for name in ("signal", "noise")]
         + [Parameter("length", np.ones(1), "log", 1e-3, 10.0)]
@@ -68,7 +68,7 @@ def test_only_what_is_held_gets_its_widest_limit():
     np.testing.assert_allclose(two.widened(["noise"]).limits()[1], np.log([10.0, 1e3, 10.0]))
 
 
-def test_a_table_where_all_is_fixed_has_no_coordinates():
+def test_table_where_all_is_fixed_has_no_coordinates():
     fixed = ParameterTable([Parameter("noise", np.array([0.1]), "log", fixed=True)])
     assert fixed.start().shape == (0,)
     np.testing.assert_allclose(fixed.values(fixed.start())["noise"], [0.1])

@@ -113,7 +113,7 @@ def test_far_from_the_points_the_prior_is_left():
     np.testing.assert_allclose(variance, predictor.signal + np.einsum("np,opq,nq->no", H_NEW, cov, H_NEW), rtol=1e-12)
 
 
-def test_the_intercept_is_part_of_the_mean_only():
+def test_intercept_is_part_of_the_mean_only():
     predictor = some_posterior()[0]
     raised = replace(predictor, intercept=np.array([5.0, -1.0]))
     (mean, variance), (higher, same) = (own.predict(X_NEW, H_NEW, return_variance=True) for own in (predictor, raised))
@@ -163,7 +163,7 @@ def test_predictors_of_single_outputs_are_joined_each_to_its_own(order):
     np.testing.assert_array_equal(joined.intercept, intercept)
 
 
-def test_it_is_frozen_and_keeps_no_row():
+def test_predictor_is_frozen_and_keeps_no_rows():
     predictor = some_posterior()[0]
     with pytest.raises(FrozenInstanceError):
         predictor.noise = np.zeros(O)
@@ -180,14 +180,14 @@ def problem_of(n):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_a_pickle_predicts_the_same_bits(shared):
+def test_pickle_predicts_same_bits(shared):
     predictor = some_posterior(shared)[0]
     again = pickle.loads(pickle.dumps(predictor))
     for found, expected in zip(again.covariance(X_NEW, H_NEW), predictor.covariance(X_NEW, H_NEW), strict=True):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_so_many_rows_at_once_that_memory_stays_small():
+def test_block_size_limits_memory():
     predictor = some_posterior()[0]
     assert predictor.rows_at_once == 4096
     large = replace(predictor.groups[0], mean=np.zeros((100, 10_000)))

@@ -31,7 +31,7 @@ def drawn(n, seed=3):
 
 
 @pytest.mark.parametrize("family", ["full", "diagonal"])
-def test_a_row_that_counts_twice_is_there_twice(family):
+def test_weight_two_equals_repeated_row(family):
     model, rows, table = problem(family)
     rng = np.random.RandomState(1)
     counts = rng.randint(1, 4, len(rows))
@@ -50,7 +50,7 @@ def test_a_row_that_counts_twice_is_there_twice(family):
 
 
 @pytest.mark.parametrize("counts", [drawn(6)[0], np.full(6, 0.1), np.array([5.0, *np.full(5, 0.1)])], ids=str)
-def test_what_a_jitter_leaves_counts_as_often_as_the_row_does(counts):
+def test_upper_bound_holds_with_jitter_and_weights(counts):
     """Points that are all rows: the upper bound holds whatever the weights."""
     model, rows, table = problem(n=6)
     rows.inputs[1] = rows.inputs[0] + 1e-9
@@ -76,7 +76,7 @@ def far_apart(counts):
 @pytest.mark.parametrize(
     ("often", "counts"), [(100.0, [100.0, *np.full(50, 0.01)]), (1.0, np.ones(20))], ids=["often", "once"]
 )
-def test_what_a_jitter_leaves_of_a_row_counts_as_often_as_the_row_may(often, counts):
+def test_upper_bound_weights_jitter_by_row(often, counts):
     """A trace of s² j so many times: by the formula of `upper_bound`, row by row."""
     counts = np.array(counts)
     model, raw, values = far_apart(counts)
@@ -91,7 +91,7 @@ def test_what_a_jitter_leaves_of_a_row_counts_as_often_as_the_row_may(often, cou
     assert Dense(raw, model.prior).likelihood(values) < expected
 
 
-def test_what_a_jitter_leaves_of_rows_that_have_been_forgotten_in_part():
+def test_upper_bound_holds_after_forgetting():
     """The sums of rows that count once, a tenth of them."""
     model, raw, values = far_apart(np.ones(20))
     statistics = model.statistics(values, blocks_of(raw, model.kernel))[0].scaled(0.1)
@@ -101,7 +101,7 @@ def test_what_a_jitter_leaves_of_rows_that_have_been_forgotten_in_part():
 
 
 @pytest.mark.parametrize("name", [name for name in KERNELS if name != "ConstantKernel"])
-def test_the_gradient_agrees_with_finite_differences_for_all_kernels(name):
+def test_gradient_agrees_with_finite_differences_for_all_kernels(name):
     model, rows, table = model_with(KERNELS[name])
     raw = weighted(rows, *drawn(len(rows)))
     objective = BoundObjective(model, table, blocks_of(raw, model.kernel))

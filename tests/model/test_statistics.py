@@ -52,7 +52,7 @@ def test_whitened_rows_agree_with_a_solve():
     np.testing.assert_allclose(V, np.linalg.solve(L, U), rtol=1e-8, atol=1e-10)
 
 
-def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
+def test_unexplained_variance_is_not_negative():
     """Nor of any row within a long lengthscale, whatever rounding says."""
     prepared = KERNEL.prepare(Z)
     own = whitening()
@@ -63,7 +63,7 @@ def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
         assert (left >= 0.0).all()
 
 
-def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
+def test_unexplained_variance_is_not_biased():
     """Of one point it is 1 - exp(-(x - z)² / ℓ²), here 1e-12 and more: right to a unit of 1, on average."""
     x = np.linspace(1e-6, 1e-4, 2000)[:, np.newaxis]
     kernel = SquaredExponential(1)
@@ -73,7 +73,7 @@ def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
 
 
 @pytest.mark.parametrize(("kernel", "size"), [(SquaredExponential(3), 1.0), (DotProduct(), 1e3)], ids=["near 1", "1e6"])
-def test_of_most_rows_that_are_points_rounding_leaves_nothing_either(kernel, size):
+def test_rows_at_points_have_no_unexplained_variance(kernel, size):
     """It would leave about a half of them something, whatever the variance is."""
     nothing = []
     for seed in range(100):
@@ -129,7 +129,7 @@ def test_gradients_in_whitened_rows_are_pulled_back():
 
 
 @pytest.mark.parametrize("size", [1, 17, 60])
-def test_the_first_pass_collects_the_sums(size):
+def test_first_pass_collects_the_sums(size):
     L, U = dense()
     V = np.linalg.solve(L, U)
     found = collect(blocks(size), whitening(), slice(0, O))
@@ -152,7 +152,7 @@ def test_sums_add_and_fade():
         np.testing.assert_array_equal(getattr(faded, name), 0.25 * getattr(whole, name))
 
 
-def test_summing_whitened_rows_keeps_digits_that_whitening_the_sums_would_lose():
+def test_whitened_sums_keep_digits():
     """Points so near to each other that K has a condition of 1e10; the oracle is a QR factorisation of L."""
     points = np.linspace(-1.0, 1.0, M)[:, np.newaxis] * [0.35, 0.0]
     own = Whitening.of(KERNEL, np.ones(D), points)
@@ -191,7 +191,7 @@ def flat(gradients):
 
 
 @pytest.mark.parametrize("size", [1, 17, 60])
-def test_the_second_pass_is_the_gradient_of_the_first(size):
+def test_second_pass_is_the_gradient_of_the_first(size):
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     statistics = collect(blocks(size), own, outputs)
     found, _ = pull_back(blocks(size), own, outputs, statistics, gradient, np.zeros((M + P, O)))
@@ -203,7 +203,7 @@ def test_the_second_pass_is_the_gradient_of_the_first(size):
     assert relative_error(flat(found), central_differences(value, THETA)) < 1e-7
 
 
-def test_a_jitter_moves_with_the_diagonal():
+def test_jitter_moves_with_the_diagonal():
     """Of a kernel whose diagonal depends on its hyperparameters and points; at the origin of one it is 0."""
     kernel, points = DotProduct(), Z.copy()
     points[0] = 0.0
@@ -221,7 +221,7 @@ def test_a_jitter_moves_with_the_diagonal():
     assert Whitening.of(KERNEL, LENGTHSCALES, np.empty((0, D))).jitter() == 0.0
 
 
-def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
+def test_errors_of_mean_replace_residuals():
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     weights = RNG.randn(M + P, O)
     V = own.project(KERNEL.prepare(X))[1]
@@ -238,7 +238,7 @@ def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
 
 
 @pytest.mark.parametrize("output", range(O))
-def test_the_second_pass_of_one_output_sees_no_other(output):
+def test_second_pass_of_one_output_sees_no_other(output):
     outputs, weights, gradient = slice(output, output + 1), RNG.randn(M + P, O), some_gradient()
     own = whitening()
     alone = replace(gradient, VE=gradient.VE[:, outputs])
@@ -251,7 +251,7 @@ def test_the_second_pass_of_one_output_sees_no_other(output):
     np.testing.assert_allclose(residuals.VE, all_residuals.VE[:, outputs], rtol=1e-9, atol=1e-11)
 
 
-def test_what_the_first_pass_left_serves_the_second_and_no_other_whitening():
+def test_second_pass_uses_cached_whitening():
     """Kept blocks give the bits of those made again; those of other points are not mistaken for one's own."""
     gradient, outputs, weights = some_gradient(), slice(0, O), np.zeros((M + P, O))
     kept, made = blocks(), blocks()

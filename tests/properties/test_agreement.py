@@ -135,7 +135,7 @@ def dynamics(draw):
 
 
 @given(dynamics(), st.sampled_from(["mean", "linearized"]), st.sampled_from(["learned", "none"]))
-def test_the_first_step_of_a_rollout_is_the_prediction(case, method, noise):
+def test_first_step_of_a_rollout_is_the_prediction(case, method, noise):
     model, o = case.fitted(), case.Y.shape[1]
     x = case.X_new[[0]]
     ahead = rollout(model, x[0, :o], x[:, o:], method=method, process_noise=noise)
@@ -148,7 +148,7 @@ def test_the_first_step_of_a_rollout_is_the_prediction(case, method, noise):
 
 
 @given(fixed_cases(known_maps=True))
-def test_a_residual_regressor_is_the_model_of_the_change(case):
+def test_residual_regressor_is_the_model_of_the_change(case):
     Y = columns_of(case.Y)[:, : case.X.shape[1]]
     o = Y.shape[1]
     if isinstance(case.model, EVGPRegressor):

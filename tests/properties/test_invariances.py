@@ -49,7 +49,7 @@ def assert_same_value(one, other, shift=0.0):
 
 
 @given(learned_cases(), st.data())
-def test_the_order_of_rows_changes_no_bit(case, draws):
+def test_order_of_rows_changes_no_bit(case, draws):
     order = draws.draw(st.permutations(range(len(case.X))))
     one, other = case.fitted(), case.fitted(case.X[order], case.Y[order])
     assert_same_bits(one, other, case.X_new)
@@ -59,7 +59,7 @@ def test_the_order_of_rows_changes_no_bit(case, draws):
 
 
 @given(learned_cases())
-def test_a_fit_repeats_to_the_bit(case):
+def test_fit_repeats_to_the_bit(case):
     model = case.fitted()
     again = clone(model).fit(case.X, case.Y)
     assert_same_bits(model, again, case.X_new)
@@ -74,7 +74,7 @@ def repetitions(draw, n_rows):
 
 
 @given(learned_cases(given_maps=STATELESS), st.data())
-def test_a_weight_is_so_many_rows_to_the_bit(case, draws):
+def test_weight_is_so_many_rows_to_the_bit(case, draws):
     weights, rows = draws.draw(repetitions(len(case.X)))
     weighted, repeated = case.fitted(sample_weight=weights), case.fitted(case.X[rows], case.Y[rows])
     assert_same_bits(weighted, repeated, case.X_new)
@@ -82,7 +82,7 @@ def test_a_weight_is_so_many_rows_to_the_bit(case, draws):
 
 
 @given(fixed_cases(), st.sampled_from([0.5, 3.0, 100.0]), st.data())
-def test_the_unit_of_known_noise_is_the_noises(case, unit, draws):
+def test_unit_of_known_noise_is_the_noises(case, unit, draws):
     n = len(case.X)
     variance = np.array(draws.draw(st.lists(st.sampled_from([1.0, 0.1, 4.0]), min_size=n, max_size=n)))
     one = case.fitted(relative_variance=variance)
@@ -102,7 +102,7 @@ def test_the_unit_of_known_noise_is_the_noises(case, unit, draws):
 
 
 @given(fixed_cases(), st.sampled_from([1.0, -100.0, 1e4]))
-def test_a_constant_added_to_a_normalised_y_is_added_to_predictions(case, constant):
+def test_constant_added_to_a_normalised_y_is_added_to_predictions(case, constant):
     one = case.with_model(normalize_y=True).fitted()
     other = case.with_model(normalize_y=True).fitted(Y=case.Y + constant)
     size = max(size_of(one, case), abs(constant))
@@ -113,7 +113,7 @@ def test_a_constant_added_to_a_normalised_y_is_added_to_predictions(case, consta
 
 
 @given(fixed_cases(), st.sampled_from([2.0, -1.0, 1e3, -1e-3]))
-def test_the_unit_of_y_is_that_of_predictions(case, unit):
+def test_unit_of_y_is_that_of_predictions(case, unit):
     one, given = case.fitted(), case.model
     signal, noise, shared = given.kernel.k1, given.kernel.k2.noise_level, given.coef_prior.shared
     scaled = case.with_model(
@@ -179,7 +179,7 @@ def test_units_and_order_of_columns_do_not_matter(case, draws):
 
 
 @given(fixed_cases(known_maps=True), st.data())
-def test_the_order_of_outputs_does_not_matter(case, draws):
+def test_order_of_outputs_does_not_matter(case, draws):
     Y = columns_of(case.Y)
     order, new = draws.draw(st.permutations(range(Y.shape[1]))), {}
     if isinstance(case.model, EVGPRegressor) and isinstance(case.model.sharing, list):

@@ -41,7 +41,7 @@ def test_predictions_are_distributions(case):
 
 
 @given(learned_cases())
-def test_what_is_learned_predicts_distributions(case):
+def test_learned_models_predict_distributions(case):
     assert_a_distribution(case.fitted(), case)
 
 

@@ -61,13 +61,13 @@ def test_no_start_of_a_local_solver_gets_nearer(seed):
 
 
 @pytest.mark.parametrize("covariance", [np.eye(60), np.zeros((60, 60))], ids=["free", "pinned"])
-def test_a_consistent_mean_is_returned_as_it_is(covariance):
+def test_consistent_mean_is_returned_as_it_is(covariance):
     found = nearest_consistent(UR10, covariance)
     assert_array_equal(found, UR10)
     assert not np.shares_memory(found, UR10)
 
 
-def test_the_margin_is_kept_and_a_wider_one_costs_more():
+def test_margin_is_kept_and_a_wider_one_costs_more():
     mean, covariance = estimate(1)
     found = [nearest_consistent(mean, covariance, margin=margin) for margin in (1e-8, 1e-4, 1e-2)]
     consistency = [physical_consistency(parameters).min() for parameters in found]
@@ -107,6 +107,6 @@ def test_scales_do_not_matter_however_far_apart_deviations_are(kind, scale):
         ({"margin": 0.2}, r"margin must be in \(0, 0\.1\]; got 0\.2"),
     ],
 )
-def test_wrong_arguments_are_named(changed, message):
+def test_invalid_arguments_raise(changed, message):
     with pytest.raises(ValueError, match=message):
         nearest_consistent(**{"mean": np.ones((1, 10)), "covariance": np.eye(10), **changed})

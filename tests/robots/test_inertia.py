@@ -47,7 +47,7 @@ def test_torques_are_linear_in_the_parameters(name):
     assert_allclose(regressor @ parameters.ravel(), pinocchio.rnea(model, data, q, v, a), rtol=1e-9, atol=1e-10)
 
 
-def test_a_pseudo_inertia_is_the_sum_over_points_of_their_homogeneous_coordinates():
+def test_pseudo_inertia_is_the_sum_over_points_of_their_homogeneous_coordinates():
     rng = np.random.default_rng(0)
     points, masses = rng.normal(size=(6, 3)), rng.uniform(0.1, 1.0, 6)
     homogeneous = np.column_stack([points, np.ones(6)])
@@ -75,7 +75,7 @@ def test_a_pseudo_inertia_is_the_sum_over_points_of_their_homogeneous_coordinate
         (np.zeros(10), 0.0),
     ],
 )
-def test_the_measure_of_consistency(parameters, expected):
+def test_measure_of_consistency(parameters, expected):
     assert_allclose(physical_consistency(parameters), expected, atol=1e-12)
 
 
@@ -100,7 +100,7 @@ def test_body_parameters_are_pinocchios_with_their_derivatives(seed):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_a_model_gets_its_parameters_and_the_given_one_stays(name):
+def test_model_gets_its_parameters_and_the_given_one_stays(name):
     model = load_robot(name)
     before, expected = model.copy(), inertial_parameters(model) * 1.3
     changed = with_parameters(model, expected, armature=0.2, damping=np.arange(model.nv), friction=0.4)
@@ -116,7 +116,7 @@ def test_a_model_gets_its_parameters_and_the_given_one_stays(name):
     assert changed == model
 
 
-def test_a_link_that_no_body_can_be_is_named():
+def test_link_that_no_body_can_be_raises():
     model = load_robot("ur10")
     parameters = inertial_parameters(model)
     parameters[2, 0] = -3.0
@@ -136,7 +136,7 @@ def test_a_link_that_no_body_can_be_is_named():
         ({"friction": np.inf}, "friction must be finite and not negative"),
     ],
 )
-def test_wrong_arguments_are_named(arguments, message):
+def test_invalid_arguments_raise(arguments, message):
     model = load_robot("ur10")
     with pytest.raises(ValueError, match=message):
         with_parameters(model, **{"parameters": inertial_parameters(model), **arguments})

@@ -55,7 +55,7 @@ def test_robots_of_the_collection_are_found_by_their_names(name):
 @pytest.mark.parametrize(
     ("name", "close"), [("pnda", "panda"), ("UR5", "ur5"), ("twodofs", "TwoDofs"), ("iiwa", "iiwa14")]
 )
-def test_an_unknown_name_gets_close_ones_and_all(name, close):
+def test_unknown_name_gets_close_ones_and_all(name, close):
     message = rf"Unknown robot '{name}'. Did you mean .*'{close}'.*The known ones are \['acrobot'.*'z1'\]"
     with pytest.raises(ValueError, match=message):
         load_robot(name)
@@ -80,7 +80,7 @@ def test_without_the_collection_the_systems_are_left_and_the_error_says_how_to_g
         load_robot("panda")
 
 
-def test_a_collection_without_a_list_of_files_is_found_by_its_place(monkeypatch, tmp_path, chain):
+def test_collection_without_a_list_of_files_is_found_by_its_place(monkeypatch, tmp_path, chain):
     folder = tmp_path / "share" / "example-robot-data" / "robots" / "chain_description"
     folder.mkdir(parents=True)
     chain.rename(folder / "mine_robot.urdf")
@@ -98,13 +98,13 @@ def test_a_collection_without_a_list_of_files_is_found_by_its_place(monkeypatch,
 # --- what can be loaded --------------------------------------------------------------------------------------------
 
 
-def test_a_model_comes_back_as_it_is():
+def test_model_comes_back_as_it_is():
     model = load_robot("ur5")
     assert load_robot(model) is model
     assert load_robot(get_system("acrobot")) == load_robot("acrobot")
 
 
-def test_a_continuous_joint_has_an_angle(chain):
+def test_continuous_joint_has_an_angle(chain):
     plain, model = pinocchio.buildModelFromUrdf(str(chain)), load_robot(chain)
     assert (plain.nq, plain.nv, model.nq, model.nv) == (4, 3, 3, 3)
     rng = np.random.default_rng(0)
@@ -130,7 +130,7 @@ def test_a_continuous_joint_has_an_angle(chain):
     ],
     ids=["one way each", "backwards only", "unknown", "lower never set"],
 )
-def test_a_motor_works_between_both_limits(lower, upper, driven, limits):
+def test_motor_works_between_both_limits(lower, upper, driven, limits):
     model = pinocchio.Model()
     for parent, name in enumerate(("a", "b")):
         model.addJoint(parent, pinocchio.JointModelRX(), pinocchio.SE3.Identity(), name)
@@ -144,7 +144,7 @@ def test_a_motor_works_between_both_limits(lower, upper, driven, limits):
 # --- what cannot ---------------------------------------------------------------------------------------------------
 
 
-def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
+def test_file_that_is_no_urdf_raises(tmp_path):
     path = tmp_path / "bad.urdf"
     path.write_text("<robot><link></robot>")
     with pytest.raises(ValueError, match=r"bad.urdf' is not a URDF that can be read"):
@@ -152,28 +152,28 @@ def test_a_file_that_is_no_urdf_is_an_error(tmp_path):
 
 
 @pytest.mark.parametrize("path", ["nothing.urdf", "some/where", "~/nothing.urdf", "~nobody-of-this-name/a.urdf"])
-def test_a_file_that_is_not_there_is_an_error(path):
+def test_file_missing_raises(path):
     with pytest.raises(ValueError, match=r"There is no file '.*the names that are known"):
         load_robot(path)
 
 
 @pytest.mark.parametrize("kind", [str, Path])
-def test_a_folder_is_told_apart(tmp_path, kind):
+def test_folder_is_told_apart(tmp_path, kind):
     with pytest.raises(ValueError, match=r"is a folder; a robot is one URDF file"):
         load_robot(kind(tmp_path))
 
 
-def test_no_name_is_no_folder():
+def test_empty_robot_name_raises():
     with pytest.raises(ValueError, match="Unknown robot ''"):
         load_robot("")
 
 
-def test_a_name_as_a_path_gets_a_hint():
+def test_name_as_a_path_gets_a_hint():
     with pytest.raises(ValueError, match=r"no file 'panda'; a robot's name must be a string, not a path"):
         load_robot(Path("panda"))
 
 
-def test_a_floating_base_is_refused():
+def test_floating_base_raises():
     with pytest.raises(ValueError, match=r"joint 'root_joint' of the type JointModelFreeFlyer.*base fixed"):
         load_robot(pinocchio.buildSampleModelHumanoidRandom())
 
@@ -181,34 +181,34 @@ def test_a_floating_base_is_refused():
 @pytest.mark.parametrize(
     "joint", [pinocchio.JointModelSpherical(), pinocchio.JointModelPlanar(), pinocchio.JointModelTranslation()]
 )
-def test_joints_of_several_velocities_are_refused(joint):
+def test_joints_of_several_velocities_raise(joint):
     model = pinocchio.Model()
     model.addJoint(0, joint, pinocchio.SE3.Identity(), "ball")
     with pytest.raises(ValueError, match=rf"joint 'ball' of the type {joint.shortname()}"):
         load_robot(model)
 
 
-def test_a_screw_joint_is_refused():
+def test_screw_joint_raises():
     model = pinocchio.Model()
     model.addJoint(0, pinocchio.JointModelHX(0.1), pinocchio.SE3.Identity(), "screw")
     with pytest.raises(ValueError, match=r"joint 'screw'.*revolute or prismatic"):
         load_robot(model)
 
 
-def test_a_model_without_joints_is_refused():
+def test_model_without_joints_raises():
     with pytest.raises(ValueError, match="has no joint that moves"):
         load_robot(pinocchio.Model())
 
 
 @pytest.mark.parametrize("robot", [3, None, ["ur5"], object()])
-def test_what_is_no_robot_is_a_type_error(robot):
+def test_invalid_robot_type_raises(robot):
     with pytest.raises(TypeError, match=r"must be a name .*list_robots.*URDF file"):
         load_robot(robot)
 
 
 @pytest.mark.parametrize("axis", [[0.0, 0.0, 2.0], [0.0, 0.0, 0.0], [0.0, 0.6, 0.80001], [0.0, 0.0, np.nan]])
 @pytest.mark.parametrize("joint", [pinocchio.JointModelRevoluteUnaligned, pinocchio.JointModelPrismaticUnaligned])
-def test_an_axis_of_another_length_is_refused(joint, axis):
+def test_axis_of_another_length_raises(joint, axis):
     model = pinocchio.Model()
     model.addJoint(0, joint(np.array(axis)), pinocchio.SE3.Identity(), "long")
     with pytest.raises(
@@ -217,7 +217,7 @@ def test_an_axis_of_another_length_is_refused(joint, axis):
         load_robot(model)
 
 
-def test_an_axis_of_a_table_is_checked():
+def test_axis_of_a_table_is_checked():
     link = dataclasses.replace(get_system("pendulum").links[0], axis=(0.0, 2.0, 0.0))
     with pytest.raises(ValueError, match="The system 'mine' has the joint 'q' with an axis of length 2"):
         load_robot(System("mine", (link,)))
@@ -235,7 +235,7 @@ def mimicking(tmp_path):
     return path
 
 
-def test_a_model_with_mimic_joints_is_refused(mimicking):
+def test_model_with_mimic_joints_raises(mimicking):
     model = pinocchio.buildModelFromUrdf(str(mimicking), mimic=True)
     with pytest.raises(ValueError, match=r"joint 'second' that mimics another; load the URDF with mimic=False"):
         load_robot(model)
@@ -287,7 +287,7 @@ def set_gravity(model, value):
     ],
 )
 @pytest.mark.parametrize("name", ["acrobot", "kinova"])
-def test_numbers_that_make_no_sense_are_named(name, change, value, message):
+def test_numbers_that_make_no_sense_raise(name, change, value, message):
     model = load_robot(name).copy()
     change(model, value)
     with pytest.raises(ValueError, match=rf"The model '{model.name}' has .*{message}"):

@@ -9,7 +9,7 @@ from skevgp.robots.numbers import RobotNumbers
 
 
 @pytest.mark.parametrize("name", ["pendulum", "cartpole", "acrobot", "iiwa14", "panda", "ur5"])
-def test_a_model_is_the_same_after_it_was_numbers(name):
+def test_model_is_the_same_after_it_was_numbers(name):
     model = load_robot(name)
     again = RobotNumbers.of(model).model()
     assert again == model
@@ -42,6 +42,6 @@ GOOD = RobotNumbers.of(load_robot("panda"))
     ],
     ids=str,
 )
-def test_numbers_that_do_not_fit_are_refused(wrong):
+def test_numbers_that_do_not_fit_raise(wrong):
     with pytest.raises(ValueError, match=r"^A robot"):
         replace(GOOD, **wrong).model()

@@ -25,24 +25,24 @@ def test_each_quantity_is_multiplied_by_its_own_factor(name):
         assert_allclose(wrong.armature[index], right.armature[index] * factor[5], rtol=1e-14)
 
 
-def test_an_inertia_stays_one_that_a_body_can_have():
+def test_inertia_stays_one_that_a_body_can_have():
     for link in list(perturb_robot("iiwa14", 0.9, random_state=0).inertias)[1:]:
         moments = np.linalg.eigvalsh(link.inertia)
         assert 0.0 < moments[0] <= moments[1] <= moments[2] <= moments[0] + moments[1]
 
 
 @pytest.mark.parametrize("scale", [-0.1, 1.0, 2.0, np.nan, np.inf])
-def test_a_scale_out_of_range_is_named(scale):
+def test_scale_out_of_range_raises(scale):
     with pytest.raises(ValueError, match="scale must be .*; got"):
         perturb_robot("acrobot", scale)
 
 
 @pytest.mark.parametrize("scale", ["much", None, True, [0.1]])
-def test_a_scale_that_is_no_number_is_named(scale):
+def test_scale_that_is_no_number_raises(scale):
     with pytest.raises(TypeError, match="scale must be a number; got"):
         perturb_robot("acrobot", scale)
 
 
-def test_an_unknown_robot_gets_close_matches():
+def test_unknown_robot_gets_close_matches():
     with pytest.raises(ValueError, match="Unknown robot 'acrobat'.*Did you mean 'acrobot'"):
         perturb_robot("acrobat")

@@ -14,7 +14,7 @@ def model_and_configurations(name, n=4):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_the_mass_matrix_is_that_of_the_composite_rigid_body_algorithm(name):
+def test_mass_matrix_is_that_of_the_composite_rigid_body_algorithm(name):
     model, configurations = model_and_configurations(name)
     for q in configurations:
         expected = pinocchio.crba(model, model.createData(), q)

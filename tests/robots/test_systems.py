@@ -21,18 +21,18 @@ def gravity(name, q):
 
 
 @pytest.mark.parametrize(("name", "close"), [("pendelum", "pendulum"), ("cart_pole", "cartpole")])
-def test_an_unknown_name_gets_the_nearest_one(name, close):
+def test_unknown_name_gets_the_nearest_one(name, close):
     with pytest.raises(ValueError, match=rf"Unknown system '{name}'.* Did you mean '{close}'\?"):
         get_system(name)
 
 
 @pytest.mark.parametrize("name", [None, 3, ["pendulum"]])
-def test_what_is_no_name_is_a_type_error(name):
+def test_invalid_name_type_raises(name):
     with pytest.raises(TypeError, match=r"must be a name .*'pendulum'.* or a System; got"):
         get_system(name)
 
 
-def test_the_table_cannot_be_changed():
+def test_table_cannot_be_changed():
     with pytest.raises(TypeError):
         SYSTEMS["mine"] = SYSTEMS["pendulum"]
     with pytest.raises(FrozenInstanceError):
@@ -81,7 +81,7 @@ def test_mass_of_the_acrobot(elbow):
     assert_allclose(mass_matrix("acrobot", [0.4, elbow]), expected, rtol=1e-13)
 
 
-def test_the_pole_leans_towards_positive_x():
+def test_pole_leans_towards_positive_x():
     model = load_robot("cartpole")
     data = model.createData()
     pinocchio.forwardKinematics(model, data, np.array([0.0, 0.1]))

@@ -41,12 +41,12 @@ NOT_DEFINITE = (
     ],
     ids=["load_robot", "NominalDynamics", "RigidBodyRegressor", "make_dynamics", "perturb_robot"],
 )
-def test_a_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_loads_a_robot(tmp_path, use):
+def test_mass_matrix_that_is_not_positive_definite_is_refused_by_all_that_loads_a_robot(tmp_path, use):
     with pytest.raises(ValueError, match=NOT_DEFINITE):
         use(arm(tmp_path / "arm.urdf", (-1.0, -1.0, -1.0)))
 
 
-def test_a_model_in_memory_is_checked_too(tmp_path):
+def test_model_in_memory_is_checked_too(tmp_path):
     model = load_robot(arm(tmp_path / "arm.urdf", (0.01, 0.01, 0.01)))
     model.inertias[2].inertia = -np.eye(3)
     with pytest.raises(ValueError, match=r"The model 'r' has a mass matrix.*that of the joint 'j2' has 1 kg"):
@@ -65,7 +65,7 @@ def test_a_model_in_memory_is_checked_too(tmp_path):
     ],
     ids=["negative", "triangle", "massless"],
 )
-def test_what_moves_by_the_laws_of_mechanics_all_the_same_is_warned_of(tmp_path, moments, mass, told):
+def test_unphysical_inertia_warns(tmp_path, moments, mass, told):
     path = arm(tmp_path / "arm.urdf", moments, mass)
     with pytest.warns(RobotModelWarning, match=rf"'b' of the joint 'j2' has {told}.*triangle inequality.*write_urdf"):
         model = load_robot(path)
@@ -78,7 +78,7 @@ def test_what_moves_by_the_laws_of_mechanics_all_the_same_is_warned_of(tmp_path,
     [(0.0, 0.0, 0.0), (0.02, 0.02, 0.0), (0.01, 0.01, 0.02), (0.00123, 0.00123, 0.00247), (1e-19, -1e-19, -1e-19)],
     ids=["point", "rod", "disk", "rounded disk", "rounding"],
 )
-def test_a_point_a_rod_a_disk_and_what_files_round_are_bodies(tmp_path, moments):
+def test_point_a_rod_a_disk_and_what_files_round_are_bodies(tmp_path, moments):
     load_robot(arm(tmp_path / "arm.urdf", moments))
 
 
@@ -96,7 +96,7 @@ def test_a_point_a_rod_a_disk_and_what_files_round_are_bodies(tmp_path, moments)
         (("0.001000", "0.00100", "0.00201"), False),
     ],
 )
-def test_a_violation_below_the_rounding_of_the_digits_is_not_warned_of(tmp_path, moments, impossible):
+def test_violation_below_the_rounding_of_the_digits_is_not_warned_of(tmp_path, moments, impossible):
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         load_robot(arm(tmp_path / "arm.urdf", moments))

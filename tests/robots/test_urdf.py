@@ -80,7 +80,7 @@ def other_parameters(model, seed=0):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_pinocchio_reads_what_was_written(name, tmp_path):
+def test_written_urdf_is_read_by_pinocchio(name, tmp_path):
     model, target = load_robot(name), tmp_path / "new.urdf"
     expected = other_parameters(model)
     friction = np.linspace(0.0, 1.0, model.nv)
@@ -150,7 +150,7 @@ def test_standard_deviations_are_those_of_mass_centre_and_inertia(arm, tmp_path)
 # --- refusals ------------------------------------------------------------------------------------------------------
 
 
-def test_the_source_is_overwritten_only_if_that_is_said(arm, tmp_path):
+def test_source_is_overwritten_only_if_that_is_said(arm, tmp_path):
     parameters, link = other_parameters(load_robot(arm)), tmp_path / "link.urdf"
     link.symlink_to(arm)
     for target in (arm, str(arm), link):
@@ -181,7 +181,7 @@ BOMB = "".join(f'<!ENTITY a{i + 1} "{f"&a{i};" * 10}">' for i in range(12))
     ],
     ids=["bomb", "dtd", "entity", "sdf", "unclosed", "empty", "binary", "encoding"],
 )
-def test_what_is_no_urdf_is_named(content, message, tmp_path):
+def test_invalid_urdf_raises(content, message, tmp_path):
     source, target = tmp_path / "wrong.urdf", tmp_path / "new.urdf"
     source.write_bytes(content if isinstance(content, bytes) else content.encode())
     with pytest.raises(ValueError, match=rf"wrong\.urdf' is not a URDF that can be read: .*{message}"):
@@ -189,14 +189,14 @@ def test_what_is_no_urdf_is_named(content, message, tmp_path):
     assert not target.exists()
 
 
-def test_a_file_without_joints_that_move_is_named(tmp_path):
+def test_file_without_joints_that_move_raises(tmp_path):
     (tmp_path / "stone.urdf").write_text('<robot name="stone"><link name="a"/></robot>')
     with pytest.raises(ValueError, match=r"stone\.urdf' has no joint that moves"):
         write_urdf(tmp_path / "stone.urdf", tmp_path / "new.urdf", np.ones((1, 10)))
 
 
 @pytest.mark.parametrize("source", ["acrobot", load_robot("ur10"), 3], ids=["system", "model", "number"])
-def test_a_robot_without_a_file_is_named(source, tmp_path):
+def test_robot_without_a_file_raises(source, tmp_path):
     with pytest.raises(ValueError, match="source must be a URDF file, or the name of a robot that has one; got"):
         write_urdf(source, tmp_path / "new.urdf", np.ones((2, 10)))
 
@@ -211,7 +211,7 @@ def test_a_robot_without_a_file_is_named(source, tmp_path):
         ({"friction_std": np.ones(3)}, "friction_std must be a number or have the shape"),
     ],
 )
-def test_wrong_arguments_are_named_and_nothing_is_written(changed, message, arm, tmp_path):
+def test_invalid_arguments_write_nothing(changed, message, arm, tmp_path):
     target, parameters = tmp_path / "new.urdf", other_parameters(load_robot(arm))
     assert (physical_consistency(parameters) > 0.0).all()
     with pytest.raises(ValueError, match=message):

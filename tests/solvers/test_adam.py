@@ -18,7 +18,7 @@ def noisy_bowl(scatter=1.0, seed=0):
     return bowl
 
 
-def test_the_minimum_of_a_noisy_bowl():
+def test_minimum_of_a_noisy_bowl():
     seen = []
     minimum = adam(noisy_bowl(), np.zeros(2), FREE, 2000, 0.1, monitor=Monitor(lambda *told: seen.append(told[:2])))
     np.testing.assert_allclose(minimum.x, 3.0, atol=0.1)
@@ -27,7 +27,7 @@ def test_the_minimum_of_a_noisy_bowl():
     assert [loss for _, loss in seen] == minimum.loss_curve
 
 
-def test_the_first_steps_are_adams():
+def test_first_steps_are_adams():
     """Kingma & Ba 2015, algorithm 1, written down; the cosine has hardly begun to fall."""
     gradients = np.array([[1.0, -4.0], [3.0, 0.5], [-2.0, 1.0]])
     given = iter(gradients)
@@ -45,7 +45,7 @@ def test_the_first_steps_are_adams():
         np.testing.assert_allclose(points[t], x, rtol=1e-6)
 
 
-def test_a_plateau_starts_the_last_fall():
+def test_plateau_starts_the_last_fall():
     """A bowl this simple needs no 20,000 steps; how many it takes does not depend on how many it may take."""
     a = adam(noisy_bowl(), np.zeros(2), FREE, 20_000, 0.1)
     b = adam(noisy_bowl(), np.zeros(2), FREE, 100_000, 0.1)
@@ -99,7 +99,7 @@ def bowl_with_a_wall(failure, at=300):
     ids=["nan", "infinite gradient", "gradient whose square overflows", "not positive definite", "Ctrl-C"],
 )
 @pytest.mark.parametrize("at", [8, 300])
-def test_what_goes_wrong_keeps_the_best_point(failure, at):
+def test_error_keeps_best_point(failure, at):
     objective, calls = bowl_with_a_wall(failure, at)
     monitor = Monitor()
     minimum = adam(objective, np.zeros(2), FREE, 1000, 0.1, monitor=monitor)

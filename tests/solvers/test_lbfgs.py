@@ -63,7 +63,7 @@ def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_stall_is_not_the_end(seed):
+def test_stall_is_not_the_end(seed):
     """In a bent valley of twenty columns three small steps in a row may lie far from the minimum at 0."""
     free = (np.full(20, -np.inf), np.full(20, np.inf))
     start = np.random.RandomState(seed).uniform(-2.0, 2.0, 20)
@@ -100,7 +100,7 @@ def test_rounding_errors_do_not_end_the_way(seed):
     assert lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
 
 
-def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
+def test_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
     def valley(x):
         return rosen(x), rosen_der(x)
 
@@ -122,7 +122,7 @@ def quadratic(H):
     return lambda x: (0.5 * float(x @ H @ x), H @ x)
 
 
-def test_the_diagonal_of_a_quadratic_is_found_exactly_whatever_the_number_of_probes():
+def test_diagonal_of_a_quadratic_is_found_exactly_whatever_the_number_of_probes():
     curvature = np.array([1.0, 4.0, 0.01, 25.0])
     for n_probes in (1, 8):
         units = curvature_units(quadratic(np.diag(curvature)), np.ones(4), EACH, n_probes)

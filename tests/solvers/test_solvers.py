@@ -37,7 +37,7 @@ def test_options_are_reached_through_the_estimator():
 
 
 @pytest.mark.parametrize("solver", ["sgd", "LBFGS", None, 3, LBFGS, {"n_restarts": 2}], ids=str)
-def test_what_is_no_solver_is_named_with_what_is(solver):
+def test_invalid_solver_raises(solver):
     names = re.escape('"lbfgs", "adam", skevgp.solvers.LBFGS(...), skevgp.solvers.Adam(...)')
     with pytest.raises(ValueError, match=f"solver must be one of {names}; got "):
         as_solver(solver)
@@ -65,7 +65,7 @@ def test_what_is_no_solver_is_named_with_what_is(solver):
     ],
     ids=str,
 )
-def test_an_option_out_of_range_is_named(solver, error, message):
+def test_option_out_of_range_raises(solver, error, message):
     with pytest.raises(error, match=message):
         as_solver(solver)
     with pytest.raises(error, match=message):
@@ -81,7 +81,7 @@ def test_natural_gradients_need_the_full_posterior():
 
 
 @few_iterations
-def test_a_subclass_may_look_at_each_evaluation():
+def test_subclass_may_look_at_each_evaluation():
     seen = []
 
     class Watched(LBFGS):
@@ -116,7 +116,7 @@ def told(sharing, solver, n_jobs=None, y=Y, **arguments):
 @few_iterations
 @pytest.mark.parametrize("sharing", ["all", "kernel"])
 @pytest.mark.parametrize("solver", [LBFGS, Adam])
-def test_a_callback_is_told_each_iteration_and_bound(solver, sharing):
+def test_callback_is_told_each_iteration_and_bound(solver, sharing):
     calls, m = told(sharing, solver)
     assert [iteration for iteration, _, _ in calls] == list(range(1, m.n_iter_ + 1))
     assert {outputs for _, _, outputs in calls} == {range(0, 2)}
@@ -127,7 +127,7 @@ def test_a_callback_is_told_each_iteration_and_bound(solver, sharing):
 
 
 @pytest.mark.parametrize("solver", [LBFGS, Adam])
-def test_a_stop_iteration_of_the_callback_ends_the_fit_with_the_best_so_far(solver):
+def test_stop_iteration_of_the_callback_ends_the_fit_with_the_best_so_far(solver):
     seen = []
 
     def stop(iteration, bound, outputs):

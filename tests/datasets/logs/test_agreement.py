@@ -42,7 +42,7 @@ def late(seconds):
         (np.where(DQ < 0.0, 0.0, DQ), "does not follow the motion where the position falls"),
     ],
 )
-def test_a_contradiction_names_joint_and_cause(load, dq, cause):
+def test_contradicting_velocity_raises(load, dq, cause):
     with pytest.raises(ValueError, match=f"log.csv: the recorded velocity contradicts the position.*{cause}"):
         load(Q, dq)
     derived = load(Q, dq, velocity="derive")
@@ -87,14 +87,14 @@ def test_stamps_may_come_in_bursts(tmp_path):
 
 
 @pytest.mark.parametrize("seconds", [0.04, 0.1, 0.2, -0.1])
-def test_the_delay_of_periodic_motion_is_the_shortest(load, seconds):
+def test_delay_of_periodic_motion_is_the_shortest(load, seconds):
     q = np.column_stack([np.sin(4.0 * np.pi * T), np.cos(4.0 * np.pi * T)])
     dq = 4.0 * np.pi * np.column_stack([np.cos(4.0 * np.pi * (T - seconds)), -np.sin(4.0 * np.pi * (T - seconds))])
     with pytest.raises(ValueError, match=f"{abs(seconds):.2g} s {'late' if seconds > 0.0 else 'early'}"):
         load(q, dq)
 
 
-def test_an_accelerometer_that_measures_gravity_too_is_no_contradiction(tmp_path):
+def test_accelerometer_that_measures_gravity_too_is_no_contradiction(tmp_path):
     file = tmp_path / "log.csv"
     np.savetxt(file, np.column_stack([T, np.sin(T), np.cos(T), 0.5 - np.sin(T), T]), delimiter=",")
     log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "acceleration": 3, "effort": 4})

@@ -69,7 +69,7 @@ def assert_recorded(log, rows=slice(None)):
     assert_allclose(np.hstack([raw.position, raw.velocity, raw.torque]), np.hstack([q, dq, current]), rtol=1e-15)
 
 
-def test_a_real_robots_file_is_what_is_read_by_hand():
+def test_real_recording_is_read():
     stamps, names, signals = states_of_db3(UR10)
     log = load_log(UR10)
     raw = log.recordings[0].raw
@@ -119,12 +119,12 @@ def test_one_of_several_topics_is_chosen(tmp_path):
         ({"gains": [1.0, 2.0]}, r"gains must be .* one for each of the 6 joints; got \[1.0, 2.0\]"),
     ],
 )
-def test_what_does_not_fit_a_recording_is_told_with_its_name(arguments, message):
+def test_invalid_recording_arguments_raise(arguments, message):
     with pytest.raises(ValueError, match=f"ur10.db3: {message}"):
         load_log(UR10, **arguments)
 
 
-def test_a_recording_without_joint_states_lists_its_topics(tmp_path):
+def test_recording_without_joint_states_lists_its_topics(tmp_path):
     text = TYPES["std_msgs/msg/String"]
     file = write(tmp_path / "bag", {"/said": ("std_msgs/msg/String", [(START, text("q"))])})
     with pytest.raises(ValueError, match=r"no topic has messages of .*JointTrajectory; it has \{'/said': 'std_msgs/ms"):
@@ -141,14 +141,14 @@ def test_a_recording_without_joint_states_lists_its_topics(tmp_path):
         ([], "the topic '/joint_states' has no messages"),
     ],
 )
-def test_missing_signals_are_told(tmp_path, messages, message):
+def test_missing_signals_raise(tmp_path, messages, message):
     with pytest.raises(ValueError, match=message):
         load_log(write(tmp_path / "bag", {"/joint_states": (STATES, messages)}))
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.9], ids=str)
 @pytest.mark.parametrize("plugin", list(StoragePlugin), ids=str)
-def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
+def test_broken_files_raise(tmp_path, plugin, share):
     file = write(tmp_path / "bag", {"/joint_states": (STATES, states())}, plugin)
     data = file.read_bytes()
     file.write_bytes(data[: int(share * len(data))])
@@ -156,7 +156,7 @@ def test_broken_files_are_told_with_their_name(tmp_path, plugin, share):
         load_log(file)
 
 
-def test_an_mcap_record_longer_than_its_file_raises(tmp_path):
+def test_mcap_record_longer_than_its_file_raises(tmp_path):
     header = b"\x89MCAP0\r\n" + struct.pack("<BQ", 1, 12) + struct.pack("<I4sI", 4, b"ros2", 0)
     footer = struct.pack("<BQQQI", 2, 20, 0, 0, 0) + b"\x89MCAP0\r\n"
     file = tmp_path / "log.mcap"
@@ -165,7 +165,7 @@ def test_an_mcap_record_longer_than_its_file_raises(tmp_path):
         load_log(file)
 
 
-def test_a_database_with_a_page_in_two_places_raises(tmp_path):
+def test_database_with_a_page_in_two_places_raises(tmp_path):
     """SQLite would read the rows of that page twice."""
     data = bytearray(UR10.read_bytes())
     size = int.from_bytes(data[16:18], "big")
@@ -180,13 +180,13 @@ def test_a_database_with_a_page_in_two_places_raises(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["log.db3", "log.mcap"])
-def test_a_missing_recording_raises_and_is_not_created(tmp_path, name):
+def test_missing_recording_raises_and_is_not_created(tmp_path, name):
     with pytest.raises(ValueError, match=f"{name}: it cannot be read as a rosbag2 recording .FileNotFoundError"):
         load_log(tmp_path / name)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):
+def test_message_that_is_none_raises(tmp_path):
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
         writer.write(connection, START, b"\x00\x01\x00\x00" + b"\xff" * 40)
@@ -194,7 +194,7 @@ def test_a_message_that_is_none_is_told_with_the_files_name(tmp_path):
         load_log(tmp_path / "bag" / "bag.mcap")
 
 
-def test_without_rosbags_the_pip_command_is_told(monkeypatch):
+def test_without_rosbags_the_pip_command_raises(monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
         load_log(UR10)
@@ -228,7 +228,7 @@ def test_incomplete_messages_at_the_ends_are_left_out_and_counted(tmp_path, fiel
         ("velocity", r"row 7 lacks the velocity of joint 'a' .*, or pass velocity=\"derive\" to ignore it"),
     ],
 )
-def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_it_out(tmp_path, field, message):
+def test_incomplete_message_between_others_is_an_error_but_where_keep_leaves_it_out(tmp_path, field, message):
     file = write(tmp_path / "bag", spoilt_states([7], **{field: []}))
     with pytest.raises(ValueError, match=f"bag.mcap: {message}"):
         load_log(file)
@@ -237,7 +237,7 @@ def test_an_incomplete_message_between_others_is_an_error_but_where_keep_leaves_
         assert load_log(file, velocity="derive").recordings[0].raw.velocity is None
 
 
-def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
+def test_joint_that_a_message_names_twice_raises(tmp_path):
     file = write(tmp_path / "one", spoilt_states([4], name=["a", "a"]))
     with pytest.raises(ValueError, match="row 4 names the joint 'a' twice, so that its values are not known; say by"):
         load_log(file)
@@ -250,7 +250,7 @@ def test_a_joint_that_a_message_names_twice_is_an_error(tmp_path):
         load_log(first)
 
 
-def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
+def test_name_twice_does_not_matter_to_other_joints(tmp_path):
     fields = {"position": [0.0, 0.0, 1.0], "velocity": [0.0, 0.0, 0.0], "effort": [0.0, 0.0, 2.0]}
     file = write(tmp_path / "hand", spoilt_states(range(len(T)), name=["finger", "finger", "a"], **fields))
     raw = load_log(file, joints=["a"], rest_velocity=0.0).recordings[0].raw
@@ -259,14 +259,14 @@ def test_a_name_twice_does_not_matter_to_other_joints(tmp_path):
         load_log(file, joints=["finger"])
 
 
-def test_a_message_that_names_few_joints_between_others_is_an_error(tmp_path):
+def test_message_that_names_few_joints_between_others_raises(tmp_path):
     fields = {"name": ["a"], "position": [1.0], "velocity": [1.0], "effort": [1.0]}
     with pytest.raises(ValueError, match=r"messages are of different joints, .*: \[\('a',\), \('a', 'b'\)\]"):
         load_log(write(tmp_path / "bag", spoilt_states([7], **fields)))
 
 
 @pytest.mark.parametrize("first", [range(0), range(3)], ids=["in all messages", "after messages without velocity"])
-def test_a_velocity_that_one_joint_never_has_is_told_with_its_name(tmp_path, first):
+def test_velocity_that_one_joint_never_has_raises(tmp_path, first):
     topics = spoilt_states(first, velocity=[])
     for row, (_, message) in enumerate(topics["/joint_states"][1]):
         if row not in first:

@@ -42,7 +42,7 @@ def assert_same_but_for_turns(found, expected, period):
         (180.0 / np.pi, 0.0, 360.0),
     ],
 )
-def test_a_wrapped_angle_gives_the_data_of_the_unwrapped_one(load, unit, low, high, recorded):
+def test_wrapped_angle_gives_the_data_of_the_unwrapped_one(load, unit, low, high, recorded):
     dq = unit * DQ if recorded else None
     shown = (unit * Q - low) % (high - low) + low
     plain, log = load(unit * Q, dq), load(shown, dq)
@@ -55,7 +55,7 @@ def test_a_wrapped_angle_gives_the_data_of_the_unwrapped_one(load, unit, low, hi
         assert_allclose(found.target - found.data[:, :2], expected.target - expected.data[:, :2], atol=1e-9 * unit)
 
 
-def test_a_jump_that_is_no_turn_cuts_the_record(load):
+def test_jump_that_is_no_turn_cuts_the_record(load):
     log = load(np.sin(T) + 1.3 * (T > 9.995), np.cos(T))
     (cut,) = [cut for cut in log.recordings[0].cuts if cut[2] == "jump"]
     assert_allclose(cut[:2], [9.99, 10.0], atol=1e-9)
@@ -66,7 +66,7 @@ def test_a_jump_that_is_no_turn_cuts_the_record(load):
     assert np.abs(transitions.target[:, 0] - transitions.data[:, 0]).max() < 0.02
 
 
-def test_a_joint_with_limits_is_not_unwrapped(load):
+def test_joint_with_limits_is_not_unwrapped(load):
     shown = (Q + np.pi) % (2.0 * np.pi) - np.pi
     log = load(shown, DQ, robot="cartpole", joints=["theta"])
     assert log.recordings[0].wrapped["theta"] > 0

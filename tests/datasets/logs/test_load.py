@@ -24,7 +24,7 @@ def test_torques_are_gains_times_currents(files, gains):
     assert_array_equal(log.data, plain.data)
 
 
-def test_the_description_tells_what_was_done(files):
+def test_description_tells_what_was_done(files):
     table = table_of(np.delete(np.sort(np.r_[T, T[::50]]), slice(300, 320)))
     write_table(files[0], table)
     told = load_log(files[0], columns=BY_NUMBER, cutoff=4.0, dt=0.02).DESCR
@@ -69,13 +69,13 @@ def test_the_description_tells_what_was_done(files):
         ({"keep": slice(9000, None)}, "first.csv: keep=slice.* leaves none of its 750 rows"),
     ],
 )
-def test_bad_values_are_named(files, arguments, message):
+def test_invalid_values_raise(files, arguments, message):
     with pytest.raises(ValueError, match=message):
         load_log(files[0], **{"columns": BY_NUMBER, **arguments})
 
 
 @pytest.mark.parametrize("keep", [(1.0, 2.0), [None], slice(0, 9)], ids=str)
-def test_of_several_files_keep_is_a_list(files, keep):
+def test_keep_of_wrong_length_raises(files, keep):
     with pytest.raises(ValueError, match="keep must be a list with one for each of the 2 files; got"):
         load_log(files, columns=BY_NUMBER, keep=keep)
 
@@ -84,7 +84,7 @@ def test_of_several_files_keep_is_a_list(files, keep):
     ("arguments", "message"),
     [({"dt": "fast"}, "dt must be a number; got 'fast'"), ({"keep": ("1", 2.0)}, "keep must be a number; got '1'")],
 )
-def test_bad_types_are_named(files, arguments, message):
+def test_invalid_types_raise(files, arguments, message):
     with pytest.raises(TypeError, match=message):
         load_log(files[0], columns=BY_NUMBER, **arguments)
 
@@ -96,12 +96,12 @@ def test_files_must_have_the_same_joints(files):
         load_log(files, columns=columns)
 
 
-def test_there_must_be_a_file():
+def test_no_file_raises():
     with pytest.raises(ValueError, match="path must be a file or several; got none"):
         load_log([])
 
 
-def test_a_file_that_is_not_there_is_an_os_error(tmp_path):
+def test_file_missing_raises(tmp_path):
     for name in ("no.csv", "no.csv.gz"):
         with pytest.raises(FileNotFoundError, match=name):
             load_log(tmp_path / name, columns=BY_NUMBER)
@@ -111,13 +111,13 @@ def test_a_file_that_is_not_there_is_an_os_error(tmp_path):
     ("name", "message"),
     [("log.pkl", r"its name must end in one of .csv, .*, .mcap\."), ("log.bag", "Convert it with: rosbags-convert")],
 )
-def test_other_kinds_of_files_are_refused(tmp_path, name, message):
+def test_other_kinds_of_files_raise(tmp_path, name, message):
     (tmp_path / name).write_bytes(b"")
     with pytest.raises(ValueError, match=f"{name}: .*{message}"):
         load_log(tmp_path / name)
 
 
-def test_signals_that_overflow_are_named(tmp_path):
+def test_signals_that_overflow_raise(tmp_path):
     table = table_of(irregular_times(3.0))
     table[100, 6] = 1e308  # a position would be cut out as a jump
     path = write_table(tmp_path / "log.csv", table)

@@ -28,7 +28,7 @@ def errors(log, t0):
 
 
 @pytest.mark.parametrize("repeated", [False, True], ids=["once", "repeated rows"])
-def test_a_motion_written_down_irregularly_is_recovered(load, repeated):
+def test_motion_written_down_irregularly_is_recovered(load, repeated):
     t = irregular_times()
     table = table_of(np.sort(np.r_[t, t[::7]]) if repeated else t)
     log = load(table)
@@ -38,7 +38,7 @@ def test_a_motion_written_down_irregularly_is_recovered(load, repeated):
 
 
 @pytest.mark.parametrize("dt", [0.004, 0.01, 0.03, 0.1])
-def test_the_grid_has_the_step_that_is_asked_for(load, dt):
+def test_grid_has_the_step_that_is_asked_for(load, dt):
     t = irregular_times()
     log = load(table_of(t), dt=dt, cutoff=4.5)
     assert_allclose(np.diff(log.time), dt, rtol=1e-9)
@@ -53,7 +53,7 @@ def waves(t, frequency):
 
 
 @pytest.mark.parametrize("frequency", [1.0, 3.0, 5.0, 8.0, 12.0])
-def test_the_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
+def test_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
     t = np.arange(0.0, 20.0, 0.002)
     log = load(waves(t, frequency), dt=0.01, cutoff=5.0)
     phase = 2.0 * np.pi * frequency * log.time[:, np.newaxis]
@@ -113,6 +113,6 @@ def spoilt(row, column, value):
         (table_of(np.arange(0.0, 9.0, 0.01)), {"dt": 1e-5}, r"dt=1e-05 s is far below the recording's step of 0.01 s"),
     ],
 )
-def test_what_cannot_be_processed_is_told_with_the_files_name(load, table, arguments, message):
+def test_unprocessable_log_raises(load, table, arguments, message):
     with pytest.raises(ValueError, match=f"log.csv: .*{message}"):
         load(table, **arguments)

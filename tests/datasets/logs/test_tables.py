@@ -85,7 +85,7 @@ def test_missing_columns_are_named_with_the_file(file, columns, message):
         ({**BY_NUMBER, "position": -1}, r"columns\['position'\] must be at least 0; got -1"),
     ],
 )
-def test_wrong_column_maps_are_errors(file, columns, message):
+def test_invalid_column_maps_raise(file, columns, message):
     with pytest.raises(ValueError, match=message):
         load_log(file, columns=columns)
 
@@ -97,7 +97,7 @@ def test_wrong_column_maps_are_errors(file, columns, message):
         ({**BY_NUMBER, "time": 0.0}, r"columns\['time'\] must be an integer; got 0.0"),
     ],
 )
-def test_column_maps_of_wrong_types_are_errors(file, columns, message):
+def test_column_maps_of_wrong_types_raise(file, columns, message):
     with pytest.raises(TypeError, match=message):
         load_log(file, columns=columns)
 
@@ -111,14 +111,14 @@ def test_names_need_a_header(tmp_path):
     ("quote", "message"),
     [("", r"row 1 lacks the position .*'a{79} in column 1 \(q\) is no number"), ('"', "it is no text, .*field limit")],
 )
-def test_a_cell_of_a_million_letters_is_named(tmp_path, quote, message):
+def test_cell_of_a_million_letters_raises(tmp_path, quote, message):
     file = tmp_path / "log.csv"
     file.write_text(f"t,q,u\n0,1,2\n1,{quote}{'a' * 10**6}{quote},2\n2,3,4\n")
     with pytest.raises(ValueError, match=f"log.csv: {message}"):
         load_log(file, columns={"time": 0, "position": 1, "effort": 2})
 
 
-def test_a_name_of_two_columns_is_an_error(tmp_path):
+def test_name_of_two_columns_raises(tmp_path):
     file = write_table(tmp_path / "log.csv", TABLE, ["t", "t", *HEADER[2:]])
     with pytest.raises(ValueError, match="asks for 't', but several columns have this name"):
         load_log(file, columns={**BY_NUMBER, "time": "t"})
@@ -141,7 +141,7 @@ def test_a_name_of_two_columns_is_an_error(tmp_path):
         (b"\xff\xfe\x00\x80", "it is no text, or its compression is broken"),
     ],
 )
-def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
+def test_invalid_table_raises(tmp_path, content, message):
     file = tmp_path / "bad.csv"
     file.write_bytes(content)
     with pytest.raises(ValueError, match=f"bad.csv: {message}"):
@@ -155,7 +155,7 @@ def test_what_is_no_table_is_told_with_its_name(tmp_path, content, message):
         ("t;q;u\n0,5;1.234,5;2\n", r"row 0 has '1.234,5' .* without separators of thousands"),
     ],
 )
-def test_points_among_decimal_commas_are_errors(tmp_path, text, message):
+def test_points_among_decimal_commas_raise(tmp_path, text, message):
     file = tmp_path / "log.csv"
     file.write_text(text)
     with pytest.raises(ValueError, match=message):
@@ -199,7 +199,7 @@ def test_incomplete_rows_at_the_ends_are_left_out_and_counted(tmp_path, expected
 
 
 @pytest.mark.parametrize("spoil", [lambda data: b"no gzip", lambda data: data[: len(data) // 2]], ids=["no", "half"])
-def test_broken_compression_is_told_with_the_name(tmp_path, spoil):
+def test_broken_compression_raises(tmp_path, spoil):
     file = tmp_path / "bad.csv.gz"
     file.write_bytes(spoil(gzip.compress(b"0,1,2\n" * 1000)))
     with pytest.raises(ValueError, match="bad.csv.gz: it is no text, or its compression is broken"):

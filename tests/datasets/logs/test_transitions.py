@@ -26,7 +26,7 @@ def parts(transitions, n=2):
     return data[:, : 2 * n], data[:, 2 * n : 3 * n], data[:, -1], transitions.target
 
 
-def test_a_row_is_a_recorded_state_with_its_torque_and_the_time_to_the_next(load):
+def test_row_is_a_recorded_state_with_its_torque_and_the_time_to_the_next(load):
     found = log_transitions(load(table_of(T)))
     states, torques, dt, then = parts(found)
     q, dq, _, current = motion(T)
@@ -73,7 +73,7 @@ def test_some_transition_must_remain(load):
         log_transitions(load(table_of(T)), stride=1000)
 
 
-def test_wrong_arguments_are_named(load):
+def test_invalid_arguments_raise(load):
     log = load(table_of(T))
     with pytest.raises(ValueError, match="stride must be at least 1; got 0"):
         log_transitions(log, stride=0)
