@@ -49,6 +49,25 @@ def test_std_covariance_and_samples_agree(model, include_noise):
     assert (np.abs(samples.mean(axis=-1) - mean) < 0.11 * std + 8.0 * EPS * np.abs(mean)).all()
 
 
+@pytest.mark.parametrize(
+    "function", [np.square, np.exp, lambda x: x + 1.0, np.sinc], ids=["square", "exp", "line", "sinc"]
+)
+def test_more_inducing_points_do_not_widen_the_std(function):
+    """With points at all rows it is the exact model's; the signal does not grow to make up for a jitter."""
+    between = (X[:-1] + X[1:]) / 2.0
+    y, truth = function(X[:, 0]), function(between[:, 0])
+    stds, errors = [], []
+    for model in (*(EVGPRegressor(n_inducing=m, random_state=0) for m in (10, 30, 100)), EGPRegressor()):
+        mean, std = model.fit(X, y).predict(between, return_std=True)
+        stds.append(np.median(std))
+        errors.append(np.sqrt(np.mean((mean - truth) ** 2)))
+    assert stds[1] < 1.3 * stds[0]
+    assert stds[2] < 0.5 * stds[1]
+    assert_allclose(stds[2], stds[3], rtol=0.1)
+    # Honest: neither far above the errors nor far below.
+    assert (np.array(errors) < 4.0 * np.array(stds)).all()
+
+
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
 @pytest.mark.parametrize("include_noise", [True, False])
 @pytest.mark.parametrize("name", ["exact, shared weights", "sparse, shared weights"])

@@ -152,6 +152,13 @@ def test_restarts_keep_the_likeliest_and_repeat():
         np.testing.assert_array_equal(fit(1, seed).predict(X_NEW), m.predict(X_NEW))
 
 
+def test_line_search_that_steps_far_off_comes_back():
+    """A little noise makes the loss 1e10 there; told as it is, the fit ended after two iterations, at 56.7 nats."""
+    x = np.linspace(0, 10, 30)[:, np.newaxis]
+    m = EGPRegressor(kernel=RBF(1.0) + WhiteKernel(1e-10, "fixed")).fit(x, x[:, 0] * np.sin(x[:, 0]))
+    assert m.log_marginal_likelihood_value_ > 160.0
+
+
 @pytest.mark.parametrize(("n", "noise"), [(40, 1e-9), (80, 0.0)])
 def test_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
     """On any processor: the fit's quality must not hang on rounding."""
@@ -215,3 +222,18 @@ def test_ctrl_c_keeps_the_best_parameters_and_warns():
         m = EGPRegressor(kernel=interrupting, n_restarts=2).fit(X, Y)
     assert 0 < m.n_iter_ < 30
     assert np.isfinite(m.predict(X_NEW)).all()
+
+
+@pytest.mark.parametrize("noise", [1e-10, 1e-6])
+def test_points_at_all_rows_give_the_exact_likelihood(noise):
+    """The sparse bound at X_m = X, where rounding in k(x, x) - |v|² is far above so low a noise."""
+    x = np.array([[1.0], [3.0], [5.0], [6.0], [7.0], [8.0]])
+    y, kernel = x[:, 0] * np.sin(x[:, 0]), RBF(1.0) + WhiteKernel(noise, "fixed")
+    sparse, exact = EVGPRegressor(kernel=kernel).fit(x, y), EGPRegressor(kernel=kernel).fit(x, y)
+    assert sparse.lower_bound_ == pytest.approx(exact.log_marginal_likelihood_value_, abs=1e-6)
+    # Rows beyond the points are something else again.
+    x_new = np.array([[2.0], [4.0]])
+    bound = sparse.partial_fit(x_new, x_new[:, 0] * np.sin(x_new[:, 0])).lower_bound_
+    both = EGPRegressor(kernel=exact.kernel_ + WhiteKernel(noise, "fixed"), max_iter=0)
+    all_rows = np.vstack([x, x_new])
+    assert bound < both.fit(all_rows, all_rows[:, 0] * np.sin(all_rows[:, 0])).log_marginal_likelihood_value_

@@ -9,8 +9,10 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import CoefPrior, EVGPRegressor
+from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
-from skevgp.metrics import negative_log_predictive_density
+from skevgp.features import InertiaForceGravity
+from skevgp.metrics import containing_ratios, negative_log_predictive_density
 from skevgp.solvers import LBFGS
 
 # A few iterations are enough.
@@ -47,6 +49,25 @@ def independent(n=2000, noise=(0.1, 0.5), seed=0):
 
 def nlpd(m, X, Y):
     return negative_log_predictive_density(Y, *m.predict(X, return_std=True))
+
+
+def test_on_new_trajectories_as_many_rows_as_should_lie_within_the_std():
+    normal = np.array([0.683, 0.954, 0.997])
+    plain, calibrated = (fitted(noise_cv=noise_cv) for noise_cv in (None, 10))
+    ratios = [containing_ratios(Y_NEW, *m.predict(X_NEW, return_std=True)) for m in (plain, calibrated)]
+    assert (ratios[0] < normal).all()
+    assert (np.abs(ratios[1] - normal) < 0.7 * np.abs(ratios[0] - normal)).all()
+    assert nlpd(calibrated, X_NEW, Y_NEW) < nlpd(plain, X_NEW, Y_NEW)
+
+
+def test_what_few_points_cannot_represent_is_not_taken_for_noise():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-3, 3, (3000, 2))
+    y = np.sin(4 * X[:, 0]) * np.cos(3 * X[:, 1]) + 0.05 * rng.randn(3000)
+    train, test = slice(0, 2000), slice(2000, None)
+    plain, calibrated = (model(n_inducing=60, noise_cv=cv).fit(X[train], y[train]) for cv in (None, 5))
+    assert calibrated.noise_variance_ < 0.9 * plain.noise_variance_
+    assert nlpd(calibrated, X[test], y[test]) < nlpd(plain, X[test], y[test])
 
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
@@ -179,11 +200,26 @@ def test_rows_of_trajectories_without_groups_are_warned_of_once():
     assert len([own for own in caught if own.category is DependentRowsWarning]) == 1
 
 
+def test_trajectories_are_warned_of_even_if_their_noise_would_not_be_much_larger():
+    """Where nothing is known, std is large anyway: log density tells."""
+    data = make_dynamics("pendulum", 10, random_state=0)
+    with pytest.warns(DependentRowsWarning):
+        model(feature_map=InertiaForceGravity("pendulum"), n_inducing=60).fit(data.data, data.target)
+
+
 def _sorted_by_y():
     """Of a function whose highest values are in a corner, where blocks of rows are predicted worse."""
     X, _ = independent(400)
     y = np.exp(X[:, 0]) + 0.3 * np.random.RandomState(1).randn(400)
     return X[np.argsort(y)], np.sort(y)
+
+
+def test_group_of_most_rows_is_not_predicted_from_the_few_others():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-3, 3, (400, 2))
+    y = np.sin(3 * X[:, 0]) * np.cos(2 * X[:, 1]) + 0.1 * rng.randn(400)
+    m = EVGPRegressor(n_inducing=80, max_iter=50, random_state=0).fit(X, y, groups=np.repeat([0, 1, 2], [380, 10, 10]))
+    assert 0.05 < np.sqrt(m.noise_variance_) < 0.2
 
 
 @pytest.mark.parametrize(

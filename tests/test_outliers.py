@@ -36,6 +36,14 @@ VARIANTS = {
 }
 
 
+def test_without_outliers_it_is_the_fit_with_gaussian_noise():
+    robust, gaussian = evgp().fit(X, Y), evgp(noise="gaussian").fit(X, Y)
+    np.testing.assert_allclose(robust.weights_, 1.0, atol=0.05)
+    np.testing.assert_allclose(robust.predict(GRID), gaussian.predict(GRID), atol=0.02)
+    assert robust.lower_bound_ == pytest.approx(gaussian.lower_bound_, abs=2.0)
+    assert robust.upper_bound_ == np.inf
+
+
 @pytest.mark.parametrize("parameters", VARIANTS.values(), ids=VARIANTS)
 def test_outliers_do_not_change_fit(parameters):
     robust = evgp(**parameters).fit(X, WRONG)

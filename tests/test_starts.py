@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
@@ -152,6 +152,21 @@ def test_as_many_points_as_rows_do_not_explain_the_noise(seed):
     fewer = EVGPRegressor(n_inducing=50, noise=Gaussian(variance=0.05), random_state=0).fit(X, y)
     assert model.lower_bound_ > fewer.lower_bound_ - 1.0
     assert 1e-3 < model.noise_variance_ < 0.1
+
+
+def test_kernel_that_explains_less_than_noise_is_tried_from_other_starts():
+    rng = np.random.RandomState(0)
+    X = np.sort(rng.uniform(-2, 2, (60, 1)), axis=0)
+    y = np.sin(2 * X[:, 0]) + 0.3 * X[:, 0] + 0.1 * rng.randn(60)
+    model = EVGPRegressor(kernel=ExpSineSquared(), n_inducing=60, random_state=0).fit(X, y)
+    assert model.lower_bound_ > -0.5 * 60 * (np.log(2 * np.pi * np.mean(y**2)) + 1.0)
+
+
+@pytest.mark.long
+def test_warm_start_that_leads_nowhere_is_left():
+    cold = model(n_inducing=12).fit(1e3 * X, Y)
+    warm = model(n_inducing=12, warm_start=True).fit(X, Y).fit(1e3 * X, Y)
+    assert warm.lower_bound_ > cold.lower_bound_ - 0.02 * abs(cold.lower_bound_)
 
 
 @pytest.mark.parametrize("make", [EGPRegressor, lambda: EVGPRegressor(n_inducing=30, noise_cv=None, random_state=0)])

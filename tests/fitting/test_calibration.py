@@ -334,6 +334,20 @@ def test_nowhere_near_is_better(family, shared):
         assert search.loss(0.01 * signal, noise) > search.loss(signal, noise) + 0.01
 
 
+def test_variances_of_few_groups_are_larger_the_less_groups_agree():
+    search = search_of(0, *small())
+    rows = [fold.rows.residuals.shape[0] for fold in search.folds]
+    alone = [np.arange(n) for n in rows]
+    many = search.in_doubt(*search.best(), alone)
+    few = search.in_doubt(*search.best(), [np.full(n, i) for i, n in enumerate(rows)])
+    assert 1.0 < many < 1.1
+    assert few >= 1.0
+    # A fold whose errors are ten times as large.
+    odd = search.folds[0]
+    odd.rows = replace(odd.rows, residuals=10.0 * odd.rows.residuals)
+    assert search.in_doubt(*search.best(), [np.full(n, i) for i, n in enumerate(rows)]) > few + 0.1
+
+
 @pytest.mark.parametrize("fixed", [False, True])
 @pytest.mark.parametrize(("first", "lowest"), [(None, 0.5), (1e-7, 0.1)])
 def test_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):

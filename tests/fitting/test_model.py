@@ -8,6 +8,7 @@ from skevgp.fitting.inducing import MAX_SAMPLE, Placement
 from skevgp.fitting.model import partition_of
 from skevgp.fitting.search import FeaturesAlone
 from skevgp.model.bounds import bounds_alone
+from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor
 
 from .cases import NO_FEATURES, H, N, O, X, Y, data_of, fitted, model_of, models, source_of, units_of
@@ -58,6 +59,14 @@ def test_groups_are_models_of_their_outputs():
     for model in models(Monitor(lambda *what: told.append(what)), sharing="none"):
         model.monitor.iteration(1, 0.0)
     assert [columns for _, _, columns in told] == [range(0, 1), range(1, 2)]
+
+
+@pytest.mark.parametrize("solver", [LBFGS(), Adam()])
+def test_noise_starts_where_the_rules_of_the_solver_say(solver):
+    model = model_of(solver=solver)
+    np.testing.assert_allclose(model.table["noise"].start, model.rules.first_noise * model.scatter)
+    np.testing.assert_allclose(model.table["noise"].lower, model.rules.lowest_noise * model.scatter)
+    assert model.sparse.jitter == model.rules.jitter
 
 
 @pytest.mark.parametrize(

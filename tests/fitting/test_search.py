@@ -181,6 +181,17 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
         search(SimpleNamespace(**vars(model()) | {"minimise": interrupted}))
 
 
+def test_what_collapsed_on_a_sample_starts_again_on_more_rows():
+    own = model(rules=replace(OWN, other_starts=()), samples=(1000, 4000))
+    made, best = drive(own, *[(5.0, COLLAPSED)] * 4, (2.0, GOOD))
+    assert [start.n_rows for start in made] == [1000, 1000, 4000, 4000, None]
+    for cold in made[::2]:
+        np.testing.assert_allclose(cold.values["hyperparameters"], [2.0, 3.0])
+        np.testing.assert_allclose(cold.values["noise"], 1e-4)
+        assert cold.cold
+    assert best.bound == 2.0
+
+
 # --- samples of the rows ----------------------------------------------------------------------------------------------
 
 

@@ -133,3 +133,19 @@ def test_coordinates_that_are_alike_have_one_unit_also_where_the_curvature_is_ne
     H = np.diag([1.0, 3.0, -2.0, -6.0])
     units = curvature_units(quadratic(H), np.ones(4), np.array([7, 7, 2, 2]), 3)
     np.testing.assert_allclose(units, [2**-0.5, 2**-0.5, 0.5, 0.5], rtol=1e-6)
+
+
+def test_with_units_a_badly_scaled_valley_is_a_few_iterations_long():
+    scale = 10.0 ** np.linspace(-1, 2, 30)
+
+    def valley(x):
+        z = x * scale
+        return float(np.sum(z**2 + 0.1 * z**4)), scale * (2.0 * z + 0.4 * z**3)
+
+    start, limits = 1.0 / scale, (np.full(30, -np.inf), np.full(30, np.inf))
+    plain = lbfgs(valley, start, limits, 300, 1e-12)
+    scaled = lbfgs(valley, start, limits, 300, 1e-12, alike=np.arange(30))
+    assert plain.converged
+    assert scaled.converged
+    assert max(plain.loss, scaled.loss) < 1e-9
+    assert scaled.n_iter < 0.7 * plain.n_iter
