@@ -56,16 +56,6 @@ def with_words(rows):
 
 
 @pytest.mark.parametrize("model", MODELS, ids=str)
-def test_maps_choose_columns_of_a_frame_by_name(model, frame_of):
-    frame, new = (frame_of({"a": rows[:, 0], "b": rows[:, 1]}) for rows in (X, X_NEW))
-    by_name = fresh(model, feature_map=make_column_transformer((TREND, ["b"]))).fit(frame, Y)
-    by_place = fresh(model, feature_map=make_column_transformer((TREND, [1]))).fit(X, Y)
-    for actual, expected in zip(by_name.predict(new, True), by_place.predict(X_NEW, True), strict=True):
-        np.testing.assert_allclose(actual, expected, rtol=1e-6)
-    assert by_name.feature_names_in_.tolist() == ["a", "b"]
-
-
-@pytest.mark.parametrize("model", MODELS, ids=str)
 @pytest.mark.parametrize("feature_map", [None, ENCODE])
 def test_without_a_kernel_map_the_columns_must_be_numbers(model, feature_map, frame_of):
     message = r"The columns \['kind'\] of X are not numbers, but with kernel_map=None .*: give a kernel_map"

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
+from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.features import InertiaForceGravity
@@ -21,19 +21,6 @@ def test_coef_names_are_feature_names(estimator):
     m = estimator.set_params(feature_map=PolynomialFeatures(1)).fit(X, Y)
     assert m.coef_names_.tolist() == ["1", "x0", "x1"]
     assert m.coef_.shape == (2, len(m.coef_names_))
-
-
-@each_estimator
-@pytest.mark.parametrize(
-    "feature_map",
-    [
-        FunctionTransformer(lambda X: X[:, :2]),
-        # It names another number of features.
-        FunctionTransformer(lambda X: X[:, :2], feature_names_out=lambda own, names: ["all"]),
-    ],
-)
-def test_map_that_does_not_say_has_numbers(estimator, feature_map):
-    assert estimator.set_params(feature_map=feature_map).fit(X, Y).coef_names_.tolist() == ["h0", "h1"]
 
 
 @each_estimator

@@ -89,21 +89,6 @@ def test_weights_of_a_union_are_divided_out():
     assert_allclose(scale, np.hstack([IF_SCALE / 4.0, wide(0.5 * X)]))
 
 
-def test_unions_and_pipelines_nest():
-    inner = make_pipeline(StandardScaler(), PolynomialFeatures(2), make_union(FunctionTransformer(), InertiaForce()))
-    mean, scale = resolve(make_union(make_pipeline(inner), InertiaForce("pendulum")))
-    polynomials = PolynomialFeatures(2).fit_transform(StandardScaler().fit_transform(X))
-    assert_array_equal(mean, np.hstack([np.zeros((2, 20)), IF_MEAN]))
-    assert_allclose(scale, np.hstack([wide(polynomials), wide(polynomials), IF_SCALE]))
-
-
-def test_number_fills_the_table():
-    mean, scale = resolve(FunctionTransformer(), mean=2, scale=0.5)
-    assert_array_equal(mean, np.full((2, 3), 2.0))
-    assert_array_equal(scale, np.full((2, 3), 0.5))
-    assert mean.dtype == float
-
-
 @pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("shape", [(3,), (2,), (1, 3), (2, 1), (3, 2), (2, 3, 1)])
 def test_table_of_another_shape_raises(name, shape):

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, DotProduct, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import PolynomialFeatures, StandardScaler
 
@@ -39,21 +38,6 @@ def test_exact_fit_equals_sparse_fit_with_all_points():
     same = EVGPRegressor(TREND, kernel, inducing_init=X, noise=Gaussian(variance=noise), max_iter=0).fit(X, Y[:, 0])
     for actual, expected in zip(same.predict(X, return_std=True), exact.predict(X, return_std=True), strict=True):
         np.testing.assert_allclose(actual, expected, atol=1e-6)
-
-
-def test_with_features_it_is_a_gaussian_process_with_their_covariance():
-    kernel, c = 1.4 * RBF([0.9, 1.6]), 2.5
-    m = EGPRegressor(
-        TREND, kernel, noise=Gaussian(variance=0.01), coef_prior=CoefPrior(mean=0.4, scale=c), max_iter=0
-    ).fit(X, Y[:, 0])
-    # h = (1, x): h Σ hᵀ = c² (1 + xᵀx').
-    g = GaussianProcessRegressor(kernel + c**2 * DotProduct(1.0), alpha=0.01, optimizer=None)
-    g.fit(X, Y[:, 0] - 0.4 * (1 + X.sum(axis=1)))
-    assert m.log_marginal_likelihood_value_ == pytest.approx(g.log_marginal_likelihood_value_, rel=1e-10)
-    mean, cov = g.predict(X_NEW, return_cov=True)
-    actual, actual_cov = m.predict(X_NEW, return_cov=True, include_noise=False)
-    np.testing.assert_allclose(actual, mean + 0.4 * (1 + X_NEW.sum(axis=1)), atol=1e-9)
-    np.testing.assert_allclose(actual_cov, cov, atol=1e-9)
 
 
 # --- vague weights ------------------------------------------------------------------------------------------------
@@ -157,17 +141,6 @@ def test_line_search_that_steps_far_off_comes_back():
     x = np.linspace(0, 10, 30)[:, np.newaxis]
     m = EGPRegressor(kernel=RBF(1.0) + WhiteKernel(1e-10, "fixed")).fit(x, x[:, 0] * np.sin(x[:, 0]))
     assert m.log_marginal_likelihood_value_ > 160.0
-
-
-@pytest.mark.parametrize(("n", "noise"), [(40, 1e-9), (80, 0.0)])
-def test_smooth_function_without_noise_is_met_to_a_millionth(n, noise):
-    """On any processor: the fit's quality must not hang on rounding."""
-    x, x_new = np.linspace(-2, 2, n)[:, np.newaxis], np.linspace(-1.99, 1.99, 333)[:, np.newaxis]
-    m = EGPRegressor().fit(x, np.sin(3 * x[:, 0]) + noise * np.random.RandomState(0).randn(n))
-    for at in (x, x_new):
-        mean, std = m.predict(at, return_std=True)
-        np.testing.assert_allclose(mean, np.sin(3 * at[:, 0]), atol=1e-6)
-        assert (std < 1e-3).all()
 
 
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")

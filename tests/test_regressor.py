@@ -193,29 +193,6 @@ def test_maps_see_the_data_as_given():
 # --- going on ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("posterior", ["full", "diagonal"])
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
-def test_partial_fit_is_fit_with_the_same_kernel_and_points(sharing, posterior):
-    m = model(feature_map=PolynomialFeatures(1), sharing=sharing, solver=LBFGS(posterior=posterior, tol=1.0)).fit(X, Y)
-    bound, points = m.lower_bound_, m.inducing_points_.copy()
-    m.partial_fit(X_NEW, Y_NEW)
-    np.testing.assert_array_equal(m.inducing_points_, points)
-    # Two halves in another order, from a model of few rows that is then given the same parameters.
-    other = model(feature_map=PolynomialFeatures(1), sharing=sharing, solver=LBFGS(posterior=posterior, tol=1.0)).fit(
-        X, Y
-    )
-    for part in (slice(40, 80), slice(0, 40)):
-        other.partial_fit(X_NEW[part], Y_NEW[part])
-    np.testing.assert_allclose(other.predict(X_NEW), m.predict(X_NEW), atol=1e-8)
-    np.testing.assert_allclose(
-        other.predict(X_NEW, return_std=True)[1], m.predict(X_NEW, return_std=True)[1], rtol=1e-7
-    )
-    assert other.lower_bound_ == pytest.approx(m.lower_bound_, rel=1e-9)
-    assert other.upper_bound_ == pytest.approx(m.upper_bound_, rel=1e-9)
-    assert m.lower_bound_ > bound
-
-
 def test_partial_fit_equals_a_fit_of_all_rows():
     kernel = ConstantKernel(2.0, "fixed") * RBF([0.8, 1.2], "fixed") + WhiteKernel(0.01, "fixed")
     first = X[:20]
@@ -320,16 +297,6 @@ def test_failed_refit_leaves_the_model_as_it_was():
     with pytest.raises(ValueError, match="give one of them"):
         m.fit(np.hstack([X, X]), Y)
     np.testing.assert_array_equal(m.predict(X_NEW), before)
-
-
-@pytest.mark.parametrize("learning_rate", [50.0, 1e6])
-def test_adam_that_diverges_says_so_and_ends_no_lower_than_it_started(learning_rate):
-    m = model(solver=Adam(learning_rate=learning_rate, posterior="diagonal"), max_iter=20, noise_cv=None)
-    with pytest.warns(ConvergenceWarning, match=r"Adam (diverged|ended with).* [Ll]ower learning_rate \(now"):
-        m.fit(X, Y)
-    start = model(max_iter=0, solver=Adam(posterior="diagonal")).fit(X, Y)
-    assert m.lower_bound_ >= start.lower_bound_ - 1e-9 * abs(start.lower_bound_)
-    assert np.isfinite(m.predict(X_NEW)).all()
 
 
 @pytest.mark.parametrize("solver", [LBFGS(), Adam(batch_size=32)], ids=str)

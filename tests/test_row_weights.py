@@ -108,19 +108,6 @@ def at_fixed_points(**parameters):
     return evgp(inducing_init=X_NEW[:9], max_iter=0, **parameters)
 
 
-def test_blocks_threads_and_pieces_do_not_matter():
-    """More rows than a block holds, seen once and in parts."""
-    rng = np.random.RandomState(2)
-    x = rng.uniform(-2.0, 2.0, (30_000, 2))
-    y = np.sin(2.0 * x[:, 0]) * x[:, 1] + 0.1 * rng.randn(30_000)
-    w, v = rng.uniform(0.0, 2.0, 30_000), np.exp(rng.randn(30_000))
-    w[::3] = 0.0
-    one, threaded = (evgp(max_iter=3, n_jobs=jobs).fit(x, y, w, relative_variance=v) for jobs in (1, 2))
-    np.testing.assert_array_equal(one.predict(X_NEW), threaded.predict(X_NEW))
-    kept = w > 0
-    assert_same(one, evgp(max_iter=3).fit(x[kept], y[kept], w[kept], relative_variance=v[kept]))
-
-
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
 def test_partial_fit_with_weights_is_one_pass(posterior):
     first, rest = slice(0, 30), slice(30, None)

@@ -4,15 +4,6 @@ import pytest
 from skevgp.datasets import make_toy
 
 
-def test_default_is_as_large_as_snelsons_data():
-    toy = make_toy(random_state=0)
-    assert set(toy) == {"data", "target", "mean", "feature_names", "target_names", "DESCR"}
-    assert toy.data.shape == (200, 1)
-    assert toy.target.shape == toy.mean.shape == (200,)
-    assert (toy.feature_names, toy.target_names) == (["x"], ["y"])
-    assert "200 points" in toy.DESCR
-
-
 def test_mean_is_waves_on_a_line_of_slope_three():
     """Between the waves, and at both ends, the line is left."""
     toy = make_toy(n_samples=20_000, noise=0.0, random_state=0)

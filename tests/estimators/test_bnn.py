@@ -151,23 +151,6 @@ def model(hidden_layer_sizes=(8,), **arguments):
     return BayesianMLPRegressor(hidden_layer_sizes, **{"max_iter": 20, "tol": 1e9, "random_state": 0} | arguments)
 
 
-# --- shapes ------------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("hidden", [(), (4,), [4, 3], 5, np.array([2, 2])], ids=str)
-def test_shapes_of_attributes(hidden):
-    m = model(hidden).fit(X, Y)
-    sizes = [2, *np.atleast_1d(hidden).astype(int), 2]
-    assert [w.shape for w in m.coefs_] == [w.shape for w in m.coefs_std_] == list(pairwise(sizes))
-    assert [b.shape for b in m.intercepts_] == [(o,) for o in sizes[1:]]
-    assert m.noise_variance_.shape == (2,)
-    assert m.n_parameters_ == 2 * sum(w.size for w in m.coefs_) + sum(b.size for b in m.intercepts_) + 2
-    assert m.loss_curve_.shape == (m.n_iter_,) == (20,)
-    assert m.validation_scores_ is None
-    for y in (Y[:, 0], Y[:, :1]):
-        assert isinstance(m.fit(X, y).noise_variance_, float)
-
-
 # --- the mathematics ---------------------------------------------------------------------------------------------
 
 

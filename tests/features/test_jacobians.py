@@ -1,5 +1,3 @@
-import pickle
-
 import numpy as np
 import pinocchio
 import pytest
@@ -136,16 +134,6 @@ def test_jacobian_validates_input(kind):
     with pytest.raises(ValueError, match="contains NaN"):
         features.jacobian(np.where(X[0, 0] == X, np.nan, X))
     assert_array_equal(features.jacobian(X.tolist()), features.jacobian(X))
-
-
-@pytest.mark.parametrize("kind", MAPS)
-@pytest.mark.parametrize("robot", ["iiwa14", "acrobot", None])
-def test_single_row_gives_the_same_as_many_and_so_does_a_pickled_map(robot, kind):
-    X = rows(robot, 30)
-    features = MAPS[kind](robot).fit(X)
-    expected = features.jacobian(X)
-    assert_array_equal(np.concatenate([features.jacobian(x[np.newaxis]) for x in X]), expected)
-    assert_array_equal(pickle.loads(pickle.dumps(features)).jacobian(X), expected)
 
 
 def test_dynamics_that_overflow_raise():

@@ -161,25 +161,9 @@ def test_invalid_number_of_columns_raises(feature_map):
 
 
 @pytest.mark.parametrize("feature_map", MAPS)
-def test_unknown_robot_lists_the_known_ones(feature_map):
-    with pytest.raises(
-        ValueError,
-        match=r"Unknown robot 'carpole'.*Did you mean 'cartpole'.*'acrobot', 'cartpole', .*'iiwa14', 'pendulum'",
-    ):
-        feature_map("carpole").fit(np.zeros((2, 5)))
-
-
-@pytest.mark.parametrize("feature_map", MAPS)
 def test_only_a_robot_gives_a_prior(feature_map):
     assert not hasattr(feature_map(), "coef_prior")
     assert hasattr(feature_map("pendulum"), "coef_prior")
-
-
-@pytest.mark.parametrize("feature_map", MAPS)
-def test_features_of_a_data_frame_are_named_after_its_columns(feature_map):
-    frame = pd.DataFrame(rows("acrobot"), columns=list("abcde"))
-    sines = ["sin(a)", "sin(a + b)"] if feature_map is InertiaForceGravity else []
-    assert feature_map("acrobot").fit(frame).get_feature_names_out().tolist() == [*"abcde", *sines]
 
 
 def test_pandas_output_keeps_the_index_and_names_the_columns():

@@ -12,7 +12,7 @@ from skevgp.datasets import make_dynamics, perturb_robot, simulate
 from skevgp.features import AngleEncoder, InertiaForce, InertiaForceGravity, LinkGravity, NominalDynamics
 from skevgp.fitting.prior import CoefPrior, resolved
 from skevgp.metrics import prediction_error
-from skevgp.robots import System, get_system, layout_of, load_robot
+from skevgp.robots import System, layout_of, load_robot
 from skevgp.robots.systems import Link
 
 ROBOTS = ["pendulum", "cartpole", "acrobot", "iiwa14", "ur5", "panda", "kinova"]
@@ -224,14 +224,6 @@ def test_velocities_whose_squares_overflow_raise():
     features = NominalDynamics("acrobot").fit(rows("acrobot"))
     with pytest.raises(ValueError, match="is singular at .* or q̇ or u is too large there"):
         features.transform([[0.1, 0.2, 1e200, 1e200, 0.0]])
-
-
-@pytest.mark.parametrize("robot", ["acrobot", get_system("acrobot"), load_robot("acrobot"), None])
-def test_pickled_map_works_the_same(robot):
-    X = rows("acrobot")
-    features = NominalDynamics(robot, terms=TERMS).fit(X)
-    features.transform(X)
-    assert_array_equal(pickle.loads(pickle.dumps(features)).transform(X), features.transform(X))
 
 
 def error(model, data):

@@ -2,13 +2,12 @@
 
 import numpy as np
 import pytest
-from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from skevgp.fitting.exact import fit_exact, log_units_of_contrasts
 from skevgp.utils.monitor import Monitor
 
-from .cases import NO_FEATURES, H, N, X, Y, problem_of, units_of
+from .cases import H, N, Y, problem_of, units_of
 
 KERNEL = ConstantKernel(1.4, (0.1, 200.0)) * RBF([0.9, 1.6], [(0.1, 9.0), (0.2, 8.0)]) + WhiteKernel(0.2)
 
@@ -18,16 +17,6 @@ def fitted(kernel=KERNEL, H=H, Y=Y, vague=False, max_iter=0, n_restarts=0, monit
     problem = problem_of(kernel=kernel, H=H, Y=Y, vague=vague, max_iter=max_iter)
     monitor = Monitor() if monitor is None else monitor
     return fit_exact(problem, np.random.RandomState(0), monitor, n_restarts, tol)
-
-
-def test_without_iterations_the_likelihood_is_scikit_learns():
-    done = fitted(H=NO_FEATURES)
-    gpr = GaussianProcessRegressor(KERNEL, optimizer=None)
-    expected = sum(gpr.fit(X, y).log_marginal_likelihood_value_ for y in Y.T)
-    assert done.log_marginal_likelihood == pytest.approx(expected, rel=1e-9)
-    np.testing.assert_allclose(
-        done.predictor().predict(X, NO_FEATURES)[0], np.column_stack([gpr.fit(X, y).predict(X) for y in Y.T]), rtol=1e-6
-    )
 
 
 @pytest.mark.parametrize(

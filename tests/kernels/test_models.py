@@ -21,7 +21,7 @@ from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective
 from skevgp.noise import Gaussian
 
-from ..oracle import central_differences, problem, relative_error, table_of
+from ..oracle import problem, table_of
 from .cases import KERNELS, REGISTERED, Z, parsed, polynomial, smooth
 
 
@@ -37,19 +37,6 @@ def model_with(kernel, shared=True, **sizes):
     size = covariance.n_hyperparameters
     table = table_of(rows.inputs, points, starts, np.ones(2), size, mean_variance=variance)
     return SparseModel(covariance, model.prior, "full", model.groups), rows, table
-
-
-@pytest.mark.parametrize(
-    ("name", "shared"),
-    # The gradient of a constant alone is nothing but that of the jitter.
-    [*((name, True) for name in KERNELS if name != "ConstantKernel"), ("matern 5/2", False), ("nested", False)],
-)
-def test_gradient_of_the_bound_agrees_with_finite_differences(name, shared):
-    """Σ k(x, x) enters the bound too."""
-    model, rows, table = model_with(KERNELS[name], shared=shared)
-    objective = BoundObjective(model, table, rows.blocks(model.kernel, 17))
-    _, gradient = objective(table.start())
-    assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start(), 1e-5)) < 1e-5
 
 
 def test_value_of_a_bound_that_depends_on_the_diagonal():

@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from skevgp.model.bounds import bounds_at_optimum
 from skevgp.model.statistics import Whitening
-from skevgp.utils.linalg import Jitter
 
 from ..oracle import problem, relative_error
 
@@ -67,16 +65,3 @@ def test_sums_of_rows_that_came_later_are_those_of_all():
     assert model.bound(values, found) == pytest.approx(model.bound(values, expected), rel=1e-9)
     means = [model.at_optimum(values, statistics).groups[0].mean for statistics in (found, expected)]
     assert relative_error(*means) < 1e-9
-
-
-def test_jitter_is_the_models():
-    model, _, values, blocks = started()
-    values = values | {"inducing_points": np.repeat(values["inducing_points"][:, :3], 2, axis=1)}
-    factors = [
-        next(type(model)(model.kernel, model.prior, "full", model.groups, jitter).whitenings(values)).L
-        for jitter in (Jitter(1e-12), Jitter(1e-6))
-    ]
-    np.testing.assert_allclose(np.diag(factors[1])[1::2] ** 2, 2e-6, rtol=1e-3)
-    assert (np.diag(factors[0])[1::2] ** 2 < 1e-10).all()
-    (bound,) = bounds_at_optimum(list(model.groups_on(values, blocks)), "full")
-    assert np.isfinite(bound.residuals().squares).all()

@@ -3,7 +3,7 @@
 import autograd.numpy as anp
 import numpy as np
 import pytest
-from autograd import grad, value_and_grad
+from autograd import value_and_grad
 
 from skevgp.data.blocks import Batch
 from skevgp.model.objectives import ElboObjective
@@ -109,41 +109,6 @@ def test_without_features_and_with_fixed_weights(family):
         expected, expected_gradient = value_and_grad(traced_loss(elbo, family, rows_of.block, rows_of.linear))(x)
         np.testing.assert_allclose(value, expected, rtol=1e-10)
         assert relative_error(gradient, expected_gradient) < 1e-9
-
-
-@pytest.mark.parametrize("shared", SHARED)
-@pytest.mark.parametrize("family", FAMILIES)
-def test_elbo_agrees_with_the_papers_formula_in_plain_autograd(family, shared):
-    """Value and gradient in all parameters, from the data, term by term (the paper's eq. elbo)."""
-    model, rows, table = problem(family, shared, n=30, m=4, p=2)
-    elbo = ElboObjective(model, table, rows.blocks(model.kernel, 30))
-    size, m = 6, 4
-    mean_unit, points = elbo.table["mean"].unit, elbo.table["inducing_points"]
-
-    def loss(x):
-        c = elbo.table.coordinates(x)
-        total = 0.0
-        for i in range(len(model.prior.scale)):
-            Z = c["inducing_points"][i % len(c["inducing_points"])] * points.unit + points.origin
-            L, V = whitened(anp.exp(c["hyperparameters"]), Z, rows.inputs)
-            s2, noise = anp.exp(c["signal"][i]), anp.exp(c["noise"][i])
-            mean = c["mean"][i] * mean_unit[i]
-            root, _ = traced_root(elbo, family, c["spread"][i], L, i)
-            covariance = root @ root.T
-            prior = model.prior
-            P = anp.concatenate([anp.sqrt(s2) * V.T, rows.features * prior.scale[i]], axis=1)
-            e = rows.residuals[:, i] - P @ mean
-            log_likelihood = -0.5 * (len(rows) * anp.log(2 * np.pi * noise) + e @ e / noise)
-            traces = anp.trace(P @ covariance @ P.T) / noise + s2 * anp.sum(1 - anp.sum(V**2, axis=0)) / noise
-            shift = mean + np.concatenate([np.zeros(m), prior.reference[i]])
-            divergence = 0.5 * (anp.trace(covariance) + shift @ shift - size - anp.linalg.slogdet(covariance)[1])
-            total = total - log_likelihood + 0.5 * traces + divergence
-        return total / len(rows)
-
-    x = away_from_the_start(elbo)
-    value, gradient = elbo.evaluate(x, batch(model, rows, 30))
-    np.testing.assert_allclose(value, loss(x), rtol=1e-9)
-    assert relative_error(gradient, grad(loss)(x)) < 1e-9
 
 
 def test_mini_batch_weighs_the_data_terms_by_N():

@@ -104,23 +104,6 @@ def test_each_group_prepares_rows_for_its_own_kernel():
         np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-10)
 
 
-def test_far_from_the_points_the_prior_is_left():
-    """Mean hᵀβ, and s² besides the variance of the weights."""
-    predictor = some_posterior()[0]
-    coef, cov = predictor.coefficients()
-    mean, variance = predictor.predict(X_NEW + 1e3, H_NEW, return_variance=True)
-    np.testing.assert_allclose(mean, H_NEW @ coef.T, rtol=1e-12)
-    np.testing.assert_allclose(variance, predictor.signal + np.einsum("np,opq,nq->no", H_NEW, cov, H_NEW), rtol=1e-12)
-
-
-def test_intercept_is_part_of_the_mean_only():
-    predictor = some_posterior()[0]
-    raised = replace(predictor, intercept=np.array([5.0, -1.0]))
-    (mean, variance), (higher, same) = (own.predict(X_NEW, H_NEW, return_variance=True) for own in (predictor, raised))
-    np.testing.assert_allclose(higher - mean, np.tile([5.0, -1.0], (11, 1)), rtol=1e-12)
-    np.testing.assert_array_equal(variance, same)
-
-
 @pytest.mark.parametrize("shared", [True, False])
 def test_scaled_outputs_are_predicted_in_their_units(shared):
     predictor, factor = some_posterior(shared)[0], np.array([10.0, 0.01])
@@ -196,21 +179,6 @@ def test_block_size_limits_memory():
     assert replace(predictor, groups=(nothing,)).rows_at_once == 4096
     middle = replace(predictor.groups[0], mean=np.zeros((1, 1000)))
     assert replace(predictor, groups=(middle, middle)).rows_at_once * 2000 <= 2**20
-
-
-def test_q_at_the_prior_predicts_the_prior():
-    """N(0, I) in whitened coordinates, and no reference: k(x, x'), and hᵀΣh' of the weights."""
-    model, _, table = problem()
-    prior = CoefficientPrior(model.prior.mean, model.prior.scale, np.zeros((O, P)))
-    values = table.values_at_start()
-    own = SparseModel(model.kernel, prior, "full", model.groups)
-    predictor = own.predictor(values, list(own.whitenings(values)), [np.zeros(M + P)] * O, [np.eye(M + P)] * O)
-    mean, covariance = predictor.covariance(X_NEW, H_NEW)
-    np.testing.assert_allclose(mean, H_NEW @ prior.mean.T, atol=1e-14)
-    for o in range(O):
-        H = H_NEW * prior.scale[o]
-        k = values["signal"][o] * squared_exponential(X_NEW, X_NEW, values["hyperparameters"])
-        np.testing.assert_allclose(covariance[:, :, o], k + H @ H.T, atol=1e-10)
 
 
 ROOT = np.array([[[2.0, 0.0], [1.0, 0.5]], [[1.0, 0.2], [0.0, 3.0]]])

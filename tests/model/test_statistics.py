@@ -94,18 +94,6 @@ def test_there_is_a_jitter_only_where_the_points_need_one():
     np.testing.assert_allclose(own.L @ own.L.T, K + JITTER.size * np.eye(2 * M), atol=1e-14)
 
 
-def test_rounding_is_no_jitter_whatever_the_variance():
-    """Of points far from the origin, where a linear covariance is large."""
-    kernel = DotProduct()
-    for seed in range(20):
-        points = 1e3 * (np.eye(D) + 0.1 * np.random.RandomState(seed).randn(D, D))
-        own = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points)
-        assert own.jitter() == 0.0
-        jittered = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points, Jitter(1e-3, 2.0))
-        largest = np.diagonal(kernel.at(np.zeros(kernel.n_hyperparameters), points).matrix()).max()
-        assert jittered.jitter() == pytest.approx(1e-3 * largest, rel=1e-9)
-
-
 def test_gradients_in_the_factor_are_pulled_back():
     weights = np.tril(RNG.randn(M, M))
     own = whitening()
@@ -126,18 +114,6 @@ def test_gradients_in_whitened_rows_are_pulled_back():
 
 
 # --- the first pass ------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("size", [1, 17, 60])
-def test_first_pass_collects_the_sums(size):
-    L, U = dense()
-    V = np.linalg.solve(L, U)
-    found = collect(blocks(size), whitening(), slice(0, O))
-    assert found.n_rows == N
-    expected = {"VV": V @ V.T, "VH": V @ H, "VR": V @ R, "HH": H.T @ H, "HR": H.T @ R, "RR": np.sum(R**2, axis=0)}
-    expected["unexplained"] = N - np.sum(V**2)
-    for name, value in expected.items():
-        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)
 
 
 def test_sums_add_and_fade():

@@ -72,18 +72,3 @@ def test_one_of_two_cartpoles_is_damped():
     free, damped = load_robot("cartpole"), load_robot("cartpole_damped")
     assert (list(free.damping), list(damped.damping)) == ([0.0, 0.0], [0.1, 0.1])
     assert_allclose(mass_matrix("cartpole_damped", [0.7, 1.0]), mass_matrix("cartpole", [0.7, 1.0]), rtol=1e-15)
-
-
-@pytest.mark.parametrize("elbow", [0.0, 1.0, -2.5])
-def test_mass_of_the_acrobot(elbow):
-    first, second, coupling = 0.083 + 0.25 + 1.0, 0.33 + 1.0, np.cos(elbow)
-    expected = [[first + second + 2 * coupling, second + coupling], [second + coupling, second]]
-    assert_allclose(mass_matrix("acrobot", [0.4, elbow]), expected, rtol=1e-13)
-
-
-def test_pole_leans_towards_positive_x():
-    model = load_robot("cartpole")
-    data = model.createData()
-    pinocchio.forwardKinematics(model, data, np.array([0.0, 0.1]))
-    tip = data.oMi[2].act(np.array([0.0, 0.0, -0.5]))
-    assert_allclose(tip, [0.5 * np.sin(0.1), 0.0, -0.5 * np.cos(0.1)], rtol=1e-14)
