@@ -1,5 +1,6 @@
 """Standard deviations, covariances and samples describe one distribution, also where rounding outweighs the noise."""
 
+import mpmath as mp
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
@@ -47,6 +48,25 @@ def test_std_covariance_and_samples_agree(model, include_noise):
     # The standard error of a standard deviation of 3,000 draws is 1.3 %, that of their mean 1.8 % of one.
     assert_allclose(samples.std(axis=-1), std, rtol=0.08)
     assert (np.abs(samples.mean(axis=-1) - mean) < 0.11 * std + 8.0 * EPS * np.abs(mean)).all()
+
+
+@pytest.mark.long
+def test_variance_of_a_noise_free_parabola_is_right_to_rounding():
+    """Against 60 digits: rounding of a sum of 60 squares that is about the signal variance."""
+    model = EGPRegressor().fit(X, X[:, 0] ** 2)
+    signal, length = model.kernel_.k1.constant_value, model.kernel_.k2.length_scale
+    rows = [0, 17, 30]
+    with mp.workdps(60):
+        x, s2, noise = [mp.mpf(float(v)) for v in X[:, 0]], mp.mpf(float(signal)), mp.mpf(model.noise_variance_)
+        K = mp.matrix([[s2 * mp.exp(-(((a - b) / mp.mpf(float(length))) ** 2) / 2) for b in x] for a in x])
+        A = K + noise * mp.eye(len(x))
+        weights = [mp.lu_solve(A, K[:, i]) for i in rows]
+        truth = [float(K[i, i] - mp.fdot(K[:, i], w) + noise) for i, w in zip(rows, weights, strict=True)]
+    _, cov = model.predict(X, return_cov=True)
+    assert_allclose(np.diag(cov)[rows], truth, rtol=0.0, atol=len(X) * EPS * signal)
+    assert_allclose(
+        [model.predict(X[[i]], return_std=True)[1][0] ** 2 for i in rows], truth, atol=len(X) * EPS * signal
+    )
 
 
 @pytest.mark.parametrize(

@@ -108,3 +108,9 @@ def test_files(tmp_path):
     (tmp_path / "model").write_bytes(b"no model")
     with pytest.raises(ValueError, match="cannot be loaded"):
         load(tmp_path / "model")
+
+
+def test_exports(tmp_path):
+    model = clone(THREADED["all"]).fit(X, Y)
+    model.to_casadi()(X_NEW[0])
+    model.to_c(tmp_path)

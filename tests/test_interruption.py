@@ -11,6 +11,7 @@ from sklearn.base import clone
 from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp.io import load, save
 from skevgp.noise import Gaussian
 from skevgp.solvers import Adam
 
@@ -90,6 +91,21 @@ def _fit(model, n):
         except KeyboardInterrupt:
             return f"raised at {places[-1]}" if "Monitor.iteration" in places else "raised"
     return "kept" if any("interrupted" in str(warning.message) for warning in caught) else f"untold: {places[-1]}"
+
+
+def test_file_is_replaced_or_as_it_was(tmp_path):
+    model, path = fitted("lbfgs")[0], tmp_path / "model.skevgp"
+    save(model, path)
+    before = path.read_bytes()
+    with interrupted_at() as places:
+        save(fitted("exact")[0], path)
+    path.write_bytes(before)
+    for n in np.linspace(2, len(places) - 5, 6).astype(int):
+        with interrupted_at(n), pytest.raises(KeyboardInterrupt):
+            save(fitted("exact")[0], path)
+        assert path.read_bytes() == before
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    np.testing.assert_array_equal(predictions(load(path)), predictions(model))
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import warnings
 
 import numpy as np
+import pandas as pd
 import pinocchio
 import pytest
 from numpy.testing import assert_allclose
@@ -75,6 +76,14 @@ def test_torques_of_a_new_trajectory_are_known_to_a_hundredth(arm, rigid):
     assert (np.sqrt(np.mean((before - truth) ** 2, axis=0)) / truth.std(axis=0)).min() > 0.05
 
 
+def test_friction_is_found(arm, rigid):
+    found = dict(zip(rigid.coef_names_, rigid.coef_, strict=True))
+    joints = list(arm.nominal.names)[1:]
+    assert_allclose([found[f"coulomb({joint})"] for joint in joints], arm.coulomb, rtol=0.1)
+    assert_allclose([found[f"viscous({joint})"] for joint in joints], arm.viscous, rtol=0.2)
+    assert_allclose(rigid.standing_std_, arm.coulomb / np.sqrt(3.0), rtol=0.1)
+
+
 def gear(X):
     """Friction that grows with load, and a wave of the gear: what a rigid body does not have."""
     n = X.shape[1] // 3
@@ -104,6 +113,15 @@ def carrying(arm, model, seed, gains=1.0, mass=2.0):
     rng, X = np.random.default_rng(seed), trajectory(6, 1000 + seed)
     clean = gains * loaded.torque(X)
     return model.estimate_payload(X, clean + 0.02 * clean.std(axis=0) * rng.normal(size=clean.shape)), body
+
+
+def test_frames_must_be_in_the_robots_order():
+    arm = Arm("pendulum")
+    frame = pd.DataFrame(arm.X, columns=["q", "dq/dt", "d2q/dt2"])
+    model = InverseDynamics("pendulum", n_inducing=0).fit(frame, arm.y)
+    assert_allclose(model.predict(frame), InverseDynamics("pendulum", n_inducing=0).fit(arm.X, arm.y).predict(arm.X))
+    with pytest.raises(ValueError, match="order"):
+        InverseDynamics("pendulum").fit(frame[["dq/dt", "q", "d2q/dt2"]], arm.y)
 
 
 def test_payload_lies_in_its_interval(arm, rigid):

@@ -88,6 +88,16 @@ def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robo
     assert not any("degrees" in cause for several in causes.values() for cause in several)
 
 
+def test_positions_beyond_their_limits_are_named_if_the_model_is_far_off():
+    arm = Arm(noise=NOISE)
+    X = arm.X.copy()
+    X[:, 0] += 9.0  # of the vertical axis: torques do not know it
+    (cause,) = causes_of(arm.nominal, X, arm.y)
+    assert cause.startswith("positions of 'shoulder_pan_joint' (from ")
+    assert "with limits of -6.28 and 6.28 rad) are beyond the joints' limits" in cause
+    assert causes_of(arm.nominal, X, arm.y, is_far=False) == []
+
+
 @pytest.mark.parametrize(
     "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.long) for robot in ("ur5", "iiwa14"))]
 )

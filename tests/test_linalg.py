@@ -4,7 +4,9 @@ import pytest
 from autograd import grad
 
 from skevgp.utils.linalg import (
+    Jitter,
     NotPositiveDefiniteError,
+    cholesky_of_covariance,
     cholesky_pullback,
     jittered_cholesky,
     lower_transposed_times,
@@ -29,6 +31,28 @@ def test_jitter_is_relative_to_the_diagonal():
     A = np.diag([1.0, 1e8, 1e-8])
     L = jittered_cholesky(A, 1e-2)
     np.testing.assert_allclose(np.diag(L) ** 2, 1.01 * np.diag(A), rtol=1e-14)
+
+
+def test_singular_matrix_gets_just_enough_jitter():
+    A = np.ones((5, 5))
+    L = jittered_cholesky(A)
+    np.testing.assert_allclose(L @ L.T, A, atol=1e-12)
+
+
+LARGE = Jitter(1e-3, well_conditioned=1e-6)
+
+
+def with_last_pivot(pivot):
+    """A covariance whose last row is known from the first but for this share of its variance."""
+    L = np.array([[1.0, 0.0], [np.sqrt(1.0 - pivot), np.sqrt(pivot)]])
+    return 4.0 * L @ L.T
+
+
+@pytest.mark.parametrize("pivot", [5e-7, 1e-12, 0.0])
+def test_one_whose_rows_nearly_follow_from_each_other_gets_it(pivot):
+    A = with_last_pivot(pivot)
+    L = cholesky_of_covariance(A, LARGE)
+    np.testing.assert_allclose(L @ L.T, A + 1e-3 * np.diag(np.diag(A)), rtol=1e-14)
 
 
 def test_jitter_above_the_most_is_not_tried():

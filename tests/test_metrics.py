@@ -44,6 +44,12 @@ def test_ratios_by_hand():
     assert_array_equal(ratios, [0.5, 0.75, 0.75])
 
 
+def test_interval_without_width_holds_what_is_predicted_exactly():
+    found = containing_ratios([1.0, 2.0], [1.0, 2.5], [1.0, 1.0], k=0)
+    assert isinstance(found, np.ndarray)
+    assert_array_equal(found, [0.5])
+
+
 def test_containing_ratios_default_widths():
     assert_array_equal(containing_ratios([0.5, 1.5, 2.5, 3.5, 4.5], np.zeros(5), np.ones(5)), [0.2, 0.4, 0.6])
 
@@ -57,11 +63,20 @@ def test_density_by_hand():
     assert negative_log_predictive_density([3.0], [0.0], [2.0]) == pytest.approx(expected, rel=1e-15)
 
 
+def test_density_sums_outputs_and_averages_rows():
+    expected = -norm.logpdf(Y, MEAN, STD).sum() / 30
+    assert negative_log_predictive_density(Y, MEAN, STD) == pytest.approx(expected, rel=1e-13)
+
+
 def test_gaussian_errors_fall_into_the_intervals_of_the_normal_distribution():
     std = RNG.uniform(0.5, 5.0, size=(20_000, 2))
     mean = RNG.normal(size=std.shape)
     ratios = containing_ratios(mean + std * RNG.standard_normal(std.shape), mean, std)
     assert_allclose(ratios, [0.6827, 0.9545, 0.9973], rtol=0, atol=0.01)
+
+
+def test_crps_sums_outputs_and_averages_rows():
+    assert crps(Y, MEAN, STD) == pytest.approx(sum(crps(*column) for column in zip(Y.T, MEAN.T, STD.T, strict=True)))
 
 
 @pytest.mark.parametrize(("y", "mean", "std"), [(0.3, 0.0, 1.0), (-7.0, 1.0, 0.5), (2.0, 2.0, 3.0)])

@@ -13,10 +13,13 @@ from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
 from skevgp.metrics import containing_ratios, negative_log_predictive_density
-from skevgp.solvers import LBFGS
+from skevgp.solvers import LBFGS, SOLVERS
 
 # A few iterations are enough.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
+
+SETTINGS = [("lbfgs", "full"), ("lbfgs", "diagonal"), ("adam", "full"), ("adam", "diagonal")]
 
 
 def trajectories(n, seed, length=100):
@@ -47,6 +50,12 @@ def independent(n=2000, noise=(0.1, 0.5), seed=0):
     return X, np.column_stack([np.sin(X[:, 0]), X[:, 0] * X[:, 1]]) + np.array(noise) * rng.randn(n, 2)
 
 
+def mean_square_z(m):
+    """Of each output on new trajectories; 1 if std is honest."""
+    mean, std = m.predict(X_NEW, return_std=True)
+    return np.mean(((Y_NEW - mean) / std) ** 2, axis=0)
+
+
 def nlpd(m, X, Y):
     return negative_log_predictive_density(Y, *m.predict(X, return_std=True))
 
@@ -68,6 +77,23 @@ def test_what_few_points_cannot_represent_is_not_taken_for_noise():
     plain, calibrated = (model(n_inducing=60, noise_cv=cv).fit(X[train], y[train]) for cv in (None, 5))
     assert calibrated.noise_variance_ < 0.9 * plain.noise_variance_
     assert nlpd(calibrated, X[test], y[test]) < nlpd(plain, X[test], y[test])
+
+
+@pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
+@pytest.mark.parametrize(("sharing", "feature_map"), [("all", None), ("none", PolynomialFeatures(1))])
+def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
+    settings = {"feature_map": feature_map, "sharing": sharing, "solver": SOLVERS[solver](posterior=posterior)}
+    # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
+    settings |= {"max_iter": 10, "X": X[:1900], "Y": Y[:1900], "groups": GROUPS[:1900]}
+    plain, calibrated = (fitted(**settings, noise_cv=noise_cv) for noise_cv in (None, 5))
+    np.testing.assert_array_equal(calibrated.inducing_points_, plain.inducing_points_)
+    np.testing.assert_array_equal(*([k.k2.theta for k in m.kernel_] for m in (calibrated, plain)))
+    np.testing.assert_array_equal(calibrated.loss_curve_, plain.loss_curve_)
+    before, z = mean_square_z(plain), mean_square_z(calibrated)
+    assert (before > 2.0).all()
+    assert (z > 0.3).all()
+    assert (z < 2.5).all()
+    assert (z < before).all()
 
 
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])

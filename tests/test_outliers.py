@@ -75,6 +75,16 @@ def test_weights_are_in_the_users_order_and_none_are_of_rows_that_do_not_count()
     np.testing.assert_allclose(weighted.predict(GRID), repeated.predict(GRID), rtol=1e-7, atol=1e-9)
 
 
+def test_partial_fit_doubts_new_rows():
+    first, rest = slice(0, 150), slice(150, None)
+    model = evgp().fit(X[first], WRONG[first]).partial_fit(X[rest], WRONG[rest])
+    clean = evgp(noise="gaussian").fit(X[first], Y[first]).partial_fit(X[rest], Y[rest])
+    assert error(model) < 1.3 * error(clean)
+    assert model.weights_.shape == (150, 2)
+    assert (model.weights_[BAD[rest]] < 0.1).all()
+    assert np.mean(model.weights_[~BAD[rest]] > 0.9) > 0.99
+
+
 def test_student_t_with_other_solvers_raises():
     with pytest.raises(ValueError, match='noise=.student-t. needs solver="lbfgs".*got solver=.adam'):
         evgp(solver="adam").fit(X, Y)

@@ -55,6 +55,17 @@ def band(display):
     return np.array(edges).T, area.get_label()
 
 
+def test_inducing_points_are_crosses_on_the_lower_edge():
+    model = fitted()
+    display = PosteriorDisplay.from_estimator(model, X)
+    crosses = lines(display)["inducing points"]
+    assert_array_equal(crosses.get_xdata(), model.inducing_points_[:, 0])
+    assert crosses.get_marker() == "x"
+    display.figure_.draw_without_rendering()
+    on_screen = crosses.get_transform().transform(np.column_stack(crosses.get_data()))
+    assert display.ax_.transAxes.inverted().transform(on_screen)[:, 1] == pytest.approx(0.03)
+
+
 def test_line_is_the_predicted_mean():
     model = fitted()
     display = PosteriorDisplay.from_estimator(model, X, label="EVGP")
@@ -136,6 +147,25 @@ def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match=r"Plotting needs the optional package 'matplotlib'.*pip install matplotlib"):
         display.plot()
+
+
+@pytest.mark.parametrize("output", [2, -3])
+def test_output_missing_raises(trend, output):
+    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
+        PosteriorDisplay.from_estimator(trend, X[:5], output=output)
+    with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
+        CoefficientDisplay.from_estimator(trend, output=output)
+
+
+def test_the_curve_is_the_mean_of_runs_and_the_band_their_range():
+    scores = np.array([[4.0, 8.0, 6.0], [1.0, np.nan, 3.0]])
+    display = LearningCurveDisplay(np.array([10, 40]), scores).plot(label="EVGP", color="#D55E00")
+    line = lines(display)["EVGP"]
+    assert_array_equal(line.get_xydata(), [[10, 6], [40, 2]])
+    assert to_rgb(line.get_color()) == to_rgb("#D55E00")
+    (area,) = display.ax_.collections
+    assert {tuple(corner) for corner in area.get_paths()[0].vertices} == {(10, 4), (10, 8), (40, 1), (40, 3)}
+    assert_allclose(area.get_facecolor()[0, :3], to_rgb("#D55E00"))
 
 
 def test_curve_is_the_mean_of_runs_and_the_band_their_range():

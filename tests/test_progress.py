@@ -114,6 +114,18 @@ def fit(progress, clock, losses, seconds=1.0, about=""):
         monitor.iteration(number, loss)
 
 
+@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
+def test_verbose_2_prints_each_iteration(stream):
+    stream = stream()
+    progress = Progress(2, stream)
+    fit(progress, Clock(), [10.0, 20.0, 30.0])
+    progress.close()
+    lines = stream.getvalue().splitlines()
+    assert [line.split()[:4] for line in lines] == [
+        ["iteration", str(number), "bound", f"{-10.0 * number:.3f}"] for number in (1, 2, 3)
+    ]
+
+
 def test_on_a_terminal_tqdm_draws_one_line():
     pytest.importorskip("tqdm")
     clock, terminal = Clock(), Terminal()
@@ -162,3 +174,13 @@ def test_without_tqdm_there_is_a_line_each_ten_seconds_and_the_last(without_tqdm
     assert stream.getvalue().splitlines() == [
         f"all rows, iteration {number}, bound -1.000, {number} s" for number in (10, 20, 25)
     ]
+
+
+def test_part_of_the_fit_is_told():
+    clock, log = Clock(), io.StringIO()
+    monitor = Monitor(progress=Progress(1, log, clock)).seen_as(about="y[:, 2]").seen_as(about="50 of 90 rows")
+    clock.now += 10.0
+    monitor.iteration(3, 2.0)
+    clock.now += 10.0
+    monitor.silent().iteration(4, 2.0)
+    assert log.getvalue() == "y[:, 2], 50 of 90 rows, iteration 3, bound -2.000, 10 s\n"

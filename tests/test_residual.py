@@ -96,6 +96,21 @@ def test_dask_arrays_stay_where_they_are(method, y, base):
         ResidualRegressor(EGPRegressor()).fit(lazy, targets)
 
 
+@pytest.mark.parametrize("method", ["sample_y", "partial_fit"])
+def test_methods_are_there_if_the_regressor_has_them(method):
+    assert hasattr(ResidualRegressor(evgp()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()).fit(X, Y), method)
+
+
+def test_partial_fit_is_the_regressors():
+    m, direct = ResidualRegressor(evgp()), evgp()
+    for rows in (slice(0, 40), slice(40, 60)):
+        m.partial_fit(X[rows], Y[rows])
+        direct.partial_fit(X[rows], Y[rows] - X[rows, :2])
+    np.testing.assert_array_equal(m.predict(X_NEW), direct.predict(X_NEW) + X_NEW[:, :2])
+
+
 # --- uncertainty passes through -----------------------------------------------------------------------------------
 
 

@@ -5,12 +5,12 @@ import pandas as pd
 import polars as pl
 import pytest
 from matplotlib import pyplot
-from sklearn.base import clone
+from sklearn.base import BaseEstimator, TransformerMixin, clone
 from sklearn.compose import make_column_transformer
 from sklearn.inspection import PartialDependenceDisplay
 from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import EVGPRegressor
+from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS
 
 pyplot.switch_backend("Agg")
@@ -37,6 +37,29 @@ def frame(package, rows=slice(None)):
 def close_figures():
     yield
     pyplot.close("all")
+
+
+class Witness(TransformerMixin, BaseEstimator):
+    """Remembers what it was given."""
+
+    seen = ()
+
+    def fit(self, X, y=None):
+        Witness.seen += (type(X),)
+        return self
+
+    def transform(self, X):
+        Witness.seen += (type(X),)
+        return np.asarray(X["age"], dtype=float).reshape(-1, 1)
+
+
+@each_frame
+@pytest.mark.parametrize("model", [FIXED, EGPRegressor(max_iter=0)], ids=lambda model: type(model).__name__)
+def test_frames_stay_frames_for_the_maps(package, model, monkeypatch):
+    monkeypatch.setattr(Witness, "seen", ())
+    m = clone(model).set_params(feature_map=Witness(), kernel_map=Witness()).fit(frame(package), Y)
+    m.predict(frame(package), return_std=True)
+    assert set(Witness.seen) == {FRAMES[package]}
 
 
 # --- frames as output ---------------------------------------------------------------------------------------------

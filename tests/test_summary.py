@@ -10,7 +10,7 @@ from sklearn.base import clone
 from sklearn.gaussian_process.kernels import RBF
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor, InverseDynamics
 from skevgp.features import AngleEncoder
 
 RNG = np.random.RandomState(0)
@@ -30,6 +30,22 @@ def fitted(model=SPARSE, inputs=X, targets=Y, **parameters):
 def numbers(frame, part, output=None):
     own = frame[frame.part == part]
     return (own if output is None else own[own.output == output]).set_index("name")
+
+
+def test_certificate_of_a_sparse_model_is_an_interval():
+    m = fitted()
+    summary = m.summary()
+    assert (summary.lower_bound, summary.upper_bound) == (m.lower_bound_, m.upper_bound_)
+    assert f"log marginal likelihood: from {m.lower_bound_:.2f} to {m.upper_bound_:.2f} nats" in str(summary)
+    assert "EVGPRegressor, 8 inducing points, for 2 outputs" in str(summary)
+
+
+def test_weights_that_outputs_share_are_said_once():
+    summary = fitted(coef_prior=CoefPrior(shared=True)).summary()
+    weights = numbers(summary.to_frame(), "weight")
+    assert weights.output.isna().all()
+    assert len(weights) == 3
+    assert "output 1" in str(summary)
 
 
 @both
@@ -73,6 +89,19 @@ def test_columns_are_called_as_the_kernel_sees_them():
     assert scales(kernel=RBF(1.0), kernel_map=FunctionTransformer(lambda x: x.to_numpy()[:, :1])).index.tolist() == [
         "k0"
     ]
+
+
+def test_torques_say_what_all_joints_share_and_what_is_of_each():
+    y = 1.2 * X[:, 1] + np.sign(X[:, 0]) + 0.1 * RNG.randn(40)
+    m = InverseDynamics(n_inducing=3, max_iter=2, random_state=0).fit(np.column_stack([X, X[:, 0] ** 2]), y)
+    summary = m.summary()
+    weights = numbers(summary.to_frame(), "weight")
+    np.testing.assert_array_equal(weights.value, m.coef_)
+    assert weights.index.tolist() == m.coef_names_.tolist()
+    assert numbers(summary.to_frame(), "noise std").value.tolist() == [m.noise_variance_[0] ** 0.5]
+    assert numbers(summary.to_frame(), "signal std").value.tolist() == pytest.approx(m.residual_std_)
+    assert summary.certificate == ""
+    assert "What was learned" in m._repr_html_()
 
 
 # --- notebooks ----------------------------------------------------------------------------------------------------

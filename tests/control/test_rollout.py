@@ -1,9 +1,12 @@
 """Multi-step prediction, against the same done by hand."""
 
 import numpy as np
+import pandas as pd
+import polars
 import pytest
 from scipy.stats import kstest, norm
 from sklearn.base import BaseEstimator
+from sklearn.compose import ColumnTransformer
 from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -69,6 +72,11 @@ def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, 
     for state in range(2):
         # The largest distance is below this in 999 of 1000 cases.
         assert kstest(found.samples[:, 0, state], norm(mean[0, state], std[0, state]).cdf).statistic < 1.95 / 100.0
+
+
+def test_without_a_jacobian_differences_do(model, inputs):
+    ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
+    np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
 
 
 def test_mean_is_fed_back(model, inputs):
@@ -147,6 +155,30 @@ def test_feedback_is_in_the_derivative(sparse):
     np.testing.assert_allclose(found.covariance[1], A @ first @ A.T + np.diag(std[0] ** 2), rtol=1e-6)
     samples = rollout(sparse, Z0, lambda z, t: z @ gain.T, n_steps=2, n_samples=50, random_state=0)
     np.testing.assert_allclose(samples.inputs[:, 1], samples.samples[:, 0] @ gain.T, rtol=1e-12)
+
+
+def sine_of_polars(frame):
+    return frame.select(polars.all().sin()).to_numpy()
+
+
+@pytest.mark.parametrize("residual", [False, True])
+@pytest.mark.parametrize(("frame_of", "sine"), [(pd.DataFrame, np.sin), (polars.DataFrame, sine_of_polars)])
+def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_of, sine):
+    X, y = data
+    frame = frame_of(dict(zip(["angle", "speed", "torque"], X.T, strict=True)))
+
+    def made(scaled, angle, sine):
+        by_names = ColumnTransformer([("s", StandardScaler(), scaled), ("a", FunctionTransformer(sine), angle)])
+        model = EVGPRegressor(kernel_map=by_names, n_inducing=10, **QUICK | {"max_iter": 0})
+        return ResidualRegressor(model) if residual else model
+
+    named, numbered = made(["speed", "torque"], ["angle"], sine).fit(frame, y), made([1, 2], [0], np.sin).fit(X, y)
+    for method in ("mean", "linearized", "sample"):
+        found, expected = (
+            rollout(each, Z0, inputs, method=method, n_samples=3, random_state=0) for each in (named, numbered)
+        )
+        np.testing.assert_allclose(found.mean, expected.mean, rtol=1e-6, atol=1e-8)
+        np.testing.assert_allclose(found.std, expected.std, rtol=1e-6, atol=1e-8)
 
 
 @pytest.mark.parametrize(

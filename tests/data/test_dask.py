@@ -9,7 +9,7 @@ import dask.array as da
 import distributed
 import numpy as np
 import pytest
-from sklearn.preprocessing import PolynomialFeatures
+from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
 from skevgp import EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
@@ -102,6 +102,14 @@ def test_partial_fit_takes_chunks():
     both = model(max_iter=0).fit(X, Y).partial_fit(X[:100] + 0.01, Y[:100])
     lazy = model(max_iter=0).fit(*chunked(X, Y)).partial_fit(*chunked(X[:100] + 0.01, Y[:100], rows=(60, 40)))
     assert_same_model(lazy, both, rtol=1e-8)
+
+
+def test_maps_are_fitted_without_bringing_the_rows_here():
+    """Chunk by chunk where a map can; else to a sample, which here is all rows."""
+    parameters = {"kernel_map": StandardScaler(), "feature_map": FunctionTransformer(np.sin), "max_iter": 5}
+    lazy = model(**parameters).fit(*chunked(X, Y))
+    np.testing.assert_allclose(lazy.kernel_map_.mean_, X.mean(axis=0), rtol=1e-12)
+    assert_same_model(lazy, model(**parameters).fit(X, Y))
 
 
 def test_nothing_of_the_size_of_the_data_reaches_the_client(monkeypatch):

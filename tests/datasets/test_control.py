@@ -34,6 +34,16 @@ def test_commands_equal_the_stored_ones_step_by_step(stored):
         assert_allclose(controller.integral, stored["smooth_I"][:, step], rtol=0, atol=1e-9)
 
 
+def test_clamped_commands_equal_the_stored_ones(stored):
+    effort, Z = stored["effort_limit"], stored["step_Z"]
+    before, after = Z[:, :-1].reshape(-1, 14), Z[:, 1:].reshape(-1, 14)
+    U = stored["step_U"].reshape(-1, 1, 7)
+    assert (np.abs(U) > effort).any()
+    ends, acted = simulate("iiwa14", before, U, return_inputs=True)
+    assert_array_equal(acted[:, 0], stored["step_U_acted"].reshape(-1, 7))
+    assert_allclose(ends[:, 1], after, rtol=0, atol=1e-8)
+
+
 @pytest.mark.parametrize("robot", ["iiwa14", "ur5", "panda", "kinova", "double_pendulum", "talos_left_arm"])
 def test_robot_arrives_at_its_target(robot):
     n = load_robot(robot).nv

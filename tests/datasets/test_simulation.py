@@ -124,6 +124,21 @@ def test_without_damping_and_inputs_energy_is_kept(name, z0):
 ZEROS = np.zeros((3, 1))
 
 
+def test_controller_acts_like_the_inputs_it_gives():
+    z0, U = np.random.default_rng(0).uniform(-1.0, 1.0, (3, 4)), np.random.default_rng(1).standard_normal((3, 5, 1))
+    assert_array_equal(simulate("acrobot", z0, lambda step, Z: U[:, step], n_steps=5), simulate("acrobot", z0, U))
+
+
+def test_motors_give_no_more_than_their_limits():
+    effort = load_robot("iiwa14").upperEffortLimit
+    U = np.random.default_rng(0).uniform(-2.0, 2.0, (2, 3, 7)) * effort
+    clipped = np.clip(U, -effort, effort)
+    z0 = np.zeros((2, 14))
+    Z, acted = simulate("iiwa14", z0, U, return_inputs=True)
+    assert_array_equal(acted, clipped)
+    assert_array_equal(Z, simulate("iiwa14", z0, clipped))
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [

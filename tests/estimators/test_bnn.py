@@ -102,6 +102,17 @@ def test_local_reparameterisation_gives_the_variance_of_pre_activations_and_outp
         np.testing.assert_allclose((inputs @ weights).var(axis=0), variance, rtol=0.04)
 
 
+@pytest.mark.parametrize("network", NETWORKS, ids=lambda network: str(network.sizes))
+def test_mini_batches_average_to_the_whole(network):
+    theta, X, Y, draws = case(network)
+    halves = [
+        network.loss_and_gradient(theta, X[half], Y[half], draws[half], N_ROWS) for half in (slice(0, 4), slice(4, 8))
+    ]
+    loss, gradient = network.loss_and_gradient(theta, X, Y, draws, N_ROWS)
+    assert np.mean([half[0] for half in halves]) == pytest.approx(loss, rel=1e-12)
+    np.testing.assert_allclose(np.mean([half[1] for half in halves], axis=0), gradient, rtol=1e-9, atol=1e-12)
+
+
 @pytest.mark.parametrize(
     ("sizes", "count"),
     [([3, 15, 15, 2], 634), ([5, 50, 50, 4], 6008), ([5, 60, 60, 4], 8408), ([21, 250, 250, 14], 143028)],
@@ -230,6 +241,22 @@ def test_held_out_rows_are_not_learned_from(monkeypatch):
     m = model(early_stopping=True, validation_fraction=0.25, max_iter=3, batch_size=7).fit(X, Y)
     assert (len(learned), len(scored), len(learned & scored)) == (90, 30, 0)
     assert len(m.loss_curve_) == len(m.validation_scores_) == 3
+
+
+def test_interruption_keeps_a_usable_model(monkeypatch):
+    original, calls = VariationalNetwork.loss_and_gradient, []
+
+    def interrupted(self, *arguments):
+        calls.append(1)
+        if len(calls) == 10:
+            raise KeyboardInterrupt
+        return original(self, *arguments)
+
+    monkeypatch.setattr(VariationalNetwork, "loss_and_gradient", interrupted)
+    with pytest.warns(ConvergenceWarning, match="interrupted"):
+        m = model().fit(X, Y)
+    assert m.n_iter_ == 9
+    assert np.isfinite(m.predict(X_NEW)).all()
 
 
 def test_loss_that_does_not_stay_finite_warns(monkeypatch):

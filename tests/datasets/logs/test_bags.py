@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from rosbags.rosbag2 import StoragePlugin, Writer
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from skevgp.datasets import load_log
@@ -45,6 +45,22 @@ def states(start=START, names=("a", "b"), velocity=True):
             START + t + late,
             state(start + t if start else 0, list(names), q[row], dq[row] if velocity else (), current[row]),
         )
+
+
+def trajectory(effort=True, start=0):
+    q, dq, ddq, current = motion(T)
+    point = TYPES["trajectory_msgs/msg/JointTrajectoryPoint"]
+    points = [
+        point(
+            q[row],
+            dq[row],
+            ddq[row],
+            current[row] if effort else np.empty(0),
+            stamp(t, "builtin_interfaces/msg/Duration"),
+        )
+        for row, t in enumerate(NS.tolist())
+    ]
+    return START, TYPES[TRAJECTORY](header(start), ["a", "b"], points)
 
 
 def write(folder, topics, plugin=StoragePlugin.MCAP):
@@ -91,6 +107,32 @@ def test_recordings_are_read_with_and_without_their_metadata(tmp_path, plugin, w
     assert_recorded(log)
     assert log.recordings[0].start == pytest.approx((START + NS[0]) * 1e-9)
     assert log.joint_names == ["a", "b"]
+
+
+@pytest.mark.parametrize(
+    ("mode", "plugin"),
+    [
+        (CompressionMode.STORAGE, StoragePlugin.MCAP),
+        (CompressionMode.FILE, StoragePlugin.SQLITE3),
+        (CompressionMode.MESSAGE, StoragePlugin.SQLITE3),
+    ],
+    ids=["chunks", "file", "messages"],
+)
+def test_compressed_recordings_are_read(tmp_path, mode, plugin):
+    writer = Writer(tmp_path / "bag", version=9, storage_plugin=plugin)
+    writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
+        for received, message in states():
+            writer.write(connection, received, STORE.serialize_cdr(message, STATES))
+    assert_recorded(load_log(tmp_path / "bag"))
+
+
+def test_trajectory_brings_its_accelerations(tmp_path):
+    log = load_log(write(tmp_path / "bag", {"/plan": (TRAJECTORY, [trajectory()])}))
+    assert_recorded(log)
+    assert_allclose(log.recordings[0].raw.acceleration, motion(T)[2], rtol=1e-15)
+    assert_allclose(log.data[:, 4:], motion(log.time + T[0])[2], atol=0.01)
 
 
 def test_joints_are_chosen_and_ordered_by_name(tmp_path):

@@ -24,6 +24,27 @@ def test_torques_are_gains_times_currents(files, gains):
     assert_array_equal(log.data, plain.data)
 
 
+@pytest.mark.parametrize(
+    ("keep", "rows"),
+    [
+        (slice(100, 500), slice(100, 500)),
+        (slice(None, -200), slice(None, -200)),
+        ((1.0, None), T - T[0] >= 1.0),
+        ((1.0, 4.5), (T - T[0] >= 1.0) & (T - T[0] <= 4.5)),
+        ((None, 4.5), T - T[0] <= 4.5),
+    ],
+)
+def test_only_what_is_kept_is_read(tmp_path, files, keep, rows):
+    table = table_of(T)
+    inside = np.zeros(len(T), dtype=bool)
+    inside[rows] = True
+    table[~inside, 1:] = np.nan
+    log = load_log(write_table(tmp_path / "spoilt.csv", table), columns=BY_NUMBER, keep=keep)
+    alone = load_log(write_table(tmp_path / "alone.csv", table[inside]), columns=BY_NUMBER)
+    assert_allclose(log.data, alone.data, atol=1e-9)
+    assert_allclose(log.time, alone.time + T[inside][0] - T[0], atol=1e-9)
+
+
 def test_description_tells_what_was_done(files):
     table = table_of(np.delete(np.sort(np.r_[T, T[::50]]), slice(300, 320)))
     write_table(files[0], table)

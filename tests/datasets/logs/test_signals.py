@@ -69,6 +69,14 @@ def test_regular_times_may_stay_and_be_filtered(load):
     assert_array_equal(np.less(errors(log, 0.0), [2e-4, 2e-4, 3e-3, 3e-3]), True)
 
 
+def test_two_periods_of_the_cutoff_are_cut_at_each_end(load):
+    t = np.arange(0.0, 10.0, 0.01)
+    log = load(table_of(t), cutoff=2.5)
+    assert_allclose(log.time[[0, -1]], [0.8, t[-1] - 0.8], atol=1e-9)
+    assert_allclose(log.recordings[0].cuts[0][:2], (0.0, 0.795), atol=1e-9)
+    assert [why for *_, why in log.recordings[0].cuts] == ["edge", "edge"]
+
+
 def test_nothing_leaks_across_a_gap(load):
     t = irregular_times()
     first, second = table_of(t[:1000]), table_of(t[1100:])
@@ -87,6 +95,38 @@ def test_nothing_leaks_across_a_gap(load):
     assert_array_equal(load(first).data, log.data[log.pieces == 0])
     assert ((log.time < gap[0]) == (log.pieces == 0)).all()
     assert (log.time[log.pieces == 1] > gap[1]).all()
+
+
+@pytest.mark.parametrize("n_rows", [1, 2, 20])
+def test_pieces_too_short_for_the_filter_are_left_out(load, n_rows):
+    t = irregular_times()
+    t = t[np.r_[0:1000, 1100 : 1100 + n_rows, 1300 : len(t)]]
+    log = load(table_of(t))
+    assert [why for *_, why in log.recordings[0].cuts if why != "edge"] == ["gap", "too short", "gap"]
+    assert len(np.unique(log.pieces)) == 2
+
+
+def resting(t, *phases):
+    """The motion as a clock goes that stands still in these phases: positions stay, velocities are 0."""
+    stands = np.any([(first <= t) & (t < last) for first, last in phases], axis=0)
+    own = np.cumsum(np.where(stands, 0.0, np.diff(t, append=t[-1])))
+    table = table_of(own)
+    table[stands, 4:6] = 0.0
+    table[:, 0] = t
+    return table
+
+
+def test_rest_is_cut_at_the_ends_and_between(load):
+    phases = [(0.0, 2.0), (8.0, 10.0), (14.0, 14.3), (18.0, 20.0)]
+    log = load(resting(np.arange(0.0, 20.0, 0.01), *phases), rest_velocity=0.02)
+    rests = [cut[:2] for cut in log.recordings[0].cuts if cut[2] == "rest"]
+    assert_allclose(rests, [phases[0], phases[1], phases[3]], atol=0.35)  # the filter rings a little
+    assert_array_equal(np.unique(log.pieces), [0, 1])
+    assert not log.groups.any()
+    slow = (np.abs(log.data[:, 2:4]) < 0.02).all(axis=1)
+    for first, last in rests:
+        assert not ((log.time > first) & (log.time < last)).any()
+    assert 0 < slow.sum() < 50  # the rest of 0.3 s
 
 
 def spoilt(row, column, value):

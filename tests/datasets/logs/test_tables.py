@@ -40,6 +40,14 @@ def test_columns_by_name_are_columns_by_number(file, expected, columns):
     assert_equal(load_log(file, columns=columns), expected)
 
 
+@pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+@pytest.mark.parametrize("header", [HEADER, None], ids=["header", "no header"])
+@pytest.mark.parametrize("name", ["log.csv", "log.csv.gz", "log.TXT"])
+def test_any_table_is_read(tmp_path, expected, delimiter, header, name):
+    file = write_table(tmp_path / name, TABLE, header, delimiter)
+    assert_equal(load_log(file, columns=BY_NUMBER), expected)
+
+
 @pytest.mark.parametrize(
     "beginning",
     [
@@ -54,6 +62,15 @@ def test_headers_are_found(tmp_path, expected, beginning):
     file = tmp_path / "log.csv"
     file.write_text(beginning + body, encoding="utf-8")
     assert_equal(load_log(file, columns=BY_NAME), expected)
+
+
+@pytest.mark.parametrize(("unit", "seconds"), [("ms", 1e-3), ("us", 1e-6), ("ns", 1e-9)])
+def test_times_have_a_unit(tmp_path, expected, unit, seconds):
+    table = TABLE.copy()
+    table[:, 0] /= seconds
+    log = load_log(write_table(tmp_path / "log.csv", table), columns=BY_NUMBER, time_unit=unit)
+    np.testing.assert_allclose(log.data, expected.data, atol=1e-8)
+    assert log.recordings[0].start == pytest.approx(expected.recordings[0].start)
 
 
 @pytest.mark.parametrize(
