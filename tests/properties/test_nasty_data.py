@@ -19,6 +19,7 @@ from skevgp.robots import inertial_parameters, load_robot
 from skevgp.solvers import LBFGS, Adam
 
 from ..datasets.logs.cases import BY_NUMBER, irregular_times, table_of, write_table
+from ..datasets.logs.test_bags import UR10, write_states
 from ..robots.test_urdf import ARM
 from .cases import data, fewer, learned_models
 
@@ -169,9 +170,17 @@ def read_robot(path):
     return (inertial_parameters(load_robot(path)),)
 
 
+def read_recording(path):
+    log = load_log(path)
+    return log.data, log.target
+
+
+# What reads each, and what writes a good one in a folder.
 FILES = {
-    "table.csv": (read_log, lambda path: write_table(path, table_of(irregular_times(3.0)))),
-    "robot.urdf": (read_robot, lambda path: path.write_text(ARM)),
+    "table.csv": (read_log, lambda folder: write_table(folder / "good.csv", table_of(irregular_times(3.0)))),
+    "robot.urdf": (read_robot, lambda folder: (folder / "good.urdf").write_text(ARM) and folder / "good.urdf"),
+    "recording.mcap": (read_recording, lambda folder: write_states(folder / "good")),
+    "recording.db3": (read_recording, lambda folder: UR10),
 }
 
 
@@ -185,9 +194,9 @@ FILES = {
 @example("number", 10**5 - 1, 0)
 def test_damaged_files_are_read_or_refused(tmp_path_factory, name, kind, where, byte):
     read, write = FILES[name]
-    path = tmp_path_factory.mktemp("damaged") / name
-    write(path)
-    path.write_bytes(damaged(path.read_bytes(), kind, where, byte))
+    folder = tmp_path_factory.mktemp("damaged")
+    path = folder / name
+    path.write_bytes(damaged(write(folder).read_bytes(), kind, where, byte))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:

@@ -135,38 +135,30 @@ def test_motor_works_between_both_limits(lower, upper, driven, limits):
 # --- what cannot ---------------------------------------------------------------------------------------------------
 
 
-def test_file_that_is_no_urdf_raises(tmp_path):
-    path = tmp_path / "bad.urdf"
-    path.write_text("<robot><link></robot>")
-    with pytest.raises(ValueError, match=r"bad.urdf' is not a URDF that can be read"):
-        load_robot(path)
-
-
-@pytest.mark.parametrize("path", ["nothing.urdf", "some/where", "~/nothing.urdf", "~nobody-of-this-name/a.urdf"])
-def test_file_missing_raises(path):
-    with pytest.raises(ValueError, match=r"There is no file '.*the names that are known"):
-        load_robot(path)
-
-
-@pytest.mark.parametrize("kind", [str, Path])
-def test_folder_is_told_apart(tmp_path, kind):
-    with pytest.raises(ValueError, match=r"is a folder; a robot is one URDF file"):
-        load_robot(kind(tmp_path))
-
-
-def test_empty_robot_name_raises():
-    with pytest.raises(ValueError, match="Unknown robot ''"):
-        load_robot("")
-
-
-def test_name_as_a_path_gets_a_hint():
-    with pytest.raises(ValueError, match=r"no file 'panda'; a robot's name must be a string, not a path"):
-        load_robot(Path("panda"))
-
-
-def test_floating_base_raises():
-    with pytest.raises(ValueError, match=r"joint 'root_joint' of the type JointModelFreeFlyer.*base fixed"):
-        load_robot(pinocchio.buildSampleModelHumanoidRandom())
+@pytest.mark.parametrize(
+    ("robot", "message"),
+    [
+        ("bad.urdf", r"bad.urdf' is not a URDF that can be read"),
+        ("nothing.urdf", r"There is no file '.*the names that are known"),
+        ("some/where", r"There is no file '.*the names that are known"),
+        ("~nobody-of-this-name/a.urdf", r"There is no file '.*the names that are known"),
+        (Path("folder"), r"is a folder; a robot is one URDF file"),
+        ("", "Unknown robot ''"),
+        (Path("panda"), r"no file 'panda'; a robot's name must be a string, not a path"),
+        (pinocchio.Model(), "has no joint that moves"),
+        (
+            pinocchio.buildSampleModelHumanoidRandom(),
+            r"joint 'root_joint' of the type JointModelFreeFlyer.*base fixed",
+        ),
+    ],
+    ids=lambda each: str(each)[:30],
+)
+def test_invalid_robot_raises(tmp_path, monkeypatch, robot, message):
+    monkeypatch.chdir(tmp_path)
+    Path("folder").mkdir()
+    Path("bad.urdf").write_text("<robot><link></robot>")
+    with pytest.raises(ValueError, match=message):
+        load_robot(robot)
 
 
 @pytest.mark.parametrize(
@@ -177,11 +169,6 @@ def test_joints_of_several_velocities_raise(joint):
     model.addJoint(0, joint, pinocchio.SE3.Identity(), "ball")
     with pytest.raises(ValueError, match=rf"joint 'ball' of the type {joint.shortname()}"):
         load_robot(model)
-
-
-def test_model_without_joints_raises():
-    with pytest.raises(ValueError, match="has no joint that moves"):
-        load_robot(pinocchio.Model())
 
 
 @pytest.mark.parametrize("robot", [3, None, ["ur5"], object()])

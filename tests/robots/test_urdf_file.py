@@ -1,4 +1,4 @@
-"""What of a URDF file Pinocchio is given; `tests/long/hostile_files.py` damages such files thousands of times."""
+"""What of a URDF file Pinocchio is given; `tests/properties/test_nasty_data.py` damages such files."""
 
 import warnings
 from itertools import pairwise
