@@ -45,7 +45,7 @@ def test_progress_shows_number_of_inducing_points(capsys):
         {"solver": LBFGS(max_inducing=None)},
     ],
 )
-def test_other_values_raise(wrong):
+def test_invalid_n_inducing_raises(wrong):
     named = "max_inducing" if "solver" in wrong else next(iter(wrong))
     with pytest.raises((ValueError, TypeError), match=named):
         model(**wrong).fit(X, Y)

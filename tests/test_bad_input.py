@@ -194,7 +194,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("kind", [EVGPRegressor, EGPRegressor])
-def test_features_that_dwarf_the_targets_beyond_what_doubles_square_raise(kind):
+def test_overflowing_prior_scale_raises(kind):
     spread = "the prior standard deviation of coef_ times features, in units of what these leave of y,"
     message = rf"^{spread} must not exceed 1e\+130 in size; "
     model = kind(PolynomialFeatures(), coef_prior=CoefPrior(scale=1e8), max_iter=5)

@@ -97,7 +97,7 @@ def test_vague_weights_need_as_many_rows():
 
 
 @pytest.mark.parametrize("scale", [np.nan, -np.inf, -1.0])
-def test_other_scales_raise(scale):
+def test_invalid_coef_scale_raises(scale):
     with pytest.raises(ValueError, match="scale of CoefPrior must"):
         EGPRegressor(TREND, coef_prior=CoefPrior(scale=scale)).fit(X, Y)
 
@@ -182,7 +182,7 @@ def test_warnings_point_at_the_line_that_fits():
         assert {warning.filename for warning in warned} == {__file__}
 
 
-def test_ctrl_c_keeps_the_best_parameters_and_warns():
+def test_interrupted_fit_keeps_best_parameters():
     looks = []
 
     def interrupting(X, Z, scale=1.0):

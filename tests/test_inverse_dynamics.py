@@ -165,7 +165,7 @@ def with_masses(arm, factor):
 
 
 @pytest.mark.parametrize("factor", [0.01, 0.1])
-def test_masses_that_are_placeholders_warn(factor):
+def test_placeholder_masses_warn(factor):
     arm = Arm()
     with pytest.warns(ConvergenceWarning, match="far from what torques say"):
         InverseDynamics(with_masses(arm, factor), n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)

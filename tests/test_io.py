@@ -231,7 +231,7 @@ def write_content(path, content, **about):
     write_members(path, {**members_of(path), "skevgp.json": json.dumps(versions)})
 
 
-def test_files_of_others_raise(path):
+def test_foreign_files_raise(path):
     save(fitted("plain"), path)
     write_members(path, {**members_of(path), "more": bytes(2**27)}, zipfile.ZIP_DEFLATED)
     with pytest.raises(ValueError, match=r"model.skevgp' .* bytes and unpacks to 1344"):

@@ -59,7 +59,7 @@ def test_when_it_is_over_the_best_so_far_is_kept(sharing, n_jobs):
 
 
 @pytest.mark.parametrize("max_time", [0, -1.0, "10"])
-def test_no_time_raises(max_time):
+def test_invalid_max_time_raises(max_time):
     with pytest.raises((ValueError, TypeError), match="max_time of LBFGS must be"):
         EVGPRegressor(solver=LBFGS(max_time=max_time)).fit(X, Y)
     with pytest.raises(ValueError, match="The 'max_time' parameter of EGPRegressor must be"):

@@ -150,7 +150,7 @@ def test_without_matplotlib_the_pip_command_is_given(monkeypatch, display):
 
 
 @pytest.mark.parametrize("output", [2, -3])
-def test_output_missing_raises(trend, output):
+def test_missing_output_raises(trend, output):
     with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):
         PosteriorDisplay.from_estimator(trend, X[:5], output=output)
     with pytest.raises(ValueError, match=f"output={output} must be the index of one of"):

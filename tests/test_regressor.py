@@ -274,7 +274,7 @@ def test_too_few_iterations_warn_and_say_what_to_change():
 
 @pytest.mark.parametrize("solver", [LBFGS, Adam])
 @pytest.mark.parametrize("sharing", ["all", "none"])
-def test_ctrl_c_keeps_the_best_parameters_and_warns(sharing, solver):
+def test_interrupted_fit_keeps_best_parameters(sharing, solver):
     def interrupt(iteration, bound, outputs):
         if iteration == 3:
             raise KeyboardInterrupt

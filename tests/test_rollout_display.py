@@ -106,7 +106,7 @@ def test_mismatched_arguments_raise(ahead, arguments, message):
         RolloutDisplay.from_rollout(ahead, **arguments)
 
 
-def test_initial_state_missing_raises(batch):
+def test_missing_initial_state_raises(batch):
     with pytest.raises(ValueError, match="index=3 must be that of one of 3 initial states"):
         RolloutDisplay.from_rollout(batch, index=3)
 

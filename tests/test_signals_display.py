@@ -109,7 +109,7 @@ def test_invalid_values_raise(log, arguments, message):
         SignalsDisplay.from_log(log, **arguments)
 
 
-def test_without_matplotlib_the_pip_command_raises(log, monkeypatch):
+def test_missing_matplotlib_raises(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match="pip install matplotlib"):
         SignalsDisplay.from_log(log)

@@ -114,7 +114,7 @@ def test_invalid_inducing_points(init, message):
 # --- what a fit says when it ends badly --------------------------------------------------------------------------
 
 
-def test_noise_that_explains_what_a_kernel_could_warns():
+def test_noise_that_explains_everything_warns():
     """One inducing point cannot follow forty waves, whatever the start."""
     x = np.linspace(0, 1, 2000)[:, np.newaxis]
     y = np.column_stack([np.sin(80 * np.pi * x[:, 0]), np.random.RandomState(0).randn(2000)])

@@ -94,13 +94,13 @@ def test_noise_is_left_out_if_that_is_asked_for(exported):
 
 
 @pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])
-def test_name_that_is_taken_in_c_raises(name, tmp_path):
+def test_reserved_c_name_raises(name, tmp_path):
     with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
         fitted(sparse()).to_c(tmp_path, name)
     assert not list(tmp_path.iterdir())
 
 
-def test_folder_missing_raises(tmp_path):
+def test_missing_folder_raises(tmp_path):
     model = fitted(sparse())
     with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):
         model.to_c(tmp_path / "missing" / "model.c")

@@ -78,7 +78,7 @@ def test_without_casadi_there_is_the_pip_command(method, monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["two words", "1st", "", "a__b", None, 3])
-def test_name_that_casadi_refuses_raises(name):
+def test_invalid_casadi_name_raises(name):
     with pytest.raises(ValueError, match=r"name must be letters, digits and single underscores.*got"):
         fitted(sparse()).to_casadi(name)
 

@@ -209,7 +209,7 @@ def test_invalid_arguments_raise(sparse, arguments, options, message, method):
         rollout(sparse, *arguments, **{"method": method, **options})
 
 
-def test_regressors_that_will_not_do_raise(data, inputs):
+def test_invalid_regressors_raise(data, inputs):
     with pytest.raises(NotFittedError):
         rollout(EVGPRegressor(), Z0, inputs)
     with pytest.raises(TypeError, match=r"LinearRegression.predict has no return_std"):

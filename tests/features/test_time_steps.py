@@ -71,7 +71,7 @@ def test_state_stays_and_features_are_multiplied_by_the_step_of_their_row(kind, 
         (AngleEncoder, ["sin(q)", "cos(q)", "dq/dt", "u_q", "dt"]),
     ],
 )
-def test_names(features, names):
+def test_names_of_columns(features, names):
     X = rows("pendulum")
     fitted = features("pendulum", dt="column").fit(X)
     assert fitted.get_feature_names_out().tolist() == names
@@ -170,7 +170,7 @@ def test_weights_are_those_of_a_second():
 
 @any_map
 @pytest.mark.parametrize("bad", [0.0, -0.01, np.nan, np.inf, -np.inf])
-def test_step_that_is_none_raises(kind, bad):
+def test_invalid_time_step_raises(kind, bad):
     X = rows("pendulum")
     features = ANY[kind]("pendulum", dt="column").fit(X)
     X[3, -1] = bad

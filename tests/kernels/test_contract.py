@@ -188,7 +188,7 @@ def test_slopes_agree_with_differences_of_the_scikit_learn_kernel(name, centre):
 
 
 @pytest.mark.parametrize("name", NO_GRADIENT)
-def test_functions_that_have_no_gradient_raise(name):
+def test_functions_without_gradient_raise(name):
     covariance, hyperparameters = parsed(KERNELS[name])
     with pytest.raises(ValueError, match="Matern kernel with nu up to 1 has no gradient"):
         covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))

@@ -116,7 +116,7 @@ def test_model_gets_its_parameters_and_the_given_one_stays(name):
     assert changed == model
 
 
-def test_link_that_no_body_can_be_raises():
+def test_inconsistent_link_raises():
     model = load_robot("ur10")
     parameters = inertial_parameters(model)
     parameters[2, 0] = -3.0

@@ -258,7 +258,7 @@ def set_gravity(model, value):
     ],
 )
 @pytest.mark.parametrize("name", ["acrobot", "kinova"])
-def test_numbers_that_make_no_sense_raise(name, change, value, message):
+def test_invalid_model_numbers_raise(name, change, value, message):
     model = load_robot(name).copy()
     change(model, value)
     with pytest.raises(ValueError, match=rf"The model '{model.name}' has .*{message}"):

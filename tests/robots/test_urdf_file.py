@@ -126,7 +126,7 @@ def test_joint_without_limits_raises(load):
     assert load(text.replace("revolute", "continuous")).nv == 1
 
 
-def test_long_arm_is_a_robot_and_an_endless_one_raises(load):
+def test_too_long_chain_raises(load):
     """Pinocchio goes from joint to joint by recursion: one of 5000 ends the interpreter."""
 
     def chain(n, kind):

@@ -228,7 +228,7 @@ def test_missing_recording_raises_and_is_not_created(tmp_path, name):
     assert not list(tmp_path.iterdir())
 
 
-def test_message_that_is_none_raises(tmp_path):
+def test_undecodable_message_raises(tmp_path):
     with Writer(tmp_path / "bag", version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         connection = writer.add_connection("/joint_states", STATES, typestore=STORE)
         writer.write(connection, START, b"\x00\x01\x00\x00" + b"\xff" * 40)
@@ -236,7 +236,7 @@ def test_message_that_is_none_raises(tmp_path):
         load_log(tmp_path / "bag" / "bag.mcap")
 
 
-def test_without_rosbags_the_pip_command_raises(monkeypatch):
+def test_missing_rosbags_raises(monkeypatch):
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
     with pytest.raises(ImportError, match=r"Reading rosbag2 files needs .* 'rosbags'.*pip install '\.\[logs\]'"):
         load_log(UR10)

@@ -122,7 +122,7 @@ def test_no_file_raises():
         load_log([])
 
 
-def test_file_missing_raises(tmp_path):
+def test_missing_file_raises(tmp_path):
     for name in ("no.csv", "no.csv.gz"):
         with pytest.raises(FileNotFoundError, match=name):
             load_log(tmp_path / name, columns=BY_NUMBER)
