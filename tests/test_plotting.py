@@ -66,6 +66,17 @@ def test_inducing_points_are_crosses_on_the_lower_edge():
     assert display.ax_.transAxes.inverted().transform(on_screen)[:, 1] == pytest.approx(0.03)
 
 
+def test_bars_are_so_many_standard_deviations():
+    display = CoefficientDisplay(["a", "b"], *np.array([[1.0, 2.0], [0.1, 0.2], [3.0, 4.0], [0.3, 0.4]])).plot(n_std=3)
+    prior, posterior = display.ax_.containers
+    assert (prior.get_label(), posterior.get_label()) == ("prior ±3 std", "posterior ±3 std")
+    for container, means, stds in ((prior, [3.0, 4.0], [0.3, 0.4]), (posterior, [1.0, 2.0], [0.1, 0.2])):
+        points, _, (bars,) = container
+        assert_array_equal(points.get_xdata(), means)
+        ends = np.array([segment[:, 0] for segment in bars.get_segments()])
+        assert_allclose(ends.T, [np.subtract(means, np.multiply(3, stds)), np.add(means, np.multiply(3, stds))])
+
+
 def test_line_is_the_predicted_mean():
     model = fitted()
     display = PosteriorDisplay.from_estimator(model, X, label="EVGP")

@@ -10,6 +10,14 @@ def test_independent_rows_are_worth_one_each():
     assert correlation_time(errors, np.zeros(20_000, dtype=int)) < 1.2
 
 
+def test_no_product_is_taken_across_runs():
+    rng = np.random.default_rng(0)
+    level = np.repeat([1.0, -1.0] * 500, 2)
+    runs = np.repeat(np.arange(1000), 2)
+    alternating = correlation_time(level + 0.01 * rng.normal(size=2000), runs)
+    assert alternating == pytest.approx(2.0, abs=0.05)  # of each run two equal rows; no lag is longer
+
+
 @pytest.mark.parametrize("factor", [0.5, 0.9])
 def test_autoregressive_process_has_its_known_time(factor):
     rng, errors = np.random.default_rng(0), np.zeros(100_000)

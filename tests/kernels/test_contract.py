@@ -162,6 +162,9 @@ def test_extreme_hyperparameters_and_distances_are_finite(name):
 NO_GRADIENT = [name for name in KERNELS if name in {*ROUGH, "matern 0.8", "periodic"}]
 
 
+SMOOTH = [name for name in KERNELS if name not in NO_GRADIENT]
+
+
 def differences(function, rows):
     """Central differences of function(rows), (..., n), in each column of its rows: (..., n, d)."""
     each = []
@@ -185,6 +188,23 @@ def test_slopes_agree_with_differences_of_the_scikit_learn_kernel(name, centre):
     close(at.slopes(prepared), differences(lambda rows: kernel(Z, rows), X))
     diagonal = np.broadcast_to(at.diagonal_slopes(prepared), X.shape)
     close(diagonal, differences(kernel.diag, X))
+
+
+@pytest.mark.parametrize("centre", [None, CENTRE])
+@pytest.mark.parametrize("name", SMOOTH)
+def test_mixed_slopes_agree_with_differences_of_slopes(name, centre):
+    covariance, hyperparameters = parsed(KERNELS[name], centre)
+    actual = covariance.at(hyperparameters, Z).mixed_slopes(covariance.prepare(X))
+    for row, own in zip(X[:10], actual, strict=False):
+        # ∂k(z, x)/∂x at x = row, as a function of z.
+        expected = differences(
+            lambda points, x=row: (
+                covariance.at(hyperparameters, points).slopes(covariance.prepare(x[np.newaxis]))[:, 0].T
+            ),
+            row[np.newaxis],
+        )[:, 0]
+        # Of a function that is differentiable just once, differences across z = x are as good as their step.
+        close(own, expected, 1e-2 if "matern 1.9" in name else 1e-4)
 
 
 @pytest.mark.parametrize("name", NO_GRADIENT)
