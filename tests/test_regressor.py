@@ -267,6 +267,13 @@ def test_same_random_state_same_bits_for_any_n_jobs(sharing, solver, monkeypatch
         np.testing.assert_array_equal(m.loss_curve_, fits[0].loss_curve_)
 
 
+def test_log_ends_with_the_line_of_the_last_iteration(capsys):
+    m = model(verbose=1, noise_cv=None).fit(X, Y)
+    line = capsys.readouterr().out.splitlines()[-1]
+    assert line.startswith(f"all rows, iteration {m.n_iter_}, bound ")
+    assert float(line.split(", ")[2].split()[1]) == pytest.approx(m.lower_bound_, abs=1e-2)
+
+
 def test_too_few_iterations_warn_and_say_what_to_change():
     with pytest.warns(ConvergenceWarning, match=r"max_iter=3 iterations. Raise max_iter"):
         model(max_iter=3).fit(X, Y)

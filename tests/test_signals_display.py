@@ -82,6 +82,14 @@ def test_lines_are_what_was_recorded_and_what_became_of_it(log):
                 assert_array_equal(values, raw[name][:, joint])
 
 
+def test_noise_does_not_set_the_scale(log):
+    display = SignalsDisplay.from_log(log)
+    kept = log.groups == 0
+    low, high = display.axes_[1, 0].get_ylim()
+    values = log.data[kept, 4]
+    assert_allclose([low, high], [values.min() - np.ptp(values) / 4.0, values.max() + np.ptp(values) / 4.0])
+
+
 def test_removed_rows_are_coloured_by_reason(log):
     display = SignalsDisplay.from_log(log)
     cuts = log.recordings[0].cuts

@@ -8,10 +8,11 @@ import polars
 import pytest
 from sklearn.base import BaseEstimator, TransformerMixin
 from sklearn.compose import ColumnTransformer
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, StandardScaler
+from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
 
 from .cases import N_OUTPUTS, QUICK, D
 
@@ -44,6 +45,21 @@ def test_jacobians_agree_with_differences_of_predictions(model, data, include_no
     np.testing.assert_array_equal(model.jacobian(X), jacobian)
     for one, other in zip(model.value_and_jacobian(X), (mean, jacobian), strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-12, atol=1e-12)
+
+
+def test_gradient_of_the_exact_model_is_the_formula(data):
+    """Rasmussen & Williams 2006, section 9.4, with k + h Σ hᵀ as the kernel (section 2.7)."""
+    X, Y, X_new = data
+    scale, s2, noise, lengths = 1.5, 2.0, 0.01, np.array([0.9, 1.2])
+    kernel = ConstantKernel(s2, "fixed") * RBF(lengths, "fixed") + WhiteKernel(noise, "fixed")
+    model = EGPRegressor(PolynomialFeatures(1), kernel, coef_prior=CoefPrior(scale=scale)).fit(X, Y[:, 0])
+    gradient, cov = model.predict_gradient(X_new, return_cov=True)
+    K = model.kernel_(X) + scale**2 * (1.0 + X @ X.T) + noise * np.eye(len(X))
+    for x, own_gradient, own_cov in zip(X_new, gradient, cov, strict=True):
+        slopes = (X - x) / lengths**2 * model.kernel_(X, x[np.newaxis]) + scale**2 * X
+        np.testing.assert_allclose(own_gradient, slopes.T @ np.linalg.solve(K, Y[:, 0]), rtol=1e-7, atol=1e-9)
+        prior = np.diag(s2 / lengths**2) + scale**2 * np.eye(D)
+        np.testing.assert_allclose(own_cov, prior - slopes.T @ np.linalg.solve(K, slopes), rtol=1e-6, atol=1e-9)
 
 
 def test_covariance_of_a_gradient_is_that_of_differences(model, data):

@@ -1,5 +1,6 @@
 """BayesianMLPRegressor: its network against oracles, and what a user sees of it."""
 
+from copy import copy
 from itertools import pairwise
 
 import autograd.numpy as anp
@@ -215,6 +216,24 @@ def test_loss_and_predictions_are_those_of_weights_drawn_from_the_attributes():
     predicted, std = m.predict(x, return_std=True)
     np.testing.assert_allclose(predicted / y.std(axis=0), functions.mean(axis=0) / y.std(axis=0), atol=0.01)
     np.testing.assert_allclose(std**2, functions.var(axis=0) + m.noise_variance_, rtol=0.05)
+
+
+@pytest.mark.parametrize("hidden", [(), (4,), (4, 3)])
+def test_warm_start_on_other_scales_is_the_same_network(hidden):
+    m = model(hidden, warm_start=True).fit(X * [1.0, 1e9] + [5.0, 0.0], Y * [1e-6, 1e6])
+    before = copy(m)
+    # Steps that go nowhere.
+    m.set_params(learning_rate_init=1e-12, max_iter=3, batch_size=120)
+    m.fit(2.0 * X * [1.0, 1e9] + [7.0, 1e9], 3.0 * Y * [1e-6, 1e6] - [1.0, 0.0])
+    for name in ("coefs_", "coefs_std_"):
+        for a, b in zip(getattr(m, name), getattr(before, name), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-9)
+    np.testing.assert_allclose(m.noise_variance_, before.noise_variance_, rtol=1e-9)
+    # Biases of the first layer are those at X = 0.
+    at_zero = [fit.intercepts_[0] - fit.X_mean_ @ fit.coefs_[0] for fit in (m, before)]
+    np.testing.assert_allclose(*at_zero, rtol=1e-6)
+    for a, b in zip(m.intercepts_[1:], before.intercepts_[1:], strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-6)
 
 
 # --- learning ----------------------------------------------------------------------------------------------------

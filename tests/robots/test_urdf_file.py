@@ -53,6 +53,15 @@ def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
     assert pinocchio.buildModelFromXML(text) == pinocchio.buildModelFromUrdf(str(path))
 
 
+@pytest.mark.parametrize("kind", ["fixed", "revolute"])
+def test_world_need_not_be_declared(load, kind):
+    """As Drake has it."""
+    joints = joint("world", "a", kind), joint("a", "b")
+    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
+    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
+        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
+
+
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
