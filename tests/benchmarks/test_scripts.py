@@ -1,0 +1,119 @@
+"""Each benchmark runs in its quick mode, and each documented command has valid options."""
+
+import argparse
+import re
+import runpy
+import shlex
+import sys
+from concurrent.futures import Future
+from pathlib import Path
+
+import pytest
+from matplotlib import rc_context
+
+ROOT = Path(__file__).parents[2]
+BENCHMARKS = ROOT / "benchmarks"
+SCRIPTS = [
+    path
+    for path in sorted(BENCHMARKS.rglob("*.py"))
+    if "parse_args()" in path.read_text() or "parse_args(arguments)" in path.read_text()
+]
+PAGES = [
+    ROOT / "README.md",
+    ROOT / "REPRODUCTION.md",
+    *(ROOT / "docs").glob("[a-z]*.md"),
+    *(ROOT / "docs" / "guide").glob("*.md"),
+    *SCRIPTS,
+]
+
+
+class InThisProcess:
+    """A pool without processes, whose start would take longer than the cells."""
+
+    def __init__(self, *arguments, **options):
+        pass
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        pass
+
+    def submit(self, run, cell):
+        future = Future()
+        future.set_result(run(cell))
+        return future
+
+
+@pytest.fixture
+def run_script(monkeypatch):
+    """Run a benchmark as ``__main__``, with its folder on the path."""
+    others = [folder for folder in sys.path if not folder.startswith(str(BENCHMARKS))]
+    monkeypatch.setattr(sys, "path", [str(BENCHMARKS), *others])
+    for name in [name for name, module in sys.modules.items() if is_benchmark(module)]:
+        monkeypatch.delitem(sys.modules, name)
+    import harness
+
+    monkeypatch.setattr(harness, "ProcessPoolExecutor", InThisProcess)
+
+    def run(script, options):
+        monkeypatch.setattr(sys, "argv", [script, *options])
+        with rc_context():  # the pictures' style ends with the script
+            runpy.run_path(str(ROOT / script), run_name="__main__")
+
+    yield run
+    for name in [name for name, module in sys.modules.items() if is_benchmark(module)]:
+        del sys.modules[name]
+
+
+def is_benchmark(module):
+    return (getattr(module, "__file__", None) or "").startswith(str(BENCHMARKS))
+
+
+def smoke(script, options="", long=False, page=True):
+    return pytest.param(script, options, page, id=f"{script} {options}", marks=[pytest.mark.long] if long else [])
+
+
+SMOKE = [
+    smoke("identification"),
+]
+
+
+@pytest.mark.parametrize(("script", "options", "page"), SMOKE)
+def test_quick_run(run_script, tmp_path, script, options, page):
+    output = tmp_path / "result.csv"
+    run_script(f"benchmarks/{script}.py", ["--quick", *shlex.split(options), "--output", str(output)])
+    before = output.read_text()
+    assert before.count("\n") > 1
+    assert output.with_suffix(".md").exists() == page
+    run_script(f"benchmarks/{script}.py", ["--quick", *shlex.split(options), "--output", str(output)])
+    assert output.read_text() == before  # nothing is measured twice
+
+
+def commands():
+    """Find (page, script, options) of each documented command."""
+    for page in PAGES:
+        for script, options in re.findall(r"python (benchmarks/[\w/]+\.py)([^`\n]*)", page.read_text()):
+            yield pytest.param(script, shlex.split(options, comments=True), id=f"{page.name}: {script}{options}")
+
+
+class ParsedError(Exception):
+    """The options are valid."""
+
+
+@pytest.mark.parametrize(("script", "options"), list(commands()))
+def test_command_has_valid_options(run_script, monkeypatch, script, options):
+    parse_args = argparse.ArgumentParser.parse_args
+
+    def parsed(self, *arguments):
+        parse_args(self, *arguments)
+        raise ParsedError
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parsed)
+    with pytest.raises(ParsedError):
+        run_script(script, options)
+
+
+@pytest.mark.parametrize("script", [path.relative_to(ROOT).as_posix() for path in SCRIPTS])
+def test_script_documents_its_command(script):
+    assert f"python {script}" in (ROOT / script).read_text()
