@@ -8,9 +8,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import norm, truncnorm
 from sklearn.base import RegressorMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
@@ -45,6 +47,8 @@ ENDED_EARLY = re.compile(
 NOTHING_LEARNED = re.compile(r"of (\d+) of \d+ outputs fitted together, though|became white noise")
 # Trajectories of a quick run.
 QUICK_TRAJECTORIES = 12
+# The paper's Table 4, by system and model. Both cartpoles have the numbers of the paper's only one.
+PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv"), index_col=["system", "model"])
 
 
 @dataclass(frozen=True)
@@ -300,6 +304,11 @@ def how_it_ended(messages: list[str], n_outputs: int) -> dict[str, Any]:
     said = " ".join(messages)
     counts = [int(found[1] or n_outputs) for found in NOTHING_LEARNED.finditer(said)]
     return {"converged": not ENDED_EARLY.search(said), "unlearned": min(sum(counts), n_outputs)}
+
+
+def limited(row: Any) -> bool:
+    """Return whether a limit of iterations ended the fit of a row."""
+    return str(row["converged"]) == "False" or str(row["max_iter"]).removesuffix(".0") == str(row["n_iter"])
 
 
 def fitted_row(

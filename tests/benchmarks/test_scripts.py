@@ -75,6 +75,11 @@ def smoke(script, options="", long=False, page=True):
 
 
 SMOKE = [
+    smoke("paper/table3", "--systems network"),
+    smoke("paper/table4", "--systems pendulum --models VGP EVGP-IFG --settings skevgp paper --jobs 1"),
+    smoke("paper/figure5", "--systems toy"),
+    smoke("paper/figure6", "--systems pendulum --models RES-DBNN EVGP-IF"),
+    smoke("paper/figure7", "--systems pendulum --settings skevgp"),
     smoke("identification"),
 ]
 
