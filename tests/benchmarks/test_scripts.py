@@ -80,6 +80,10 @@ SMOKE = [
     smoke("paper/figure5", "--systems toy"),
     smoke("paper/figure6", "--systems pendulum --models RES-DBNN EVGP-IF"),
     smoke("paper/figure7", "--systems pendulum --settings skevgp"),
+    smoke("peers/against_gpr", "--systems pendulum --models GPR EVGP"),
+    smoke(
+        "peers/against_peers", "--datasets smooth --peers 'scikit-learn GPR' 'scikit-learn BayesianRidge'", long=True
+    ),
     smoke("identification"),
 ]
 
