@@ -162,6 +162,10 @@ class Peer:
         """Fit a job."""
         raise NotImplementedError
 
+    def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
+        """Return what is timed for control loops, of a model of ``X``, ``Y``, ``inducing_points``, rows ``ahead``."""
+        raise NotImplementedError
+
 
 class Skevgp(Peer):
     """EVGPRegressor with its defaults, except for m, threads and, if the job says so, iterations and sharing.
@@ -312,6 +316,34 @@ class GPflow(Peer):
             return mean.numpy(), np.sqrt(variance.numpy())
 
         return predict
+
+    def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
+        """The posterior is cached and compiled, as GPflow's guide to fast predictions says."""
+        import gpflow
+        import tensorflow as tf
+
+        scales = np.full(given.X.shape[1], 1.5)
+        model = self.model(given.X, given.Y, given.inducing_points, scales, 1.0, 0.01)
+        posterior = model.posterior(gpflow.posteriors.PrecomputeCacheType.TENSOR)
+
+        @tf.function
+        def moments(rows: Any) -> Any:
+            return posterior.predict_f(rows)
+
+        @tf.function
+        def with_jacobian(rows: Any) -> Any:
+            with tf.GradientTape() as tape:
+                tape.watch(rows)
+                mean, _ = posterior.predict_f(rows)
+            return mean, tape.batch_jacobian(mean, rows)
+
+        row, rows = tf.constant(given.ahead[:1]), tf.constant(given.ahead)
+        return {
+            "row, mean and std": lambda: moments(row),
+            "row, mean and Jacobian": lambda: with_jacobian(row),
+            "horizon, mean and std": lambda: moments(rows),
+            "horizon, mean and Jacobian": lambda: with_jacobian(rows),
+        }
 
 
 class GPJax(Peer):
@@ -562,6 +594,36 @@ class GPyTorch(Peer):
 
         return predict
 
+    def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
+        """An exact model of one output, of as many rows as inducing points, with fast predictive variances."""
+        import gpytorch
+        import torch
+
+        n = len(given.inducing_points)
+        rows, targets = (torch.tensor(values[:n]) for values in (given.X, given.Y[:, 0]))
+
+        class Exact(gpytorch.models.ExactGP):
+            def __init__(self) -> None:
+                super().__init__(rows, targets, likelihood)
+                self.mean = gpytorch.means.ZeroMean()
+                self.covariance = gpytorch.kernels.RBFKernel(ard_num_dims=rows.shape[1])
+
+            def forward(self, x: Any) -> Any:
+                return gpytorch.distributions.MultivariateNormal(self.mean(x), self.covariance(x))
+
+        likelihood = gpytorch.likelihoods.GaussianLikelihood().double()
+        model = Exact().double()
+        model.covariance.lengthscale, likelihood.noise = torch.full((1, rows.shape[1]), 1.5), 0.01
+        model.eval()
+
+        def moments(x: Any) -> Any:
+            with torch.no_grad(), gpytorch.settings.fast_pred_var():
+                said = model(x)
+                return said.mean, said.variance
+
+        row, horizon = torch.tensor(given.ahead[:1]), torch.tensor(given.ahead)
+        return {"row, mean and std": lambda: moments(row), "horizon, mean and std": lambda: moments(horizon)}
+
 
 class ExactGP(Peer):
     """scikit-learn's GaussianProcessRegressor. Its default floor of the noise, 1e-5, is above the noise of dynamics."""
@@ -592,6 +654,18 @@ class ExactGP(Peer):
             gp = GaussianProcessRegressor(kernel, random_state=job.seed).fit(scaled.X, scaled.Y[:, columns])
             models.append(lambda X, gp=gp: gp.predict(X, return_std=True))
         return Fitted(scaled.predictor(models), [], "converged")
+
+    def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
+        """An exact model of as many rows as inducing points."""
+        from sklearn.gaussian_process import GaussianProcessRegressor
+        from sklearn.gaussian_process.kernels import RBF
+
+        n, kernel = len(given.inducing_points), RBF(np.full(given.X.shape[1], 1.5))
+        model = GaussianProcessRegressor(kernel, alpha=0.01, optimizer=None).fit(given.X[:n], given.Y[:n])
+        return {
+            "row, mean and std": lambda: model.predict(given.ahead[:1], return_std=True),
+            "horizon, mean and std": lambda: model.predict(given.ahead, return_std=True),
+        }
 
 
 class Line(Peer):
@@ -684,12 +758,28 @@ def run(peer: Peer, job: Job) -> dict[str, Any]:
     }
 
 
+def microseconds(call: Callable[[], object], seconds: float) -> float:
+    """Return the median of as many calls as fit into the time, at least 20."""
+    for _ in range(5):
+        call()
+    each: list[float] = []
+    end = time.perf_counter() + seconds
+    while len(each) < 20 or time.perf_counter() < end:
+        start = time.perf_counter()
+        call()
+        each.append(time.perf_counter() - start)
+    return 1e6 * float(np.median(each))
+
+
 def main() -> None:
-    """Run a job, or answer at fixed hyperparameters, on two cores."""
+    """Run a job, answer at fixed hyperparameters, or time predictions, on two cores."""
     peer, given, result = PEERS[sys.argv[1]], load(Path(sys.argv[2])), sys.argv[3]
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, sorted(os.sched_getaffinity(0))[:2])
-    if hasattr(given, "kernel"):
+    if hasattr(given, "ahead"):
+        timed = {name: microseconds(call, given.seconds) for name, call in peer.calls(given).items()}
+        np.savez(result, calls=list(timed), microseconds=list(timed.values()))
+    elif hasattr(given, "kernel"):
         bound, mean, variance = peer.at_fixed(given)
         np.savez(result, bound=bound, mean=mean, variance=variance)
     else:

@@ -154,9 +154,9 @@ def interpreters(peers: Iterable[str], peer_python: str) -> dict[str, str]:
     return found
 
 
-def work(python: str, peer: str, given: dict[str, Any], time_limit: float = 300.0) -> SimpleNamespace:
-    """Run a peer in a process of its own, with the same skevgp as here."""
-    environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
+def work(python: str, peer: str, given: dict[str, Any], time_limit: float = 300.0, **variables: str) -> SimpleNamespace:
+    """Run a peer in a process of its own, with the same skevgp as here and further environment variables."""
+    environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3", **variables}
     if PEERS[peer].package == "skevgp":
         paths = [str(Path(skevgp.__file__).parents[1]), os.environ.get("PYTHONPATH")]
         environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))

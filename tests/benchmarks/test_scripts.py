@@ -84,6 +84,13 @@ SMOKE = [
     smoke(
         "peers/against_peers", "--datasets smooth --peers 'scikit-learn GPR' 'scikit-learn BayesianRidge'", long=True
     ),
+    smoke("speed", "latency", long=True),
+    smoke("speed", "casadi"),
+    smoke("speed", "evaluation"),
+    smoke("speed", "rows"),
+    smoke("speed", "million", long=True),
+    smoke("speed", "checkout", long=True),
+    smoke("robustness", "--parts seeds"),
     smoke("identification"),
 ]
 
