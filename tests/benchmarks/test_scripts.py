@@ -90,6 +90,9 @@ SMOKE = [
     smoke("speed", "rows"),
     smoke("speed", "million", long=True),
     smoke("speed", "checkout", long=True),
+    smoke("calibration", "--systems pendulum"),
+    smoke("tables", "models --sets toy-200", long=True),
+    smoke("tables", "inducing --sets toy-200"),
     smoke("robustness", "--parts seeds"),
     smoke("identification"),
 ]
