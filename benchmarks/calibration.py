@@ -196,7 +196,7 @@ def main() -> None:
         for noise_cv in ("None", "5")
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    rows = harness.frame(output).query("size == @size")
+    rows = harness.frame(output, size=size)
     blank = {name: rows[name].astype(object).where(rows[name].notna(), "") for name in ("variant", "noise", "noise_cv")}
     rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)
     tables = {"systems": table_of(rows[systems]), "tables": table_of(rows[~systems])}

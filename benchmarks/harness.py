@@ -141,10 +141,11 @@ def read(path: Path) -> list[Row]:
     return list(csv.DictReader(io.StringIO(whole_lines(path), newline="")))
 
 
-def frame(path: Path) -> pd.DataFrame:
-    """Return the rows as a data frame; empty if there is no file."""
+def frame(path: Path, **where: Any) -> pd.DataFrame:
+    """Return the rows with some values as a data frame; empty if there is no file."""
     text = whole_lines(path)
-    return pd.read_csv(io.StringIO(text)) if text else pd.DataFrame()
+    rows = pd.read_csv(io.StringIO(text)) if text else pd.DataFrame(columns=list(where))
+    return rows[np.logical_and.reduce([rows[name] == value for name, value in where.items()])] if where else rows
 
 
 def append(rows: Sequence[Mapping[str, Any]], path: Path) -> None:

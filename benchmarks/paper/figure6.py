@@ -169,7 +169,7 @@ def main() -> None:
     ]
     again = limited if options.limited else None
     n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since, again=again)
-    rows = named(harness.frame(output).query("size == @size"))
+    rows = named(harness.frame(output, size=size))
     for setting in rows["setting"].unique():
         stem = output.stem + ("" if setting == "skevgp" else f"_{setting}")
         plot(rows[rows["setting"] == setting], output.with_name(f"{stem}.png"))

@@ -194,7 +194,7 @@ def main() -> None:
         for system, seed, setting, model in itertools.product(options.systems, seeds, options.settings, options.models)
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    rows, tables = harness.frame(output).query("size == @size"), {}
+    rows, tables = harness.frame(output, size=size), {}
     for system, own in rows.groupby("system"):
         tables[system] = table_of(own)
         authors = own["setting"].str.startswith("author")

@@ -255,7 +255,7 @@ def main() -> None:
     ]
     again = limited if options.limited else None
     n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since, again=again)
-    rows = harness.frame(output).query("size == @size and noise == @noise")
+    rows = harness.frame(output, size=size, noise=noise)
     (plot_reliability if noise else plot_errors)(rows, output.with_suffix(".png"))
     harness.write_page("The results: Table 4 of the paper, and ours", tables_of(rows), output, n_failures)
 

@@ -4,12 +4,17 @@ import argparse
 import re
 import runpy
 import shlex
+import shutil
 import sys
 from concurrent.futures import Future
 from pathlib import Path
 
+import numpy as np
 import pytest
 from matplotlib import rc_context
+
+from skevgp.features import RigidBodyRegressor
+from skevgp.robots.loading import urdf_path
 
 ROOT = Path(__file__).parents[2]
 BENCHMARKS = ROOT / "benchmarks"
@@ -97,7 +102,7 @@ SMOKE = [
     smoke("tables", "models --sets toy-200", long=True),
     smoke("tables", "inducing --sets toy-200"),
     smoke("robustness", "--parts seeds"),
-    smoke("identification"),
+    smoke("robots", "identification"),
 ]
 
 
@@ -110,6 +115,29 @@ def test_quick_run(run_script, tmp_path, script, options, page):
     assert output.with_suffix(".md").exists() == page
     run_script(f"benchmarks/{script}.py", ["--quick", *shlex.split(options), "--output", str(output)])
     assert output.read_text() == before  # nothing is measured twice
+
+
+@pytest.mark.long
+def test_quick_run_on_logs(run_script, tmp_path):
+    """The real arms' script runs on logs of a simulated arm."""
+    home = tmp_path / "data" / "ur10e"
+    home.mkdir(parents=True)
+    shutil.copy(urdf_path("ur10"), home / "ur10e.urdf")
+    body = RigidBodyRegressor("ur10", friction=["coulomb"])
+    rng = np.random.default_rng(0)
+    for name in ("20sec_8harm", "30sec_12harm", "40sec_12harm", "14harm50sec", "14harm50secLoad"):
+        t = 0.01 * np.arange(1400)
+        phase = np.clip(t - 6.4, 0.0, None)[:, np.newaxis]
+        wave, size = rng.uniform(1.0, 2.5, 6), rng.uniform(0.5, 1.0, 6)
+        sines, cosines = size * np.sin(wave * phase), size * np.cos(wave * phase)
+        X = np.hstack([size - cosines, wave * sines, wave**2 * cosines])
+        torque = body.fit(X).transform(X) @ body.coef_prior(6)[0] + 0.05 * rng.normal(size=(len(t), 6))
+        rows = np.column_stack([t, X[:, :12], torque / 12.0])
+        np.savetxt(home / f"ur-20_02_05-{name}.csv.gz", rows, delimiter=",")
+    output = tmp_path / "real_arms.csv"
+    run_script("benchmarks/robots.py", ["real", "--data", str(home.parent), "--quick", "--output", str(output)])
+    assert "| EVGP |" in output.with_suffix(".md").read_text()
+    assert output.with_name("real_arms_parameters.csv").read_text().count(",mass,") == 2
 
 
 def commands():
