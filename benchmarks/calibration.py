@@ -158,6 +158,13 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
+def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page."""
+    blank = {name: rows[name].astype(object).where(rows[name].notna(), "") for name in ("variant", "noise", "noise_cv")}
+    rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)
+    return {"systems": table_of(rows[systems]), "tables": table_of(rows[~systems])}
+
+
 def variants(data: str, folder: Path | None) -> list[str]:
     """Of a table: shuffled, and sorted by a column and the target."""
     if data in TABLES:
@@ -196,10 +203,7 @@ def main() -> None:
         for noise_cv in ("None", "5")
     ]
     n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    rows = harness.frame(output, size=size)
-    blank = {name: rows[name].astype(object).where(rows[name].notna(), "") for name in ("variant", "noise", "noise_cv")}
-    rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)
-    tables = {"systems": table_of(rows[systems]), "tables": table_of(rows[~systems])}
+    tables = tables_of(harness.frame(output, size=size))
     harness.write_page("Standard deviations that hold", tables, output, n_failures)
 
 

@@ -193,7 +193,6 @@ def run_missing(
     run: Callable[[Any], Any],
     output: Path,
     jobs: int = 1,
-    say: Any = None,  # LEGACY
     fresh: bool = False,
     since: str | None = None,
     again: Callable[[Row], bool] | None = None,
@@ -276,10 +275,8 @@ def figure_of(value: Any) -> str:
     return f"{value:#.3g}".rstrip(".") if np.isfinite(value) else ""
 
 
-def table(data: Any, lines: Any = None) -> str:
+def table(data: pd.DataFrame) -> str:
     """Write a data frame in Markdown, without its index."""
-    if lines is not None:  # LEGACY
-        return "\n".join(f"| {' | '.join(cells)} |" for cells in [data, ["---"] * len(data), *lines]) + "\n"
     rows = [list(map(str, data.columns)), ["---"] * data.shape[1]]
     columns = [data.iloc[:, i].tolist() for i in range(data.shape[1])]
     rows += [[figure_of(cell) for cell in row] for row in zip(*columns, strict=True)]
@@ -419,24 +416,3 @@ def noisy_waves(n_rows: int, n_columns: int, rng: np.random.RandomState) -> Iter
         X = rng.uniform(-2.0, 2.0, (n_rows, n_columns))
         truth = np.sin(X @ directions).sum(axis=1)
         yield X, truth + 0.1 * rng.randn(n_rows), truth
-
-
-# --- LEGACY --------------------------------------------------------------------------------------------------------
-
-
-def provenance_text(rows: Iterable[Row]) -> str:
-    columns = ({row[name] for row in rows} for name in ("date", "versions", "machine"))
-    dates, versions, machines = (sorted(values) for values in columns)
-    return f"{' to '.join(dict.fromkeys((dates[0], dates[-1])))}; {'; '.join(versions)}; {', '.join(machines)}."
-
-
-def column(rows: Iterable[Row], name: str) -> np.ndarray:
-    return np.array([float(row[name]) for row in rows])
-
-
-def write_report(parts: Iterable[str], output: Path, n_failures: int = 0) -> None:
-    text = "\n\n".join(part.strip("\n") for part in parts) + "\n"
-    if text.strip():
-        output.with_suffix(".md").write_text(text)
-    if n_failures:
-        raise SystemExit(f"{n_failures} cells failed; run again to try only these.")

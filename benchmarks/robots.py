@@ -612,12 +612,8 @@ def rms(values: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def identification(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
-    """Measure, and return the table and the number of failures."""
-    seeds = range(options.seeds or (2 if options.quick else 50))
-    cells = [Simulated(cutoff, seed, size) for seed in seeds for cutoff in FILTERS]
-    n_failures = harness.run_missing(cells, run_simulated, output, options.jobs, since=options.since)
-    rows = harness.frame(output, size=size)
+def identification_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the table of the page: a line per filter."""
     lines = []
     for cutoff, own in rows.fillna({"cutoff": "none"}).groupby("cutoff", sort=False):
         shares = own["covered"] / own["n_told"]
@@ -637,7 +633,15 @@ def identification(options: Any, output: Path, size: str) -> tuple[dict[str, pd.
                 "seconds": f"{own['fit_seconds'].mean():.1f}",
             }
         )
-    return {"identification": pd.DataFrame(lines)}, n_failures
+    return {"identification": pd.DataFrame(lines)}
+
+
+def identification(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
+    """Measure, and return the table and the number of failures."""
+    seeds = range(options.seeds or (2 if options.quick else 50))
+    cells = [Simulated(cutoff, seed, size) for seed in seeds for cutoff in FILTERS]
+    n_failures = harness.run_missing(cells, run_simulated, output, options.jobs, since=options.since)
+    return identification_tables(harness.frame(output, size=size)), n_failures
 
 
 def main() -> None:

@@ -101,7 +101,7 @@ SMOKE = [
     smoke("calibration", "--systems pendulum"),
     smoke("tables", "models --sets toy-200", long=True),
     smoke("tables", "inducing --sets toy-200"),
-    smoke("robustness", "--parts seeds"),
+    smoke("robustness"),
     smoke("robots", "identification"),
 ]
 
