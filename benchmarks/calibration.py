@@ -33,7 +33,7 @@ from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import AngleEncoder, InertiaForceGravity
 from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error
 
-# Inducing points and trajectories to learn from.
+# Numbers of inducing points and of training trajectories.
 SYSTEMS = {"pendulum": (10, 24), "cartpole": (60, 24), "acrobot": (100, 24), "iiwa14": (100, 40)}
 TEST_TRAJECTORIES = 40
 NOISES = ("0.0", "0.01")
@@ -43,7 +43,7 @@ TABLES = {
     "friedman2": lambda seed: datasets.make_friedman2(1500, noise=30.0, random_state=seed),
     "friedman3": lambda seed: datasets.make_friedman3(1500, noise=0.1, random_state=seed),
 }
-# Of larger tables so many rows are learned from.
+# Largest number of training rows.
 MOST_ROWS, ITERATIONS = 12_000, 100
 
 
@@ -64,7 +64,7 @@ Part = tuple[np.ndarray, np.ndarray]
 
 
 def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
-    """Trajectories to learn from, others, and the groups of the first; all with the same noise."""
+    """Return training and test trajectories with the same noise, and the groups of the former."""
     n = 6 if cell.size == "quick" else SYSTEMS[cell.data][1]
     everything = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
     train = everything.groups < n
@@ -76,7 +76,7 @@ def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
 
 
 def table(cell: Cell) -> tuple[Part, Part]:
-    """Rows to learn from, in the order that the cell says, and others; columns in units of their scatter."""
+    """Return training rows in the order of the variant, and test rows; columns are standardised."""
     rng = np.random.RandomState(cell.seed)
     if cell.data in TABLES:
         rows = rng.permutation(np.column_stack(TABLES[cell.data](cell.seed)))
@@ -96,7 +96,7 @@ def table(cell: Cell) -> tuple[Part, Part]:
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Fit one model, and look at it on the test rows; ``fit_seconds`` is processor time of one thread."""
+    """Fit one model and evaluate it on the test rows. ``fit_seconds`` is processor time of one thread."""
     max_iter = 10 if cell.size == "quick" else ITERATIONS
     settings = {
         "noise_cv": None if cell.noise_cv == "None" else int(cell.noise_cv),
@@ -166,7 +166,7 @@ def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
 
 
 def variants(data: str, folder: Path | None) -> list[str]:
-    """Of a table: shuffled, and sorted by a column and the target."""
+    """Return the orders of a table's rows: shuffled, and sorted by a column and by the target."""
     if data in TABLES:
         width = np.shape(TABLES[data](0)[0])[1]
     else:

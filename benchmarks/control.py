@@ -69,10 +69,10 @@ def size_of(options: Any) -> str:
 
 # --- rollouts ------------------------------------------------------------------------------------------------------
 
-# The EVGPs' inducing points; the others have the paper's number.
+# Numbers of inducing points of EVGP. The other models have the paper's number.
 ROLLOUT_SYSTEMS = {"pendulum": (10,), "cartpole": (60, 150), "acrobot": (150,), "iiwa14": (350,)}
 DEFAULT_SYSTEMS = ("pendulum", "cartpole", "acrobot")
-# Angles go round: a GP alone, which predicts them themselves and not how they change, cannot have them encoded.
+# VGP predicts angles and not their changes, so its angles cannot be encoded.
 ROLLOUT_MODELS = {
     "EVGP-IFG": "skevgp-angles",
     "EVGP-IF": "skevgp-angles",
@@ -84,7 +84,7 @@ MAIN = "EVGP-IFG"
 ROLLOUT_NOISES, SHARES = ("0.0", "0.01"), ("1", "0.1")
 HORIZONS = (1, 10, 50, 100)
 TEST_TRAJECTORIES, PARTICLES, ITERATIONS = 40, 100, 300
-# How each is called, and what rollout is told.
+# Name of each method, and arguments of `rollout`.
 METHODS: dict[str, dict[str, str]] = {
     "consistent": {},
     "consistent, no noise": {"process_noise": "none"},
@@ -96,7 +96,7 @@ METHODS: dict[str, dict[str, str]] = {
 
 @dataclass(frozen=True)
 class Rollout:
-    """One fit."""
+    """One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories."""
 
     system: str
     model: str
@@ -109,7 +109,7 @@ class Rollout:
 
 
 class Independent(RegressorMixin, BaseEstimator):
-    """A fitted regressor of which only predictions are known, so that each step is drawn anew."""
+    """A fitted regressor without functions to follow, so that each step is an independent draw."""
 
     def __init__(self, regressor: Any):
         self.regressor = regressor
@@ -123,7 +123,7 @@ class Independent(RegressorMixin, BaseEstimator):
 
 
 def data(cell: Rollout) -> tuple[Bunch, Bunch]:
-    """What to learn from, and true trajectories of other states and inputs."""
+    """Return training data, and true trajectories from other states with other inputs."""
     n_test = 4 if cell.size == "quick" else TEST_TRAJECTORIES
     everything = make_dynamics(
         cell.system, random_state=cell.seed, noise=float(cell.noise), input_noise=float(cell.noise)
@@ -140,17 +140,17 @@ def data(cell: Rollout) -> tuple[Bunch, Bunch]:
 
 
 def particles_of(model: str) -> str:
-    """How its particles go: of a network no function can be followed."""
+    """Return the method of particles. A network has no functions that particles could follow."""
     return "independent" if model == "RES-DBNN" else "consistent"
 
 
 def methods_of(model: str) -> list[str]:
-    """All of the main model, what the page shows of others."""
+    """Return all methods for the main model, and two for the others."""
     return list(METHODS) if model == MAIN else [particles_of(model), "mean"]
 
 
 def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
-    """The score of samples (n, ...), of which no number makes it better or worse on average (Ferro 2014)."""
+    """Return the CRPS of samples (n, ...), whose mean does not depend on n (Ferro 2014)."""
     n = len(samples)
     ranks = 2.0 * np.arange(n) - n + 1.0
     spread = np.tensordot(ranks, np.sort(samples, axis=0), axes=1) / (n * (n - 1))
@@ -158,13 +158,13 @@ def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
 
 
 def crps_of_normal(truth: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """The score of a normal distribution (Gneiting & Raftery 2007)."""
+    """Return the CRPS of a normal distribution (Gneiting & Raftery 2007)."""
     z = (truth - mean) / std
     return std * (z * (2.0 * norm.cdf(z) - 1.0) + 2.0 * norm.pdf(z) - 1.0 / np.sqrt(np.pi))
 
 
 def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) -> dict[str, float]:
-    """After so many steps; the states of truth (n, steps, 2 n_joints), positions first, have this scatter."""
+    """Return scores after some steps, of states (n, steps, 2 n_joints) with this scatter, positions first."""
     true, mean, std = (values[:, step - 1] / scatter for values in (truth, ahead.mean, ahead.std))
     errors, n_joints = np.abs(true - mean), len(scatter) // 2
     positions = np.sqrt(np.mean(errors[:, :n_joints] ** 2, axis=1))
@@ -177,13 +177,13 @@ def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) ->
         "error_p90": np.quantile(positions, 0.9),
         **{f"cr{k}": np.mean(errors <= k * std) for k in (1, 2, 3)},
         "crps": crps.mean(),
-        # .674 if errors are as large as they are said to be.
+        # 0.674 if standard deviations are calibrated.
         "errors_in_std": np.median(errors / std),
     }
 
 
 def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
-    """Fit one model, and roll it out in all ways; ``fit_seconds`` is processor time of one thread."""
+    """Fit one model and roll it out by all methods. ``fit_seconds`` is processor time of one thread."""
     train, test = data(cell)
     model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, cell.max_iter))
     if cell.n_inducing:
@@ -217,7 +217,7 @@ def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
 
 
 def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bunch, float]:
-    """The rollout, NaN if the learned system is unstable, and processor seconds."""
+    """Return the rollout, NaN if the learned system is unstable, and processor seconds."""
     n, n_states = len(test.trajectories), test.target.shape[1]
     inputs = test.data[:, n_states:].reshape(n, -1, test.data.shape[1] - n_states)
     options = {"n_samples": 10 if cell.size == "quick" else PARTICLES, "random_state": cell.seed, **METHODS[method]}
@@ -235,7 +235,7 @@ def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bun
 
 
 def sizes(system: str, model: str) -> tuple[int, ...]:
-    """Inducing points."""
+    """Return the numbers of inducing points."""
     if model.startswith("EVGP"):
         return ROLLOUT_SYSTEMS[system]
     if model == "RES-DBNN":
@@ -245,7 +245,7 @@ def sizes(system: str, model: str) -> tuple[int, ...]:
 
 
 def rollout_cells(options: Any) -> list[Rollout]:
-    """The largest models come last, and other seeds after all systems."""
+    """Return the cells. The largest models come last, and other seeds after all systems."""
     seeds = range(options.seeds or (1 if options.quick else 2))
     systems = ("pendulum",) if options.quick else options.systems or DEFAULT_SYSTEMS
     return [
@@ -310,13 +310,13 @@ SECONDS = (1.5, 3.0, 4.5, 9.0, 30.0)
 NOISES = (0.0, 0.01)
 LENGTHS = (10, 25)
 SYSTEMS = ("cartpole", "pendulum")
-TRUTHS = 3  # seeds; without data they differ in the first plans only
+TRUTHS = 3  # number of seeds, which differ in the first plans only
 SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
 
 
 @dataclass(frozen=True)
 class SwingUp:
-    """A run."""
+    """One run. The truth has no data, and no noise."""
 
     system: str
     model: str
@@ -328,7 +328,7 @@ class SwingUp:
 
 
 class Truth:
-    """The simulated system as a model of itself: four steps of Runge and Kutta's method, and differences."""
+    """The simulated system as a model: four Runge-Kutta steps, and finite differences."""
 
     def __init__(self, system: str, n_steps: int = 4):
         self._plant, self._n_steps = Plant(system), n_steps
@@ -356,7 +356,7 @@ class Truth:
 
 
 def firm(system: str) -> dict[str, np.ndarray]:
-    """A prior of EVGP-IFG's weights, for `EVGPRegressor`, that hardly doubts the kinematics."""
+    """Return the prior of EVGP-IFG's weights with exact kinematics, as an argument of `EVGPRegressor`."""
     n_joints = Plant(system).layout.n_joints
     features = InertiaForceGravity(system, dt=mpc.DT).fit(np.zeros((1, 2 * n_joints + 1)))
     mean, scale = features.coef_prior(2 * n_joints)
@@ -366,7 +366,7 @@ def firm(system: str) -> dict[str, np.ndarray]:
 
 
 def run_swing_up(cell: SwingUp) -> dict[str, Any]:
-    """Learn, and swing up; seconds of processor time of one thread."""
+    """Learn, and swing up. Seconds are processor time of one thread."""
     task = mpc.TASKS[cell.system]
     with threadpool_limits(1), warnings.catch_warnings():
         for expected in (ConvergenceWarning, DependentRowsWarning):
@@ -395,7 +395,7 @@ def run_swing_up(cell: SwingUp) -> dict[str, Any]:
 
 
 def swing_up_cells(options: Any) -> list[SwingUp]:
-    """Seed by seed, so that a page of some seeds is whole."""
+    """Return the cells, seed by seed, so that the page is complete after each seed."""
     if options.quick:
         return [SwingUp("pendulum", model, 3.0, 0.0, mpc.LENGTH, 0, "quick") for model in ("evgp-ifg", "gp")]
     models, systems, found = options.models or SWING_UPS, options.systems or SYSTEMS, []
@@ -440,13 +440,13 @@ CONTROLLERS = {
     GP: "+ GP of the residual, without physics",
 }
 CASES = ("waves", "slow waves", "moves")
-# Of a step that waits for nothing: medians of so many.
+# Number of timed steps.
 CALLS = 1000
 
 
 @dataclass(frozen=True)
 class Tracking:
-    """An arm."""
+    """One arm, with its payload in kg."""
 
     payload: float
     seed: int
@@ -455,7 +455,7 @@ class Tracking:
 
 @dataclass(frozen=True)
 class Size:
-    """Of the log, in runs of seconds; of models; and how many references and moves are tried."""
+    """Size of the log and of models, and numbers of references and moves."""
 
     n_runs: int = 6
     seconds: float = 10.0
@@ -471,7 +471,7 @@ SIZES = {"full": Size(), "quick": Size(3, 4.0, 10, 20, 30, 1, 20, 50)}
 
 
 class WithoutPhysics:
-    """The nominal model, and a Gaussian process of all columns for what it misses of each joint."""
+    """The nominal model, and a Gaussian process of all columns for the residual torque of each joint."""
 
     def __init__(self, body: RigidBody, n_inducing: int, seed: int, max_iter: int | None):
         self._body = body
@@ -489,7 +489,7 @@ class WithoutPhysics:
 
 
 def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Size, seed: int) -> dict[str, Any]:
-    """All that learn, from the same log."""
+    """Fit all models to the same log."""
     X, y, groups = log
     options = {"max_rows": 1500, "max_iter": size.max_iter, "random_state": seed}
     return {
@@ -500,7 +500,7 @@ def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Size, seed: int) -
 
 
 def references(n: int, seed: int) -> dict[str, np.ndarray]:
-    """Not those of the log."""
+    """Return references that are not in the log."""
     starts, ends = arms.positions(n, seed + 2)
     durations = np.random.RandomState(seed + 3).uniform(1.2, 2.0, n)
     return {
@@ -513,7 +513,7 @@ def references(n: int, seed: int) -> dict[str, np.ndarray]:
 def tracking_errors(
     arm: arms.Arm, body: RigidBody, models: dict[str, Any], cases: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, str, str, float]]:
-    """Rms over joints and steps, mrad."""
+    """Yield root mean square errors over joints and steps, mrad."""
     for case, reference in cases.items():
         controllers = {NOMINAL: ComputedTorque(body, reference), "integral": ComputedTorque(body, reference, ki=400.0)}
         for name, model in models.items():
@@ -526,7 +526,7 @@ def tracking_errors(
 def step_costs(
     body: RigidBody, models: dict[str, Any], reference: np.ndarray, calls: int
 ) -> Iterator[tuple[str, str, str, float]]:
-    """Microseconds of a step of one arm; controllers take turns, each after each, so that all see the same machine."""
+    """Yield microseconds of a step of one arm. Controllers alternate, so that all run under the same load."""
     reference = reference[:, :1]
     ahead = {name: arms.missed_by(body, model, reference) for name, model in models.items()}
     known = {
@@ -564,7 +564,7 @@ def _one_row(body: RigidBody, model: Any) -> Callable[[np.ndarray], np.ndarray]:
 def broken_limits(
     arm: arms.Arm, body: RigidBody, model: Any, X: np.ndarray, n_moves: int, share: float, seed: int
 ) -> Iterator[tuple[str, str, str, float]]:
-    """How many moves break a limit: at any joint and step, and where the plan comes closest to it.
+    """Yield how many moves break a limit: at any joint and step, and where the plan comes closest to it.
 
     The latter also of those only in which the joint accelerates there no more than it did in the log, of rows X.
     """
@@ -599,7 +599,7 @@ def broken_limits(
 
 
 def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
-    """Log, learn, track, and move fast: a row for each number."""
+    """Log, learn, track, and move fast. Return a row for each number."""
     size, seed, body = SIZES[cell.size], 1000 * cell.seed + round(10 * cell.payload), RigidBody(load_robot("iiwa14"))
     with threadpool_limits(1), warnings.catch_warnings():
         for expected in (ConvergenceWarning, DependentRowsWarning):
@@ -608,7 +608,7 @@ def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
         log = arms.track(arm, ComputedTorque(body, arms.waves(size.n_runs, size.seconds, seed + 100)), seed=0)
         rows = arms.log_of(log)
         models, cases = learn(rows, body, size, seed), references(size.n_references, seed + 200)
-        share = 0.35 if cell.payload <= 3.0 else 0.45  # with less they can hardly be held
+        share = 0.35 if cell.payload <= 3.0 else 0.45  # with less the arm can hardly hold them
         found = [
             *tracking_errors(arm, body, models, cases),
             *step_costs(body, models, cases["waves"], size.calls),

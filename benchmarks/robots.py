@@ -58,7 +58,7 @@ SIGNALS: dict[str, Any] = {"dt": 0.01, "cutoff": 5.0}
 COLUMNS = {"time": 0, "position": range(1, 7), "velocity": range(7, 13), "current": range(13, 19)}
 # Torque per current, N m / A, of a catalogue (De Luca), as the logs' README has them.
 GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)
-# In which rows the arm moves along its trajectory, the first one is 1; of other files all that is not at rest.
+# First and last row, from 1, in which the arm moves along its trajectory. Other files: all rows not at rest.
 MOVING = {
     "20sec_8harm": (320, 2310),
     "30sec_12harm": (635, 3510),
@@ -68,14 +68,14 @@ MOVING = {
     "14harm50secLoad": (308, 5071),
     "ptp_10_points": (700, 4200),
 }
-# The ur10's one recording, in thirds that are groups.
+# The only recording of the ur10, in thirds that are groups.
 UR10 = {
     "exciting 1/3": (0.0, 9.2),
     "exciting 2/3": (9.2, 18.4),
     "exciting 3/3": (18.4, None),
     "validation": None,
 }
-# What each fit is trained on.
+# Training logs of each fit.
 SPLITS = {
     "ur10e": {
         "three": ("20sec_8harm", "30sec_12harm", "40sec_12harm"),
@@ -88,7 +88,7 @@ SPLITS = {
         "two thirds": ("exciting 1/3", "exciting 2/3"),
     },
 }
-# Tests of no fit, so that all fits of an arm are compared on the same ones.
+# Logs that no fit is tested on, so that all fits of an arm have the same tests.
 TRAINING = {"ur10e": SPLITS["ur10e"]["three"], "ur10": ()}
 # Logs with a load, without it, and the load's mass if it is known, kg.
 LOADS = (("14harm50secLoad", "14harm50sec", 2.805), ("load", "unload", None))
@@ -107,7 +107,7 @@ MODELS = (
 
 @dataclass(frozen=True)
 class Real:
-    """One fit."""
+    """One fit to a real arm."""
 
     robot: str
     split: str
@@ -118,7 +118,7 @@ class Real:
 
 @dataclass(frozen=True)
 class Question:
-    """What is asked of an identified arm: its load, or with ``loaded`` empty its friction."""
+    """The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+"."""
 
     robot: str
     trained: str
@@ -129,7 +129,7 @@ class Question:
 
 
 def paths_of(robot: str, folder: Path) -> dict[str, Path]:
-    """The logs that are there, by the names that they have here."""
+    """Return the files of the logs by name."""
     if robot == "ur10":
         files = [folder / robot / f"{name}_trajectory.db3" for name in ("ur10_exciting", "validation")]
         named = {name: files[name == "validation"] for name in UR10}
@@ -142,7 +142,7 @@ def paths_of(robot: str, folder: Path) -> dict[str, Path]:
 
 @lru_cache
 def log_of(robot: str, name: str, folder: Path) -> Bunch:
-    """One log."""
+    """Read a log."""
     path = paths_of(robot, folder)[name]
     if robot == "ur10":
         return load_log(path, keep=UR10[name], **SIGNALS)
@@ -152,7 +152,7 @@ def log_of(robot: str, name: str, folder: Path) -> Bunch:
 
 @lru_cache
 def moving(robot: str, folder: Path) -> tuple[str, ...]:
-    """Names of the logs in which the arm moves."""
+    """Return names of the logs in which the arm moves."""
     names = []
     for name in paths_of(robot, folder):
         try:
@@ -170,20 +170,20 @@ def has_load(name: str) -> bool:
 
 
 def splits_of(robot: str, folder: Path, size: str) -> dict[str, tuple[str, ...]]:
-    """Those whose training logs are there; in a quick run the first."""
+    """Return the splits whose training logs exist; in a quick run only the first."""
     there = moving(robot, folder)
     found = {split: names for split, names in SPLITS[robot].items() if set(names) <= set(there)}
     return dict(list(found.items())[: 1 if size == "quick" else None])
 
 
 def tests_of(robot: str, split: str, folder: Path) -> list[str]:
-    """What a fit is tested on."""
+    """Return the names of the test logs."""
     taken = {*TRAINING[robot], *SPLITS[robot][split]}
     return [name for name in moving(robot, folder) if name not in taken and not has_load(name)]
 
 
 def rows_of(robot: str, names: Sequence[str], folder: Path, size: str) -> Bunch:
-    """Rows of several logs, each a group; in a quick run every tenth."""
+    """Return rows of several logs. Each log is a group. A quick run takes every tenth row."""
     logs = [log_of(robot, name, folder) for name in names]
     step = 10 if size == "quick" else 1
     return Bunch(
@@ -198,7 +198,7 @@ def urdf_of(robot: str, folder: Path) -> str:
 
 
 class LinearTorques(RegressorMixin, BaseEstimator):
-    """Rigid-body features with the weights of the URDF, or those of least squares whose band is the errors' spread."""
+    """Rigid-body features with the weights of the URDF or of least squares; std is that of the training errors."""
 
     def __init__(self, robot: Any, least_squares: bool = True):
         self.robot = robot
@@ -219,7 +219,7 @@ class LinearTorques(RegressorMixin, BaseEstimator):
 
 
 class LinearThenGP(RegressorMixin, BaseEstimator):
-    """Least squares, and a Gaussian process of all columns on what they leave: its band is the whole one."""
+    """Least squares, and a Gaussian process of all columns on the residual, which gives the std."""
 
     def __init__(self, linear: LinearTorques, regressor: EVGPRegressor):
         self.linear = linear
@@ -239,7 +239,7 @@ class LinearThenGP(RegressorMixin, BaseEstimator):
 
 
 def model_of(name: str, robot: str, quick: bool) -> tuple[Any, bool, bool]:
-    """A regressor as it comes, whether it has a band, and whether it is told which rows are one trajectory."""
+    """Return a regressor with its defaults, whether it has a std, and whether its fit takes groups."""
     short = {"max_iter": 5} if quick else {}
     gp = EVGPRegressor(n_inducing=10 if quick else 100, random_state=0, **short)
     if name == "CAD":
@@ -266,7 +266,7 @@ def arm_of(robot: str, quick: bool, gain_scale: float = 0.0) -> InverseDynamics:
 
 
 def run_real(cell: Real) -> list[dict[str, Any]]:
-    """Fit a model, and look at each joint of each test file; ``fit_seconds`` is processor time of one thread."""
+    """Fit a model and evaluate each joint on each test file. ``fit_seconds`` is processor time of one thread."""
     robot = urdf_of(cell.robot, cell.folder)
     train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], cell.folder, cell.size)
     model, has_band, by_groups = model_of(cell.model, robot, cell.size == "quick")
@@ -299,7 +299,7 @@ def run_real(cell: Real) -> list[dict[str, Any]]:
 
 
 def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dict[str, Any]:
-    """Of one joint (n, 1); nothing of bands where there are none."""
+    """Return scores of one joint (n, 1); empty without a std."""
     error = {"nmse": np.mean((mean - truth) ** 2) / truth.var()}
     if std is None:
         return {**error, **dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")}
@@ -309,7 +309,7 @@ def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dic
 
 
 def ask(question: Question) -> list[dict[str, Any]]:
-    """What is found, with its standard deviation."""
+    """Return what was identified, with standard deviations."""
     train = rows_of(question.robot, question.trained.split("+"), question.folder, question.size)
     arm = arm_of(urdf_of(question.robot, question.folder), question.size == "quick", question.gain_scale)
     with threadpool_limits(1), warnings.catch_warnings():
@@ -336,7 +336,7 @@ def ask(question: Question) -> list[dict[str, Any]]:
 
 
 def questions_of(folder: Path, size: str) -> list[Question]:
-    """Loads, by what the same arm did without them, alone and with the training files; and friction by each split."""
+    """Return questions of loads, from the log without the load alone and with training logs, and of friction."""
     there = moving("ur10e", folder)
     splits = splits_of("ur10e", folder, size)
     questions = []
@@ -489,9 +489,9 @@ def real(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame]
 
 ROBOT, ERROR, NOISE = "ur10", 0.2, 0.02
 FILTERS = {"none": None, "5 Hz": 5.0}
-# Of trajectories: base frequency, rad/s, harmonics, seconds, step.
+# Trajectories: base frequency in rad/s, number of harmonics, seconds, step.
 BASE, HARMONICS, SECONDS, STEP = 2.0 * np.pi * 0.03, 8, 30.0, 0.01
-# Coulomb's friction, N m, and viscous, N m s/rad, as shares of the largest torque, but of no more than 100 N m.
+# Coulomb friction (N m) and viscous friction (N m s/rad) as shares of the largest torque, or of 100 N m if less.
 FRICTION, LARGEST = (0.02, 0.1), 100.0
 STICTION = RigidBodyRegressor().stiction_velocity
 TOLD = 0.25  # a share of the prior's variance
@@ -499,7 +499,7 @@ TOLD = 0.25  # a share of the prior's variance
 
 @dataclass(frozen=True)
 class Simulated:
-    """One arm."""
+    """One simulated arm, and the cutoff of the filter."""
 
     cutoff: str
     seed: int
@@ -507,7 +507,7 @@ class Simulated:
 
 
 def trajectory(rng: np.random.Generator, n_joints: int, size: str) -> np.ndarray:
-    """Rows [q, q̇, q̈] of sums of sines."""
+    """Return rows [q, q̇, q̈] of sums of sines."""
     t = np.arange(0.0, SECONDS / (3.0 if size == "quick" else 1.0), STEP)
     waves = BASE * np.arange(1, HARMONICS + 1)
     a, b = rng.normal(size=(2, HARMONICS, n_joints)) / (1.5 * np.arange(1, HARMONICS + 1)[:, np.newaxis])
@@ -518,7 +518,7 @@ def trajectory(rng: np.random.Generator, n_joints: int, size: str) -> np.ndarray
 
 
 def arm(cell: Simulated) -> Bunch:
-    """The model that is known, the true weights, and data; other trajectories, without noise and filter, as tests."""
+    """Return the nominal model, the true weights, training data, and test data without noise and filter."""
     rng = np.random.default_rng(cell.seed)
     nominal = load_robot(ROBOT)
     true = perturb_robot(nominal, ERROR, random_state=cell.seed)
@@ -544,7 +544,7 @@ def arm(cell: Simulated) -> Bunch:
 
 
 def filtered(X: np.ndarray, y: np.ndarray, cutoff: float | None) -> tuple[np.ndarray, np.ndarray]:
-    """What becomes of a log: accelerations are not recorded."""
+    """Write a log without accelerations and read it by `load_log`."""
     n = y.shape[1]
     table = np.column_stack([STEP * np.arange(len(X)), X[:, : 2 * n], y])
     columns = {"time": 0, "position": range(1, n + 1), "velocity": range(n + 1, 2 * n + 1)}
@@ -556,7 +556,7 @@ def filtered(X: np.ndarray, y: np.ndarray, cutoff: float | None) -> tuple[np.nda
 
 
 def root_of(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """C with C Cᵀ = covariance, of the columns that are not 0, and its pseudo-inverse."""
+    """Return C with C Cᵀ = covariance, without its columns of zeros, and its pseudo-inverse."""
     scale = np.sqrt(np.diag(covariance))
     eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
     kept = eigenvalues > 1e-10 * eigenvalues.max()
@@ -565,7 +565,7 @@ def root_of(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 def told(arm: Bunch, model: InverseDynamics) -> tuple[np.ndarray, np.ndarray]:
-    """Errors of what torques tell in standard deviations, and these as shares of the prior's."""
+    """Return errors of identified combinations in standard deviations, and these as shares of the prior's."""
     _, covariance = model.feature_map_.coef_prior(arm.target.shape[1])
     _, whitening = root_of(covariance)
     variances, directions = np.linalg.eigh(whitening @ model.coef_cov_ @ whitening.T)
@@ -576,7 +576,7 @@ def told(arm: Bunch, model: InverseDynamics) -> tuple[np.ndarray, np.ndarray]:
 
 
 def run_simulated(cell: Simulated) -> dict[str, Any]:
-    """Identify one arm; ``fit_seconds`` is processor time of one thread."""
+    """Identify one arm. ``fit_seconds`` is processor time of one thread."""
     one = arm(cell)
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")
@@ -588,7 +588,7 @@ def run_simulated(cell: Simulated) -> dict[str, Any]:
     H = model.feature_map_.transform(X)
     scatter = truth.std(axis=0)
     missed = rms(H @ model.coef_ - truth) / scatter
-    # Without friction: what a model with the identified links alone would be asked for.
+    # Without friction: torques of the identified links alone.
     links = 10 * truth.shape[1]
     of_links = H[:, :, :links] @ (model.coef_ - one.weights)[:links]
     return {

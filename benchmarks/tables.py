@@ -63,7 +63,7 @@ GRID = tuple(int(np.ceil(10 * 1.5**k)) for k in range(13))
 
 
 class Data(NamedTuple):
-    """Rows to learn from, rows held out, and the feature map if there is one."""
+    """Training rows, held-out rows, and the feature map if there is one."""
 
     X: np.ndarray
     y: np.ndarray
@@ -76,9 +76,9 @@ Draw = Callable[[int, np.random.RandomState], tuple[np.ndarray, np.ndarray]]
 
 
 def drawn(draw: Draw, n_rows: int, seed: int) -> Data:
-    """Rows of which those that are held out follow the others."""
+    """Draw training rows and held-out rows."""
     X, y = draw(n_rows + N_TEST, np.random.RandomState(seed))
-    # Some come in order.
+    # Some sets are sorted.
     order = np.random.RandomState(1000 + seed).permutation(len(X))
     (train, test), y = (order[:n_rows], order[n_rows:]), y / y[order[:n_rows]].std(axis=0)
     return Data(X[train], y[train], X[test], y[test])
@@ -89,7 +89,7 @@ def toy(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
 
 
 def sines(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    """Eight of them, one of each column, added."""
+    """Return a sum of eight sines, one of each column, with noise."""
     X = rng.uniform(-2.0, 2.0, (n, 8))
     return X, np.sin(2.0 * X).sum(axis=1) + 0.3 * rng.randn(n)
 
@@ -127,7 +127,7 @@ def diabetes(seed: int) -> Data:
 
 
 def dynamics(system: str, n_rows: int, noise: float, with_features: bool, seed: int) -> Data:
-    """The change of the last velocity over a step; of other trajectories to test."""
+    """Return the change of the last velocity over a step. Held-out rows are of other trajectories."""
     parts: list[np.ndarray] = []
     for random_state, n in ((seed, n_rows), (1000 + seed, N_TEST)):
         bunch = make_dynamics(system, -(-n // 25), 25, noise=noise, random_state=random_state)
@@ -141,7 +141,7 @@ def dynamics(system: str, n_rows: int, noise: float, with_features: bool, seed: 
 
 
 def houses(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    """Like California's: prices jump between districts, people and rooms are skewed; few are cut off at 5."""
+    """Return houses like California's: prices jump between districts, columns are skewed, few prices reach 5."""
     place, age = rng.uniform(0.0, 6.0, (n, 2)), rng.randint(1, 53, n)
     income, people = np.exp(1.2 + 0.45 * rng.randn(n)), np.exp(7.0 + 0.7 * rng.randn(n))
     rooms = np.exp(1.6 + 0.1 * income / 3 + 0.3 * rng.randn(n))
@@ -153,7 +153,7 @@ def houses(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
 
 
 def boxes(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    """Ten columns; inside each of forty boxes, of three columns each, y is higher or lower by a constant."""
+    """Return ten columns. Inside each of forty boxes of three columns, y is higher or lower by a constant."""
     X, y = rng.uniform(0.0, 1.0, (n, 10)), 0.3 * rng.randn(n)
     for _ in range(40):
         columns = rng.choice(10, 3, replace=False)
@@ -216,7 +216,7 @@ class Drawing:
 
 
 class Predicted(NamedTuple):
-    """A mean, a standard deviation, and an interval."""
+    """Mean, standard deviation, and interval."""
 
     mean: np.ndarray
     std: np.ndarray
@@ -225,7 +225,7 @@ class Predicted(NamedTuple):
 
 
 def gaussian(regressor: Any, data: Data) -> tuple[Any, Callable[[], Predicted]]:
-    """Of a regressor with ``return_std``."""
+    """Fit a regressor with ``return_std``."""
     regressor.fit(data.X, data.y)
 
     def predict() -> Predicted:
@@ -236,7 +236,7 @@ def gaussian(regressor: Any, data: Data) -> tuple[Any, Callable[[], Predicted]]:
 
 
 def boosted(data: Data, seed: int, folds: bool) -> tuple[None, Callable[[], Predicted]]:
-    """A fit for the mean, and for the std two quantiles, or the errors of five folds that were left out."""
+    """Fit boosting for the mean; std comes from two quantiles, or from the errors of five folds."""
     make = partial(HistGradientBoostingRegressor, random_state=seed)
     mean_model = make().fit(data.X, data.y)
     if folds:
@@ -256,7 +256,7 @@ def boosted(data: Data, seed: int, folds: bool) -> tuple[None, Callable[[], Pred
 
 
 def exact(n_columns: int) -> RegressorMixin:
-    """Bounds for data without noise too, and a start at little noise, as skevgp has it."""
+    """Return an exact GP with bounds for data without noise, which starts at little noise as skevgp does."""
     signal = ConstantKernel(1.0, (1e-6, 1e9)) * RBF(np.ones(n_columns), (1e-3, 1e6))
     return GaussianProcessRegressor(signal + WhiteKernel(1e-2, (1e-10, 10.0)), normalize_y=True, random_state=0)
 
@@ -277,13 +277,13 @@ LARGE = tuple(name for name in MODELS if name not in ("GPR", "EVGP, auto"))
 
 
 def standardised(data: Data) -> Data:
-    """With columns of mean 0 and variance 1 among the rows of the fit."""
+    """Scale columns to mean 0 and variance 1 on the training rows."""
     scaler = StandardScaler().fit(data.X)
     return data._replace(X=scaler.transform(data.X), X_test=scaler.transform(data.X_test))
 
 
 def measured(model: str, data: Data, seed: int) -> dict[str, Any]:
-    """A model's row."""
+    """Fit a model and return its scores."""
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         wall, start = time.perf_counter(), time.process_time()
@@ -312,7 +312,7 @@ def run_models(cell: Drawing) -> list[dict[str, Any]]:
     data = standardised(MODEL_SETS[cell.name](cell.seed))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        for model in MODELS:  # what is imported and allocated once is not a fit's
+        for model in MODELS:  # imports and first allocations are not timed
             MODELS[model](data._replace(X=data.X[:30], y=data.y[:30]), 0)[1]()
     own = {"name": cell.name, "seed": cell.seed, "n_rows": len(data.X)}
     models = MODELS if len(data.X) <= EXACT_ROWS else LARGE
@@ -387,7 +387,7 @@ class Fit:
 
 
 def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:
-    """A model, and its row."""
+    """Fit a model; return it with its scores."""
     common = {"feature_map": data.feature_map, "normalize_y": data.feature_map is None, "random_state": seed}
     regressor: Any
     if model == "exact":
@@ -415,7 +415,7 @@ def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:
 
 
 def likelihood_of(regressor: EVGPRegressor, data: Data) -> float:
-    """The exact log marginal likelihood at a sparse model's parameters."""
+    """Return the exact log marginal likelihood at a sparse model's parameters."""
     exact = EGPRegressor(
         data.feature_map,
         regressor.kernel_,
@@ -427,7 +427,7 @@ def likelihood_of(regressor: EVGPRegressor, data: Data) -> float:
 
 
 def run_inducing(cell: Fit) -> dict[str, Any]:
-    """One model on one drawing; "grid" is the smallest of the grid that is good enough."""
+    """Fit one model. "grid" is the smallest of the grid that is good enough."""
     data = INDUCING_SETS[cell.name](cell.seed)
     if cell.model == "grid":
         _, exact = fitted(data, "exact", cell.seed)

@@ -153,7 +153,7 @@ def run(cell: Cell) -> dict[str, Any]:
     regressor = regressor_of(cell, train.X)
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # What is imported and allocated once is not the fit's.
+        # Imports and first allocations are not measured.
         regressor_of(cell, train.X).fit(train.X[:10], train.y[:10]).predict(test.X[:10], return_std=True)
         with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")

@@ -1,4 +1,4 @@
-"""What a Gaussian process package brings along: what pip installs, how large that is, and how much code it is itself.
+"""The size of Gaussian process packages: what pip installs with each, in MB, and how much code it is.
 
 Each package is installed by pip, alone, in an empty environment; the CSV has one row per package. Code is counted in
 lines of the package's own Python files that hold code (tests left out): no comments, no docstrings, no blank lines.
