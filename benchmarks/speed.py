@@ -557,20 +557,27 @@ class Checkout:
 
     job: str
     checkout: str
+    commit: str
     seed: int
     repeat: int
     folder: Path = field(compare=False)
     quick: bool = field(compare=False)
 
 
+def commit_of(folder: Path) -> str:
+    """Return the commit of a checkout, with "-dirty" if files differ from it."""
+    command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+
+
 def checkout_cells(options: Any) -> list[Checkout]:
-    folders = {"this": Path(__file__).resolve().parents[1], "other": options.other}
-    folders["other"] = folders["other"] or folders["this"]
-    jobs = ["pendulum"] if options.quick else list(INDUCING)
-    turns = [(job, seed, repeat) for job in jobs for seed in range(1 if options.quick else 4) for repeat in range(1)]
+    here = Path(__file__).resolve().parents[1]
+    folders = {"this": here, "other": (options.other or here).resolve()}
+    jobs, seeds = (["pendulum"], 1) if options.quick else (list(INDUCING), 4)
     return [
-        Checkout(job, name, seed, repeat, folder.resolve(), options.quick)
-        for job, seed, repeat in turns
+        Checkout(job, name, commit_of(folder), seed, 0, folder, options.quick)
+        for job in jobs
+        for seed in range(seeds)
         for name, folder in folders.items()
     ]
 
@@ -581,15 +588,14 @@ def run_checkout(cell: Checkout) -> dict[str, Any]:
     environment = os.environ | {"PYTHONPATH": str(cell.folder)}
     options = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
     said = json.loads(subprocess.run([sys.executable, "-c", FIT, job], **options).stdout.splitlines()[-1])
-    command = ["git", "-C", str(cell.folder), "describe", "--always", "--dirty"]
-    commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-    known = {name: getattr(cell, name) for name in ("job", "checkout", "seed", "repeat")}
-    return {**known, "commit": commit, **said, **harness.provenance()}
+    known = {name: getattr(cell, name) for name in ("job", "checkout", "commit", "seed", "repeat")}
+    return {**known, **said, **harness.provenance()}
 
 
 def checkout_table(rows: pd.DataFrame) -> pd.DataFrame:
     """Return medians of times, the median of their ratios, and means of the rest: this / other."""
     names = ["seconds", "cpu_seconds", "n_iter", "bound", "error", "nlpd"]
+    rows = rows.drop_duplicates(["job", "checkout", "seed", "repeat"], keep="last")  # of the last run
     pairs = rows.pivot(index=["job", "seed", "repeat"], columns="checkout", values=names).dropna()
     lines = []
     for job, own in pairs.groupby("job"):
@@ -632,7 +638,7 @@ PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables,
         "1,000,000 rows",
     ),
     "checkout": (
-        "against_checkout_quick",
+        "checkout",
         checkout_cells,
         run_checkout,
         partial(one_table, checkout_table, "checkout"),

@@ -81,11 +81,11 @@ def smoke(script, options="", long=False, page=True):
 
 SMOKE = [
     smoke("paper/table3", "--systems network"),
-    smoke("paper/table4", "--systems pendulum --models VGP EVGP-IFG --settings skevgp paper --jobs 1"),
+    smoke("paper/table4", "--systems pendulum --models RES-DBNN EVGP-IFG --settings skevgp"),
     smoke("paper/figure5", "--systems toy"),
-    smoke("paper/figure6", "--systems pendulum --models RES-DBNN EVGP-IF"),
+    smoke("paper/figure6", "--systems pendulum --models EVGP-IF EVGP-IFG"),
     smoke("paper/figure7", "--systems pendulum --settings skevgp"),
-    smoke("peers/against_gpr", "--systems pendulum --models GPR EVGP"),
+    smoke("peers/against_gpr", "--systems smooth --models GPR EVGP --sizes 60"),
     smoke(
         "peers/against_peers", "--datasets smooth --peers 'scikit-learn GPR' 'scikit-learn BayesianRidge'", long=True
     ),
