@@ -160,6 +160,7 @@ def test_where_nothing_is_missed_nothing_is_made_worse(arm, rigid):
     assert (ours < physics + 0.1 * noise).all()
 
 
+@pytest.mark.filterwarnings("ignore:The residuals of:sklearn.exceptions.ConvergenceWarning")
 def test_the_same_bits_for_any_number_of_threads():
     arm = Arm("acrobot", missed=gear)
     one, two = (arm.fit(n_inducing=5, max_iter=10, n_jobs=jobs) for jobs in (1, 2))
@@ -247,6 +248,7 @@ def test_consistent_weights_predict_as_well(arm, rigid):
     assert_allclose(model.predict(arm.new), rigid.predict(arm.new), atol=0.02 * arm.y.std())
 
 
+@pytest.mark.filterwarnings("ignore:The residuals of:sklearn.exceptions.ConvergenceWarning")
 def test_one_joint_and_a_sliding_one():
     arm = Arm("cartpole")
     assert arm.fit(n_inducing=5, max_iter=5).predict(arm.new).shape == (500, 2)

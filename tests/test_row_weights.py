@@ -216,7 +216,6 @@ def test_partial_fit_from_the_prior_of_the_points_is_the_fit():
     assert parts.lower_bound_ == pytest.approx(whole.lower_bound_, rel=1e-8)
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("as_dask", [True, False])
 def test_dask(as_dask):
     import dask.array as da

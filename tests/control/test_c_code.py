@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from sklearn.pipeline import make_union
 
+import skevgp
 from skevgp import CoefPrior, ResidualRegressor
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 
@@ -155,7 +156,7 @@ def test_the_header_says_what_is_what(tmp_path):
     text = header.read_text()
     assert "q, v, a* /, u, w" in text
     assert "without the noise of y" in text
-    assert f"CasADi {ca.CasadiMeta.version()}" in text
+    assert f"skevgp {skevgp.__version__} with CasADi {ca.CasadiMeta.version()}" in text
     assert "int evgp_predict(const double *x, double *mean, double *variance);" in text
 
 
