@@ -218,10 +218,11 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
         value, unit, scale = ("n_bytes", "MB", 1e-6) if title.startswith("Space") else ("seconds", "ms", 1e3)
         shown = [curve for curve in curves if curve.varied in varied and curve.value == value]
         axes.set_visible(bool(shown))
-        for curve in shown:
+        for number, curve in enumerate(shown):
             sizes, values = points_of(curve, data)
             label = f"{curve.name}: {exponents(curve, data)[0]:.2f}"
-            axes.plot(sizes, scale * values, "o:" if curve.few else "o-", markersize=4, label=label)
+            marker = "o" if number < len(harness.PALETTE) else "s"  # colours begin again
+            axes.plot(sizes, scale * values, f"{marker}{':' if curve.few else '-'}", markersize=4, label=label)
         if not shown:
             continue
         for which in "xy":
@@ -230,7 +231,7 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
         axes.set_ylim(low, high * (high / low) ** 0.6)  # room for the legend
         axes.set(title=title, xlabel=" or ".join(LABELS[name] for name in varied), ylabel=unit)
         axes.legend(loc="upper left", fontsize=7)
-    figure.suptitle("Behind each name its exponent")
+    figure.suptitle("Numbers in the legends: exponents of power laws")
     harness.save_picture(figure, path)
 
 

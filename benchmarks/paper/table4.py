@@ -196,7 +196,8 @@ def plot_errors(rows: pd.DataFrame, path: Path) -> None:
 
 def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
     """Draw a panel per system and setting: the share that intervals hold less the share that they promise."""
-    rows = rows[rows["angles"] == "raw"]
+    # Old rows have no such shares.
+    rows = rows[(rows["angles"] == "raw") & rows[f"within_{PROMISED[0]}"].notna()]
     panels = rows.groupby("system", sort=False)["setting"].unique()
     systems = [system for system in SYSTEMS if system in panels]
     n_columns = max(map(len, panels))

@@ -357,8 +357,11 @@ def plot(rows: pd.DataFrame, curves: pd.DataFrame, path: Path) -> None:
                 values = points[f"{measure}_so_far"]
                 if measure == "bound":
                     values = values.cummax() / points["n_train"]
-                style = {"color": palette.get(peer, "#555555"), "linestyle": "--" if sharing == "all" else "-"}
-                label = peer + ", shared" * (sharing == "all")
+                style = {
+                    "color": palette.get(peer, "#555555"),
+                    "linestyle": {"none": "-", "all": "--"}.get(sharing, ":"),
+                }
+                label = peer + {"none": "", "all": ", shared"}.get(sharing, f", sharing={sharing}")
                 axes.plot(points["cpu_seconds_so_far"], values, label=label, **style)
                 axes.plot(points["cpu_seconds_so_far"].iloc[-1], values.iloc[-1], "o", color=style["color"])
                 ends.append(values.iloc[-1])
