@@ -127,7 +127,6 @@ def test_partial_fit_with_weights_is_one_pass(posterior):
     assert_same(begun, evgp(solver=LBFGS(posterior=posterior), max_iter=5).fit(X[first], Y[first], NOISE[first]))
 
 
-@pytest.mark.long
 @pytest.mark.parametrize("as_dask", [True, False])
 def test_dask(as_dask):
     import dask.array as da

@@ -11,7 +11,7 @@ import numpy as np
 from ..utils.linalg import NotPositiveDefiniteError
 from ..utils.monitor import Monitor
 from ..utils.validation import check_integer, check_real
-from .base import Callback, Limits, Minimum, Objective, Solver
+from .base import Callback, Limits, MiniBatchSolver, Minimum, Objective
 
 _DECAY_FIRST, _DECAY_SECOND, _EPSILON = 0.9, 0.999, 1e-8
 # Largest entry of a gradient. The square of a larger one overflows, after which no step moves.
@@ -20,7 +20,7 @@ _LARGEST = 1e150
 _WINDOW, _FEWEST = 50, 1500
 
 
-class Adam(Solver):
+class Adam(MiniBatchSolver):
     """Adam on mini-batches over all parameters, including those of q: the solver of the paper.
 
     Parameters
@@ -75,7 +75,6 @@ class Adam(Solver):
     """
 
     default_max_iter: ClassVar[int] = 16_000
-    stochastic: ClassVar[bool] = True
 
     def __init__(
         self,

@@ -55,7 +55,7 @@ class Solver(StatefulEstimator):
     """A solver with its options; a subclass has `minimise`."""
 
     default_max_iter: ClassVar[int]  # for max_iter=None
-    stochastic: ClassVar[bool]  # whether it takes mini-batches of the rows
+    stochastic: ClassVar[bool] = False  # whether it takes mini-batches of the rows
 
     n_restarts: int
     callback: Callback | None
@@ -64,11 +64,6 @@ class Solver(StatefulEstimator):
     max_time: float | None
     # Largest number of inducing points for n_inducing="auto". Only a solver that sees all rows uses it.
     max_inducing: int = 1000
-    # Only a solver that sees mini-batches uses these: rows of a mini-batch, length of the first step, and whether q
-    # moves by natural gradients.
-    batch_size: int = 256
-    learning_rate: float = 0.01
-    natural_gradient: bool = False
 
     def check(self) -> None:
         """Raise an error if an option is out of range."""
@@ -82,6 +77,17 @@ class Solver(StatefulEstimator):
             check_real(self.max_time, f"max_time of {name}", minimum=0.0, strict=True)
         if not (isinstance(self.tol, str) and self.tol == "auto"):
             check_real(self.tol, f"tol of {name}", minimum=0.0)
+
+
+class MiniBatchSolver(Solver):
+    """A solver that sees mini-batches of the rows. Its `minimise` has the arguments of `Adam.minimise`."""
+
+    stochastic = True
+
+    batch_size: int = 256
+    learning_rate: float = 0.01
+    # Whether q moves by natural gradients.
+    natural_gradient: bool = False
 
 
 class Guarded:

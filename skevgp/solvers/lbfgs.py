@@ -84,7 +84,6 @@ class LBFGS(Solver):
     """
 
     default_max_iter: ClassVar[int] = 1000
-    stochastic: ClassVar[bool] = False
     descent: ClassVar[Descent] = Descent()
 
     def __init__(

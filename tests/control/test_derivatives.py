@@ -13,6 +13,7 @@ from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, OneHotEncoder, PolynomialFeatures, StandardScaler
 
 from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
+from skevgp.noise import Gaussian
 
 from .cases import N_OUTPUTS, QUICK, D
 
@@ -143,6 +144,8 @@ def test_novelty_takes_what_predict_takes_and_derivatives_need_numbers(data):
     for method in (model.compile, model.sample_functions):
         with pytest.raises(ValueError, match=message):
             method()
+    with pytest.raises(ValueError, match=r"inputs of Gaussian noise needs numbers.*\['c'\] are not numbers"):
+        model.set_params(noise=Gaussian(inputs=0.1)).fit(frame_of(X), Y[:, 0])
     numbers = EVGPRegressor(kernel_map=StandardScaler(), n_inducing=10, **QUICK)
     numbers.fit(pd.DataFrame(X, columns=["a", "c"]), Y[:, 0])
     with pytest.raises(ValueError, match=message):
