@@ -1,13 +1,12 @@
-"""Do standard deviations hold, without calibration (noise_cv=None) and with that by default?
+"""Are standard deviations calibrated, without calibration (noise_cv=None) and with the default?
 
-Of simulated systems, which are fitted with groups=train.groups, on new trajectories; of tables of independent rows,
-with nothing set, on rows that were not seen, shuffled and sorted by a column. Writes one row per fit to a CSV as soon
-as it is done (what is there already is not fitted again), and a page beside it.
+Systems are fitted with ``groups=train.groups`` and tested on new trajectories. Tables of independent rows are fitted
+with their rows shuffled or sorted by a column, and tested on held-out rows.
 
-    python benchmarks/calibration.py                        # four systems, four tables, four seeds: half an hour
-    python benchmarks/calibration.py --folder ~/uci         # and the tables in there: <name>/data.csv.gz, whose last
-                                                            # column is the target, and <name>/test_mask.csv.gz
-    python benchmarks/calibration.py --quick                # a system and a table, small, one seed: a minute
+    python benchmarks/calibration.py                 # four systems, four tables, four seeds: half an hour
+    python benchmarks/calibration.py --folder ~/uci  # also the tables in there: NAME/data.csv.gz, whose last column is
+                                                     # the target, and NAME/test_mask.csv.gz
+    python benchmarks/calibration.py --quick         # a system and a table, small, one seed: a minute
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import itertools
 import sys
 import time
 import warnings
-from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,18 +22,18 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).parent))  # for what the scripts share
 
 import numpy as np
+import pandas as pd
 from sklearn import datasets
 from threadpoolctl import threadpool_limits
 
 import harness
-from harness import Row
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import AngleEncoder, InertiaForceGravity
 from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error
 
-# Inducing points and trajectories to learn from.
+# Numbers of inducing points and of training trajectories.
 SYSTEMS = {"pendulum": (10, 24), "cartpole": (60, 24), "acrobot": (100, 24), "iiwa14": (100, 40)}
 TEST_TRAJECTORIES = 40
 NOISES = ("0.0", "0.01")
@@ -45,29 +43,13 @@ TABLES = {
     "friedman2": lambda seed: datasets.make_friedman2(1500, noise=30.0, random_state=seed),
     "friedman3": lambda seed: datasets.make_friedman3(1500, noise=0.1, random_state=seed),
 }
-# Of larger tables so many rows are learned from.
+# Largest number of training rows.
 MOST_ROWS, ITERATIONS = 12_000, 100
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One fit.
-
-    Attributes
-    ----------
-    data : str
-        A system or a table.
-    variant : str
-        Of a system "", or "angles" with an AngleEncoder as kernel_map; of a table "shuffled", or "sorted by" a column.
-    noise : str
-        Of a system.
-    seed : int
-    noise_cv : str
-        "None" or a number of folds.
-    size : {"full", "quick"}
-    folder : Path or None
-        Of further tables.
-    """
+    """One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows."""
 
     data: str
     variant: str
@@ -82,7 +64,7 @@ Part = tuple[np.ndarray, np.ndarray]
 
 
 def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
-    """Trajectories to learn from, others, and the groups of the first; all with the same noise."""
+    """Return training and test trajectories with the same noise, and the groups of the former."""
     n = 6 if cell.size == "quick" else SYSTEMS[cell.data][1]
     everything = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
     train = everything.groups < n
@@ -94,7 +76,7 @@ def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
 
 
 def table(cell: Cell) -> tuple[Part, Part]:
-    """Rows to learn from, in the order that the cell says, and others; columns in units of their scatter."""
+    """Return training rows in the order of the variant, and test rows; columns are standardised."""
     rng = np.random.RandomState(cell.seed)
     if cell.data in TABLES:
         rows = rng.permutation(np.column_stack(TABLES[cell.data](cell.seed)))
@@ -114,7 +96,7 @@ def table(cell: Cell) -> tuple[Part, Part]:
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Fit one model, and look at it on the test rows; ``fit_seconds`` is processor time of one thread."""
+    """Fit one model and evaluate it on the test rows. ``fit_seconds`` is processor time of one thread."""
     max_iter = 10 if cell.size == "quick" else ITERATIONS
     settings = {
         "noise_cv": None if cell.noise_cv == "None" else int(cell.noise_cv),
@@ -149,60 +131,42 @@ def run(cell: Cell) -> dict[str, Any]:
     }
 
 
-def say(row: dict[str, Any]) -> str:
-    return f"CR-2 {row['cr2']:.3f}, NLPD {row['nlpd']:.3f}, {row['fit_seconds']:.1f} s"
-
-
-def lines(rows: Sequence[Row]) -> Iterator[list[str]]:
-    """Of a table: one for each setting, of the seeds that were fitted with and without."""
-    keys = dict.fromkeys((row["data"], row["variant"], row["noise"]) for row in rows)
-    for key in keys:
-        own = [row for row in rows if (row["data"], row["variant"], row["noise"]) == key]
-        by_seed = [
-            {row["seed"]: row for row in own if (row["noise_cv"] == "None") is without} for without in (True, False)
-        ]
-        seeds = sorted(by_seed[0].keys() & by_seed[1].keys())
-        if not seeds:
+def table_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return a line for each setting, of the seeds that were fitted both without noise_cv and with it."""
+    lines = []
+    for (data, variant, noise), own in rows.groupby(["data", "variant", "noise"], sort=False):
+        without = own["noise_cv"].isin(["None", ""])
+        plain, default = (part.set_index("seed") for part in (own[without], own[~without]))
+        seeds = plain.index.intersection(default.index)
+        if seeds.empty:
             continue
-        plain, default = ([rows[seed] for seed in seeds] for rows in by_seed)
-        cr2, nlpd, error, seconds = (
-            [harness.column(part, name) for part in (plain, default)]
-            for name in ("cr2", "nlpd", "error_mean", "fit_seconds")
+        plain, default = plain.loc[seeds], default.loc[seeds]
+        means = {name: (plain[name].mean(), default[name].mean()) for name in ("cr2", "nlpd")}
+        lines.append(
+            {
+                "": " ".join(part for part in (data, variant, f"noise {noise}" * (noise != "")) if part),
+                "seeds": len(seeds),
+                "CR-2": "{:.3f} → {:.3f}".format(*means["cr2"]),
+                "of seeds": f"{default['cr2'].min():.3f} to {default['cr2'].max():.3f}",
+                "NLPD per output": "{:.3f} → {:.3f}".format(*means["nlpd"]),
+                "at worst": f"{(default['nlpd'] - plain['nlpd']).max():+.3f}",
+                "Error, ratio": f"{(default['error_mean'] / plain['error_mean']).mean():.3f}",
+                "time, ratio": f"{default['fit_seconds'].sum() / plain['fit_seconds'].sum():.2f}",
+                "warned": int(default["dependent"].sum()),
+            }
         )
-        change = nlpd[1] - nlpd[0]
-        yield [
-            " ".join(part for part in (key[0], key[1], key[2] and f"noise {key[2]}") if part),
-            str(len(seeds)),
-            f"{cr2[0].mean():.3f} → {cr2[1].mean():.3f}",
-            f"{cr2[1].min():.3f} to {cr2[1].max():.3f}",
-            f"{nlpd[0].mean():.3f} → {nlpd[1].mean():.3f}",
-            f"{change.max():+.3f}",
-            f"{(error[1] / error[0]).mean():.3f}",
-            f"{seconds[1].sum() / seconds[0].sum():.2f}",
-            f"{sum(row['dependent'] == 'True' for row in default)}",
-        ]
+    return pd.DataFrame(lines)
 
 
-def paragraphs(rows: Sequence[Row]) -> list[str]:
-    """The page."""
-    header = ["", "seeds", "CR-2", "of seeds", "NLPD per output", "at worst", "Error, ratio", "time, ratio", "warned"]
-    parts = []
-    for title, of_systems in (("On new trajectories, by groups", True), ("Independent rows, by random folds", False)):
-        found = list(lines([row for row in rows if (row["data"] in SYSTEMS) is of_systems]))
-        if found:
-            parts += [f"## {title}", harness.table(header, found)]
-    if not parts:
-        return []
-    said = (
-        "Without noise_cv → by default, 100 iterations; means over seeds. CR-2 should be .954. At worst: how much "
-        "higher NLPD is than without, of all seeds. Warned: of how many seeds a fit said that rows near each other "
-        "are alike."
-    )
-    return ["# Standard deviations that hold", said, *parts, harness.provenance_text(rows)]
+def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page."""
+    blank = {name: rows[name].astype(object).where(rows[name].notna(), "") for name in ("variant", "noise", "noise_cv")}
+    rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)
+    return {"systems": table_of(rows[systems]), "tables": table_of(rows[~systems])}
 
 
 def variants(data: str, folder: Path | None) -> list[str]:
-    """Of a table: shuffled, and sorted by a column and the target."""
+    """Return the orders of a table's rows: shuffled, and sorted by a column and by the target."""
     if data in TABLES:
         width = np.shape(TABLES[data](0)[0])[1]
     else:
@@ -238,8 +202,9 @@ def main() -> None:
         for data, variant, noise in settings
         for noise_cv in ("None", "5")
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, say, since=options.since)
-    harness.write_report(paragraphs([row for row in harness.read(output) if row["size"] == size]), output, n_failures)
+    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
+    tables = tables_of(harness.frame(output, size=size))
+    harness.write_page("Standard deviations that hold", tables, output, n_failures)
 
 
 if __name__ == "__main__":

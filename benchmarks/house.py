@@ -99,20 +99,12 @@ def lines_of_folders() -> dict[str, tuple[int, int, int]]:
         of_docstrings: set[int] = set()
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
-                of_docstrings |= set(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
+                of_docstrings.update(range(node.body[0].lineno, (node.body[0].end_lineno or 0) + 1))
         of_code: set[int] = set()
         with path.open("rb") as file:
             for token in tokenize.tokenize(file.readline):
-                if token.type not in (
-                    tokenize.COMMENT,
-                    tokenize.NL,
-                    tokenize.NEWLINE,
-                    tokenize.ENCODING,
-                    tokenize.INDENT,
-                ):
-                    of_code |= set(
-                        range(token.start[0], token.end[0] + (token.type != tokenize.DEDENT and bool(token.string)))
-                    )
+                if token.type not in (tokenize.COMMENT, tokenize.ENCODING) and token.string.strip():
+                    of_code.update(range(token.start[0], token.end[0] + 1))
         counts[folder, "code"] += len(of_code - of_docstrings)
         counts[folder, "docstring"] += len(of_docstrings)
         counts[folder, "files"] += 1

@@ -1,6 +1,6 @@
 """A simulated arm with a payload and friction that its model does not know, and a computed-torque controller.
 
-What `plot_tracking.py` and `benchmarks/tracking.py` share. Trajectories are arrays of shape (n_steps, n_runs,
+What `plot_tracking.py` and `benchmarks/control.py` share. Trajectories are arrays of shape (n_steps, n_runs,
 3 * n_joints) with rows [q, q̇, q̈]; all runs are simulated at once.
 """
 

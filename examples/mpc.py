@@ -1,6 +1,6 @@
 """Model predictive control on a learned model: iLQR with a limit on the input, planned anew at each step.
 
-What `plot_swing_up.py` and `benchmarks/swing_up.py` share.
+What `plot_swing_up.py` and `benchmarks/control.py` share.
 """
 
 from __future__ import annotations

@@ -6,7 +6,7 @@ A Gaussian process says how sure it is of each row, and learns smooth functions 
 any number of rows. Here `EVGPRegressor` stands beside scikit-learn's exact `GaussianProcessRegressor`, beside
 `HistGradientBoostingRegressor` with quantiles, and beside `BayesianRidge`: on the diabetes data, on Friedman's three
 functions, and on made houses, of which it is the trees that like them. Run ``python examples/plot_tabular.py --help``
-for options; ``benchmarks/tabular.py`` has more rows, sets and seeds.
+for options; ``benchmarks/tables.py`` has more rows, sets and seeds.
 """
 
 # %%

@@ -45,48 +45,150 @@ def whitened(lengthscales, Z, X):
     return L, anp.linalg.solve(L, squared_exponential(Z, X, lengthscales))
 
 
-def collapsed_bound(lengthscales, signal, noise, Z, rows, prior, family="full"):
-    """Summed over outputs; Z (g, m, d) with g = 1 or one set per output."""
-    total = 0.0
-    for o in range(len(prior.scale)):
-        L, V = whitened(lengthscales, Z[o % len(Z)], rows.inputs)
-        P = anp.concatenate([anp.sqrt(signal[o]) * V.T, rows.features * prior.scale[o]], axis=1)
-        r = rows.residuals[:, o] + rows.features @ (prior.scale[o] * prior.reference[o])
-        B = np.eye(P.shape[1]) + P.T @ P / noise[o]
-        log_det = anp.linalg.slogdet(B)[1]
-        quadratic = (r @ r - (P.T @ r) @ anp.linalg.solve(B, P.T @ r) / noise[o]) / noise[o]
-        trace = signal[o] * anp.sum(1.0 - anp.sum(V**2, axis=0)) / noise[o]
-        total = total - 0.5 * (len(rows) * anp.log(2 * np.pi * noise[o]) + log_det + quadratic + trace)
-        if family == "diagonal":
-            m = len(L)
-            T = anp.linalg.inv(L)
-            precision = T.T @ B[:m, :m] @ T
-            diagonal = anp.concatenate([anp.diag(precision), anp.diag(B)[m:]])
-            log_det_precision = log_det - 2.0 * anp.sum(anp.log(anp.diag(L)))
-            total = total - 0.5 * (anp.sum(anp.log(diagonal)) - log_det_precision)
-    return total
+def own(values, o):
+    """Of output o, if outputs have rows of their own (n, o, d)."""
+    return values[:, o] if values.ndim == 3 else values
 
 
-def dense_bounds(lengthscales, signal, noise, Z, rows, prior):
-    """Lower bound, log marginal likelihood and upper bound from (N, N) matrices, summed over outputs."""
-    N, bounds = len(rows), np.zeros(3)
-    for o in range(len(prior.scale)):
-        points = Z[o % len(Z)]
-        U = squared_exponential(points, rows.inputs, lengthscales)
-        K = signal[o] * squared_exponential(rows.inputs, rows.inputs, lengthscales)
-        Q = signal[o] * U.T @ np.linalg.solve(squared_exponential(points, points, lengthscales), U)
-        linear = rows.features @ np.diag(prior.scale[o] ** 2) @ rows.features.T
-        r, t = rows.residuals[:, o] + rows.features @ (prior.scale[o] * prior.reference[o]), np.trace(K - Q)
+class Dense:
+    """The model from (N, N) matrices, in autograd.numpy: y ~ N(H β, Q + σ² V) for each output, one below the other.
 
-        def log_density(determinant_of, inverse_of, r=r):
-            log_det = np.linalg.slogdet(determinant_of)[1]
-            return -0.5 * (N * np.log(2.0 * np.pi) + log_det + r @ np.linalg.solve(inverse_of, r))
+    Q is k(X, Z) k(Z, Z)⁻¹ k(Z, X) of inducing points Z, or with ``exact`` k(X, X). Values are those of the library's
+    parameter tables. Row i has the weight w (`counts`) and the noise variance σ² v (`counts / precision`).
+    """
 
-        exact, sparse = K + linear + noise[o] * np.eye(N), Q + linear + noise[o] * np.eye(N)
-        bounds[0] += log_density(sparse, sparse) - 0.5 * t / noise[o]
-        bounds[1] += log_density(exact, exact)
-        bounds[2] += log_density(sparse, sparse + t * np.eye(N))
-    return bounds
+    def __init__(self, rows, prior, family="full", exact=False):
+        self.X, self.H, targets = rows.inputs, rows.features, rows.targets
+        ones = np.ones(len(self.X))
+        self.counts = ones if rows.counts is None else rows.counts
+        self.precision = ones if rows.precision is None else rows.precision
+        self.prior, self.family, self.exact = prior, family, exact
+        self.outputs = range(len(prior.scale))
+        self.residuals = targets + self.linear(self.H, prior.offset - prior.mean)
+
+    def linear(self, H, weights):
+        return np.stack([own(H, o) @ weights[o] for o in self.outputs], axis=1)
+
+    def k(self, values, o, A, B):
+        return values["signal"][o] * squared_exponential(A, B, values["hyperparameters"])
+
+    def sparse_k(self, values, o, A, B):
+        """What the inducing points know of k(A, B)."""
+        Z = values["inducing_points"][o % len(values["inducing_points"])]
+        return self.k(values, o, A, Z) @ anp.linalg.solve(self.k(values, o, Z, Z), self.k(values, o, Z, B))
+
+    @property
+    def known_k(self):
+        return self.k if self.exact else self.sparse_k
+
+    def covariance(self, values, k, A, H_A, B, H_B):
+        """Of all outputs of rows A and B: (o n_A, o n_B)."""
+        C = self.prior.roots()
+
+        def block(i, j):
+            if i != j and not self.prior.shared:
+                return np.zeros((len(A), len(B)))
+            linear = own(H_A, i) @ C[i] @ C[j].T @ own(H_B, j).T
+            return linear + k(values, i, own(A, i), own(B, i)) if i == j else linear
+
+        return anp.concatenate([anp.concatenate([block(i, j) for j in self.outputs], axis=1) for i in self.outputs])
+
+    def noise(self, values):
+        return anp.concatenate([values["noise"][o] / self.precision for o in self.outputs])
+
+    def total(self, values, k):
+        return self.covariance(values, k, self.X, self.H, self.X, self.H) + anp.diag(self.noise(values))
+
+    def log_density(self, values, S, wide=0.0):
+        """Of the residuals, w times each: N(y | g, a)ʷ = N(y | g, a / w) (2πa)^(-(w - 1) / 2) w^(-1 / 2)."""
+        r, w = self.residuals.T.ravel(), np.tile(self.counts, len(self.outputs))
+        copies = (w - 1.0) @ anp.log(2.0 * np.pi * self.noise(values) * w) + np.log(w).sum()
+        quadratic = r @ anp.linalg.solve(S + wide * np.eye(len(r)), r)
+        return -0.5 * (len(r) * LOG_2PI + anp.linalg.slogdet(S)[1] + quadratic + copies)
+
+    def likelihood(self, values):
+        return self.log_density(values, self.total(values, self.k))
+
+    def traces(self, values):
+        """Of what the inducing points leave of each output's covariance, per unit of noise."""
+        inputs = [own(self.X, o) for o in self.outputs]
+        left = (self.k(values, o, X, X) - self.sparse_k(values, o, X, X) for o, X in enumerate(inputs))
+        return [self.precision @ anp.diag(each) for each in left]
+
+    def bound(self, values):
+        """The lower bound of the family; the likelihood if the model is exact."""
+        if self.exact:
+            return self.likelihood(values)
+        lost = sum(t / values["noise"][o] for o, t in enumerate(self.traces(values)))
+        return self.log_density(values, self.total(values, self.sparse_k)) - 0.5 * (lost + self.gap(values))
+
+    def upper_bound(self, values):
+        """Of rows that count once, and weights of each output."""
+        total = 0.0
+        for o in self.outputs:
+            targets = self.residuals[:, [o]] + self.H @ (self.prior.mean - self.prior.offset)[[o]].T
+            rows = SimpleNamespace(inputs=self.X, features=self.H, targets=targets, counts=None, precision=None)
+            alone = Dense(rows, self.prior.outputs([o]))
+            its = values | {name: values[name][[o]] for name in ("signal", "noise")}
+            its["inducing_points"] = values["inducing_points"][[o % len(values["inducing_points"])]]
+            total += alone.log_density(its, alone.total(its, alone.sparse_k), alone.traces(its)[0])
+        return total
+
+    # --- a diagonal q ---------------------------------------------------------------------------------------------
+
+    def projected(self, values, o, A, H_A):
+        """What g is of (f_m, β): (n, m + p)."""
+        Z = values["inducing_points"][o % len(values["inducing_points"])]
+        return anp.hstack([anp.linalg.solve(self.k(values, o, Z, Z), self.k(values, o, Z, A)).T, H_A])
+
+    def of_values_and_weights(self, values, o):
+        """The posterior precision of (f_m, β)."""
+        Z = values["inducing_points"][o % len(values["inducing_points"])]
+        A, p = self.projected(values, o, self.X, self.H), self.H.shape[1]
+        K_inv, C_inv = anp.linalg.inv(self.k(values, o, Z, Z)), np.diag(self.prior.scale[o] ** -2.0)
+        top = anp.hstack([K_inv, np.zeros((len(Z), p))])
+        prior = anp.concatenate([top, np.hstack([np.zeros((p, len(Z))), C_inv])])
+        return prior + A.T @ (self.precision[:, None] / values["noise"][o] * A)
+
+    def gap(self, values):
+        """What the diagonal family loses, twice."""
+        if self.family == "full":
+            return 0.0
+        precisions = (self.of_values_and_weights(values, o) for o in self.outputs)
+        return sum(anp.sum(anp.log(anp.diag(each))) - anp.linalg.slogdet(each)[1] for each in precisions)
+
+    # --- predictions ----------------------------------------------------------------------------------------------
+
+    def predict(self, values, A, H_A):
+        """Mean (n, o), and covariance (o n, o n) of noise-free rows; of a diagonal q the variances only (n, o)."""
+        S, n = self.total(values, self.known_k), len(A)
+        cross = self.covariance(values, self.known_k, A, H_A, self.X, self.H)
+        mean = (cross @ np.linalg.solve(S, self.residuals.T.ravel())).reshape(-1, n).T + self.linear(
+            H_A, self.prior.mean
+        )
+        prior = self.covariance(values, self.k, A, H_A, A, H_A)
+        if self.family == "full":
+            return mean, prior - cross @ np.linalg.solve(S, cross.T)
+        known = [
+            self.projected(values, o, A, H_A) ** 2 / np.diag(self.of_values_and_weights(values, o))
+            for o in self.outputs
+        ]
+        left = [np.diag(self.k(values, o, A, A) - self.sparse_k(values, o, A, A)) for o in self.outputs]
+        return mean, np.transpose([own.sum(axis=1) + rest for own, rest in zip(known, left, strict=True)])
+
+    def weights(self, values):
+        """Means (o, p) and covariances (o, p, p)."""
+        C, S = self.prior.roots(), self.total(values, self.known_k)
+        means, covariances = [], []
+        for o in self.outputs:
+            each = [C[o] @ C[i].T @ own(self.H, i).T * float(i == o or self.prior.shared) for i in self.outputs]
+            cross = np.hstack(each)
+            means.append(self.prior.mean[o] + cross @ np.linalg.solve(S, self.residuals.T.ravel()))
+            covariances.append(C[o] @ C[o].T - cross @ np.linalg.solve(S, cross.T))
+            if self.family == "diagonal":
+                m = len(values["inducing_points"][0])
+                covariances[o] = np.diag(1.0 / np.diag(self.of_values_and_weights(values, o))[m:])
+        return np.array(means), np.array(covariances)
 
 
 class ArrayRows:
@@ -98,12 +200,24 @@ class ArrayRows:
     def __len__(self):
         return len(self.inputs)
 
+    @property
+    def raw(self):
+        return RawRows(self.inputs, self.features, self.residuals)
+
     def blocks(self, kernel, size, **options):
-        raw, make = (
-            RawRows(self.inputs, self.features, self.residuals),
-            partial(block_of, kernels=(kernel,), to_internal=lambda raw: raw),
-        )
-        return LocalBlocks(lambda rows: make(raw[rows]), len(self), 6, size=size, **options)
+        return blocks_of(self.raw, kernel, size, **options)
+
+
+def blocks_of(raw, kernel, size=17, **options):
+    make = partial(block_of, kernels=(kernel,), to_internal=lambda rows: rows)
+    return LocalBlocks(lambda rows: make(raw[rows]), len(raw.inputs), 6, size=size, **options)
+
+
+def values_of(table, flat):
+    """The parameters at coordinates of a table without hand-written code, for autograd."""
+    c, points = table.coordinates(flat), table["inducing_points"]
+    values = {name: anp.exp(c[name]) for name in ("hyperparameters", "signal", "noise")}
+    return values | {"inducing_points": c["inducing_points"] * points.unit + points.origin}
 
 
 def identity_rows(inputs, residuals):

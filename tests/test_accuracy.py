@@ -31,9 +31,11 @@ def test_little_is_lost_at_a_ratio_of_1e8(name):
     assert library.get("gradient", 0.0) < 1e-6
 
 
-@pytest.mark.parametrize("ratio", [1.0, 1e8, 1e10])
+@pytest.mark.parametrize(
+    "ratio", [1e8, pytest.param(1.0, marks=pytest.mark.long), pytest.param(1e10, marks=pytest.mark.long)]
+)
 @pytest.mark.parametrize("name", MODELS)
-@pytest.mark.parametrize("seed", [0, 1])
+@pytest.mark.parametrize("seed", [0])
 def test_with_k_nearly_singular_no_more_is_lost_than_doubles_of_its_values_lose(name, ratio, seed):
     """That is more than 1e-8 of the bound and 1e-6 of variances: no algorithm has them who has doubles of K."""
     model = MODELS[name](Problem.drawn(ratio, 1e16, seed=seed, **SHAPE))
@@ -44,19 +46,6 @@ def test_with_k_nearly_singular_no_more_is_lost_than_doubles_of_its_values_lose(
         assert inputs[figure] < 1e-8
     if name != "given q":
         assert library["mean"] < 1e-8
-
-
-def test_variances_of_the_exact_model_lose_no_digits_to_an_inverse():
-    """Of k(x, x) - |v|² with v as a product with L⁻¹ they lost 600 times as much."""
-    model = MODELS["exact"](Problem.drawn(1e10, 1e8, n=40, m=6, d=2, p=0, seed=1))
-    library, _, kernel = errors(model, gradient=False, draws=2)
-    assert library["latent variance"] < 40 * kernel["latent variance"]
-
-
-@pytest.mark.parametrize("name", ["collapsed", "given q", "exact"])
-def test_so_it_is_of_the_gradient(name):
-    library, _, kernel = errors(MODELS[name](Problem.drawn(1e8, 1e16, seed=1, **SHAPE)), draws=2)
-    assert library["gradient"] < SLACK * kernel["gradient"]
 
 
 # --- inducing points at all rows --------------------------------------------------------------------------------------
@@ -86,13 +75,3 @@ def test_points_at_all_rows_give_the_exact_model_with_hardly_any_noise(p):
     np.testing.assert_allclose(std, exact_std, rtol=1e-8 + share)
     if p:
         np.testing.assert_allclose(sparsely.coef_, exactly.coef_, **of_mean)
-
-
-def test_if_k_is_nearly_singular_points_at_all_rows_are_the_exact_model():
-    """A jitter j of K would take up to j s² I of y's covariance, 10 % of the noise here."""
-    problem, sparsely, exactly = both(1e16, 2)
-    assert sparsely.lower_bound_ == pytest.approx(exactly.log_marginal_likelihood_value_, rel=1e-9)
-    assert sparsely.upper_bound_ == sparsely.lower_bound_
-    of_both = (one.predict(problem.X_new, return_std=True) for one in (sparsely, exactly))
-    for found, expected in zip(*of_both, strict=True):
-        np.testing.assert_allclose(found, expected, rtol=0, atol=1e-8 * np.abs(problem.y).max())

@@ -4,121 +4,36 @@ import re
 
 import numpy as np
 import pytest
-from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EGPRegressor, EVGPRegressor
+from skevgp import EVGPRegressor
 from skevgp.solvers import LBFGS, Adam
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2.0, 2.0, (150, 2))
 # A line and a wave: they ask for other numbers of points.
 Y = np.column_stack([X[:, 0], np.sin(4.0 * X[:, 0]) * X[:, 1]]) + 0.05 * RNG.randn(150, 2)
-X_NEW = RNG.uniform(-2.0, 2.0, (40, 2))
 
 
 def model(**arguments):
     return EVGPRegressor(**{"n_inducing": "auto", "sharing": "all", "random_state": 0} | arguments)
 
 
-def test_it_is_as_good_as_the_exact_model_with_fewer_points_than_rows():
-    y = Y[:, 1]
-    m, exact = model(noise_cv=None).fit(X, y), EGPRegressor().fit(X, y)
-    assert 15 < len(m.inducing_points_) < 100
-    assert m.lower_bound_ > exact.log_marginal_likelihood_value_ - 0.02 * len(X)
-    np.testing.assert_allclose(m.predict(X_NEW), exact.predict(X_NEW), atol=0.1)
-    assert m.n_iter_ == len(m.loss_curve_)
-    assert -m.loss_curve_[-1] == pytest.approx(m.lower_bound_, rel=1e-6)
-
-
-def test_what_the_features_explain_needs_no_points():
+def test_few_points_if_features_explain_targets():
     m = model(feature_map=PolynomialFeatures(1)).fit(X, Y[:, 0])
     assert len(m.inducing_points_) == 10
 
 
-@pytest.mark.parametrize("n_rows", [1, 2, 12])
-def test_few_rows_are_all_of_them_points(n_rows):
-    m = model(max_iter=20, solver=LBFGS(tol=1.0)).fit(X[:n_rows], Y[:n_rows, 1])
-    assert len(m.inducing_points_) <= n_rows
-    assert np.isfinite(m.predict(X_NEW)).all()
-
-
 @pytest.mark.filterwarnings("ignore:The noise explains everything:sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("most", [1, 7, 10, 17])
-def test_there_are_no_more_points_than_allowed(most):
+@pytest.mark.parametrize("most", [1, 10])
+def test_max_inducing_is_respected(most):
     m = model(solver=LBFGS(max_inducing=most, tol=1.0), max_iter=50).fit(X, Y[:, 1])
     assert len(m.inducing_points_) == most
 
 
-def test_a_number_is_what_it_was():
-    for arguments in ({}, {"solver": LBFGS(max_inducing=5)}):
-        assert len(model(n_inducing=12, max_iter=0, **arguments).fit(X, Y).inducing_points_) == 12
-
-
-def test_outputs_that_share_nothing_have_their_own_numbers():
-    m = model(sharing="none", feature_map=PolynomialFeatures(1)).fit(X, Y)
-    line, wave = m.inducing_points_
-    assert len(line) == 10
-    assert len(wave) > 15
-    mean, std = m.predict(X_NEW, return_std=True)
-    for o in range(2):
-        alone = model(feature_map=PolynomialFeatures(1)).fit(X, Y[:, o])
-        np.testing.assert_allclose(mean[:, o], alone.predict(X_NEW), atol=0.02)
-    assert std.shape == (40, 2)
-    assert m.partial_fit(X_NEW, mean).inducing_points_[1].shape == wave.shape
-
-
-@pytest.mark.parametrize("sharing", ["all", "kernel"])
-def test_outputs_that_share_a_kernel_have_one_number(sharing):
-    m = model(sharing=sharing, max_iter=50, solver=LBFGS(tol=1.0)).fit(X, Y)
-    assert m.inducing_points_.shape[:-2] == (() if sharing == "all" else (2,))
-    assert m.inducing_points_.shape[-2] > 10
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_the_number_of_threads_does_not_change_a_bit():
-    one, two = (model(n_jobs=n_jobs, max_iter=30).fit(X, Y) for n_jobs in (1, 2))
-    np.testing.assert_array_equal(one.inducing_points_, two.inducing_points_)
-    np.testing.assert_array_equal(one.predict(X_NEW), two.predict(X_NEW))
-
-
-def test_given_points_are_the_first_of_them():
-    m = model(inducing_init=X[:12], max_iter=0).fit(X, Y[:, 1])
-    np.testing.assert_allclose(m.inducing_points_[:12], X[:12], atol=1e-12)
-    assert len(m.inducing_points_) > 12
-
-
-def test_a_warm_start_begins_with_the_points_that_were_found():
-    m = model(warm_start=True, max_iter=200, solver=LBFGS(tol=1.0)).fit(X, Y[:, 1])
-    first, bound = len(m.inducing_points_), m.lower_bound_
-    m.fit(X, Y[:, 1])
-    assert first <= len(m.inducing_points_) <= 1.5 * first + 1
-    assert m.lower_bound_ > bound - 1.0
-
-
-def test_an_interrupted_fit_keeps_the_best():
-    def stop(iteration, bound, outputs):
-        bounds.append(bound)
-        if len(bounds) == 150:
-            raise KeyboardInterrupt
-
-    bounds = []
-    with pytest.warns(ConvergenceWarning, match="interrupted"):
-        m = model(solver=LBFGS(callback=stop)).fit(X, Y[:, 1])
-    assert len(bounds) == 150
-    assert m.lower_bound_ > bounds[0]
-    assert np.isfinite(m.predict(X_NEW)).all()
-
-
-def test_who_looks_on_is_told_how_many_points_there_are(capsys):
+def test_progress_shows_number_of_inducing_points(capsys):
     model(verbose=1, max_iter=30, solver=LBFGS(tol=1.0)).fit(X, Y[:, 1])
     assert re.match(r"\d+ points, all rows, iteration ", capsys.readouterr().out.splitlines()[-1])
-
-
-def test_it_is_a_parameter_like_others():
-    m = clone(model(solver=LBFGS(max_inducing=30)))
-    assert (m.n_inducing, m.get_params()["solver__max_inducing"]) == ("auto", 30)
 
 
 @pytest.mark.parametrize(
@@ -130,7 +45,7 @@ def test_it_is_a_parameter_like_others():
         {"solver": LBFGS(max_inducing=None)},
     ],
 )
-def test_other_values_are_refused(wrong):
+def test_invalid_n_inducing_raises(wrong):
     named = "max_inducing" if "solver" in wrong else next(iter(wrong))
     with pytest.raises((ValueError, TypeError), match=named):
         model(**wrong).fit(X, Y)
@@ -142,7 +57,7 @@ def test_adam_is_told_a_number(solver):
         model(solver=solver).fit(X, Y)
 
 
-def test_a_warm_start_has_no_more_points_than_it_may():
+def test_warm_start_has_no_more_points_than_it_may():
     m = EVGPRegressor(n_inducing="auto", warm_start=True, random_state=0)
     X = np.random.RandomState(0).uniform(-3.0, 3.0, (200, 2))
     y = np.sin(2.0 * X[:, 0]) * np.cos(X[:, 1]) + 0.1 * X[:, 1]

@@ -50,56 +50,26 @@ def test_auto_asks_the_map(feature_map):
     assert_array_equal(scale, expected_scale)
 
 
-def test_a_map_without_an_opinion_gets_a_wide_prior():
+def test_map_without_an_opinion_gets_a_wide_prior():
     polynomials = PolynomialFeatures(2)
     mean, scale = resolve(polynomials)
     assert_array_equal(mean, np.zeros((2, 10)))
     assert_allclose(scale, wide(polynomials.transform(X)))
 
 
-@pytest.mark.parametrize("feature_map", [InertiaForce(), InertiaForceGravity()])
-def test_a_map_without_a_robot_gets_a_wide_prior(feature_map):
-    mean, scale = resolve(feature_map)
-    assert_array_equal(mean, np.zeros(mean.shape))
-    assert_allclose(scale, wide(feature_map.transform(X)))
-
-
-def test_a_constant_target_gets_a_scale_of_its_own_size():
-    _, scale = resolve(FunctionTransformer(), targets=np.full((20, 1), -4.0))
-    assert_allclose(scale, [10.0 * 4.0 / np.sqrt(np.mean(X**2, axis=0))])
-
-
-def test_a_target_and_a_feature_of_zeros_get_a_finite_scale():
+def test_target_and_a_feature_of_zeros_get_a_finite_scale():
     nothing = FunctionTransformer(np.zeros_like)
     assert_array_equal(resolve(nothing, targets=np.zeros((20, 1)))[1], [[10.0, 10.0, 10.0]])
 
 
-def test_without_features_the_prior_is_empty():
-    mean, scale, _ = resolved(CoefPrior(), None, X, np.empty((2, 0)), 2)
-    assert mean.shape == scale.shape == (2, 0)
-
-
-def test_a_union_concatenates():
+def test_union_concatenates():
     polynomials = PolynomialFeatures(2)
     mean, scale = resolve(make_union(InertiaForce("pendulum"), polynomials))
     assert_array_equal(mean, np.hstack([IF_MEAN, np.zeros((2, 10))]))
     assert_allclose(scale, np.hstack([IF_SCALE, wide(polynomials.fit_transform(X))]))
 
 
-def test_a_union_keeps_the_order_of_its_parts():
-    mean, scale = resolve(make_union(FunctionTransformer(), InertiaForce("pendulum")))
-    assert_array_equal(mean, np.hstack([np.zeros((2, 3)), IF_MEAN]))
-    assert_allclose(scale, np.hstack([wide(X), IF_SCALE]))
-
-
-def test_a_union_may_pass_columns_through_and_drop_parts():
-    union = FeatureUnion([("gone", "drop"), ("x", "passthrough"), ("physics", InertiaForce("pendulum"))])
-    mean, scale = resolve(union)
-    assert_array_equal(mean, np.hstack([np.zeros((2, 3)), IF_MEAN]))
-    assert_allclose(scale, np.hstack([wide(X), IF_SCALE]))
-
-
-def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
+def test_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of):
     names = ["theta", "dtheta/dt", "u"]
     frame = frame_of({"kind": ["x", "y"] * 10} | dict(zip(names, X.T, strict=True)))
     scaled = make_pipeline(StandardScaler(), InertiaForce("pendulum"))
@@ -110,7 +80,7 @@ def test_the_parts_of_a_column_transformer_see_their_columns_of_a_frame(frame_of
     assert_allclose(scale, np.hstack([wide(features[:, :2]), IF_SCALE]))
 
 
-def test_the_weights_of_a_union_are_divided_out():
+def test_weights_of_a_union_are_divided_out():
     union = FeatureUnion(
         [("physics", InertiaForce("pendulum")), ("x", "passthrough")], transformer_weights={"physics": 4.0, "x": 0.5}
     )
@@ -119,60 +89,9 @@ def test_the_weights_of_a_union_are_divided_out():
     assert_allclose(scale, np.hstack([IF_SCALE / 4.0, wide(0.5 * X)]))
 
 
-def test_a_pipeline_has_the_prior_of_its_last_step():
-    mean, scale = resolve(make_pipeline(FunctionTransformer(), InertiaForce("pendulum")))
-    assert_array_equal(mean, IF_MEAN)
-    assert_array_equal(scale, IF_SCALE)
-
-
-def test_a_scaler_behind_the_physics_takes_its_prior_away():
-    mean, scale = resolve(make_pipeline(InertiaForce("pendulum"), StandardScaler()))
-    assert_array_equal(mean, np.zeros((2, 3)))
-    assert_allclose(scale, wide(StandardScaler().fit_transform(X)))
-
-
-def test_unions_and_pipelines_nest():
-    inner = make_pipeline(StandardScaler(), PolynomialFeatures(2), make_union(FunctionTransformer(), InertiaForce()))
-    mean, scale = resolve(make_union(make_pipeline(inner), InertiaForce("pendulum")))
-    polynomials = PolynomialFeatures(2).fit_transform(StandardScaler().fit_transform(X))
-    assert_array_equal(mean, np.hstack([np.zeros((2, 20)), IF_MEAN]))
-    assert_allclose(scale, np.hstack([wide(polynomials), wide(polynomials), IF_SCALE]))
-
-
-def test_a_number_fills_the_table():
-    mean, scale = resolve(FunctionTransformer(), mean=2, scale=0.5)
-    assert_array_equal(mean, np.full((2, 3), 2.0))
-    assert_array_equal(scale, np.full((2, 3), 0.5))
-    assert mean.dtype == float
-
-
-def test_an_array_is_the_table():
-    table = np.arange(6.0).reshape(2, 3)
-    mean, scale = resolve(FunctionTransformer(), mean=-table, scale=table.tolist())
-    assert_array_equal(mean, -table)
-    assert_array_equal(scale, table)
-
-
-def test_one_of_the_two_may_stay_auto():
-    mean, scale = resolve(InertiaForce("pendulum"), scale=7.0)
-    assert_array_equal(mean, IF_MEAN)
-    assert_array_equal(scale, np.full((2, 3), 7.0))
-
-
-def test_arguments_overrule_a_map_that_fits_no_target():
-    mean, _ = resolve(InertiaForce("pendulum"), mean=1.0, scale=1.0, targets=TARGETS[:, :1])
-    assert_array_equal(mean, [[1.0, 1.0, 1.0]])
-
-
-@pytest.mark.parametrize("row", [[1.0, 2.0, 3.0], [[1.0, 2.0, 3.0]]])
-def test_one_output_takes_its_row_alone(row):
-    mean, _ = resolve(FunctionTransformer(), mean=row, targets=TARGETS[:, :1])
-    assert_array_equal(mean, [[1.0, 2.0, 3.0]])
-
-
 @pytest.mark.parametrize("name", ["mean", "scale"])
 @pytest.mark.parametrize("shape", [(3,), (2,), (1, 3), (2, 1), (3, 2), (2, 3, 1)])
-def test_a_table_of_another_shape_is_named(name, shape):
+def test_table_of_another_shape_raises(name, shape):
     with pytest.raises(ValueError, match=rf"{name} of CoefPrior must be .* \(2, 3\); got the shape \({shape[0]},"):
         resolve(FunctionTransformer(), **{name: np.ones(shape)})
 
@@ -182,7 +101,7 @@ def test_one_output_does_not_take_a_row_of_another_width():
         resolve(FunctionTransformer(), mean=[1.0, 2.0], targets=TARGETS[:, :1])
 
 
-def test_a_negative_scale_is_an_error():
+def test_negative_scale_raises():
     with pytest.raises(ValueError, match=r"scale of CoefPrior must not be negative; its smallest value is -2\.0"):
         resolve(FunctionTransformer(), scale=[[1.0, 1.0, 1.0], [1.0, -2.0, 1.0]])
 
@@ -192,10 +111,6 @@ def test_a_negative_scale_is_an_error():
 def test_values_must_be_finite(name, value):
     with pytest.raises(ValueError, match="must be finite"):
         resolve(FunctionTransformer(), **{name: value})
-
-
-def test_a_scale_of_zero_is_allowed():
-    assert_array_equal(resolve(FunctionTransformer(), scale=0.0)[1], np.zeros((2, 3)))
 
 
 @pytest.mark.parametrize(
@@ -208,40 +123,23 @@ def test_a_scale_of_zero_is_allowed():
         (0.0, 1.0),
     ],
 )
-def test_a_map_whose_prior_has_another_shape_is_named(mean, scale):
+def test_map_whose_prior_has_another_shape_raises(mean, scale):
     with pytest.raises(ValueError, match=r"(?s)coef_prior of Opinionated.* = \(2, 3\), .*; got "):
         resolve(Opinionated(mean, scale))
 
 
-def test_a_part_of_a_union_whose_prior_has_another_width_is_an_error():
+def test_part_of_a_union_whose_prior_has_another_width_raises():
     union = make_union(Opinionated(np.zeros((2, 2)), np.ones((2, 2))), FunctionTransformer())
     with pytest.raises(ValueError, match=r"\(2, 3\), .*; got \[\(2, 2\), \(2, 2\)\]"):
         resolve(union)
 
 
-def test_a_map_whose_scale_is_negative_is_an_error():
-    with pytest.raises(ValueError, match="scale of CoefPrior must not be negative"):
-        resolve(Opinionated(np.zeros((2, 3)), -np.ones((2, 3))))
-
-
-def test_a_map_whose_mean_is_not_finite_is_an_error():
-    with pytest.raises(ValueError, match="must be finite"):
-        resolve(Opinionated(np.full((2, 3), np.nan), np.ones((2, 3))))
-
-
-def test_the_width_of_the_target_must_fit_the_robot():
+def test_width_of_the_target_must_fit_the_robot():
     with pytest.raises(ValueError, match="y has 1 columns, but InertiaForce"):
         resolve(InertiaForce("pendulum"), targets=TARGETS[:, :1])
 
 
-@pytest.mark.parametrize("last", ["passthrough", None])
-def test_a_pipeline_that_ends_with_nothing_keeps_the_prior(last):
-    mean, scale = resolve(make_pipeline(InertiaForce("pendulum"), last))
-    assert_array_equal(mean, IF_MEAN)
-    assert_array_equal(scale, IF_SCALE)
-
-
-def test_a_column_transformer_keeps_the_prior_of_its_parts():
+def test_column_transformer_keeps_the_prior_of_its_parts():
     columns = make_column_transformer(
         (PolynomialFeatures(1), [0]), (InertiaForce("pendulum"), [0, 1, 2]), ("drop", [1]), ("passthrough", [2])
     )
@@ -252,30 +150,8 @@ def test_a_column_transformer_keeps_the_prior_of_its_parts():
     assert_allclose(scale[:, [0, 1, 5]], wide(columns.transform(X))[:, [0, 1, 5]])
 
 
-@pytest.mark.parametrize(("weight", "factor"), [(-2.0, -0.5), (None, 1.0)])
-def test_weights_of_a_union_may_be_negative_or_none(weight, factor):
-    union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": weight})
-    mean, scale, _ = resolved(CoefPrior(), union.fit(X), X, wide(X), 2)
-    assert_allclose(mean, factor * IF_MEAN)
-    assert_allclose(scale, abs(factor) * IF_SCALE)
-
-
-def test_a_part_of_weight_zero_says_nothing():
-    union = FeatureUnion([("if", InertiaForce("pendulum"))], transformer_weights={"if": 0.0})
-    mean, scale = resolve(union)
-    assert_array_equal(mean, 0.0)
-    assert np.isfinite(scale).all()
-
-
-def test_nan_in_a_scale_leaves_it_to_the_data():
-    mean, scale = resolve(Opinionated(np.ones((2, 3)), np.array([[1.0, np.nan, 2.0]] * 2)))
-    assert_array_equal(mean, 1.0)
-    assert_array_equal(scale[:, [0, 2]], [[1.0, 2.0]] * 2)
-    assert_allclose(scale[:, 1], wide(X)[:, 1])
-
-
 @pytest.mark.parametrize("prior", [None, np.ones((2, 3))])
-def test_a_prior_that_is_not_two_arrays_is_an_error(prior):
+def test_prior_that_is_not_two_arrays_raises(prior):
     class Broken(Opinionated):
         def coef_prior(self, n_outputs):
             return prior

@@ -1,15 +1,11 @@
 """Targets that do not vary, or hardly against their mean: the std keeps above the rounding of y, far away it is 1."""
 
-import warnings
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.model_selection import GroupKFold, cross_val_score
 
 from skevgp import EGPRegressor, EVGPRegressor
-from skevgp.metrics import make_std_scorer, negative_log_predictive_density
+from skevgp.metrics import negative_log_predictive_density
 
 RNG = np.random.default_rng(0)
 X = RNG.uniform(size=(100, 2))
@@ -21,17 +17,8 @@ both = pytest.mark.parametrize(
 
 
 @both
-def test_one_row_leaves_the_prior_scale_far_from_it(model):
-    """As scikit-learn's scale of a column without scatter, the prior's is then 1."""
-    mean, std = model.fit([[1.0, 2.0]], [3.0]).predict([[1.0, 2.0], [1e3, 1e3]], return_std=True)
-    assert_allclose(mean, 3.0)
-    assert np.spacing(3.0) < std[0] < 1e-3
-    assert_allclose(std[1], 1.0, rtol=1e-3)
-
-
-@both
 @pytest.mark.parametrize("constant", [0.0, 1.0, -7.0, 1e-12, 1e12, 1e20])
-def test_the_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, constant):
+def test_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, constant):
     y = np.full(5, constant)
     mean, std = model.fit(X[:5], y).predict(np.vstack([X[:5], [[1e9, 1e9]]]), return_std=True)
     assert_allclose(mean, constant)
@@ -42,59 +29,23 @@ def test_the_std_of_a_constant_is_above_its_rounding_and_1_far_away(model, const
 
 
 @both
-def test_the_std_of_a_constant_does_not_depend_on_its_value(model):
-    first = model.fit(X, np.zeros(100)).predict(X[:3] + 10.0, return_std=True)[1]
-    other = model.fit(X, np.full(100, 7.0)).predict(X[:3] + 10.0, return_std=True)[1]
-    assert_allclose(other, first, rtol=1e-6)
-
-
-@both
-def test_the_std_is_above_the_rounding_of_y_where_y_is_tiny_against_its_mean(model):
+def test_std_is_above_the_rounding_of_y_where_y_is_tiny_against_its_mean(model):
     y = 1e6 + 1e-7 * WAVE
     mean, std = model.fit(X, y).predict(X, return_std=True)
     assert (std > np.spacing(1e6)).all()
     assert np.std(mean - y) < 1e-7
 
 
-@pytest.mark.parametrize("groups", [None, GROUPS], ids=["rows", "groups"])
-@pytest.mark.parametrize("sharing", ["auto", "all", "kernel", "none"])
+@pytest.mark.parametrize("sharing", ["auto", "kernel"])
 @pytest.mark.parametrize("normalize_y", [True, False])
-def test_a_locked_joint_among_others_costs_nothing(sharing, groups, normalize_y):
+def test_constant_output_does_not_affect_others(sharing, normalize_y):
     """Warnings are errors here; the other output is as well predicted as alone."""
     Y = np.column_stack([WAVE, np.full(100, 0.3)])
     model = EVGPRegressor(normalize_y=normalize_y, n_inducing=15, sharing=sharing, random_state=0)
-    mean, std = model.fit(X, Y, groups=groups).predict(X, return_std=True)
+    mean, std = model.fit(X, Y, groups=GROUPS).predict(X, return_std=True)
     assert (std[:, 1] > np.spacing(0.3)).all()
     assert_allclose(mean[:, 1], 0.3, atol=1e-4)
     assert negative_log_predictive_density(Y[:, 1] + 1e-15, mean[:, 1], std[:, 1]) < -5.0
-    alone = model.set_params(sharing="all").fit(X, WAVE, groups=groups).predict(X, return_std=True)
+    alone = model.set_params(sharing="all").fit(X, WAVE, groups=GROUPS).predict(X, return_std=True)
     assert_allclose(mean[:, 0], alone[0], atol=0.1)
     assert_allclose(std[:, 0], alone[1], rtol=0.2)
-
-
-def test_scorers_survive_a_constant_output():
-    Y = np.column_stack([WAVE, np.full(100, 0.3)])
-    scorer = make_std_scorer(negative_log_predictive_density, greater_is_better=False)
-    model = EVGPRegressor(normalize_y=True, n_inducing=15, random_state=0)
-    scores = cross_val_score(model, X, Y, groups=GROUPS, cv=GroupKFold(5), scoring=scorer)
-    assert np.isfinite(scores).all()
-    assert (scores > 5.0).all()
-
-
-@pytest.mark.parametrize("max_iter", [0, 30])
-@pytest.mark.parametrize("model", ["exact", "all", "kernel", "auto"])
-def test_far_from_the_data_a_constant_among_others_has_the_std_of_one_alone(model, max_iter):
-    options = {"normalize_y": True, "max_iter": max_iter, "random_state": 0}
-    model = EGPRegressor(**options) if model == "exact" else EVGPRegressor(sharing=model, n_inducing=20, **options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model.fit(X, np.column_stack([WAVE, np.full(100, 3.0)]))
-    std = model.predict(np.vstack([np.full((1, 2), 1e7), X[:5]]), return_std=True)[1][:, 1]
-    assert_allclose(std[0], 1.0, rtol=1e-6)
-    assert std[1:].max() < 0.6
-
-
-def test_a_constant_beside_an_output_of_noise_alone_has_the_std_of_one_alone():
-    model = EVGPRegressor(normalize_y=True, n_inducing=20, random_state=0)
-    model.fit(X, np.column_stack([RNG.standard_normal(100), np.full(100, 3.0)]))
-    assert_allclose(model.predict(np.full((1, 2), 1e7), return_std=True)[1][0, 1], 1.0, rtol=1e-6)

@@ -18,8 +18,6 @@ MODELS = {
     "exact, a line": (EGPRegressor(), Y[:, 1]),
     "exact, several outputs": (EGPRegressor(), Y),
     "exact, shared weights": (EGPRegressor(PolynomialFeatures(1), coef_prior=CoefPrior(shared=True)), Y),
-    "sparse": (EVGPRegressor(n_inducing=12, random_state=0), Y),
-    "sparse, all rows": (EVGPRegressor(random_state=0), Y),
     "sparse, diagonal": (EVGPRegressor(n_inducing=12, solver=LBFGS(posterior="diagonal"), random_state=0), Y),
     "sparse, shared weights": (
         EVGPRegressor(PolynomialFeatures(1), n_inducing=12, coef_prior=CoefPrior(shared=True), random_state=0),
@@ -52,22 +50,8 @@ def test_std_covariance_and_samples_agree(model, include_noise):
     assert (np.abs(samples.mean(axis=-1) - mean) < 0.11 * std + 8.0 * EPS * np.abs(mean)).all()
 
 
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("include_noise", [True, False])
-@pytest.mark.parametrize("name", ["exact, shared weights", "sparse, shared weights"])
-def test_the_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noise):
-    regressor, y = MODELS[name]
-    regressor.fit(X, y)
-    _, std = regressor.predict(X_NEW, return_std=True, include_noise=include_noise)
-    _, joint = regressor.predict(X_NEW, return_cov="joint", include_noise=include_noise)
-    assert_allclose(np.diag(joint), std.ravel() ** 2, rtol=1e-9)
-    assert np.linalg.eigvalsh(joint)[0] >= -len(joint) * EPS * np.diag(joint).max()
-    samples = regressor.sample_y(X_NEW, 3000, random_state=0, include_noise=include_noise)
-    far = samples[-2:].reshape(2 * 3, -1)  # where the weights say nearly all
-    assert_allclose(np.corrcoef(far), joint[-6:, -6:] / np.outer(std[-2:], std[-2:]), atol=0.1)
-
-
-def test_the_variance_of_a_noise_free_parabola_is_right_to_rounding():
+@pytest.mark.long
+def test_variance_of_a_noise_free_parabola_is_right_to_rounding():
     """Against 60 digits: rounding of a sum of 60 squares that is about the signal variance."""
     model = EGPRegressor().fit(X, X[:, 0] ** 2)
     signal, length = model.kernel_.k1.constant_value, model.kernel_.k2.length_scale
@@ -104,16 +88,16 @@ def test_more_inducing_points_do_not_widen_the_std(function):
     assert (np.array(errors) < 4.0 * np.array(stds)).all()
 
 
-def test_rows_after_a_fit_to_few_noise_free_ones_are_folded_in():
-    """The first fit is the exact model's, what follows the sparse one's with its lowest noise."""
-    truth = X[:, 0] ** 2
-    model = EVGPRegressor(random_state=0).fit(X[::2], truth[::2])
-    points = model.inducing_points_.shape
-    before = model.predict(X, return_std=True)
-    model.partial_fit(X[1::2], truth[1::2])
-    mean, std = model.predict(X, return_std=True)
-    assert model.inducing_points_.shape == points == (30, 1)
-    assert_allclose(before[0], truth, atol=1e-5)
-    assert_allclose(mean, truth, atol=1e-5)
-    assert (std < 1e-4).all()
-    assert model.lower_bound_ <= model.upper_bound_ + 1e-6 * abs(model.upper_bound_)
+@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+@pytest.mark.parametrize("include_noise", [True, False])
+@pytest.mark.parametrize("name", ["exact, shared weights", "sparse, shared weights"])
+def test_joint_covariance_of_shared_weights_is_that_of_samples(name, include_noise):
+    regressor, y = MODELS[name]
+    regressor.fit(X, y)
+    _, std = regressor.predict(X_NEW, return_std=True, include_noise=include_noise)
+    _, joint = regressor.predict(X_NEW, return_cov="joint", include_noise=include_noise)
+    assert_allclose(np.diag(joint), std.ravel() ** 2, rtol=1e-9)
+    assert np.linalg.eigvalsh(joint)[0] >= -len(joint) * EPS * np.diag(joint).max()
+    samples = regressor.sample_y(X_NEW, 3000, random_state=0, include_noise=include_noise)
+    far = samples[-2:].reshape(2 * 3, -1)  # where the weights say nearly all
+    assert_allclose(np.corrcoef(far), joint[-6:, -6:] / np.outer(std[-2:], std[-2:]), atol=0.1)

@@ -79,7 +79,7 @@ def assert_same(found, expected):
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", THREADED)
-def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
+def test_number_of_threads_changes_no_bit(name, monkeypatch):
     """With blocks so small that threads have something to do."""
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 16)
     monkeypatch.setattr("skevgp.data.blocks._WORTH_THREADS", 0)
@@ -89,7 +89,7 @@ def test_the_number_of_threads_changes_no_bit(name, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["none", "natural", *OTHERS])
-def test_a_seed_and_a_random_state_with_that_seed_give_the_same_bits(name):
+def test_seed_and_a_random_state_with_that_seed_give_same_bits(name):
     model = (THREADED | OTHERS)[name]
     inner = "regressor__random_state" if name == "residual" else "random_state"
     one = said_by(clone(model).fit(X, Y))
@@ -111,7 +111,7 @@ def digests(names=("auto", "natural", "exact", "network")):
 
 @pytest.mark.long
 @pytest.mark.parametrize(("hash_seed", "threads"), [("0", "1"), ("random", "4")])
-def test_other_processes_give_the_same_bits(hash_seed, threads):
+def test_other_processes_give_same_bits(hash_seed, threads):
     """Whatever the order of sets of strings, and the threads that BLAS may have."""
     code = f"import json, warnings, {__name__} as t; warnings.simplefilter('ignore'); print(json.dumps(t.digests()))"
     environment = os.environ | {

@@ -7,10 +7,8 @@ import sys
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import numpy as np
 import pytest
 
-from skevgp.metrics import prediction_error
 from skevgp.robots import load_robot
 from skevgp.robots.loading import urdf_path
 
@@ -32,148 +30,38 @@ def run(script, *arguments, monkeypatch):
     return runpy.run_path(str(script), run_name="__main__")
 
 
-def test_sparse_gp(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_sparse_gp.py", tmp_path / "picture.png", monkeypatch=monkeypatch)
-    assert "EVGPRegressor" in capsys.readouterr().out
-    assert names["difference"] < 1.0
-    assert (tmp_path / "picture.png").stat().st_size > 10_000
+EXAMPLE_RUNS = [
+    ("sparse_gp", ["picture.png"], "EVGPRegressor"),
+    ("tabular", [], "inducing points, for 1 output"),
+    ("online", [], "forgetting factor"),
+    ("learn_dynamics", ["--system", "pendulum"], "EVGP-IFG"),
+    ("link_gravity", [], "shoulder_lift_joint"),
+    ("nominal_dynamics", [], "the wrong model without data"),
+    ("any_robot", [], "constant velocity"),
+    ("rollout", [], "share of the true states within 2 std"),
+    ("swing_up", ["--system", "cartpole"], "EVGP-IFG"),
+    ("crocoddyl", ["--system", "pendulum"], "particles are"),
+    ("real_arm", [], "coulomb(wrist_3_joint)"),
+    ("payload", [], "online, forgetting factor 0.8"),
+    ("tracking", [], "break a limit"),
+]
 
 
-def test_tabular(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_tabular.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    results = names["results"]
-    assert len(results) == 5 * 4
-    for name in names["sets"]:
-        ours, theirs, trees, _ = (results[name, label] for label in names["labels"])
-        assert ours[1] < min(theirs[1] + 0.1, trees[1])  # NLPD, of few rows
-        assert 0.8 < ours[2] < 0.98
-    assert "inducing points, for 1 output" in capsys.readouterr().out
-    assert (tmp_path / "tabular.png").stat().st_size > 10_000
-
-
-def test_online(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_online.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    assert "forgetting factor" in capsys.readouterr().out
-    after = [np.median(error[names["change"] :]) for error in names["errors"].values()]
-    assert after[2] < after[0]  # what forgets follows
-    assert (tmp_path / "online.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
-def test_learn_dynamics(monkeypatch, capsys, tmp_path, system):
-    run(LEARN, "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
-    lines = capsys.readouterr().out.splitlines()
-    errors = {
-        line.split()[0]: float(line.split()[1]) for line in lines if line.split()[0].endswith(("GP", "IF", "IFG"))
-    }
-    assert errors.keys() == {"VGP", "RES-VGP", "EVGP-IF", "EVGP-IFG"}
-    assert max(errors.values()) < 1.0
-    assert errors["EVGP-IFG"] < 0.1
-    assert (tmp_path / f"learn_dynamics_{system}.png").stat().st_size > 10_000
-
-
-def test_link_gravity(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_link_gravity.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    assert "shoulder_lift_joint" in capsys.readouterr().out
-    for case, label in ((("iiwa14", "q6"), "u_x and u_y"), (("ur5", "shoulder_lift_joint"), "u_x")):
-        curves = names["curves"][case]
-        np.testing.assert_allclose(curves[label], curves["gravity's torque"], rtol=0, atol=1e-9)
-    assert names["weights"][1] == pytest.approx(-names["moment"][1])
-    assert (tmp_path / "link_gravity.png").stat().st_size > 10_000
-
-
-def test_nominal_dynamics(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_nominal_dynamics.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    errors = names["results"]
-    assert errors["IF + nominal"][-1] < names["untrained_error"] < errors["IFG"][-1]
-    np.testing.assert_allclose(names["weights"], names["test"].dt, rtol=0.3)
-    assert "the wrong model without data" in capsys.readouterr().out
-    assert (tmp_path / "nominal_dynamics.png").stat().st_size > 10_000
-
-
-def test_any_robot(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_any_robot.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    truth = names["moves"].target
-    errors = {name: prediction_error(truth, mean) for name, (mean, _) in names["predictions"].items()}
-    assert errors["IF + wrong URDF"] < min(errors["IF"], prediction_error(truth, names["constant"]))
-    assert "constant velocity" in capsys.readouterr().out
-    assert (tmp_path / "any_robot_ur5.png").stat().st_size > 10_000
-
-
-def test_rollout(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_rollout.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    assert names["rollouts"].keys() == {"pendulum", "cartpole", "acrobot"}
-    for system, ahead in names["rollouts"].items():
-        errors = np.median(np.abs(ahead.mean - names["truths"][system]), axis=(0, 2))
-        assert errors[0] < min(0.2, errors[-1])
-        assert (np.median(ahead.std, axis=(0, 2))[[0, -1]] > 0.1 * errors[[0, -1]]).all()
-    assert "share of the true states within 2 std" in capsys.readouterr().out
-    assert (tmp_path / "rollout.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
-def test_swing_up(monkeypatch, capsys, tmp_path, system):
-    names = run(EXAMPLES / "plot_swing_up.py", "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
-    assert names["runs"]["EVGP-IFG"].success
-    for found in names["runs"].values():
-        assert found.distance[0] == np.pi
-        assert np.abs(found.inputs).max() <= names["task"].limit
-    assert "EVGP-IFG" in capsys.readouterr().out
-    assert (tmp_path / f"swing_up_{system}.png").stat().st_size > 10_000
-
-
-@pytest.mark.parametrize("system", ["pendulum", "cartpole"])
-def test_crocoddyl(monkeypatch, capsys, tmp_path, system):
-    pytest.importorskip("crocoddyl", reason="the extra 'control' is not installed")
-    names = run(EXAMPLES / "plot_crocoddyl.py", "--system", system, "--output", tmp_path, monkeypatch=monkeypatch)
-    assert names["success"]["with FDDP's gains"]
-    assert not names["success"]["inputs as planned"]
-    assert names["furthest"].keys() == {"Fx", "Fu", "Lx", "Lu", "Lxx", "Lxu", "Luu"}
-    assert 0.0 < max(names["furthest"].values()) < 1e-3  # differences of 1e-5
-    # The plan keeps the limit, and is a motion of the model.
-    Z, U, limit = names["Z"], names["U"], names["task"].limit
-    assert np.abs(U).max() == pytest.approx(limit)
-    np.testing.assert_allclose(names["fast"].predict(np.hstack([Z[:-1], U])), Z[1:], rtol=0, atol=1e-6)
-    assert "particles are" in capsys.readouterr().out
-    assert (tmp_path / f"crocoddyl_{system}.png").stat().st_size > 10_000
-
-
-def test_tables_without_matplotlib():
-    result = command_line(script=EXAMPLES / "plot_tabular.py", code="sys.modules['matplotlib'] = None")
-    assert result.returncode == 1
-    assert "pip install matplotlib" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
-def test_without_crocoddyl():
-    result = command_line(script=EXAMPLES / "plot_crocoddyl.py", code="sys.modules['crocoddyl'] = None")
-    assert result.returncode == 1
-    assert "pip install pin crocoddyl matplotlib" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
-def test_real_arm(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_real_arm.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    errors = {name: error.mean() for name, error in names["errors"].items()}
-    assert errors["InverseDynamics"] < errors["least squares"] < 0.1 * errors["URDF"]
-    assert (names["inside"] > 0.7).all()
-    assert "coulomb(wrist_3_joint)" in capsys.readouterr().out
-    for picture in ("real_arm.png", "real_arm_signals.png"):
-        assert (tmp_path / picture).stat().st_size > 10_000
-
-
-def test_payload(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_payload.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    least, largest = names["found"][0.1][-1].mass_interval
-    assert least < names["mass"] < largest
-    remembers, forgets = (names["followed"][factor][0, -1] for factor in (1.0, 0.8))
-    assert abs(forgets - names["mass"]) < abs(remembers - names["mass"])
-    assert "online, forgetting factor 0.8" in capsys.readouterr().out
-    assert (tmp_path / "payload.png").stat().st_size > 10_000
+@pytest.mark.parametrize(("name", "arguments", "printed"), EXAMPLE_RUNS, ids=[name for name, *_ in EXAMPLE_RUNS])
+def test_example_prints_and_draws(monkeypatch, capsys, tmp_path, name, arguments, printed):
+    if name == "crocoddyl":
+        pytest.importorskip("crocoddyl", reason="the extra 'control' is not installed")
+    monkeypatch.chdir(tmp_path)
+    output = [] if name == "sparse_gp" else ["--output", tmp_path]
+    run(EXAMPLES / f"plot_{name}.py", *arguments, *output, monkeypatch=monkeypatch)
+    assert printed in capsys.readouterr().out
+    pictures = [*tmp_path.glob("*.png")]
+    assert pictures
+    assert all(picture.stat().st_size > 10_000 for picture in pictures)
 
 
 @pytest.mark.parametrize("script", ["plot_real_arm.py", "plot_payload.py"])
-def test_a_folder_with_a_urdf_and_logs_takes_the_place_of_the_simulation(monkeypatch, tmp_path, script):
+def test_example_takes_folder_of_logs(monkeypatch, tmp_path, script):
     write_log = runpy.run_path(str(EXAMPLES / "simulated_arm.py"))["write_log"]
     robot = load_robot("ur10")
     names = ["20sec_8harm", "30sec_12harm", "40sec_12harm", "50sec_12harm"]
@@ -186,15 +74,6 @@ def test_a_folder_with_a_urdf_and_logs_takes_the_place_of_the_simulation(monkeyp
     (folder / "arm.urdf").write_bytes(urdf_path("ur10").read_bytes())
     found = run(EXAMPLES / script, folder, "--output", tmp_path, monkeypatch=monkeypatch)
     assert found["com" if "payload" in script else "truth"] is None
-
-
-def test_tracking(monkeypatch, capsys, tmp_path):
-    names = run(EXAMPLES / "plot_tracking.py", "--output", tmp_path, monkeypatch=monkeypatch)
-    assert names["errors"]["with what was learned"] < 0.2 * names["errors"]["nominal model"]
-    broken = [np.mean(peak > 1.0) for *_, peak in names["tried"].values()]
-    assert broken[1] < broken[0]  # with and without what the std adds
-    assert "break a limit" in capsys.readouterr().out
-    assert (tmp_path / "tracking.png").stat().st_size > 10_000
 
 
 def command_line(*arguments, script=LEARN, code=""):
@@ -215,39 +94,17 @@ def test_help():
     assert "--system {acrobot,cartpole,pendulum}" in result.stdout
 
 
-def test_a_wrong_system_lists_the_right_ones():
+def test_invalid_system_lists_systems():
     result = command_line("--system", "pendulums")
     assert result.returncode == 2
     assert "invalid choice: 'pendulums'" in result.stderr
     assert "cartpole" in result.stderr
 
 
-def test_an_unknown_robot_is_a_line_not_a_traceback():
-    result = command_line("--robot", "urr5", script=EXAMPLES / "plot_any_robot.py")
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: Unknown robot 'urr5'")
-    assert "Traceback" not in result.stderr
-
-
-@pytest.mark.parametrize("script", ["plot_real_arm.py", "plot_payload.py"])
-def test_a_folder_without_a_urdf_is_a_line_not_a_traceback(tmp_path, script):
-    result = command_line(str(tmp_path), script=EXAMPLES / script)
-    assert result.returncode == 1
-    assert result.stderr.startswith("error: ")
-    assert "robot.urdf" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
-def test_a_wrong_size_is_a_line_not_a_traceback():
-    result = command_line("--trajectories", "0")
-    assert result.returncode == 1
-    assert result.stderr == "error: n_trajectories must be at least 1; got 0.\n"
-
-
 @pytest.mark.parametrize(
     ("package", "pip"), [("pinocchio", "pip install pin"), ("matplotlib", "pip install pin matplotlib")]
 )
-def test_without_an_optional_package(package, pip):
+def test_missing_package_names_pip_command(package, pip):
     result = command_line(code=f"sys.modules[{package!r}] = None")
     assert result.returncode == 1
     assert pip in result.stderr
@@ -269,7 +126,7 @@ def test_without_an_optional_package(package, pip):
         "plot_payload.py",
     ],
 )
-def test_the_stories_of_robots_without_pinocchio(script):
+def test_example_without_pinocchio_names_pip_command(script):
     result = command_line(script=EXAMPLES / script, code="sys.modules['pinocchio'] = None")
     assert result.returncode == 1
     assert "pip install pin" in result.stderr

@@ -25,7 +25,7 @@ class OwnError(RuntimeError):
 
 
 @pytest.mark.parametrize("n_jobs", [1, 2])
-def test_an_error_in_a_thread_is_the_users_own(n_jobs):
+def test_error_in_a_thread_is_the_users_own(n_jobs):
     def failing(X, Z, size=1.0):
         if n_jobs == 1 or current_thread() is not main_thread():
             raise OwnError("no kernel", 17)
@@ -64,6 +64,6 @@ print(all(vars(model)[name] is value for name, value in known.items()), (model.p
 
 @pytest.mark.long
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="RLIMIT_AS")
-def test_where_memory_ends_there_is_a_memory_error_and_the_model_is_as_it_was():
+def test_memory_error_keeps_model():
     done = subprocess.run([sys.executable, "-W", "ignore", "-c", MEMORY], capture_output=True, text=True, check=False)
     assert done.stdout.splitlines() == ["MemoryError True", "True True"], done.stderr

@@ -12,7 +12,7 @@ COLUMNS = {"a": [1.0, 2.0], "word": ["hot", "cold"]}
 
 
 @pytest.mark.parametrize("frame", [pd.DataFrame(COLUMNS), pl.DataFrame(COLUMNS), pa.table(COLUMNS)], ids=type)
-def test_a_frame_comes_back(frame):
+def test_frame_comes_back(frame):
     again = FrameColumns.of(frame).frame()
     assert type(again) is type(frame)
     for name, values in COLUMNS.items():
@@ -20,7 +20,7 @@ def test_a_frame_comes_back(frame):
 
 
 @pytest.mark.parametrize("value", [None, "a", np.eye(2), [[1.0]], {"a": [1.0]}])
-def test_what_is_no_frame_is_none(value):
+def test_array_is_no_frame(value):
     assert FrameColumns.of(value) is None
 
 
@@ -39,6 +39,6 @@ def test_without_its_package_a_frame_gets_the_pip_command(monkeypatch):
         (FrameColumns("pandas", ["a", "b"], [np.zeros(2), np.zeros(3)]), "differ in length"),
     ],
 )
-def test_columns_that_do_not_fit_are_refused(columns, message):
+def test_columns_that_do_not_fit_raise(columns, message):
     with pytest.raises(ValueError, match=message):
         columns.frame()

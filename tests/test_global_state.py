@@ -20,18 +20,8 @@ from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from threadpoolctl import threadpool_info
 
-from skevgp import InverseDynamics, rollout
-from skevgp.datasets import make_dynamics
-from skevgp.features import InertiaForceGravity
+from skevgp import rollout
 from skevgp.io import load, save
-from skevgp.plotting import (
-    CalibrationDisplay,
-    CoefficientDisplay,
-    LearningCurveDisplay,
-    LossDisplay,
-    PosteriorDisplay,
-    RolloutDisplay,
-)
 from skevgp.solvers import LBFGS, Adam
 
 from .test_determinism import OTHERS, THREADED, X_NEW, X, Y, evgp
@@ -111,18 +101,6 @@ def test_interrupted_fits(solver, n_jobs):
         evgp(solver=solver, n_jobs=n_jobs, sharing="none").fit(X, Y)
 
 
-def broken(*told):
-    raise ZeroDivisionError
-
-
-@pytest.mark.parametrize("n_jobs", [1, 2])
-def test_fits_that_fail(n_jobs):
-    with pytest.raises(ZeroDivisionError):
-        evgp(solver=LBFGS(callback=broken), n_jobs=n_jobs, sharing="none").fit(X, Y)
-    with pytest.raises(ValueError, match="NaN"):
-        evgp(n_jobs=n_jobs).fit(X, np.full_like(Y, np.nan))
-
-
 def test_files(tmp_path):
     for name in ("all", "exact", "network", "residual"):
         save(clone((THREADED | OTHERS)[name]).fit(X, Y), tmp_path / "model")
@@ -136,24 +114,3 @@ def test_exports(tmp_path):
     model = clone(THREADED["all"]).fit(X, Y)
     model.to_casadi()(X_NEW[0])
     model.to_c(tmp_path)
-
-
-def test_pictures():
-    model = clone(THREADED["all"]).fit(X[:, :1], Y[:, 0])
-    PosteriorDisplay.from_estimator(model, X[:, :1], Y[:, 0])
-    CoefficientDisplay.from_estimator(model)
-    LossDisplay.from_estimator(model)
-    CalibrationDisplay.from_estimator(model, X[:, :1], Y[:, 0])
-    LearningCurveDisplay.from_estimator(
-        model, X[:, :1], Y[:, 0], X_NEW[:, :1], Y[:9, 0], sizes=[20, 40], n_runs=1, random_state=0
-    )
-    ahead = rollout(clone(THREADED["all"]).fit(X, Y), X_NEW[0], np.empty((3, 0)), n_samples=3, random_state=2)
-    RolloutDisplay.from_rollout(ahead)
-    pyplot.close("all")
-
-
-def test_data_and_physics():
-    train = make_dynamics("pendulum", 3, 20, n_jobs=2, random_state=0)
-    evgp(InertiaForceGravity("pendulum")).fit(train.data, train.target, groups=train.groups)
-    rows = np.random.RandomState(0).uniform(-1.0, 1.0, (40, 6))
-    InverseDynamics("acrobot", n_inducing=4, max_iter=2, random_state=0).fit(rows, rows[:, :2])

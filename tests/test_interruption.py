@@ -8,13 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 from sklearn.base import clone
-from sklearn.exceptions import ConvergenceWarning, NotFittedError
 from threadpoolctl import threadpool_info
 
 from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.io import load, save
 from skevgp.noise import Gaussian
-from skevgp.solvers import LBFGS, Adam
+from skevgp.solvers import Adam
 
 from .interruption import interrupted_at
 
@@ -94,32 +93,19 @@ def _fit(model, n):
     return "kept" if any("interrupted" in str(warning.message) for warning in caught) else f"untold: {places[-1]}"
 
 
-def test_a_second_ctrl_c_does_not_wait():
-    """It ends the fit where it is; the model is as it was."""
-
-    class Impatient(LBFGS):
-        def minimise(self, *arguments):
-            minimum = super().minimise(*arguments)
-            signal.raise_signal(signal.SIGINT)
-            signal.raise_signal(signal.SIGINT)
-            return minimum
-
-    model = sparse(solver=Impatient())
-    with pytest.raises(KeyboardInterrupt):
-        model.fit(X, Y)
-    with pytest.raises(NotFittedError):
-        model.predict(X)
-
-
-def test_who_handles_ctrl_c_goes_on_to_do_so():
-    seen = []
-    before = signal.signal(signal.SIGINT, lambda *_: seen.append(1))
-    try:
-        with interrupted_at(fitted("lbfgs")[1] + 50), pytest.warns(ConvergenceWarning, match="Raise max_iter"):
-            sparse().fit(X, Y)
-    finally:
-        signal.signal(signal.SIGINT, before)
-    assert seen == [1]
+def test_file_is_replaced_or_as_it_was(tmp_path):
+    model, path = fitted("lbfgs")[0], tmp_path / "model.skevgp"
+    save(model, path)
+    before = path.read_bytes()
+    with interrupted_at() as places:
+        save(fitted("exact")[0], path)
+    path.write_bytes(before)
+    for n in np.linspace(2, len(places) - 5, 6).astype(int):
+        with interrupted_at(n), pytest.raises(KeyboardInterrupt):
+            save(fitted("exact")[0], path)
+        assert path.read_bytes() == before
+        assert [file.name for file in tmp_path.iterdir()] == [path.name]
+    np.testing.assert_array_equal(predictions(load(path)), predictions(model))
 
 
 @pytest.mark.parametrize(
@@ -134,7 +120,7 @@ def test_who_handles_ctrl_c_goes_on_to_do_so():
     ],
     ids=["predict", "partial_fit", "particles", "linearised", "jacobian", "sample_y"],
 )
-def test_what_is_done_with_a_model_ends_at_once_and_leaves_it_as_it_was(use):
+def test_interrupted_methods_keep_model(use):
     model = pickle.loads(pickle.dumps(fitted("lbfgs")[0]))
     before = predictions(model)
     other = pickle.loads(pickle.dumps(model))
@@ -144,18 +130,3 @@ def test_what_is_done_with_a_model_ends_at_once_and_leaves_it_as_it_was(use):
         with interrupted_at(n), pytest.raises(KeyboardInterrupt):
             use(model)
         np.testing.assert_array_equal(predictions(model), before)
-
-
-def test_a_file_is_replaced_or_as_it_was(tmp_path):
-    model, path = fitted("lbfgs")[0], tmp_path / "model.skevgp"
-    save(model, path)
-    before = path.read_bytes()
-    with interrupted_at() as places:
-        save(fitted("exact")[0], path)
-    path.write_bytes(before)
-    for n in np.linspace(2, len(places) - 5, 6).astype(int):
-        with interrupted_at(n), pytest.raises(KeyboardInterrupt):
-            save(fitted("exact")[0], path)
-        assert path.read_bytes() == before
-        assert [file.name for file in tmp_path.iterdir()] == [path.name]
-    np.testing.assert_array_equal(predictions(load(path)), predictions(model))

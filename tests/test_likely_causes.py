@@ -1,16 +1,12 @@
 """What `InverseDynamics` says of columns in another order or in degrees, and nothing of these where all is right."""
 
 import warnings
-from time import perf_counter
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.exceptions import ConvergenceWarning
 
 from skevgp import InverseDynamics
-from skevgp.datasets import load_robot
-from skevgp.exceptions import RobotModelWarning
 from skevgp.features import NominalDynamics, RigidBodyRegressor
 from skevgp.identification.likely_causes import likely_causes
 from skevgp.robots import RigidBody
@@ -46,8 +42,7 @@ def warning_of(robot, X, y, **data):
     return str(caught[0].message) if caught else ""
 
 
-@pytest.mark.parametrize("masses", [1.0, 0.1], ids=["rough", "placeholders"])
-@pytest.mark.parametrize("what", ["X and y", "X", "y"])
+@pytest.mark.parametrize(("what", "masses"), [("X and y", 1.0), ("X", 0.1), ("y", 1.0)])
 def test_columns_in_another_order_are_named_in_their_order(what, masses):
     arm = Arm(noise=NOISE)
     order = [2, 1, 0, 5, 3, 4]
@@ -59,17 +54,9 @@ def test_columns_in_another_order_are_named_in_their_order(what, masses):
     assert cause == f"the columns of {what} seem to be in the order {columns}, and must be in the robot's: {names}"
 
 
-def test_the_warning_of_a_fit_names_the_order():
-    """A driver that names the elbow first; the score is .8 then."""
-    arm = Arm(noise=NOISE)
-    message = warning_of(arm.nominal, columns_of(arm.X, [2, 1, 0, 3, 4, 5]), arm.y[:, [2, 1, 0, 3, 4, 5]])
-    assert "far from what torques say: the columns of X and y seem to be in the order ['elbow_joint', 's" in message
-    assert warning_of(arm.nominal, arm.X, arm.y) == ""
-
-
 @pytest.mark.long
 @pytest.mark.parametrize("robot", ["iiwa14", "panda"])
-def test_the_order_of_more_joints_is_searched_step_by_step(robot):
+def test_order_of_more_joints_is_searched_step_by_step(robot):
     arm = Arm(robot, noise=NOISE)
     order = np.random.default_rng(0).permutation(arm.nominal.nv)
     columns = [arm.nominal.names[1 + joint] for joint in order.tolist()]
@@ -77,8 +64,7 @@ def test_the_order_of_more_joints_is_searched_step_by_step(robot):
     assert any(f"columns of X and y seem to be in the order {columns}" in cause for cause in found)
 
 
-@pytest.mark.parametrize("blocks", ["qva", "q"])
-@pytest.mark.parametrize("robot", ["ur5", "kinova"])  # the latter has joints without limits
+@pytest.mark.parametrize(("robot", "blocks"), [("ur5", "qva"), ("kinova", "q")])  # the latter has joints without limits
 def test_degrees_are_named(robot, blocks):
     arm = Arm(robot, noise=NOISE)
     names = list(arm.nominal.names)[1:]
@@ -87,18 +73,10 @@ def test_degrees_are_named(robot, blocks):
     assert cause == f"{signals} of {names} look like degrees, and must be in radians"
 
 
-def test_degrees_of_one_joint_are_named():
-    arm = Arm(noise=NOISE)
-    causes = causes_of(arm.nominal, in_degrees(arm.X, "qva", [1]), arm.y)
-    assert len(causes) == 1
-    assert "positions, velocities and accelerations of ['shoulder_lift_joint'] look like degrees" in causes[0]
-
-
-@pytest.mark.parametrize("robot", ["cartpole", "so100", "kinova", "ur10"])
-@pytest.mark.parametrize("seed", range(2))
-def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robot, seed):
+@pytest.mark.parametrize("robot", ["cartpole", "ur10"])
+def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robot):
     """Without gravity, in amperes, or with signs of their own, torques are explained best without some signals."""
-    arm, rng = Arm(robot, noise=0.0), np.random.default_rng(seed)
+    arm, rng = Arm(robot, noise=0.0), np.random.default_rng(0)
     q, v, a = np.split(arm.X, 3, axis=1)
     forces = RigidBody(arm.nominal).forces
     wrong = {
@@ -108,26 +86,6 @@ def test_radians_do_not_look_like_degrees_where_torques_are_of_another_kind(robo
     }
     causes = {name: causes_of(arm.nominal, arm.X, y) for name, y in wrong.items()}
     assert not any("degrees" in cause for several in causes.values() for cause in several)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("robot", ["panda", "solo12", "g1_29dof_rev_1_0"])
-def test_the_search_for_causes_is_short(robot):
-    """About a second; the limit is for busy machines."""
-    arm = Arm(robot, noise=NOISE)
-    y = arm.y + 3.0 * arm.y.std(axis=0) * np.random.default_rng(0).normal(size=arm.y.shape)
-    feature_map = RigidBodyRegressor(arm.nominal).fit(arm.X)
-    prior, began = feature_map.coef_prior(y.shape[1]), perf_counter()
-    likely_causes(feature_map, arm.X, y, prior, is_far=True)
-    assert perf_counter() - began < 8.0
-
-
-def test_degrees_in_another_order_are_named_both():
-    arm = Arm(noise=NOISE)
-    order = [2, 1, 0, 3, 4, 5]
-    causes = causes_of(arm.nominal, in_degrees(columns_of(arm.X, order), "qva", range(6)), arm.y[:, order])
-    assert "look like degrees" in causes[0]
-    assert "in the order ['elbow_joint', 'shoulder_lift_joint', 'shoulder_pan_joint', 'w" in causes[-1]
 
 
 def test_positions_beyond_their_limits_are_named_if_the_model_is_far_off():
@@ -140,19 +98,10 @@ def test_positions_beyond_their_limits_are_named_if_the_model_is_far_off():
     assert causes_of(arm.nominal, X, arm.y, is_far=False) == []
 
 
-def test_of_many_joints_positions_are_compared_with_limits_only():
-    model = load_robot("romeo")
-    X = np.zeros((2, 3 * model.nv))
-    X[:, 4] = 90.0
-    (cause,) = causes_of(model, X, np.zeros((2, model.nv)))
-    assert f"positions of {model.names[5]!r} (from 90 to 90" in cause
-    assert "look like degrees" in cause
-
-
 @pytest.mark.parametrize(
     "robot", ["acrobot", *(pytest.param(robot, marks=pytest.mark.long) for robot in ("ur5", "iiwa14"))]
 )
-def test_where_columns_are_right_no_other_cause_is_named(robot):
+def test_right_columns_give_no_cause(robot):
     """However little torques are explained."""
     arm, rng = Arm(robot, noise=NOISE), np.random.default_rng(0)
     scale, n = arm.y.std(axis=0), arm.nominal.nv
@@ -175,7 +124,7 @@ UR5 = ["shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint", "wrist_1_join
 NAMES = [f"{signal}/{joint}" for signal in ("position", "velocity", "acceleration") for joint in UR5]
 
 
-def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(frame_of):
+def test_frame_whose_names_say_that_joints_are_in_another_order_raises(frame_of):
     arm = Arm(noise=NOISE)
     X, y = frame_of(dict(zip(NAMES, arm.X.T, strict=True))), frame_of(dict(zip(UR5, arm.y.T, strict=True)))
     assert warning_of("ur5", X, y) == ""
@@ -187,34 +136,10 @@ def test_a_frame_whose_names_say_that_joints_are_in_another_order_is_refused(fra
         InverseDynamics("ur5").fit(X, frame_of({name: arm.y[:, UR5.index(name)] for name in by_name}))
 
 
-def test_the_columns_of_each_joint_side_by_side_are_refused(frame_of):
+def test_columns_of_each_joint_side_by_side_raise(frame_of):
     side_by_side = [f"{joint}/{signal}" for joint in UR5 for signal in ("q", "dq", "u")]
     frame = frame_of({name: np.zeros(2) for name in side_by_side})
     with pytest.raises(ValueError, match="by their names they are those of the joints"):
         RigidBodyRegressor("ur5").fit(frame)
     ordered = [f"{joint}/{signal}" for signal in ("q", "dq", "u") for joint in UR5]
     assert NominalDynamics("ur5").fit_transform(frame_of({name: np.zeros(2) for name in ordered})).shape == (2, 6)
-
-
-@pytest.mark.parametrize("names", [list("abcdef") * 3, [f"x{number}" for number in range(18)]])
-def test_names_that_say_nothing_of_joints_are_any(names):
-    names = [f"{name}{number}" for number, name in enumerate(names)]
-    RigidBodyRegressor("ur5").fit(pd.DataFrame(np.zeros((2, 18)), columns=names))
-
-
-def test_of_an_unphysical_robot_a_fit_warns_once():
-    model = load_robot("acrobot").copy()
-    model.inertias[2].inertia = np.diag([0.1, 0.33, 0.1])
-    arm = Arm("acrobot", noise=NOISE)
-    with pytest.warns(RobotModelWarning, match="'q2' has 1 kg and moments") as caught:
-        InverseDynamics(model, n_inducing=0).fit(arm.X, arm.y, groups=arm.groups)
-    assert len(caught) == 1
-
-
-@pytest.mark.parametrize("robot", ["cartpole", "ur5"])
-def test_torques_without_gravity_are_no_sign_of_degrees(robot):
-    """A driver that compensates gravity leaves it out: positions at 0 explain the rest as well as radians do."""
-    arm = Arm(robot, noise=NOISE)
-    q, v, a = np.split(arm.X, 3, axis=1)
-    gravity = RigidBody(arm.model).forces(q, 0.0 * v, 0.0 * a)
-    assert not any("degrees" in cause for cause in causes_of(arm.nominal, arm.X, arm.y - gravity))

@@ -26,7 +26,7 @@ def sparse():
     return EVGPRegressor(n_inducing=8, noise_cv=None, random_state=0).fit(X, y)
 
 
-def test_the_line_is_minus_the_loss(sparse):
+def test_line_is_minus_the_loss(sparse):
     display = LossDisplay.from_estimator(sparse, label="m", color="black")
     assert_array_equal(display.line_.get_ydata(), -sparse.loss_curve_)
     assert_array_equal(display.line_.get_xdata(), np.arange(1, sparse.n_iter_ + 1))
@@ -34,44 +34,7 @@ def test_the_line_is_minus_the_loss(sparse):
     assert display.ax_.get_ylabel() == "lower bound (nats)"
 
 
-def test_the_exact_model_shows_its_likelihood():
-    display = LossDisplay.from_estimator(EGPRegressor().fit(X, y))
-    assert display.ax_.get_ylabel() == "log marginal likelihood (nats)"
-
-
-def test_a_gap_is_how_far_the_bound_is_below_the_best(sparse):
-    display = LossDisplay.from_estimator(sparse, gap=True)
-    expected = (-sparse.loss_curve_).max() + sparse.loss_curve_
-    assert np.nanmin(display.line_.get_ydata()) > 0.0
-    assert_array_equal(display.line_.get_ydata()[expected > 0], expected[expected > 0])
-    assert display.ax_.get_yscale() == "log"
-    assert display.ax_.get_ylabel() == "lower bound: nats below its best"
-
-
-def test_the_end_of_a_fit_is_seen_whatever_the_beginning():
-    bound = np.concatenate([[-1e9, -1e6], np.linspace(10.0, 20.0, 8)])
-    display = LossDisplay(bound).plot()
-    low, high = display.ax_.get_ylim()
-    assert 9.0 < low < 10.0 < 20.0 < high < 21.0
-
-
-def test_curves_share_axes_and_all_are_seen():
-    first = LossDisplay(np.linspace(10.0, 20.0, 8)).plot(label="a")
-    second = LossDisplay(np.linspace(-40.0, 0.0, 8)).plot(ax=first.ax_, label="b")
-    low, high = first.ax_.get_ylim()
-    assert low < -28.0
-    assert high > 20.0
-    assert first.line_.get_color() != second.line_.get_color()
-
-
-def test_one_iteration_is_a_dot():
-    display = LossDisplay(np.array([3.0])).plot()
-    low, high = display.ax_.get_ylim()
-    assert low < 3.0 < high
-    assert display.line_.get_marker() == "."
-
-
-def test_what_has_no_iterations_is_an_error():
+def test_model_without_iterations_raises():
     with pytest.raises(ValueError, match="EVGPRegressor has no iterations to show"):
         LossDisplay.from_estimator(EVGPRegressor(n_inducing=8, max_iter=0, random_state=0).fit(X, y))
     with pytest.raises(NotFittedError):
@@ -89,8 +52,3 @@ def test_points_that_cannot_be_evaluated_are_gaps():
         display = LossDisplay.from_estimator(model, gap=gap)
         display.figure_.canvas.draw()
         assert np.isfinite(display.ax_.get_ylim()).all()
-
-
-def test_an_unfitted_exact_model_has_nothing_to_show():
-    with pytest.raises(NotFittedError):
-        LossDisplay.from_estimator(EGPRegressor())

@@ -1,4 +1,4 @@
-from math import log, pi, sqrt
+from math import log, pi
 
 import numpy as np
 import pytest
@@ -35,25 +35,8 @@ def test_error_by_hand():
     assert prediction_error([[0.0, 0.0], [1.0, 2.0]], [[3.0, 4.0], [1.0, 3.0]]) == 3.0
 
 
-def test_error_of_one_output_is_the_mean_absolute_error():
-    assert prediction_error([1.0, 2.0, 3.0], [0.0, 4.0, 3.0]) == 1.0
-
-
-def test_error_row_by_row():
-    norms = [sqrt(sum(difference**2 for difference in row)) for row in Y - MEAN]
-    assert prediction_error(Y, MEAN) == pytest.approx(sum(norms) / 30, rel=1e-14)
-
-
 def test_std_norm_by_hand():
     assert std_norm([[3.0, 4.0], [5.0, 12.0]]) == 9.0
-
-
-def test_std_norm_of_one_output_is_the_mean():
-    assert std_norm([1.0, 2.0, 6.0]) == 3.0
-
-
-def test_std_norm_row_by_row():
-    assert std_norm(STD) == pytest.approx(sum(sqrt(sum(s**2 for s in row)) for row in STD) / 30, rel=1e-14)
 
 
 def test_ratios_by_hand():
@@ -61,28 +44,18 @@ def test_ratios_by_hand():
     assert_array_equal(ratios, [0.5, 0.75, 0.75])
 
 
-def test_one_two_and_three_deviations_are_what_the_paper_has():
-    assert_array_equal(containing_ratios([0.5, 1.5, 2.5, 3.5, 4.5], np.zeros(5), np.ones(5)), [0.2, 0.4, 0.6])
-
-
-def test_an_interval_without_width_holds_what_is_predicted_exactly():
+def test_interval_without_width_holds_what_is_predicted_exactly():
     found = containing_ratios([1.0, 2.0], [1.0, 2.5], [1.0, 1.0], k=0)
     assert isinstance(found, np.ndarray)
     assert_array_equal(found, [0.5])
 
 
-def test_the_edge_of_the_interval_is_inside():
+def test_containing_ratios_default_widths():
+    assert_array_equal(containing_ratios([0.5, 1.5, 2.5, 3.5, 4.5], np.zeros(5), np.ones(5)), [0.2, 0.4, 0.6])
+
+
+def test_edge_of_the_interval_is_inside():
     assert_array_equal(containing_ratios([2.0], [0.0], [1.0], k=[1.9, 2.0]), [0.0, 1.0])
-
-
-def test_ratios_pair_by_pair():
-    pairs = list(zip(Y.ravel(), MEAN.ravel(), STD.ravel(), strict=True))
-    expected = [sum(abs(y - mean) <= k * std for y, mean, std in pairs) / 90 for k in (0.5, 1, 2)]
-    assert_allclose(containing_ratios(Y, MEAN, STD, k=(0.5, 1, 2)), expected, rtol=1e-15)
-
-
-def test_ratios_of_exact_predictions_without_uncertainty():
-    assert_array_equal(containing_ratios([1.0, 2.0], [1.0, 2.5], [0.0, 0.0]), [0.5, 0.5, 0.5])
 
 
 def test_density_by_hand():
@@ -95,12 +68,6 @@ def test_density_sums_outputs_and_averages_rows():
     assert negative_log_predictive_density(Y, MEAN, STD) == pytest.approx(expected, rel=1e-13)
 
 
-def test_the_true_standard_deviation_has_the_best_density():
-    y = 2.0 * RNG.standard_normal(10_000)
-    scores = [negative_log_predictive_density(y, np.zeros_like(y), np.full_like(y, std)) for std in (1.0, 2.0, 4.0)]
-    assert np.argmin(scores) == 1
-
-
 def test_gaussian_errors_fall_into_the_intervals_of_the_normal_distribution():
     std = RNG.uniform(0.5, 5.0, size=(20_000, 2))
     mean = RNG.normal(size=std.shape)
@@ -108,14 +75,12 @@ def test_gaussian_errors_fall_into_the_intervals_of_the_normal_distribution():
     assert_allclose(ratios, [0.6827, 0.9545, 0.9973], rtol=0, atol=0.01)
 
 
-def test_the_density_of_gaussian_errors_is_their_entropy():
-    y = 3.0 * RNG.standard_normal(50_000)
-    score = negative_log_predictive_density(y, np.zeros_like(y), np.full_like(y, 3.0))
-    assert score == pytest.approx(0.5 * log(2 * pi) + log(3.0) + 0.5, abs=0.02)
+def test_crps_sums_outputs_and_averages_rows():
+    assert crps(Y, MEAN, STD) == pytest.approx(sum(crps(*column) for column in zip(Y.T, MEAN.T, STD.T, strict=True)))
 
 
 @pytest.mark.parametrize(("y", "mean", "std"), [(0.3, 0.0, 1.0), (-7.0, 1.0, 0.5), (2.0, 2.0, 3.0)])
-def test_the_crps_is_its_integral(y, mean, std):
+def test_crps_is_its_integral(y, mean, std):
     def below(x):
         return norm.cdf(x, mean, std) ** 2
 
@@ -126,27 +91,11 @@ def test_the_crps_is_its_integral(y, mean, std):
     assert crps([y], [mean], [std]) == pytest.approx(expected, rel=1e-7)
 
 
-def test_the_crps_sums_outputs_and_averages_rows():
-    assert crps(Y, MEAN, STD) == pytest.approx(sum(crps(*column) for column in zip(Y.T, MEAN.T, STD.T, strict=True)))
-
-
-def test_the_crps_without_uncertainty_is_the_error():
+def test_crps_without_uncertainty_is_the_error():
     assert crps([1.0, -2.0, 3.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1e-320]) == pytest.approx(5.0 / 3.0)
 
 
-def test_the_true_standard_deviation_has_the_best_crps():
-    y = 2.0 * RNG.standard_normal(10_000)
-    scores = [crps(y, np.zeros_like(y), np.full_like(y, std)) for std in (1.0, 1.6, 2.0, 2.4, 4.0)]
-    assert np.argmin(scores) == 2
-
-
-def test_the_calibration_error_is_the_area_between_the_curve_and_the_diagonal():
-    levels = np.linspace(0.0, 1.0, 200_001)[1:-1]
-    shares = containing_ratios(Y, MEAN, STD, k=norm.ppf(0.5 + levels / 2))
-    assert calibration_error(Y, MEAN, STD) == pytest.approx(np.abs(shares - levels).mean(), abs=1e-5)
-
-
-def test_the_calibration_error_by_hand():
+def test_calibration_error_by_hand():
     """One value, at the end of the interval of probability p: the area is that of two triangles."""
     for p in (0.0, 0.3, 0.5, 1.0):
         expected = 0.5 * p**2 + 0.5 * (1.0 - p) ** 2
@@ -156,16 +105,11 @@ def test_the_calibration_error_by_hand():
 
 
 @pytest.mark.parametrize(("factor", "expected"), [(0.0, 0.5), (1.0, 0.0), (1e9, 0.5)])
-def test_the_calibration_error_of_gaussian_errors(factor, expected):
+def test_calibration_error_of_gaussian_errors(factor, expected):
     errors = RNG.standard_normal(40_000)
     assert calibration_error(errors, np.zeros_like(errors), np.full_like(errors, factor)) == pytest.approx(
         expected, abs=0.005
     )
-
-
-def test_the_calibration_error_by_chance_is_as_the_docstring_says():
-    found = [calibration_error(*(part(400) for part in (RNG.standard_normal, np.zeros, np.ones))) for _ in range(200)]
-    assert np.mean(found) * 20.0 == pytest.approx(0.313, abs=0.04)  # of a Brownian bridge: sqrt(pi / 32)
 
 
 def test_levels_are_those_of_intervals_that_just_hold_the_value():
@@ -183,31 +127,14 @@ def test_scorers_are_scores_of_which_more_is_better():
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_one_column_equals_one_dimension(metric):
-    row = arguments(metric, Y[:, 0], MEAN[:, 0], STD[:, 0])
-    column = arguments(metric, Y[:, :1], MEAN[:, :1], STD[:, :1])
-    assert_array_equal(metric(*row), metric(*column))
-
-
-@pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_lists_work(metric):
-    assert_array_equal(metric(*(part.tolist() for part in arguments(metric))), metric(*arguments(metric)))
-
-
-@pytest.mark.parametrize("metric", [prediction_error, negative_log_predictive_density, crps, calibration_error])
-def test_scores_are_plain_floats(metric):
-    assert type(metric(*arguments(metric))) is float
-
-
-@pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_another_number_of_rows_is_an_error(metric):
+def test_another_number_of_rows_raises(metric):
     with pytest.raises(ValueError, match="inconsistent numbers of samples"):
         metric(*arguments(metric, mean=MEAN[:-1]))
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
 @pytest.mark.parametrize("mean", [MEAN[:, :1], MEAN[:, 0]])
-def test_another_number_of_outputs_is_an_error(metric, mean):
+def test_another_number_of_outputs_raises(metric, mean):
     with pytest.raises(ValueError, match=r"same number of outputs; got .*'y_true': 3, 'y_pred': 1"):
         metric(*arguments(metric, mean=mean))
 
@@ -215,59 +142,37 @@ def test_another_number_of_outputs_is_an_error(metric, mean):
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
 @pytest.mark.parametrize(("name", "argument"), [("y_true", "y"), ("y_pred", "mean")])
 @pytest.mark.parametrize("value", [np.nan, np.inf])
-def test_a_value_that_is_not_finite_is_named(metric, name, argument, value):
+def test_value_that_is_not_finite_raises(metric, name, argument, value):
     with pytest.raises(ValueError, match=rf"Input {name} contains"):
         metric(*arguments(metric, **{argument: np.add(Y, [0.0, 0.0, value])}))
 
 
 @pytest.mark.parametrize("metric", OF_STD)
-def test_a_standard_deviation_that_is_not_finite_is_named(metric):
+def test_standard_deviation_that_is_not_finite_raises(metric):
     with pytest.raises(ValueError, match="Input std contains NaN"):
         metric(Y, MEAN, np.full_like(STD, np.nan))
 
 
 @pytest.mark.parametrize("metric", OF_STD)
-def test_a_negative_standard_deviation_is_an_error(metric):
+def test_negative_standard_deviation_raises(metric):
     with pytest.raises(ValueError, match=r"std must .*smallest value is -0\.5"):
         metric([0.0, 0.0], [0.0, 0.0], [1.0, -0.5])
 
 
-def test_std_norm_of_what_is_not_finite_names_it():
-    with pytest.raises(ValueError, match="Input std contains NaN"):
-        std_norm([1.0, np.nan])
-
-
-@pytest.mark.parametrize("metric", [*OF_PREDICTIONS, std_norm])
-def test_single_precision_is_taken_as_double(metric):
-    """Rounded when it was made, and no further."""
-    single = [part.astype(np.float32) for part in ((STD,) if metric is std_norm else arguments(metric))]
-    assert_array_equal(metric(*single), metric(*(part.astype(float) for part in single)))
-
-
-def test_std_norm_of_negative_values_is_an_error():
+def test_std_norm_of_negative_values_raises():
     with pytest.raises(ValueError, match=r"std must not be negative; its smallest value is -0\.5"):
         std_norm([1.0, -0.5])
 
 
-def test_the_density_needs_a_positive_standard_deviation():
+def test_density_needs_a_positive_standard_deviation():
     with pytest.raises(ValueError, match=r"std must be above 0; its smallest value is 0\.0"):
         negative_log_predictive_density([0.0], [0.0], [0.0])
 
 
 @pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_no_rows_are_an_error(metric):
+def test_no_rows_raise(metric):
     with pytest.raises(ValueError, match="minimum of 1 is required"):
         metric(*arguments(metric, y=[], mean=[], std=[]))
-
-
-@pytest.mark.parametrize("metric", OF_PREDICTIONS)
-def test_three_dimensions_are_an_error(metric):
-    with pytest.raises(ValueError, match="dim"):
-        metric(*arguments(metric, y=Y[np.newaxis]))
-
-
-def test_one_width_may_stand_alone():
-    np.testing.assert_array_equal(containing_ratios([0.5, 1.5], [0.0, 0.0], [1.0, 1.0], k=1), [0.5])
 
 
 @pytest.mark.parametrize("k", [-1, [1, np.nan], [1, None]])

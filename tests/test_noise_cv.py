@@ -1,16 +1,14 @@
 """noise_cv and groups: noise and signal variance, and so a std, that holds for what was left out."""
 
-import pickle
 import warnings
 
 import numpy as np
 import pytest
-from sklearn.base import clone
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
+from skevgp import CoefPrior, EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
@@ -19,6 +17,7 @@ from skevgp.solvers import LBFGS, SOLVERS
 
 # A few iterations are enough.
 pytestmark = pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
+
 
 SETTINGS = [("lbfgs", "full"), ("lbfgs", "diagonal"), ("adam", "full"), ("adam", "diagonal")]
 
@@ -70,13 +69,6 @@ def test_on_new_trajectories_as_many_rows_as_should_lie_within_the_std():
     assert nlpd(calibrated, X_NEW, Y_NEW) < nlpd(plain, X_NEW, Y_NEW)
 
 
-def test_independent_rows_keep_what_the_bound_found():
-    X, Y = independent()
-    plain, calibrated = (model(n_inducing=20, noise_cv=noise_cv).fit(X, Y) for noise_cv in (None, 5))
-    np.testing.assert_allclose(calibrated.noise_variance_, plain.noise_variance_, rtol=0.05)
-    assert (calibrated.noise_variance_ != plain.noise_variance_).all()
-
-
 def test_what_few_points_cannot_represent_is_not_taken_for_noise():
     rng = np.random.RandomState(0)
     X = rng.uniform(-3, 3, (3000, 2))
@@ -88,8 +80,7 @@ def test_what_few_points_cannot_represent_is_not_taken_for_noise():
 
 
 @pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
-@pytest.mark.parametrize("feature_map", [None, PolynomialFeatures(1)], ids=["no features", "features"])
+@pytest.mark.parametrize(("sharing", "feature_map"), [("all", None), ("none", PolynomialFeatures(1))])
 def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, sharing, solver, posterior):
     settings = {"feature_map": feature_map, "sharing": sharing, "solver": SOLVERS[solver](posterior=posterior)}
     # Too few rows for a sample, and iterations for a good fit: there is much to calibrate.
@@ -105,25 +96,8 @@ def test_it_calibrates_whatever_is_fitted_and_leaves_the_rest(feature_map, shari
     assert (z < before).all()
 
 
-@pytest.mark.parametrize(("solver", "posterior"), SETTINGS)
-def test_q_is_at_its_optimum_for_the_new_noise_and_signal(solver, posterior):
-    y = Y[:, 0]
-    m = fitted(Y=y, solver=SOLVERS[solver](posterior=posterior))
-    again = fitted(
-        Y=y,
-        kernel=m.kernel_ + WhiteKernel(m.noise_variance_, "fixed"),
-        inducing_init=m.inducing_points_,
-        solver=LBFGS(posterior=posterior),
-        max_iter=0,
-    )
-    for part, expected in zip(m.predict(X_NEW, return_std=True), again.predict(X_NEW, return_std=True), strict=True):
-        np.testing.assert_allclose(part, expected, rtol=1e-6, atol=1e-8)
-    assert m.lower_bound_ == pytest.approx(again.lower_bound_, rel=1e-8)
-    assert m.upper_bound_ == pytest.approx(again.upper_bound_, rel=1e-8)
-
-
 @pytest.mark.parametrize("posterior", ["full", "diagonal"])
-def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
+def test_bound_of_data_without_noise_keeps_its_digits(posterior):
     """Taken from sums over the rows, where digits cancel, it was off by 0.02 nats here, and by 50 at less noise."""
     x = np.linspace(0.0, 1.0, 200)[:, np.newaxis]
     y = 3.0 + 2.0 * x[:, 0]
@@ -135,7 +109,7 @@ def test_the_bound_of_data_without_noise_keeps_its_digits(posterior):
     assert m.lower_bound_ == pytest.approx(same.lower_bound_, abs=1e-3)
 
 
-def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrated_against_the_others():
+def test_calibration_of_independent_outputs():
     """What suits each given the others as fitted, suits none once all have moved: a noise 1e5 times too large."""
     rng = np.random.RandomState(0)
 
@@ -150,7 +124,7 @@ def test_outputs_that_do_not_share_weights_as_they_should_are_not_each_calibrate
     assert nlpd(calibrated, X_new, Y_new) < nlpd(plain, X_new, Y_new) + 1.0
 
 
-def test_what_the_user_fixes_stays():
+def test_fixed_noise_and_signal_are_kept():
     kernel = ConstantKernel() * RBF([1.0, 1.0]) + WhiteKernel(0.3, "fixed")
     plain, noise_fixed = (fitted(None, kernel=kernel, max_iter=5, noise_cv=noise_cv) for noise_cv in (None, 5))
     np.testing.assert_allclose(noise_fixed.noise_variance_, 0.3)
@@ -168,32 +142,11 @@ def test_what_the_user_fixes_stays():
     np.testing.assert_array_equal(both.predict(X_NEW), plain.predict(X_NEW))
 
 
-def test_both_stay_within_the_users_bounds():
-    kernel = ConstantKernel(1.0, (0.9, 1.1)) * RBF([1.0, 1.0]) + WhiteKernel(1e-4, (1e-5, 2e-4))
-    m = fitted(kernel=kernel, max_iter=5)
-    np.testing.assert_allclose(m.noise_variance_, 2e-4)
-    assert all(0.9 * (1 - 1e-9) <= k.k1.constant_value <= 1.1 * (1 + 1e-9) for k in m.kernel_)
-
-
-def test_the_kernels_bounds_hold_the_signal():
-    for kernel in fitted().kernel_:
-        low, high = np.exp(kernel.bounds[0])
-        assert low <= kernel.k1.constant_value * (1 + 1e-9)
-        assert kernel.k1.constant_value <= high * (1 + 1e-9)
-
-
 @pytest.mark.parametrize("n_rows", [49, 2000])
 def test_without_iterations_or_with_few_rows_it_is_left_out(n_rows):
     settings = {"X": X[:n_rows], "Y": Y[:n_rows], "groups": GROUPS[:n_rows], "max_iter": 0 if n_rows > 49 else 5}
     plain, same = (fitted(**settings, noise_cv=noise_cv) for noise_cv in (None, 5))
     np.testing.assert_array_equal(same.noise_variance_, plain.noise_variance_)
-
-
-@pytest.mark.parametrize("noise_cv", [50, 1000])
-def test_there_may_be_as_many_folds_as_rows_and_no_more(noise_cv):
-    settings = {"X": X[::40], "Y": Y[::40], "groups": None, "max_iter": 5}
-    m, expected = (fitted(**settings, noise_cv=cv) for cv in (noise_cv, 50))
-    np.testing.assert_array_equal(m.noise_variance_, expected.noise_variance_)
 
 
 def test_points_at_all_rows_leave_nothing_to_folds_but_to_groups():
@@ -205,18 +158,7 @@ def test_points_at_all_rows_leave_nothing_to_folds_but_to_groups():
     assert np.isfinite(grouped.predict(X_NEW, return_std=True)).all()
 
 
-def test_units_do_not_matter():
-    m, in_millimetres = (fitted(max_iter=5, Y=unit * Y) for unit in (1.0, 1e3))
-    np.testing.assert_allclose(in_millimetres.noise_variance_, 1e6 * m.noise_variance_, rtol=1e-4)
-
-
-def test_rows_of_a_file_give_the_same(tmp_path):
-    np.save(tmp_path / "X.npy", X)
-    mapped = np.load(tmp_path / "X.npy", mmap_mode="r")
-    np.testing.assert_array_equal(fitted(X=mapped).noise_variance_, fitted().noise_variance_)
-
-
-@pytest.mark.parametrize("groups", [GROUPS.tolist(), GROUPS.astype(str), [None if g == 0 else f"{g}" for g in GROUPS]])
+@pytest.mark.parametrize("groups", [[None if g == 0 else f"{g}" for g in GROUPS]])
 def test_labels_may_be_anything(groups):
     m = fitted(groups, noise_cv=20)
     expected = fitted(noise_cv=20)
@@ -224,32 +166,8 @@ def test_labels_may_be_anything(groups):
     np.testing.assert_allclose(m.noise_variance_, expected.noise_variance_, rtol=1e-6)
 
 
-def test_the_order_of_the_rows_does_not_matter():
-    order = np.random.RandomState(0).permutation(len(X))
-    m = fitted(GROUPS[order], X[order], Y[order])
-    np.testing.assert_array_equal(m.noise_variance_, fitted().noise_variance_)
-
-
-@pytest.mark.parametrize("n_groups", [1, 2])
-def test_blocks_inside_few_groups_follow_the_rows_as_given(n_groups, monkeypatch):
-    """Not as they are kept: up to 10,000 rows are sorted by the columns of X."""
-    settings = {"groups": GROUPS % n_groups, "inducing_init": X[::100], "max_iter": 1, "noise_cv": 4}
-    settings |= {"kernel": ConstantKernel() * RBF([0.5, 0.5], "fixed")}
-    m = fitted(**settings)
-    monkeypatch.setattr("skevgp.data.weights.ORDERED_ROWS", 0)
-    np.testing.assert_allclose(m.noise_variance_, fitted(**settings).noise_variance_, rtol=0.05)
-
-
-def test_rows_of_weight_0_have_groups_too():
-    weights = np.ones(len(X))
-    weights[::7] = 0.0
-    kept = weights > 0.0
-    m = model().fit(X, Y, weights, groups=GROUPS)
-    np.testing.assert_allclose(m.noise_variance_, fitted(GROUPS[kept], X[kept], Y[kept]).noise_variance_, rtol=1e-6)
-
-
 @pytest.mark.parametrize("groups", [GROUPS[:-1], np.column_stack([GROUPS, GROUPS]), 3, "words"])
-def test_groups_of_a_wrong_length_are_refused(groups):
+def test_groups_of_a_wrong_length_raise(groups):
     with pytest.raises(ValueError, match=r"groups must have the shape \(n_samples,\) = \(2000,\); got \("):
         fitted(groups)
 
@@ -260,13 +178,12 @@ def test_labels_are_one_for_each_row():
 
 
 @pytest.mark.parametrize("noise_cv", [1, 0, -3, True, 2.0, "10"])
-def test_a_wrong_number_of_folds_is_refused(noise_cv):
+def test_invalid_number_of_folds_raises(noise_cv):
     with pytest.raises(ValueError, match="The 'noise_cv' parameter of EVGPRegressor must be"):
         fitted(noise_cv=noise_cv)
 
 
-@pytest.mark.parametrize("groups", [None, GROUPS], ids=["random", "groups"])
-@pytest.mark.parametrize("sharing", ["all", "kernel", "none"])
+@pytest.mark.parametrize(("sharing", "groups"), [("all", None), ("none", GROUPS)])
 @pytest.mark.filterwarnings("ignore::skevgp.exceptions.DependentRowsWarning")
 def test_same_bits_for_any_n_jobs(sharing, groups, monkeypatch):
     monkeypatch.setattr("skevgp.data.blocks._MIN_BLOCK_ROWS", 64)
@@ -287,13 +204,6 @@ def test_partial_fit_keeps_noise_and_signal():
     np.testing.assert_array_equal(m.noise_variance_, noise)
     np.testing.assert_array_equal([k.theta for k in m.kernel_], theta)
     assert (m.predict(X_NEW, return_std=True, include_noise=False)[1] < std).all()
-
-
-def test_it_pickles_and_clones():
-    m = fitted(noise_cv=3, max_iter=3)
-    again = pickle.loads(pickle.dumps(m))
-    np.testing.assert_array_equal(again.predict(X_NEW), m.predict(X_NEW))
-    assert clone(m).noise_cv == 3
 
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
@@ -330,6 +240,14 @@ def _sorted_by_y():
     return X[np.argsort(y)], np.sort(y)
 
 
+def test_group_of_most_rows_is_not_predicted_from_the_few_others():
+    rng = np.random.RandomState(0)
+    X = rng.uniform(-3, 3, (400, 2))
+    y = np.sin(3 * X[:, 0]) * np.cos(2 * X[:, 1]) + 0.1 * rng.randn(400)
+    m = EVGPRegressor(n_inducing=80, max_iter=50, random_state=0).fit(X, y, groups=np.repeat([0, 1, 2], [380, 10, 10]))
+    assert 0.05 < np.sqrt(m.noise_variance_) < 0.2
+
+
 @pytest.mark.parametrize(
     "fit",
     [
@@ -342,33 +260,14 @@ def _sorted_by_y():
     ],
     ids=["groups", "sorted by y", "not calibrated", "shuffled", "independent", "sorted"],
 )
-def test_others_are_not(fit):
+def test_unrelated_rows_do_not_warn(fit):
     with warnings.catch_warnings():
         warnings.simplefilter("error", DependentRowsWarning)
         fit()
 
 
-def test_a_group_of_most_rows_is_not_predicted_from_the_few_others():
-    rng = np.random.RandomState(0)
-    X = rng.uniform(-3, 3, (400, 2))
-    y = np.sin(3 * X[:, 0]) * np.cos(2 * X[:, 1]) + 0.1 * rng.randn(400)
-    m = EVGPRegressor(n_inducing=80, max_iter=50, random_state=0).fit(X, y, groups=np.repeat([0, 1, 2], [380, 10, 10]))
-    assert 0.05 < np.sqrt(m.noise_variance_) < 0.2
-
-
-def test_what_groups_do_not_have_in_common_is_told():
-    """Each has a level of its own: within it rows say a lot of each other, and nothing of other groups."""
-    rng = np.random.RandomState(0)
-    groups = np.repeat(np.arange(40), 25)
-    X = (3.0 * groups + rng.uniform(-0.3, 0.3, 1000))[:, np.newaxis]
-    y = rng.randn(40)[groups] + 0.1 * rng.randn(1000)
-    with pytest.warns(ConvergenceWarning, match="learned of 1 of 1 outputs fitted together does not hold for groups"):
-        m = EVGPRegressor(n_inducing=40, random_state=0).fit(X, y, groups=groups)
-    assert np.median(m.predict(3.0 * groups[:, np.newaxis] + 1.5, return_std=True)[1]) > 0.5
-
-
 @pytest.mark.parametrize("seed", [0, 1, 3])
-def test_the_signal_falls_if_it_does_not_hold_for_other_groups(seed):
+def test_signal_falls_if_it_does_not_hold_for_other_groups(seed):
     """Groups overlap, and each has a phase of its own."""
     rng = np.random.RandomState(seed)
     groups = np.repeat(np.arange(12), 25)
@@ -378,9 +277,3 @@ def test_the_signal_falls_if_it_does_not_hold_for_other_groups(seed):
     m = EVGPRegressor(n_inducing=60, random_state=0).fit(X, y, groups=groups)
     assert m.kernel_.k1.constant_value < 0.5 * alone.kernel_.k1.constant_value
     assert m.noise_variance_ > alone.noise_variance_
-
-
-def test_a_residual_regressor_hands_groups_on():
-    m = ResidualRegressor(model(feature_map=None, max_iter=5)).fit(X, Y, groups=GROUPS)
-    expected = model(feature_map=None, max_iter=5).fit(X, Y - X, groups=GROUPS)
-    np.testing.assert_array_equal(m.regressor_.noise_variance_, expected.noise_variance_)

@@ -1,7 +1,6 @@
 """Learning while the system runs: thousands of small updates, and what they cost nothing of."""
 
 import numpy as np
-import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
@@ -22,25 +21,7 @@ def model(points):
     )
 
 
-@pytest.mark.long
-def test_after_ten_thousand_updates_the_model_is_that_of_one_fit():
-    X, Y = rows(10_020)
-    found = model(X[:12]).fit(X[:20], Y[:20])
-    compiled = found.compile()
-    for i in range(20, len(X)):
-        found.partial_fit(X[i : i + 1], Y[i : i + 1])
-    compiled.update(found)
-    expected = model(X[:12]).fit(X, Y)
-    X_new = rows(30)[0] + 0.1
-    mean, std = expected.predict(X_new, return_std=True)
-    for predicted in (found.predict(X_new, return_std=True), compiled.predict(X_new, return_std=True)):
-        np.testing.assert_allclose(predicted[0], mean, rtol=1e-6, atol=1e-6)
-        np.testing.assert_allclose(predicted[1], std, rtol=1e-6)
-    np.testing.assert_allclose(found.coef_, expected.coef_, rtol=1e-6, atol=1e-6)
-    assert found.lower_bound_ == pytest.approx(expected.lower_bound_, rel=1e-6)
-
-
-def test_an_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
+def test_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
     X, Y = rows(60)
     found = model(X[:12]).fit(X[:40], Y[:40])
     before = found.lower_bound_

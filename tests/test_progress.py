@@ -1,10 +1,8 @@
 """What is told while a fit runs, and how it is told to stop."""
 
 import io
-import os
 import re
 import sys
-from functools import partial
 from threading import Thread
 from types import SimpleNamespace
 from typing import ClassVar
@@ -12,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
-from skevgp.utils.monitor import Monitor, Progress, monitor_of
+from skevgp.utils.monitor import Monitor, Progress
 
 
 def heard():
@@ -21,45 +19,10 @@ def heard():
     return told, Monitor(lambda *what: told.append(what))
 
 
-def test_an_iteration_is_told_with_its_number_and_loss():
-    told, monitor = heard()
-    monitor.iteration(1, 5.0)
-    monitor.iteration(2, 4.0)
-    assert [what[:2] for what in told] == [(1, 5.0), (2, 4.0)]
-
-
-def test_nobody_needs_to_listen():
-    Monitor().iteration(1, 5.0)
-
-
-def test_a_part_tells_in_the_units_and_numbers_of_the_whole():
+def test_part_tells_in_the_units_and_numbers_of_the_whole():
     told, monitor = heard()
     monitor.seen_as(100, 2.0, 7.0, range(1, 3)).iteration(3, 5.0)
     assert told == [(103, 2.0 * 5.0 + 7.0, range(1, 3))]
-
-
-def test_parts_of_parts_compose():
-    """Per row of the internal units -> all rows in internal units -> in the user's, with iterations before each."""
-    told, monitor = heard()
-    in_users_units = monitor.seen_as(shift=30.0, outputs=range(0, 1))
-    second_stage = in_users_units.seen_as(100, 60.0)
-    second_stage.seen_as(20, 0.5, 1.0).iteration(3, 4.0)
-    assert told == [(123, 60.0 * (0.5 * 4.0 + 1.0) + 30.0, range(0, 1))]
-
-
-def test_a_part_that_knows_its_outputs_better_says_so():
-    told, monitor = heard()
-    whole = monitor.seen_as(outputs=range(0, 4))
-    whole.seen_as(5).iteration(1, 0.0)
-    whole.seen_as(outputs=range(2, 3)).iteration(1, 0.0)
-    assert [what[2] for what in told] == [range(0, 4), range(2, 3)]
-
-
-def test_a_part_leaves_the_whole_as_it_was():
-    told, monitor = heard()
-    monitor.seen_as(100, 2.0, 7.0, range(3))
-    monitor.iteration(1, 5.0)
-    assert told == [(1, 5.0, range(0))]
 
 
 # --- stopping ------------------------------------------------------------------------------------------------------
@@ -72,33 +35,6 @@ def test_ctrl_c_inside_ends_the_work_without_an_error():
         raise KeyboardInterrupt
     assert done == ["before"]
     assert monitor.stopped
-
-
-def test_other_errors_are_not_kept():
-    monitor = Monitor()
-    with pytest.raises(ZeroDivisionError), monitor.keeping_the_best():
-        raise ZeroDivisionError
-    assert not monitor.stopped
-
-
-def test_what_ends_well_is_not_stopped():
-    monitor = Monitor()
-    with monitor.keeping_the_best():
-        monitor.iteration(1, 0.0)
-    assert not monitor.stopped
-
-
-@pytest.mark.parametrize("where", ["whole", "part"])
-def test_ctrl_c_anywhere_stops_all_parts(where):
-    told, monitor = heard()
-    parts = monitor.seen_as(10), monitor.seen_as(20).seen_as(5)
-    (monitor if where == "whole" else parts[1]).stop()
-    for one in (monitor, *parts):
-        assert one.stopped
-        with pytest.raises(KeyboardInterrupt):
-            one.iteration(1, 0.0)
-    # What comes too late is not told.
-    assert told == []
 
 
 def test_ctrl_c_in_one_thread_ends_the_others_at_their_next_iteration():
@@ -117,19 +53,6 @@ def test_ctrl_c_in_one_thread_ends_the_others_at_their_next_iteration():
     for thread in threads:
         thread.join(60.0)
         assert not thread.is_alive()
-
-
-def test_a_listener_may_stop_the_fit():
-    def interrupt(number, loss, outputs):
-        if number == 3:
-            raise KeyboardInterrupt
-
-    monitor = Monitor(interrupt)
-    with monitor.keeping_the_best():
-        for number in range(1, 10):
-            monitor.iteration(number, 0.0)
-    assert number == 3
-    assert monitor.stopped
 
 
 # --- what the user sees --------------------------------------------------------------------------------------------
@@ -216,45 +139,6 @@ def test_on_a_terminal_tqdm_draws_one_line():
     assert last.endswith("\n")
 
 
-@pytest.mark.skipif(not hasattr(os, "openpty"), reason="Windows has no pseudo-terminals.")
-def test_a_live_line_is_no_longer_than_the_terminal():
-    pytest.importorskip("tqdm")
-    termios = pytest.importorskip("termios")
-    ours, theirs = os.openpty()
-    with os.fdopen(theirs, "w") as terminal, os.fdopen(ours, "rb", buffering=0) as screen:
-        termios.tcsetwinsize(theirs, (30, 40))
-        clock = Clock()
-        progress = Progress(1, terminal, clock)
-        fit(progress, clock, [1.0, 2.0], about="the name of a part of the fit")
-        progress.close()
-        lines = screen.read(10_000).decode().split("\r")
-    assert lines[1] == "the name of a part of the fit, iteratio"
-    assert all(len(line) < 40 for line in lines)
-
-
-def test_in_a_notebook_tqdm_draws_one_line_a_few_times_a_second(notebook):
-    clock, stream = Clock(), io.StringIO()
-    progress = Progress(1, stream, clock)
-    fit(progress, clock, np.zeros(1001), seconds=0.01)
-    progress.close()
-    (bar,) = notebook
-    assert bar.closed
-    assert 30 <= len(bar.texts) <= 102
-    assert bar.texts[-1] == "iteration 1001, bound -0.000, 10 s"
-    assert stream.getvalue() == ""
-
-
-def test_disabled_bars_are_not_drawn(monkeypatch):
-    """As by the environment variable TQDM_DISABLE, which tqdm reads when it is imported."""
-    pytest.importorskip("tqdm")
-    clock, terminal = Clock(), Terminal()
-    progress = Progress(1, terminal, clock)
-    monkeypatch.setattr(progress, "_tqdm", partial(progress._tqdm, disable=True))
-    fit(progress, clock, np.zeros(3))
-    progress.close()
-    assert terminal.getvalue() == ""
-
-
 def test_models_fitted_side_by_side_share_a_bar(notebook):
     """A line is about the model that has just had an iteration."""
     clock = Clock()
@@ -292,21 +176,7 @@ def test_without_tqdm_there_is_a_line_each_ten_seconds_and_the_last(without_tqdm
     ]
 
 
-def test_a_log_has_lines_even_with_tqdm():
-    pytest.importorskip("tqdm")
-    clock, log = Clock(), io.StringIO()
-    fit(Progress(1, log, clock), clock, np.ones(12))
-    assert log.getvalue() == "iteration 10, bound -1.000, 10 s\n"
-
-
-@pytest.mark.parametrize("stream", [Terminal, io.StringIO])
-def test_a_fit_without_iterations_leaves_no_line(stream):
-    stream = stream()
-    Progress(1, stream).close()
-    assert stream.getvalue() == ""
-
-
-def test_the_part_of_the_fit_is_told():
+def test_part_of_the_fit_is_told():
     clock, log = Clock(), io.StringIO()
     monitor = Monitor(progress=Progress(1, log, clock)).seen_as(about="y[:, 2]").seen_as(about="50 of 90 rows")
     clock.now += 10.0
@@ -314,33 +184,3 @@ def test_the_part_of_the_fit_is_told():
     clock.now += 10.0
     monitor.silent().iteration(4, 2.0)
     assert log.getvalue() == "y[:, 2], 50 of 90 rows, iteration 3, bound -2.000, 10 s\n"
-
-
-def test_a_callback_is_told_the_bound():
-    told = []
-    with monitor_of(0, lambda *what: told.append(what)) as monitor:
-        monitor.seen_as(outputs=range(0, 2)).iteration(4, -3.0)
-    assert told == [(4, 3.0, range(0, 2))]
-
-
-@pytest.mark.parametrize("verbose", [0, 1, 2])
-def test_both_are_served(verbose, capsys):
-    told = []
-    for callback in (lambda *what: told.append(what), None):
-        with monitor_of(verbose, callback) as monitor:
-            monitor.iteration(1, 5.0)
-    assert len(told) == 1
-    printed = capsys.readouterr()
-    assert len(printed.out.splitlines()) == (2 if verbose else 0)
-    assert printed.err == ""
-
-
-def test_a_fit_that_fails_ends_its_line(capsys):
-    def fit():
-        with monitor_of(1) as monitor:
-            monitor.iteration(1, 5.0)
-            raise ZeroDivisionError
-
-    with pytest.raises(ZeroDivisionError):
-        fit()
-    assert capsys.readouterr().out == "iteration 1, bound -5.000, 0 s\n"

@@ -18,7 +18,7 @@ SNIPPETS = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
 
 
 @pytest.mark.long
-def test_the_toy_and_the_pendulum_run():
+def test_toy_and_the_pendulum_run():
     for snippet in SNIPPETS[:2]:
         names = {}
         exec(snippet, names)
@@ -36,7 +36,7 @@ def test_any_robot_runs():
 
 
 @pytest.mark.long
-def test_a_real_arm_runs(tmp_path, monkeypatch, capsys):
+def test_real_arm_runs(tmp_path, monkeypatch, capsys):
     """On logs of a simulated one."""
     monkeypatch.chdir(tmp_path)
     shutil.copy(urdf_path("ur10"), "arm.urdf")
@@ -92,8 +92,3 @@ def test_there_is_one_command_line_for_each_job(name):
     assert len(commands) == 1
     assert "\n" not in commands[0]
     assert commands[0].startswith("python3 -m venv .venv && .venv/bin/pip install ")
-
-
-def test_links_and_pictures_exist():
-    for target in re.findall(r"\]\((?!http)([^)#]+)\)", README):
-        assert (Path(__file__).parents[1] / target).exists(), target

@@ -1,24 +1,17 @@
-import pickle
-
 import dask.array as da
 import numpy as np
 import pandas as pd
 import pytest
 import sklearn
 from sklearn.base import BaseEstimator, RegressorMixin, clone
-from sklearn.compose import make_column_transformer
-from sklearn.exceptions import NotFittedError
 from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.linear_model import LinearRegression, Ridge, SGDRegressor
+from sklearn.linear_model import LinearRegression, Ridge
 from sklearn.metrics import r2_score
 from sklearn.model_selection import cross_validate
 from sklearn.pipeline import make_pipeline
-from sklearn.preprocessing import OneHotEncoder, StandardScaler
-from sklearn.svm import SVR
-from sklearn.utils import get_tags
+from sklearn.preprocessing import StandardScaler
 
 from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.features import AngleEncoder
 
 RNG = np.random.RandomState(0)
 X = RNG.uniform(-2, 2, (60, 3))
@@ -59,7 +52,7 @@ class Recorder(RegressorMixin, BaseEstimator):
 
 @pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
 @pytest.mark.parametrize("regressor", [LinearRegression(), evgp(), GaussianProcessRegressor(optimizer=None)], ids=str)
-def test_it_is_the_regressor_of_the_change_plus_the_base(regressor, y, base):
+def test_prediction_is_base_plus_change(regressor, y, base):
     change = clone(regressor).fit(X, y - X[:, base].reshape(y.shape)).predict(X_NEW)
     m = ResidualRegressor(regressor).fit(X, y)
     np.testing.assert_array_equal(m.predict(X_NEW), change + X_NEW[:, base].reshape(change.shape))
@@ -67,7 +60,7 @@ def test_it_is_the_regressor_of_the_change_plus_the_base(regressor, y, base):
 
 
 @pytest.mark.parametrize("base", [[2, 0], np.array([2, 0]), [-1, -3], ["force", "angle"], np.array(["force", "angle"])])
-def test_the_base_columns_are_chosen_by_index_or_name(base):
+def test_base_columns_are_chosen_by_index_or_name(base):
     frame = pd.DataFrame(X, columns=NAMES)
     m = ResidualRegressor(LinearRegression(), base=base).fit(frame, Y)
     np.testing.assert_array_equal(m.base_, [2, 0])
@@ -75,36 +68,6 @@ def test_the_base_columns_are_chosen_by_index_or_name(base):
     # A linear regression learns the same sum whatever is taken away before.
     direct = LinearRegression().fit(X, Y).predict(X_NEW)
     np.testing.assert_allclose(m.predict(pd.DataFrame(X_NEW, columns=NAMES)), direct, atol=1e-12)
-
-
-@pytest.mark.parametrize("base", [1, "speed", [1], ["speed"]])
-def test_one_output_needs_one_column(base):
-    m = ResidualRegressor(Recorder(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y[:, 1])
-    np.testing.assert_array_equal(m.regressor_.fit_given_[1], Y[:, 1] - X[:, 1])
-    np.testing.assert_array_equal(m.predict(pd.DataFrame(X_NEW, columns=NAMES)), X_NEW[:, 1])
-
-
-def test_a_data_frame_stays_one_for_the_regressor():
-    frame = pd.DataFrame(X, columns=NAMES)
-    m = ResidualRegressor(Recorder()).fit(frame, Y[:, 0])
-    m.predict(frame)
-    assert m.regressor_.fit_given_[0] is frame
-    assert m.regressor_.predict_given_[0] is frame
-    assert m.feature_names_in_.tolist() == NAMES
-    assert m.n_features_in_ == 3
-
-
-@pytest.mark.parametrize("base", [["force", "angle"], [2, 2]])
-def test_columns_of_a_frame_other_than_the_base_may_be_words(base, frame_of):
-    columns = dict(zip(NAMES, X.T, strict=True))
-    frame = frame_of(columns | {"kind": np.where(X[:, 0] > 0, "right", "left")})
-    encode = make_column_transformer((OneHotEncoder(drop="if_binary"), ["kind"]))
-    m = ResidualRegressor(make_pipeline(encode, LinearRegression()), base=base).fit(frame, Y)
-    start = X[:, [2, 0] if base[0] == "force" else [2, 2]]
-    sides = (X[:, :1] > 0).astype(float)
-    expected = start + LinearRegression().fit(sides, Y - start).predict(sides)
-    np.testing.assert_allclose(m.predict(frame), expected, atol=1e-12)
-    assert m.feature_names_in_.tolist() == [*NAMES, "kind"]
 
 
 def test_base_columns_of_a_frame_must_be_finite_numbers(frame_of):
@@ -115,15 +78,7 @@ def test_base_columns_of_a_frame_must_be_finite_numbers(frame_of):
         m.fit(frame_of({"angle": np.full(60, np.nan)}), Y[:, 0])
 
 
-@pytest.mark.parametrize("dtype", [np.uint8, np.int64, np.float32])
-def test_numbers_of_other_types_do_not_wrap_around(dtype):
-    states = np.array([[3, 1], [5, 2], [9, 3]], dtype=dtype)
-    target = np.array([1, 2, 3], dtype=dtype)
-    m = ResidualRegressor(Recorder()).fit(states, target)
-    np.testing.assert_array_equal(m.regressor_.fit_given_[1], [-2.0, -3.0, -6.0])
-
-
-@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["1-D", "(n, 1)", "(n, 2)"])
+@pytest.mark.parametrize(("y", "base"), TARGETS[::2], ids=["1-D", "(n, 2)"])
 @pytest.mark.parametrize("method", ["fit", "partial_fit"])
 def test_dask_arrays_stay_where_they_are(method, y, base):
     lazy, targets = da.from_array(X, chunks=(25, 2)), da.from_array(y, chunks=-1)
@@ -141,38 +96,27 @@ def test_dask_arrays_stay_where_they_are(method, y, base):
         ResidualRegressor(EGPRegressor()).fit(lazy, targets)
 
 
-def test_the_regressor_itself_is_left_alone():
-    inner = LinearRegression()
-    m = ResidualRegressor(inner).fit(X, Y)
-    assert not hasattr(inner, "coef_")
-    assert m.regressor is inner
-    np.testing.assert_array_equal(pickle.loads(pickle.dumps(m)).predict(X_NEW), m.predict(X_NEW))
+@pytest.mark.parametrize("method", ["sample_y", "partial_fit"])
+def test_methods_are_there_if_the_regressor_has_them(method):
+    assert hasattr(ResidualRegressor(evgp()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()), method)
+    assert not hasattr(ResidualRegressor(LinearRegression()).fit(X, Y), method)
+
+
+def test_partial_fit_is_the_regressors():
+    m, direct = ResidualRegressor(evgp()), evgp()
+    for rows in (slice(0, 40), slice(40, 60)):
+        m.partial_fit(X[rows], Y[rows])
+        direct.partial_fit(X[rows], Y[rows] - X[rows, :2])
+    np.testing.assert_array_equal(m.predict(X_NEW), direct.predict(X_NEW) + X_NEW[:, :2])
 
 
 # --- uncertainty passes through -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
-@pytest.mark.parametrize("include_noise", [True, False])
-@pytest.mark.parametrize("asked", ["return_std", "return_cov"])
-def test_the_spread_is_the_regressors(y, base, asked, include_noise):
-    options = {asked: True, "include_noise": include_noise}
-    mean, spread = evgp().fit(X, y - X[:, base].reshape(y.shape)).predict(X_NEW, **options)
-    shifted, same = ResidualRegressor(evgp()).fit(X, y).predict(X_NEW, **options)
-    np.testing.assert_array_equal(same, spread)
-    np.testing.assert_array_equal(shifted, mean + X_NEW[:, base].reshape(mean.shape))
-
-
-@pytest.mark.parametrize(("y", "base"), TARGETS, ids=["one output", "one column", "two outputs"])
-def test_samples_are_the_regressors_plus_the_base(y, base):
-    samples = evgp().fit(X, y - X[:, base].reshape(y.shape)).sample_y(X_NEW, 4, 7, include_noise=False)
-    shifted = ResidualRegressor(evgp()).fit(X, y).sample_y(X_NEW, 4, 7, include_noise=False)
-    np.testing.assert_array_equal(shifted, samples + X_NEW[:, base].reshape(*samples.shape[:-1], 1))
-
-
 @pytest.mark.parametrize("asked", ["return_std", "return_cov"])
 @pytest.mark.parametrize("routed", [False, True])
-def test_the_spread_passes_through_pipelines_around_and_inside(asked, routed):
+def test_spread_passes_through_pipelines_around_and_inside(asked, routed):
     scale, shift = StandardScaler().fit(X), evgp()
     Z, Z_new = scale.transform(X), scale.transform(X_NEW)
     mean, spread = shift.fit(Z, Y - Z[:, :2]).predict(Z_new, **{asked: True})
@@ -187,88 +131,7 @@ def test_the_spread_passes_through_pipelines_around_and_inside(asked, routed):
     np.testing.assert_array_equal(other, evgp().fit(Z, Y - X[:, :2]).predict(Z_new, **{asked: True})[1])
 
 
-def test_angles_are_encoded_for_the_regressor_alone():
-    change = np.sin(X[:, 0]) - 0.3 * np.cos(X[:, 0])
-    m = ResidualRegressor(make_pipeline(AngleEncoder(angles=[0]), LinearRegression())).fit(X, X[:, 0] + change)
-    turned = X + [20.0 * np.pi, 0.0, 0.0]
-    np.testing.assert_allclose(m.predict(turned), turned[:, 0] + change, atol=1e-9)
-
-
-def test_samples_work_for_scikit_learns_gaussian_process_too():
-    m = ResidualRegressor(GaussianProcessRegressor(random_state=0, optimizer=None, alpha=0.1)).fit(X, Y)
-    samples, mean = m.sample_y(X_NEW, 2000), m.predict(X_NEW)
-    np.testing.assert_allclose(samples.mean(axis=-1), mean, atol=0.15)
-
-
-@pytest.mark.parametrize("method", ["sample_y", "partial_fit"])
-def test_methods_are_there_if_the_regressor_has_them(method):
-    assert hasattr(ResidualRegressor(evgp()), method)
-    assert not hasattr(ResidualRegressor(LinearRegression()), method)
-    assert not hasattr(ResidualRegressor(LinearRegression()).fit(X, Y), method)
-
-
-# --- going on -----------------------------------------------------------------------------------------------------
-
-
-def test_partial_fit_is_the_regressors():
-    m, direct = ResidualRegressor(evgp()), evgp()
-    for rows in (slice(0, 40), slice(40, 60)):
-        m.partial_fit(X[rows], Y[rows])
-        direct.partial_fit(X[rows], Y[rows] - X[rows, :2])
-    np.testing.assert_array_equal(m.predict(X_NEW), direct.predict(X_NEW) + X_NEW[:, :2])
-
-
-def test_partial_fit_goes_on_and_fit_starts_anew():
-    m = ResidualRegressor(SGDRegressor(random_state=0)).partial_fit(X, Y[:, 0])
-    first = m.regressor_
-    assert m.partial_fit(X, Y[:, 0]).regressor_ is first
-    assert m.fit(X, Y[:, 0]).regressor_ is not first
-
-
-def test_partial_fit_refuses_other_outputs():
-    m = ResidualRegressor(evgp()).partial_fit(X, Y)
-    with pytest.raises(ValueError, match="y has 1 outputs, but the model has 2"):
-        m.partial_fit(X, Y[:, 0])
-
-
 # --- scikit-learn's conventions -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("regressor", [SVR(), LinearRegression(), evgp()], ids=str)
-def test_outputs_are_as_many_as_the_regressor_takes(regressor):
-    tags, own = get_tags(ResidualRegressor(regressor)), get_tags(regressor)
-    assert tags.target_tags == own.target_tags
-    assert not tags.input_tags.sparse
-    assert tags.estimator_type == "regressor"
-
-
-@pytest.mark.parametrize("method", ["fit", "partial_fit"])
-def test_weights_reach_the_regressor(method):
-    weight = RNG.uniform(size=60)
-    m = getattr(ResidualRegressor(Recorder()), method)(X, Y[:, 0], sample_weight=weight)
-    assert m.regressor_.fit_given_[2] is weight
-
-
-def test_weighted_regressions_are_those_of_the_change():
-    weight = RNG.uniform(size=60)
-    m = ResidualRegressor(Ridge()).fit(X, Y, sample_weight=weight)
-    np.testing.assert_array_equal(m.regressor_.coef_, Ridge().fit(X, Y - X[:, :2], sample_weight=weight).coef_)
-
-
-@pytest.mark.parametrize("method", ["fit", "partial_fit"])
-def test_routed_weights_reach_the_regressor_if_it_requests_them(routing, method):
-    weight = RNG.uniform(size=60)
-    request = {f"set_{method}_request": {"sample_weight": True}}
-    inner = Recorder()
-    for setter, wanted in request.items():
-        inner = getattr(inner, setter)(**wanted)
-    m = getattr(ResidualRegressor(inner), method)(X, Y[:, 0], sample_weight=weight)
-    assert m.regressor_.fit_given_[2] is weight
-
-
-def test_weights_that_are_not_requested_are_refused_with_routing(routing):
-    with pytest.raises(sklearn.exceptions.UnsetMetadataPassedError, match="sample_weight"):
-        ResidualRegressor(Recorder()).fit(X, Y[:, 0], sample_weight=np.ones(60))
 
 
 def test_weights_are_routed_through_a_cross_validation(routing):
@@ -280,11 +143,6 @@ def test_weights_are_routed_through_a_cross_validation(routing):
     np.testing.assert_array_equal(found["estimator"][0].regressor_.coef_, direct.coef_)
     score = r2_score(Y[:30], direct.predict(X[:30]) + X[:30, :2], sample_weight=weight[:30])
     assert found["test_score"][0] == pytest.approx(score, rel=1e-12)
-
-
-def test_keywords_of_predict_pass_with_routing_too(routing):
-    m = ResidualRegressor(evgp()).fit(X, Y)
-    assert len(m.predict(X_NEW, return_std=True)) == 2
 
 
 # --- errors -------------------------------------------------------------------------------------------------------
@@ -304,7 +162,7 @@ def test_keywords_of_predict_pass_with_routing_too(routing):
         ({}, "base={} must be one index or name"),
     ],
 )
-def test_a_base_that_is_not_in_x_is_refused(base, message):
+def test_base_that_is_not_in_x_raises(base, message):
     with pytest.raises(ValueError, match=message):
         ResidualRegressor(LinearRegression(), base=base).fit(pd.DataFrame(X, columns=NAMES), Y)
 
@@ -314,33 +172,17 @@ def test_names_need_a_data_frame():
         ResidualRegressor(LinearRegression(), base=["angle", "speed"]).fit(X, Y)
 
 
-def test_more_outputs_than_columns_are_refused():
+def test_more_outputs_than_columns_raise():
     with pytest.raises(ValueError, match=r"first n_outputs=2 columns of X, which has 1; give base"):
         ResidualRegressor(LinearRegression()).fit(X[:, :1], Y)
     assert ResidualRegressor(LinearRegression(), base=[0, 0]).fit(X[:, :1], Y).predict(X[:, :1]).shape == (60, 2)
 
 
-def test_targets_that_are_not_numbers_are_refused():
-    with pytest.raises(ValueError, match="y must be real numbers"):
-        ResidualRegressor(LinearRegression()).fit(X, np.array(["1.0"] * 60))
-
-
 @pytest.mark.parametrize("method", ["fit", "partial_fit"])
-def test_a_fit_that_fails_leaves_the_model_as_it_was(method):
+def test_fit_that_fails_leaves_the_model_as_it_was(method):
     m = ResidualRegressor(evgp()).fit(X, Y)
     before = m.predict(X_NEW)
     with pytest.raises(ValueError, match="features|columns|base"):
         getattr(m, method)(X[:, :1], Y)
     np.testing.assert_array_equal(m.predict(X_NEW), before)
     assert m.n_features_in_ == 3
-
-
-def test_it_predicts_after_a_fit_only():
-    m = ResidualRegressor(evgp(n_inducing=0))
-    for method in (m.predict, m.sample_y):
-        with pytest.raises(NotFittedError):
-            method(X)
-    with pytest.raises(ValueError, match="n_inducing"):
-        m.fit(X, Y)
-    with pytest.raises(NotFittedError):
-        m.predict(X)

@@ -1,28 +1,23 @@
 """Scorers that see the predicted standard deviation, in scikit-learn's own hands."""
 
-import pickle
 from functools import partial
 
 import numpy as np
-import pandas as pd
-import polars as pl
 import pytest
 import sklearn
 from scipy.stats import norm
-from sklearn.base import BaseEstimator, RegressorMixin, clone
+from sklearn.base import clone
 from sklearn.compose import TransformedTargetRegressor
 from sklearn.decomposition import PCA
 from sklearn.ensemble import BaggingRegressor
 from sklearn.experimental import enable_halving_search_cv  # noqa: F401
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
-from sklearn.inspection import permutation_importance
 from sklearn.linear_model import BayesianRidge, LinearRegression
 from sklearn.model_selection import (
     GridSearchCV,
     GroupKFold,
     HalvingGridSearchCV,
-    KFold,
     cross_val_score,
     cross_validate,
 )
@@ -40,7 +35,6 @@ from skevgp.metrics import (
     neg_nlpd,
     negative_log_predictive_density,
 )
-from skevgp.solvers import LBFGS
 
 X, y = (part[np.random.RandomState(0).permutation(60)] for part in make_toy(60, random_state=0, return_X_y=True))
 Y = np.column_stack([y, 3.0 - 2.0 * X[:, 0]])
@@ -65,22 +59,14 @@ def nlpd_of(model, inputs=X, targets=y):
     ],
     ids=str,
 )
-def test_a_score_is_minus_the_metric_of_mean_and_std(model):
+def test_score_is_minus_the_metric_of_mean_and_std(model):
     fitted = clone(model).fit(X, y)
     assert neg_nlpd(fitted, X, y) == pytest.approx(nlpd_of(fitted))
     assert neg_crps(fitted, X, y) == pytest.approx(-crps(y, *fitted.predict(X, return_std=True)))
 
 
-def test_cross_validation_takes_several_at_once():
-    scoring = {"nlpd": neg_nlpd, "calibration": neg_calibration_error, "r2": "r2"}
-    found = cross_validate(SPARSE, X, y, cv=KFold(3), scoring=scoring, return_estimator=True, error_score="raise")
-    for fold, (_, test) in enumerate(KFold(3).split(X)):
-        assert found["test_nlpd"][fold] == pytest.approx(nlpd_of(found["estimator"][fold], X[test], y[test]))
-    assert (found["test_r2"] > 0.3).all()
-
-
 @pytest.mark.parametrize("search", [GridSearchCV, partial(HalvingGridSearchCV, random_state=1)], ids=["all", "halving"])
-@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
+@pytest.mark.parametrize("scorer", SCORERS[:1], ids=repr)
 def test_searches_choose_the_noise_that_is_there(search, scorer):
     """Of fixed ones; a score of means alone could not tell the largest from the true one."""
     kernels = [RBF(2.0) + WhiteKernel(noise, "fixed") for noise in (1e-4, 3.0, 3000.0)]
@@ -90,22 +76,7 @@ def test_searches_choose_the_noise_that_is_there(search, scorer):
     assert scorer(found, X, y) == scorer(found.best_estimator_, X, y)
 
 
-def test_a_column_whose_shuffling_costs_density_is_important():
-    rows = np.column_stack([X, np.random.RandomState(0).randn(60)])
-    model = SPARSE.set_params(max_iter=None, solver=LBFGS(tol=1.0))
-    model = clone(model).fit(rows, y)
-    found = permutation_importance(model, rows, y, scoring=neg_nlpd, n_repeats=3, random_state=0)
-    assert found.importances_mean[0] > 10 * abs(found.importances_mean[1])
-
-
-@pytest.mark.parametrize("scorer", SCORERS, ids=repr)
-def test_scorers_survive_processes(scorer):
-    fitted = clone(SPARSE).fit(X, y)
-    assert pickle.loads(pickle.dumps(scorer))(fitted, X, y) == scorer(fitted, X, y)
-    assert cross_val_score(SPARSE, X, y, scoring=scorer, cv=2, n_jobs=2).shape == (2,)
-
-
-def test_a_scorer_says_how_it_was_made():
+def test_scorer_says_how_it_was_made():
     assert repr(neg_crps) == "make_std_scorer(crps, greater_is_better=False)"
     scorer = make_std_scorer(norm.logpdf, where=1)
     assert repr(scorer) == "make_std_scorer(logpdf, where=1)"
@@ -113,33 +84,18 @@ def test_a_scorer_says_how_it_was_made():
         make_std_scorer("crps")
 
 
-def test_options_reach_the_metric():
-    def far(y_true, y_pred, std, k):
-        return float(np.mean(np.abs(y_true - y_pred) > k * std))
-
-    fitted = clone(SPARSE).fit(X, y)
-    shares = [make_std_scorer(far, k=k)(fitted, X, y) for k in (0.0, 1.0, 100.0)]
-    assert shares[0] == 1.0 > shares[1] > shares[2] == 0.0
-
-
 # --- what scikit-learn puts around a regressor -------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("transformer", [StandardScaler(), MinMaxScaler((-1.0, 3.0)), None], ids=str)
-@pytest.mark.parametrize("targets", [y, Y, Y[:, :1]], ids=["one", "two", "column"])
-def test_where_y_is_scaled_std_is_scaled_back(transformer, targets):
+@pytest.mark.parametrize(
+    ("transformer", "targets"), [(StandardScaler(), y), (MinMaxScaler((-1.0, 3.0)), Y), (None, Y[:, :1])]
+)
+def test_scaled_target_scales_std(transformer, targets):
     model = TransformedTargetRegressor(SPARSE, transformer=transformer).fit(X, targets)
     inner = model.transformer_.transform(targets.reshape(60, -1)).reshape(targets.shape)
     step = np.diff(targets.reshape(60, -1)[:2], axis=0) / np.diff(inner.reshape(60, -1)[:2], axis=0)
     inside = neg_nlpd(model.regressor_, X, inner)
     assert neg_nlpd(model, X, targets) == pytest.approx(inside - np.log(np.abs(step)).sum())
-
-
-def test_where_y_is_scaled_downwards_std_stays_positive():
-    scaler = StandardScaler()
-    model = TransformedTargetRegressor(BayesianRidge(), transformer=scaler).fit(X, y)
-    model.transformer_.scale_ *= -1.0
-    assert neg_crps(model, X, y) < 0.0
 
 
 @pytest.mark.parametrize(
@@ -151,7 +107,7 @@ def test_where_y_is_scaled_downwards_std_stays_positive():
     ],
     ids=str,
 )
-def test_where_y_is_bent_there_is_no_std_of_y(options):
+def test_nonlinear_target_transformer_raises(options):
     model = TransformedTargetRegressor(SPARSE, **options).fit(X, Y)
     with pytest.raises(TypeError, match=r"(?s)A TransformedTargetRegressor with .* has no standard deviation of y"):
         neg_nlpd(model, X, Y)
@@ -165,21 +121,6 @@ def test_independent_models_of_outputs_are_put_side_by_side():
     assert np.isfinite(cross_val_score(nested, X, Y, scoring=neg_crps, cv=2, error_score="raise")).all()
 
 
-class Bold(RegressorMixin, BaseEstimator):
-    """It hands on what it is asked for."""
-
-    def fit(self, X, y):
-        self.regressor_ = BayesianRidge().fit(X, y)
-        return self
-
-    def predict(self, X, **params):
-        return self.regressor_.predict(X, **params)
-
-
-def test_what_hands_on_is_asked():
-    assert neg_nlpd(Bold().fit(X, y), X, y) == nlpd_of(BayesianRidge().fit(X, y))
-
-
 class Deaf(BayesianRidge):
     """Takes any argument, and does nothing with it."""
 
@@ -187,30 +128,21 @@ class Deaf(BayesianRidge):
         return super().predict(X)
 
 
-def test_a_mean_alone_is_no_pair():
+def test_predict_without_std_raises():
     with pytest.raises(TypeError, match="returns no pair of mean and std"):
         neg_crps(Deaf().fit(X, y), X[:2], y[:2])
 
 
-def test_what_knows_no_return_std_says_so():
+def test_regressor_without_return_std_raises():
     model = BaggingRegressor(BayesianRidge(), n_estimators=2).fit(X, y)
     with pytest.raises(TypeError, match="BaggingRegressor.predict takes no return_std"):
         neg_crps(model, X, y)
 
 
 @pytest.mark.parametrize("model", [LinearRegression(), RegressorChain(SPARSE)], ids=str)
-def test_what_says_no_std_is_an_error_that_says_so(model):
+def test_scorer_without_std_raises(model):
     with pytest.raises(TypeError, match=rf"{type(model).__name__}.predict takes no return_std"):
         neg_nlpd(model.fit(X, Y), X, Y)
-
-
-@pytest.mark.parametrize("frame", [pd.DataFrame, pl.DataFrame])
-def test_frames_and_series_of_targets(frame):
-    columns = frame({"a": X[:, 0]})
-    targets = frame({"y": y})
-    for given in (targets["y"], targets):
-        model = clone(SPARSE).fit(columns, given)
-        assert neg_crps(model, columns, given) == pytest.approx(neg_crps(clone(SPARSE).fit(X, y), X, y))
 
 
 # --- groups ------------------------------------------------------------------------------------------------------
@@ -265,26 +197,3 @@ def test_groups_are_routed_to_the_fit_and_to_the_split(wrapped, inner):
     )
     for (train, _), fitted in zip(GroupKFold(3).split(X, y, GROUPS), found["estimator"], strict=True):
         np.testing.assert_array_equal(inner(fitted).told_, GROUPS[train])
-
-
-@pytest.mark.usefixtures("routing")
-def test_groups_are_routed_in_a_search():
-    model = make_pipeline(StandardScaler(), clone(WITNESS).set_fit_request(groups=True))
-    grid = GridSearchCV(model, {"witness__n_inducing": [3, 5]}, scoring=neg_nlpd, cv=GroupKFold(3))
-    found = grid.fit(X, y, groups=GROUPS)
-    np.testing.assert_array_equal(found.best_estimator_[-1].told_, GROUPS)
-    assert np.isfinite(found.cv_results_["mean_test_score"]).all()
-
-
-def test_without_routing_groups_split_and_a_parameter_tells_the_fit():
-    found = cross_validate(
-        WITNESS,
-        X,
-        y,
-        groups=GROUPS,
-        params={"groups": GROUPS},
-        cv=GroupKFold(3),
-        scoring=neg_nlpd,
-        return_estimator=True,
-    )
-    assert all(len(np.unique(fitted.told_)) == 8 for fitted in found["estimator"])

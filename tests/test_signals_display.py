@@ -82,31 +82,15 @@ def test_lines_are_what_was_recorded_and_what_became_of_it(log):
                 assert_array_equal(values, raw[name][:, joint])
 
 
-@pytest.mark.parametrize("row", range(3), ids=ROWS)
-def test_no_line_reaches_across_a_gap(log, row):
-    ax = SignalsDisplay.from_log(log).axes_[row, 0]
-    gaps = [cut[:2] for cut in log.recordings[0].cuts if cut[2] == "gap"]
-    assert len(gaps) == 2
-    for line in ax.lines:
-        time, values = line.get_data()
-        whole = np.isfinite(time[1:]) & np.isfinite(time[:-1]) & np.isfinite(values[1:]) & np.isfinite(values[:-1])
-        for first, last in gaps:
-            middle = (first + last) / 2.0
-            assert not (whole & (time[:-1] < middle) & (time[1:] > middle)).any()
+def test_noise_does_not_set_the_scale(log):
+    display = SignalsDisplay.from_log(log)
+    kept = log.groups == 0
+    low, high = display.axes_[1, 0].get_ylim()
+    values = log.data[kept, 4]
+    assert_allclose([low, high], [values.min() - np.ptp(values) / 4.0, values.max() + np.ptp(values) / 4.0])
 
 
-def test_accelerations_that_were_not_recorded_are_differences(log):
-    raw = log.recordings[0].raw
-    line = lines(SignalsDisplay.from_log(log).axes_[1, 1])["recorded"]
-    assert line.get_label() == "recorded, or differences"
-    steps = np.diff(raw.time)
-    inside = steps < 0.05
-    time, values = recorded(SignalsDisplay.from_log(log).axes_[1, 1])
-    assert_allclose(values, (np.diff(raw.velocity[:, 1]) / steps)[inside])
-    assert_allclose(time, ((raw.time[1:] + raw.time[:-1]) / 2.0)[inside])
-
-
-def test_what_was_cut_is_coloured_by_its_reason(log):
+def test_removed_rows_are_coloured_by_reason(log):
     display = SignalsDisplay.from_log(log)
     cuts = log.recordings[0].cuts
     assert {why for *_, why in cuts} == {"gap", "edge", "rest", "too short"}
@@ -116,58 +100,6 @@ def test_what_was_cut_is_coloured_by_its_reason(log):
         colours = {why: {span[2] for span, cut in zip(drawn, cuts, strict=True) if cut[2] == why} for *_, why in cuts}
         assert all(len(found) == 1 for found in colours.values())
         assert len(set.union(*colours.values())) == 4
-
-
-def test_the_legend_says_each_thing_once(log):
-    (legend,) = SignalsDisplay.from_log(log).figure_.legends
-    labels = [text.get_text() for text in legend.get_texts()]
-    assert labels[:2] == ["recorded, or differences", "processed"]
-    assert sorted(labels[2:]) == ["cut: filter's edge", "cut: rest", "cut: too short", "gap"]
-
-
-def test_noise_does_not_set_the_scale(log):
-    display = SignalsDisplay.from_log(log)
-    kept = log.groups == 0
-    low, high = display.axes_[1, 0].get_ylim()
-    values = log.data[kept, 4]
-    assert_allclose([low, high], [values.min() - np.ptp(values) / 4.0, values.max() + np.ptp(values) / 4.0])
-
-
-@pytest.mark.parametrize("joints", [1, -1, "elbow", ["elbow"], [1]], ids=str)
-def test_one_joint_is_drawn_alone(log, joints):
-    display = SignalsDisplay.from_log(log, joints=joints)
-    assert display.axes_.shape == (3, 1)
-    assert display.axes_[0, 0].get_title() == "elbow"
-    assert_array_equal(recorded(display.axes_[2, 0])[1], log.recordings[0].raw.torque[:, 1])
-
-
-def test_joints_are_drawn_in_the_order_that_is_asked_for(log):
-    display = SignalsDisplay.from_log(log, joints=["elbow", 0])
-    assert [ax.get_title() for ax in display.axes_[0]] == ["elbow", "shoulder"]
-
-
-def test_any_file_is_drawn(log):
-    display = SignalsDisplay.from_log(log, file=-1)
-    assert display.figure_.get_suptitle() == "second.csv"
-    assert_array_equal(lines(display.axes_[0, 0])["processed"].get_xdata(), log.recordings[1].processed.time)
-
-
-@pytest.mark.parametrize("shape", [(3,), (3, 1)])
-def test_given_axes_are_used(log, shape):
-    figure, axes = pyplot.subplots(3)
-    display = SignalsDisplay.from_log(log, joints=0, axes=axes.reshape(shape))
-    assert list(display.axes_[:, 0]) == list(axes)
-    assert display.figure_ is figure
-    assert not figure.legends
-
-
-def test_a_constant_signal_has_a_scale(tmp_path):
-    t = np.arange(0.0, 5.0, 0.01)
-    file = tmp_path / "log.csv"
-    np.savetxt(file, np.column_stack([t, t, np.ones_like(t), np.full_like(t, 2.0)]), delimiter=",")
-    log = load_log(file, columns={"time": 0, "position": 1, "velocity": 2, "effort": 3})
-    low, high = SignalsDisplay.from_log(log).axes_[2, 0].get_ylim()
-    assert low < 2.0 < high
 
 
 @pytest.mark.parametrize(
@@ -180,12 +112,12 @@ def test_a_constant_signal_has_a_scale(tmp_path):
         ({"axes": np.empty(3, dtype=object)}, r"axes must be of shape \(3, 2\), a column for each joint; got \(3,\)"),
     ],
 )
-def test_bad_values_are_named(log, arguments, message):
+def test_invalid_values_raise(log, arguments, message):
     with pytest.raises(ValueError, match=message):
         SignalsDisplay.from_log(log, **arguments)
 
 
-def test_without_matplotlib_the_pip_command_is_told(log, monkeypatch):
+def test_missing_matplotlib_raises(log, monkeypatch):
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)
     with pytest.raises(ImportError, match="pip install matplotlib"):
         SignalsDisplay.from_log(log)

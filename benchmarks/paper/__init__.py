@@ -1,6 +1,5 @@
-"""The tables and figures of the paper, run here, on the systems and models of `models`.
+"""The tables and figures of the paper, computed here, on the systems and models of `models`.
 
-`complexity` is its Table 3, `results_table` its Table 4 (`cartpole` a closer look at some of its lines), `toy` its
-Figure 5, `learning_curves` its Figure 6, `beta` its Figure 7. Scales and sizes, its Tables 1 and 2, are the defaults of
-`skevgp.datasets.make_dynamics` and in `models`.
+Its Table 1, of scales, is the defaults of `skevgp.datasets.make_dynamics`; its Table 2, of sizes, is in `models`.
+``published.csv`` has the numbers of its Table 4.
 """

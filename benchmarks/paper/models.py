@@ -8,9 +8,11 @@ import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from scipy.stats import norm, truncnorm
 from sklearn.base import RegressorMixin, TransformerMixin
 from sklearn.exceptions import ConvergenceWarning
@@ -45,21 +47,13 @@ ENDED_EARLY = re.compile(
 NOTHING_LEARNED = re.compile(r"of (\d+) of \d+ outputs fitted together, though|became white noise")
 # Trajectories of a quick run.
 QUICK_TRAJECTORIES = 12
+# The paper's Table 4, by system and model. Both cartpoles have the numbers of the paper's only one.
+PUBLISHED = pd.read_csv(Path(__file__).with_name("published.csv"), index_col=["system", "model"])
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How to fit a model of the table.
-
-    Attributes
-    ----------
-    system, model, setting : str
-    seed : int
-        Of the fit and of the nominal arm.
-    size : {"full", "quick"}
-    max_iter : int or None
-        Of an EVGP; None is the regressor's, or that of a quick run.
-    """
+    """How to fit a model. ``max_iter=None`` is that of the regressor, or of a quick run."""
 
     system: str
     model: str
@@ -71,17 +65,7 @@ class Fit:
 
 @dataclass(frozen=True)
 class Quick:
-    """Limits of a quick run, so that the large systems take no longer.
-
-    Attributes
-    ----------
-    lbfgs : int
-        Iterations.
-    adam : int
-        Steps.
-    epochs : int
-        Of the network.
-    """
+    """Iterations of L-BFGS, steps of Adam and epochs of the network in a quick run."""
 
     lbfgs: int
     adam: int
@@ -96,12 +80,12 @@ QUICK = {
     "iiwa14": Quick(10, 2, 3),
 }
 SYSTEMS = tuple(QUICK)
-# The network learns until rows held back gain nothing. (What whole trajectories held back would choose: network.py.)
+# The network learns until rows held back gain nothing.
 UNTIL_FLAT: dict[str, Any] = {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 1000}
 
 
 def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, Any]:
-    """Where EVGP starts in the author's public library, twodlearn, whose defaults need not be the paper's.
+    """Return where EVGP starts in the author's library, twodlearn, whose defaults need not be the paper's.
 
     Noise of std 1, a signal of std 0.5, lengthscales (1 / m)^(1 / D) and inducing points from a truncated normal, in
     the data's units; weights with a prior scale of 1 or 100; Adam with a fixed step of 0.01 on batches of 50.
@@ -120,7 +104,7 @@ def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, A
 
 
 def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> EVGPRegressor:
-    """With inertia and force, with gravity too, or without features."""
+    """Return an EVGP with features of inertia and force, with gravity too, or without features."""
     features = None if physics is None else physics(fit.system)
     if fit.setting == "skevgp-nominal":
         wrong = perturb_robot(fit.system, NOMINAL_ERROR, random_state=fit.seed)
@@ -139,12 +123,12 @@ def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> E
 
 
 def residual_vgp(fit: Fit, n_inducing: int) -> ResidualRegressor:
-    """It learns the change of state."""
+    """Return a VGP that learns the change of state."""
     return ResidualRegressor(evgp(None, fit, n_inducing))
 
 
 def residual_network(fit: Fit, hidden_layer_sizes: tuple[int, int]) -> ResidualRegressor:
-    """It learns the change of state; in the paper's setting with a standard normal prior on its weights."""
+    """Return a network that learns the change of state."""
     network = BayesianMLPRegressor(
         hidden_layer_sizes,
         prior_scale=1.0 if fit.setting == "paper" else None,
@@ -158,16 +142,7 @@ def residual_network(fit: Fit, hidden_layer_sizes: tuple[int, int]) -> ResidualR
 
 @dataclass(frozen=True)
 class Model:
-    """A model of the table.
-
-    Attributes
-    ----------
-    build : callable
-        (fit, its size) -> an unfitted regressor.
-    sizes : tuple
-        Of the pendulum, both cartpoles, the acrobot and iiwa14: inducing points or hidden units, the paper's Table 2.
-    settings : tuple of str
-    """
+    """A model: how it is built, its sizes on each of `SYSTEMS` (the paper's Table 2), and its settings."""
 
     build: Callable[[Fit, Any], RegressorMixin]
     sizes: tuple[Any, ...]
@@ -186,25 +161,25 @@ MODELS = {
 
 
 def build(fit: Fit) -> RegressorMixin:
-    """The unfitted regressor, of the paper's size."""
+    """Return the unfitted regressor, of the paper's size."""
     model = MODELS[fit.model]
     return model.build(fit, model.sizes[SYSTEMS.index(fit.system)])
 
 
 def has(system: str, model: str, setting: str, angles: str = "raw") -> bool:
-    """Whether there is such a cell: a nominal model is for iiwa14's EVGP; sines and cosines know no turns to wrap."""
+    """Return whether there is such a cell. Sines and cosines need no wrapped angles."""
     of_system = setting != "skevgp-nominal" or system == "iiwa14"
     return setting in MODELS[model].settings and of_system and (angles == "raw" or setting != "skevgp-angles")
 
 
 def fitted_part(regressor: Any) -> Any:
-    """The EVGP or the network inside."""
+    """Return the EVGP or the network inside."""
     regressor = getattr(regressor, "regressor_", regressor)
     return regressor[-1] if hasattr(regressor, "steps") else regressor
 
 
 def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
-    """The paper's metrics of a prediction, quantiles of the error over rows and a proper score."""
+    """Return the paper's metrics, quantiles of the error over rows, and the NLPD."""
     errors = np.linalg.norm(target - mean, axis=1)
     cr1, cr2, cr3 = containing_ratios(target, mean, std)
     return {
@@ -220,33 +195,19 @@ def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str,
 
 
 def reliability(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
-    """The share of the targets that intervals of each promised share hold, those of normal distributions."""
+    """Return the shares of the targets within intervals of normal distributions."""
     half_widths = norm.ppf(0.5 + 0.5 * np.array(PROMISED))
     ratios = containing_ratios(target, mean, std, half_widths)
     return {f"within_{share}": ratio for share, ratio in zip(PROMISED, ratios, strict=True)}
 
 
 def beyond_range(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Which entries of test rows (n_test, d) lie beyond their column's range over training rows (n_train, d)."""
+    """Return which entries of test rows lie beyond their column's range over training rows."""
     return (test < train.min(axis=0)) | (test > train.max(axis=0))
 
 
 def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
-    """How the test rows fare whose columns all lie within the training rows' ranges, and which columns do not.
-
-    Parameters
-    ----------
-    train, test : Bunch
-        With ``data``.
-    errors : ndarray of shape (n_test,)
-
-    Returns
-    -------
-    columns : dict
-        ``error_inside`` is their mean error, ``error_outside`` that of the others (NaN without any), ``inside`` the
-        share of the rows; ``outside`` tells of each end of a column's range that rows go beyond their number, the end
-        and how far they go: "1:31:3.02:8.31 1:4:-3.02:-3.7".
-    """
+    """Return errors inside and outside the training rows' ranges, and what is outside (column:rows:end:farthest)."""
     low, high = train.data.min(axis=0), train.data.max(axis=0)
     beyond = beyond_range(train.data, test.data)
     inside = ~beyond.any(axis=1)
@@ -267,13 +228,13 @@ def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
 
 
 def groups_of(regressor: Any, train: Bunch) -> dict[str, np.ndarray]:
-    """What an EVGP, or one that learns changes of state, is told of its rows' trajectories."""
+    """Return the argument ``groups`` of fit, for a regressor that has it."""
     inner = getattr(regressor, "regressor", regressor)
     return {"groups": train.groups} if isinstance(inner, EVGPRegressor) and "groups" in train else {}
 
 
 def timed(regressor: Any, train: Bunch, test: Bunch) -> tuple[np.ndarray, np.ndarray, float, list[Any]]:
-    """Fit it: mean and std (n, o) on the test rows, processor seconds of one thread, and its convergence warnings."""
+    """Fit; return mean and std on the test rows, processor seconds of one thread, and convergence warnings."""
     with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", ConvergenceWarning)
         start = time.process_time()
@@ -284,46 +245,20 @@ def timed(regressor: Any, train: Bunch, test: Bunch) -> tuple[np.ndarray, np.nda
 
 
 def how_it_ended(messages: list[str], n_outputs: int) -> dict[str, Any]:
-    """Whether a search ended by itself, and of how many outputs its Gaussian process learned nothing.
-
-    Parameters
-    ----------
-    messages : list of str
-        Of its convergence warnings.
-    n_outputs : int
-
-    Returns
-    -------
-    columns : dict
-        ``converged`` and ``unlearned``: at least so many, for groups of outputs with the same message tell it once.
-    """
+    """Return whether a search ended by itself, and of at least how many outputs the GP learned nothing."""
     said = " ".join(messages)
     counts = [int(found[1] or n_outputs) for found in NOTHING_LEARNED.finditer(said)]
     return {"converged": not ENDED_EARLY.search(said), "unlearned": min(sum(counts), n_outputs)}
 
 
-def fitted_row(
-    fit: Fit, train: Bunch, test: Bunch, changes: dict[str, Any] | None = None, **columns: Any
-) -> dict[str, Any]:
-    """Fit a model, look at it on test rows, and tell it all in a row of a CSV.
+def limited(row: Any) -> bool:
+    """Return whether a limit of iterations ended the fit of a row."""
+    return str(row["converged"]) == "False" or str(row["max_iter"]).removesuffix(".0") == str(row["n_iter"])
 
-    Parameters
-    ----------
-    fit : Fit
-    train, test : Bunch
-        With ``data`` and ``target``.
-    changes : dict, default=None
-        Parameters set on the regressor on top of the setting's.
-    **columns
-        What else the row tells, of the data.
 
-    Returns
-    -------
-    row : dict
-        ``fit_seconds`` is processor time of one thread.
-    """
-    changes = changes or {}
-    regressor, max_iter = build(fit).set_params(**changes), changes.get("max_iter", fit.max_iter)
+def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str, Any]:
+    """Fit a model and evaluate it on test rows; return a row of a CSV."""
+    regressor = build(fit)
     mean, std, seconds, caught = timed(regressor, train, test)
     fitted = fitted_part(regressor)
     return {
@@ -335,7 +270,7 @@ def fitted_row(
         "fit_seconds": seconds,
         **columns,
         "size": fit.size,
-        "max_iter": "" if max_iter is None or fit.model == "RES-DBNN" else max_iter,
+        "max_iter": "" if fit.max_iter is None or fit.model == "RES-DBNN" else fit.max_iter,
         "n_iter": fitted.n_iter_,
         "bound_per_row": getattr(fitted, "lower_bound_", np.nan) / len(train.data),
         **how_it_ended([str(warning.message) for warning in caught], train.target.shape[1]),

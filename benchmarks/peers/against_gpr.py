@@ -1,9 +1,8 @@
 """EVGPRegressor against scikit-learn's GaussianProcessRegressor as the number of rows grows.
 
 Time, memory, error and NLPD of fits to the first N rows, in random order, of a data set: of the paper's pendulum and
-cartpole (the change of state is learned; no noise) and of a smooth function of 8 columns with noise. Each fit has a
-process of its own and one thread. Writes a row per fit to a CSV (what is there is not run again), and from it a
-Markdown page and a picture.
+cartpole (the change of the state is learned; no noise) and of a smooth function of 8 columns with noise. Each fit has a
+process of its own and one thread.
 
     python benchmarks/peers/against_gpr.py          # half an hour to an hour of one core
     python benchmarks/peers/against_gpr.py --quick  # 50 and 150 rows: under a minute
@@ -11,12 +10,9 @@ Markdown page and a picture.
 
 Models without features: "GPR" is scikit-learn's, with ConstantKernel * RBF (a lengthscale per column) + WhiteKernel,
 ``normalize_y=True`` and its own optimizer; all columns of y share kernel and noise. "EGP" and "EVGP" (100 inducing
-points) are skevgp's with their defaults; each column of y has its signal variance and noise. Beside each EVGP the CSV
-has its exact counterpart: GPR with the EVGP's kernel and noise, without an optimizer. With gravity's features there are
-"EGP-IFG" and "EVGP-IFG" (the paper's 10 or 60 inducing points).
-
-An exact fit's time grows with N³: where that would take a model beyond --time-limit, judged by the N before, it is left
-out.
+points) are skevgp's with their defaults. The CSV also has the exact counterpart of each EVGP: GPR with the EVGP's
+kernel and noise, without an optimizer. With gravity's features there are "EGP-IFG" and "EVGP-IFG" (the paper's 10 or 60
+inducing points). A fit is left out if, judged by smaller ones, it would take longer than --time-limit.
 """
 
 from __future__ import annotations
@@ -25,15 +21,15 @@ import itertools
 import sys
 import time
 import warnings
-from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
+import pandas as pd
 from sklearn.base import RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
@@ -42,7 +38,6 @@ from threadpoolctl import threadpool_limits
 
 import harness
 from paper.models import Fit, build
-from peers import against_gpr_report
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForceGravity
@@ -52,20 +47,28 @@ SYSTEMS = ("pendulum", "cartpole", "smooth")
 # The data sets of systems end before the larger sizes.
 SIZES, QUICK_SIZES = (125, 250, 500, 1000, 2000, 4000, 10_000, 30_000, 100_000), (50, 150)
 N_ROWS = 4800
-# Up to here an EVGP is compared with its exact counterpart.
-COUNTERPART_ROWS = 2000
-N_INDUCING = 100
+COUNTERPART_ROWS = 2000  # up to here an EVGP is compared with its exact counterpart
+# Models, the largest power of N with which the time of a fit grows, and their systems.
+MODELS = {
+    "GPR": (3, SYSTEMS),
+    "EVGP": (1, SYSTEMS),
+    "EGP": (3, ("smooth",)),
+    "EGP-IFG": (3, ("pendulum", "cartpole")),
+    "EVGP-IFG": (1, ("pendulum", "cartpole")),
+}
+MEASURES = {
+    "fit_seconds": "fit, s",
+    "predict_seconds": "predict 1000 rows, s",
+    "memory_mb": "memory, MB",
+    "error": "error",
+    "nlpd": "NLPD",
+    "log_likelihood": "log likelihood / N",
+}
 
 
 @dataclass(frozen=True)
 class Cell:
-    """One fit.
-
-    Attributes
-    ----------
-    system, model : str
-    n_rows, seed : int
-    """
+    """One fit."""
 
     system: str
     model: str
@@ -73,61 +76,22 @@ class Cell:
     seed: int
 
 
-def gpr(cell: Cell, X: np.ndarray) -> GaussianProcessRegressor:
-    """Started from the spread of the columns; bounds for data without noise, of which skevgp's is the floor."""
-    signal = ConstantKernel(1.0, (1e-6, 1e9)) * RBF(X.std(axis=0), (1e-3, 1e6))
-    return GaussianProcessRegressor(signal + WhiteKernel(1e-2, (1e-10, 10.0)), normalize_y=True)
-
-
-def egp(cell: Cell, X: np.ndarray) -> EGPRegressor:
-    return EGPRegressor(random_state=cell.seed)
-
-
-def evgp(cell: Cell, X: np.ndarray) -> EVGPRegressor:
-    return EVGPRegressor(n_inducing=N_INDUCING, random_state=cell.seed)
-
-
-def egp_with_gravity(cell: Cell, X: np.ndarray) -> EGPRegressor:
-    return EGPRegressor(InertiaForceGravity(cell.system), random_state=cell.seed)
-
-
-def evgp_with_gravity(cell: Cell, X: np.ndarray) -> RegressorMixin:
-    """That of the paper's results, its Table 4."""
+def regressor_of(cell: Cell, X: np.ndarray) -> RegressorMixin:
+    """Return an unfitted model."""
+    features = InertiaForceGravity(cell.system) if cell.model.endswith("IFG") else None
+    if cell.model == "GPR":
+        # Bounds for data without noise, of which skevgp's is the floor.
+        signal = ConstantKernel(1.0, (1e-6, 1e9)) * RBF(X.std(axis=0), (1e-3, 1e6))
+        return GaussianProcessRegressor(signal + WhiteKernel(1e-2, (1e-10, 10.0)), normalize_y=True)
+    if cell.model.startswith("EGP"):
+        return EGPRegressor(features, random_state=cell.seed)
+    if cell.model == "EVGP":
+        return EVGPRegressor(n_inducing=100, random_state=cell.seed)
     return build(Fit(cell.system, "EVGP-IFG", "skevgp", cell.seed, "full", None))
 
 
-@dataclass(frozen=True)
-class Model:
-    """A line of the picture.
-
-    Attributes
-    ----------
-    build : callable
-        (cell, X) -> an unfitted regressor.
-    growth : int
-        The power of N with which the time of a fit grows at most.
-    systems : tuple of str
-    with_features : bool
-        Then it predicts the next state, of which the features' prior speaks; otherwise the change of state.
-    """
-
-    build: Callable[[Cell, np.ndarray], RegressorMixin]
-    growth: int
-    systems: tuple[str, ...] = SYSTEMS
-    with_features: bool = False
-
-
-MODELS = {
-    "GPR": Model(gpr, 3),
-    "EGP": Model(egp, 3, ("smooth",)),
-    "EVGP": Model(evgp, 1),
-    "EGP-IFG": Model(egp_with_gravity, 3, ("pendulum", "cartpole"), with_features=True),
-    "EVGP-IFG": Model(evgp_with_gravity, 1, ("pendulum", "cartpole"), with_features=True),
-}
-
-
 class Rows(NamedTuple):
-    """Inputs, what is observed, and that without noise."""
+    """Inputs, observations, and observations without noise."""
 
     X: np.ndarray
     y: np.ndarray
@@ -135,7 +99,7 @@ class Rows(NamedTuple):
 
 
 def data(cell: Cell) -> tuple[Rows, Rows]:
-    """Training and test rows; those of a smaller N are among those of a larger one."""
+    """Return training and test rows. The rows of a smaller N are among those of a larger one."""
     if cell.system == "smooth":
         pieces = harness.noisy_waves(N_ROWS, 8, np.random.RandomState(cell.seed))
         test = Rows(*next(pieces))
@@ -144,19 +108,20 @@ def data(cell: Cell) -> tuple[Rows, Rows]:
     rows = []
     for random_state in (cell.seed, 1000 + cell.seed):
         X, y = make_dynamics(cell.system, random_state=random_state, return_X_y=True)
-        change = y if MODELS[cell.model].with_features else y - X[:, : y.shape[1]]
+        # The prior of features speaks of the next state, other models learn the change of the state.
+        change = y if cell.model.endswith("IFG") else y - X[:, : y.shape[1]]
         rows.append(Rows(X, change, change))
     order = np.random.RandomState(cell.seed).permutation(len(rows[0].X))[: cell.n_rows]
     return Rows(*(a[order] for a in rows[0])), rows[1]
 
 
 def density(test: Rows, mean: np.ndarray, std: np.ndarray) -> float:
-    """NLPD; not a number where GPR has rounded a negative variance up to 0."""
+    """Return the NLPD; NaN where GPR has rounded a negative variance up to 0."""
     return negative_log_predictive_density(test.y, mean, std) if (std > 0.0).all() else np.nan
 
 
 def log_likelihood(regressor: Any, y: np.ndarray) -> float:
-    """In nats of the units of y, summed over outputs; of an EVGP its lower bound."""
+    """Return it in nats of the units of y, summed over outputs; of an EVGP its lower bound."""
     if isinstance(regressor, EVGPRegressor):
         return regressor.lower_bound_
     value = float(regressor.log_marginal_likelihood_value_)
@@ -166,7 +131,7 @@ def log_likelihood(regressor: Any, y: np.ndarray) -> float:
 
 
 def counterpart(evgp: EVGPRegressor, train: Rows, test: Rows) -> dict[str, float]:
-    """What the exact GP says with the EVGP's kernel and noise, which are per output."""
+    """Predict by the exact GP with the EVGP's kernel and noise, which are per output."""
     kernels = evgp.kernel_ if isinstance(evgp.kernel_, list) else [evgp.kernel_]
     parts, value = [], 0.0
     for kernel, noise, y in zip(kernels, np.ravel(evgp.noise_variance_), np.atleast_2d(train.y.T), strict=True):
@@ -183,14 +148,13 @@ def counterpart(evgp: EVGPRegressor, train: Rows, test: Rows) -> dict[str, float
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Fit, predict, and measure both."""
-    model = MODELS[cell.model]
+    """Fit and predict, and measure both."""
     train, test = data(cell)
-    regressor = model.build(cell, train.X)
+    regressor = regressor_of(cell, train.X)
     with threadpool_limits(1), warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        # What is imported and allocated once is not the fit's.
-        model.build(cell, train.X).fit(train.X[:10], train.y[:10]).predict(test.X[:10], return_std=True)
+        # Imports and first allocations are not measured.
+        regressor_of(cell, train.X).fit(train.X[:10], train.y[:10]).predict(test.X[:10], return_std=True)
         with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")
             start = time.process_time()
@@ -206,7 +170,7 @@ def run(cell: Cell) -> dict[str, Any]:
                 exact = counterpart(regressor, train, test)
     convergence = [str(warning.message) for warning in caught if issubclass(warning.category, ConvergenceWarning)]
     return {
-        **{name: getattr(cell, name) for name in ("system", "model", "n_rows", "seed")},
+        **asdict(cell),
         "m": regressor.inducing_points_.shape[-2] if isinstance(regressor, EVGPRegressor) else "",
         "fit_seconds": fit_seconds,
         "predict_seconds": 1000.0 * predict_seconds / len(test.X),
@@ -222,17 +186,8 @@ def run(cell: Cell) -> dict[str, Any]:
     }
 
 
-def say(row: dict[str, Any]) -> str:
-    return f"{row['fit_seconds']:.2f} s, {row['memory_mb']:.0f} MB, error {row['error']:.3g}, NLPD {row['nlpd']:.2f}"
-
-
-def has(cell: Cell) -> bool:
-    """Whether there is such a cell."""
-    return cell.system in MODELS[cell.model].systems and (cell.system == "smooth" or cell.n_rows <= N_ROWS)
-
-
 def expected_seconds(rows: list[harness.Row], cell: Cell) -> float:
-    """What a fit takes at most, judged by the largest that is smaller."""
+    """Return what a fit takes at most, judged by the largest smaller one."""
     smaller = [
         (int(row["n_rows"]), float(row["fit_seconds"]))
         for row in rows
@@ -240,37 +195,88 @@ def expected_seconds(rows: list[harness.Row], cell: Cell) -> float:
         and int(row["n_rows"]) < cell.n_rows
     ]
     n, seconds = max(smaller, default=(1, 0.0))
-    return seconds * (cell.n_rows / n) ** MODELS[cell.model].growth
+    return seconds * (cell.n_rows / n) ** MODELS[cell.model][0]
+
+
+def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return exponents over the four largest sizes, and a table of all measures per data set."""
+    means = rows.groupby(["system", "model", "n_rows"]).mean(numeric_only=True)
+    for name in ("log_likelihood", "counterpart_log_likelihood"):
+        means[name] = means[name] / means.index.get_level_values("n_rows")
+    exponents, tables = [], {}
+    for system in [name for name in SYSTEMS if name in set(rows["system"])]:
+        parts = []
+        for name, measure in MEASURES.items():
+            for model in [name for name in MODELS if name in means.loc[system].index]:
+                parts.append((measure, model, means.loc[system, model][name]))
+            if f"counterpart_{name}" in means and "EVGP" in means.loc[system].index:
+                exact = means.loc[system, "EVGP"][f"counterpart_{name}"].dropna()
+                parts.append((measure, "EVGP, made exact", exact))
+        table = pd.DataFrame([values for *_, values in parts])
+        table = table.set_axis([str(n) for n in table.columns], axis=1)
+        table.insert(0, "model", [model for _, model, _ in parts])
+        table.insert(0, "", [measure for measure, *_ in parts])
+        tables[system] = table
+        for model in [name for name in MODELS if name in means.loc[system].index]:
+            own = means.loc[system, model].tail(4)
+            x = np.log(own.index)
+            powers = [
+                f"{np.polyfit(x, np.log(np.maximum(own[name], 1e-9)), 1)[0]:.2f}" if len(own) > 1 else ""
+                for name in ("fit_seconds", "memory_mb")
+            ]
+            exponents.append([system, model, str(own.index[-1]), *powers])
+    header = ["data", "model", "largest N", "time", "memory"]
+    return {"exponents": pd.DataFrame(exponents, columns=header), **tables}
+
+
+def plot(rows: pd.DataFrame, path: Path) -> None:
+    """Draw time, memory, error and NLPD over N; a column of panels per data set."""
+    systems = [name for name in SYSTEMS if name in set(rows["system"])]
+    names = ("fit_seconds", "memory_mb", "error", "nlpd")
+    options = {"figsize": (harness.WIDTH, 8.4), "squeeze": False, "sharex": "col"}
+    figure, grid = harness.pyplot().subplots(len(names), len(systems), **options)
+    for panels, system in zip(grid.T, systems, strict=True):
+        panels[0].set_title(system)
+        panels[-1].set_xlabel("rows, N")
+        for axes, name in zip(panels, names, strict=True):
+            for model, colour, marker in zip(MODELS, harness.PALETTE, "sDov^", strict=False):
+                own = rows[(rows["system"] == system) & (rows["model"] == model)].groupby("n_rows")[name].mean()
+                if len(own):
+                    axes.plot(own, f"{marker}-", color=colour, label=model)
+            if name != "nlpd":
+                harness.logarithmic(axes)
+        harness.logarithmic(panels[-1], "x")
+    for axes, name in zip(grid[:, 0], names, strict=True):
+        axes.set_ylabel(MEASURES[name])
+    harness.legend(figure, ncols=5)
+    harness.save_picture(figure, path)
 
 
 def main() -> None:
     parser = harness.argument_parser(
-        __doc__, quick="50 and 150 rows", seeds="seeds 0, 1, ...; default: 1", systems=SYSTEMS
+        __doc__, quick="50 and 150 rows", seeds="number of seeds; default: 1", systems=SYSTEMS
     )
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
     parser.add_argument("--sizes", nargs="+", type=int, help="rows; default: 125 to 4000, smooth to 100,000")
-    parser.add_argument(
-        "--time-limit", type=float, default=300.0, help="seconds a fit may be expected to take; default: %(default)g"
-    )
+    said = "seconds a fit may be expected to take; default: %(default)g"
+    parser.add_argument("--time-limit", type=float, default=300.0, help=said)
     options = parser.parse_args()
-    output = harness.output_path(options, "against_gpr")
-    n_failures = 0
-    # One after the other, since how long a size takes tells what the next would.
+    output, n_failures = harness.output_path(options, "against_gpr"), 0
+    # One size after the other, since the time of a size tells that of the next.
     for n_rows in sorted(options.sizes or (QUICK_SIZES if options.quick else SIZES)):
-        rows = harness.read(output)
+        done = harness.read(output)
         cells = [
             cell
-            for seed in range(1 if options.seeds is None else options.seeds)
+            for seed in range(options.seeds or 1)
             for system in options.systems
             for model in options.models
-            if has(cell := Cell(system, model, n_rows, seed)) and expected_seconds(rows, cell) <= options.time_limit
+            if system in MODELS[model][1] and (system == "smooth" or n_rows <= N_ROWS)
+            if expected_seconds(done, cell := Cell(system, model, n_rows, seed)) <= options.time_limit
         ]
-        n_failures += harness.run_missing(cells, run, output, options.jobs, say, fresh=True, since=options.since)
-
-    rows = harness.read(output)
-    if rows:
-        against_gpr_report.plot(rows, output.with_suffix(".png"))
-    harness.write_report(against_gpr_report.paragraphs(rows) if rows else [], output, n_failures)
+        n_failures += harness.run_missing(cells, run, output, options.jobs, fresh=True, since=options.since)
+    rows = harness.frame(output)
+    plot(rows, output.with_suffix(".png"))
+    harness.write_page("EVGPRegressor and GaussianProcessRegressor as N grows", tables_of(rows), output, n_failures)
 
 
 if __name__ == "__main__":

@@ -1,38 +1,27 @@
 """skevgp against other libraries: same data, same number of inducing points, same kernel, same start.
 
-First every library has to agree with the others at fixed hyperparameters (`agreement.py`). Then it writes one row per
-fit to a CSV (fits that are there already are not repeated), bound, RMSE and NLPD over time to a second one, draws a
-picture from both, and writes and prints a Markdown page: how long each took to reach the bound and the NLPD of GPflow's
-SGPR after its iterations, and means over seeds. Peers that are not installed are left out. GPflow needs another NumPy
-than skevgp and GPJax: give the interpreter that has the peers (see requirements.txt, requirements_jax.txt), in a run
-for each.
+First every library has to agree with dense matrices at fixed hyperparameters. Then each fit is a row of a CSV, and its
+bound, RMSE and NLPD over time are in a second CSV. Peers that are not installed are left out. GPflow needs another
+NumPy than skevgp and GPJax: give the interpreter that has the peers (see requirements.txt and requirements_jax.txt).
 
     python benchmarks/peers/against_peers.py --peer-python .peers/bin/python --data-folder ../uci
     python benchmarks/peers/against_peers.py --peers "GPJax SGPR" --peer-python .peers_jax/bin/python
     python benchmarks/peers/against_peers.py --datasets cartpole --peers skevgp "GPflow SGPR" --redo
-    python benchmarks/peers/against_peers.py --quick  # half a minute: small data, skevgp and scikit-learn
+    python benchmarks/peers/against_peers.py --quick  # small data, skevgp and scikit-learn: half a minute
 
-All ten splits of the tables, GPflow's SGPR, gradient boosting and a straight line beside skevgp, without curves:
+All ten splits of the tables, with GPflow's SGPR, gradient boosting, a straight line and skevgp, without curves:
 
     python benchmarks/peers/against_peers.py --all-splits --peer-python .peers/bin/python --data-folder ../uci
 
-The tables airfoil, elevators and kin40k are read from --data-folder (NAME/data.csv.gz, the target last, and
-NAME/test_mask.csv.gz, a column per split); a seed is a split. Their inputs and targets are standardised with the
-training rows; so are those of "smooth", 10,000 rows of waves of 8 columns with noise. Of systems the change of the
-state is learned.
+The tables airfoil, elevators and kin40k are read from --data-folder: NAME/data.csv.gz with the target last, and
+NAME/test_mask.csv.gz with a column per split. A seed is a split. Tables and "smooth", 10,000 rows of waves of 8 columns
+with noise, are standardised with the training rows. Of systems the change of the state is learned.
 
-The kernel is a squared exponential with a lengthscale per column, the prior mean 0; signal variance and noise are of
-each output, or shared as the peer does it: skevgp keeps them per output, the others share them too. skevgp has its
-defaults; the noise of the others starts at all of the variance (GPflow's own start), of systems at a hundredth, and
-they have 120 iterations of L-BFGS (GPflow, GPJax; of the acrobot 200), 300 steps of Adam of 0.1 (GPyTorch's SGPR: its
-tutorial's 0.01 gets nowhere in as many), or an exact GP on 1,500 rows. Gradient boosting has a constant variance, from
-5-fold cross-validation outside the clock. Each fit has a process of its own on two cores. The clock starts with the
-arrays in memory and the libraries imported, so that TensorFlow's tracing and JAX's compilation are part of a fit; it
-does not run while a fit is looked at. Of skevgp, what there was at an earlier time is what a fit returns that is ended
-then, with its time.
-
-GPJax's L-BFGS is its `fit_lbfgs`: that of Optax, whose line search is another than SciPy's, with the whole fit compiled
-at once. It is in double precision, which JAX's own is not.
+The kernel is a squared exponential with a lengthscale per column; the prior mean is 0. skevgp has its defaults. The
+noise of the others starts at the whole variance, of systems at a hundredth. They have 120 iterations of L-BFGS (GPflow,
+GPJax; of the acrobot 200), 300 steps of Adam (GPyTorch), or an exact GP on 1,500 rows. Each fit has a process of its
+own on two cores. The clock starts with the arrays in memory and the libraries imported, so that TensorFlow's tracing
+and JAX's compilation are part of a fit.
 """
 
 from __future__ import annotations
@@ -43,68 +32,116 @@ import platform
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable
-from functools import cache, partial
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
+import pandas as pd
+from scipy.linalg import cho_factor, cho_solve
+from scipy.spatial.distance import cdist
+from scipy.stats import multivariate_normal
 
 import harness
 import skevgp
-from harness import Row
-from peers import against_peers_report, agreement
-from peers.data import DATASETS, QUICK, Data, DataSet
-from peers.jobs import Job, Result
-from peers.models import PEERS
+from peers.adapters import PEERS, load
+from skevgp import EVGPRegressor
+from skevgp.datasets import make_dynamics
 from skevgp.metrics import negative_log_predictive_density, std_norm
 
+KEY = ["peer", "dataset", "sharing", "seed"]
+SUBSET = 1500  # rows of an exact GP
+TOLERANCE = 1e-6  # relative difference from dense matrices
 _LINE, _TREES = "scikit-learn BayesianRidge", "scikit-learn HistGradientBoosting"
-_TABLES = [name for name, one in DATASETS.items() if one.from_folder]
-# What options mean that are not given: usually, for all splits of the tables, and in short mode.
-DEFAULTS: dict[str, dict[str, Any]] = {
-    "against_peers": {
-        "datasets": list(DATASETS),
-        "seeds": 1,
-        "checkpoints": 12,
-        "peers": ["skevgp", "GPflow SGPR", "GPyTorch SGPR", "GPJax SGPR", "scikit-learn GPR", _TREES, _LINE],
-    },
-    "splits": {
-        "datasets": _TABLES,
-        "seeds": 10,
-        "checkpoints": 0,
-        "peers": ["skevgp", "GPflow SGPR", _TREES, _LINE],
-    },
-    "against_peers_quick": {
-        "datasets": list(QUICK),
-        "seeds": 1,
-        "checkpoints": 3,
-        "peers": ["skevgp", "scikit-learn GPR", _TREES, _LINE],
-    },
+
+
+# --- data ----------------------------------------------------------------------------------------------------------
+
+
+class Sets(NamedTuple):
+    """Training and test rows."""
+
+    X: np.ndarray
+    Y: np.ndarray
+    X_test: np.ndarray
+    Y_test: np.ndarray
+
+
+def standardised(X: np.ndarray, y: np.ndarray, is_test: np.ndarray) -> Sets:
+    """Scale inputs and target by the training rows' mean and standard deviation."""
+    sets = []
+    for table in (X, y[:, np.newaxis]):
+        train = table[~is_test]
+        spread = train.std(axis=0)
+        sets.append((table - train.mean(axis=0)) / np.where(spread > 0.0, spread, 1.0))
+    return Sets(*(table[rows] for rows in (~is_test, is_test) for table in sets))
+
+
+def tabular(name: str, seed: int, folder: Path | None) -> Sets:
+    """Read a split of a table."""
+    if folder is None:
+        raise SystemExit(f"{name} is read from a folder: give --data-folder, or other --datasets.")
+    table, masks = (np.loadtxt(folder / name / f"{file}.csv.gz", delimiter=",") for file in ("data", "test_mask"))
+    return standardised(table[:, :-1], table[:, -1], masks[:, seed] == 1.0)
+
+
+def smooth(n_rows: int, seed: int, folder: Path | None) -> Sets:
+    """Make sums of waves of 8 columns; about 1 % of their variance is noise."""
+    pieces = harness.noisy_waves(n_rows, 8, np.random.RandomState(seed))
+    (X, y, _), (X_test, y_test, _) = (next(pieces) for _ in range(2))
+    return standardised(np.vstack([X, X_test]), np.concatenate([y, y_test]), np.arange(2 * n_rows) >= n_rows)
+
+
+def dynamics(system: str, seed: int, folder: Path | None, **sizes: int) -> Sets:
+    """Simulate changes of the state, in the units of the system."""
+    X, Y, X_test, Y_test = (
+        array
+        for random_state in (seed, 1000 + seed)
+        for array in make_dynamics(system, random_state=random_state, return_X_y=True, **sizes)
+    )
+    return Sets(X, Y - X[:, : Y.shape[1]], X_test, Y_test - X_test[:, : Y.shape[1]])
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A data set, the size of its model, the limit of L-BFGS, and where the noise of the other peers starts."""
+
+    load: Callable[[int, Path | None], Sets]
+    n_inducing: int
+    max_iter: int = 120
+    first_noise: float = 1.0
+    several: bool = False  # outputs, which may share
+
+
+TABLES = ("airfoil", "elevators", "kin40k")
+SIZES = {"pendulum": (40, 120), "cartpole": (100, 120), "acrobot": (250, 200), "iiwa14": (500, 120)}
+DATASETS = {
+    **{name: DataSet(partial(tabular, name), 256) for name in TABLES},
+    "smooth": DataSet(partial(smooth, 10_000), 256),
+    **{name: DataSet(partial(dynamics, name), *sizes, 0.01, several=True) for name, sizes in SIZES.items()},
 }
-KEY = ("peer", "dataset", "sharing", "seed")
-COLUMNS = (
-    *(*KEY, "m", "n_train"),
-    *("seconds", "cpu_seconds", "predict_seconds", "iterations", "evaluations", "stop", "bound", "output_bounds"),
-    *("rmse", "nlpd", "error_mean", "error_median", "error_p99", "std_norm", "load", "date", "versions", "machine"),
-)
-CURVE_COLUMNS = (*KEY, "n_train", "seconds_so_far", "cpu_seconds_so_far", "bound_so_far", "rmse_so_far", "nlpd_so_far")
-_CURVE_POINTS = 150
+QUICK = {
+    "smooth": DataSet(partial(smooth, 200), 8, 20),
+    "pendulum": DataSet(partial(dynamics, "pendulum", n_trajectories=5, n_steps=12), 8, 20, 0.01, several=True),
+}
+# datasets, seeds, checkpoints and peers that are not given
+DEFAULTS: dict[str, tuple[Any, ...]] = {
+    "against_peers": (list(DATASETS), 1, 12, list(PEERS)),
+    "splits": (list(TABLES), 10, 0, ["skevgp", "GPflow SGPR", _TREES, _LINE]),
+    "quick": (list(QUICK), 1, 3, ["skevgp", "scikit-learn GPR", _TREES, _LINE]),
+}
 
 
-def environment(peer: str) -> dict[str, str]:
-    """Of a peer's process: the same skevgp as here, installed or not."""
-    own = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3"}
-    if PEERS[peer].package == "skevgp":
-        here = str(Path(skevgp.__file__).parents[1])
-        own["PYTHONPATH"] = os.pathsep.join(filter(None, [here, os.environ.get("PYTHONPATH")]))
-    return own
+# --- running -------------------------------------------------------------------------------------------------------
 
 
 def interpreters(peers: Iterable[str], peer_python: str) -> dict[str, str]:
-    """The interpreter of each peer that is installed; says which are not."""
+    """Return the interpreter of each peer that is installed."""
     found = {}
     for peer in peers:
         module = PEERS[peer].package
@@ -117,208 +154,305 @@ def interpreters(peers: Iterable[str], peer_python: str) -> dict[str, str]:
     return found
 
 
-def work(python: str, peer: str, given: Path, result: Path, time_limit: float = 300.0) -> None:
-    """Run a peer in a process of its own.
-
-    Raises
-    ------
-    RuntimeError
-        If the peer failed, with the last line of what it said; or ran over its time.
-    """
-    command = [python, str(Path(__file__).parent / "models.py"), peer, str(given), str(result)]
-    try:
-        done = subprocess.run(
-            command, env=environment(peer), capture_output=True, text=True, timeout=time_limit, check=False
-        )
-    except subprocess.TimeoutExpired as error:
-        raise RuntimeError("time") from error
-    if done.returncode:
-        raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
-
-
-def fit(python: str, peer: str, job: Job) -> Result:
-    """Run a job in a process of its own, which may take its time for all checkpoints."""
+def work(python: str, peer: str, given: dict[str, Any], time_limit: float = 300.0, **variables: str) -> SimpleNamespace:
+    """Run a peer in a process of its own, with the same skevgp as here and further environment variables."""
+    environment = os.environ | {"TF_CPP_MIN_LOG_LEVEL": "3", **variables}
+    if PEERS[peer].package == "skevgp":
+        paths = [str(Path(skevgp.__file__).parents[1]), os.environ.get("PYTHONPATH")]
+        environment["PYTHONPATH"] = os.pathsep.join(filter(None, paths))
     with tempfile.TemporaryDirectory() as folder:
-        given, result = Path(folder, "job.npz"), Path(folder, "result.npz")
-        job.save(given)
-        work(python, peer, given, result, (2 + 4 * (job.n_checkpoints > 0)) * job.time_limit + 60)
-        return Result.load(result)
+        job, result = Path(folder, "job.npz"), Path(folder, "result.npz")
+        np.savez(job, **given)
+        command = [python, str(Path(__file__).with_name("adapters.py")), peer, str(job), str(result)]
+        options = {"env": environment, "capture_output": True, "text": True, "check": False, "timeout": time_limit}
+        try:
+            done = subprocess.run(command, **options)
+        except subprocess.TimeoutExpired as error:
+            raise RuntimeError("time") from error
+        if done.returncode:
+            raise RuntimeError((done.stderr.strip().splitlines() or ["no message"])[-1])
+        return load(result)
 
 
 def scores(Y: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
-    """RMSE and NLPD, over rows; not a number where scikit-learn's GPR has rounded a negative variance up to 0."""
+    """Return RMSE and NLPD. The NLPD is NaN where scikit-learn's GPR has rounded a negative variance up to 0."""
     nlpd = negative_log_predictive_density(Y, mean, std) if (std > 0.0).all() else np.nan
     return {"rmse": float(np.sqrt(np.mean(np.sum((Y - mean) ** 2, axis=1)))), "nlpd": nlpd}
 
 
-def run(python: str, peer: str, data: Data, job: Job, key: Row) -> tuple[Row, list[Row]]:
-    """Fit one peer: its row of the table, and its curve."""
-    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
-    provenance = harness.provenance()
-    values: dict[str, object] = {
-        "m": {"inducing": len(job.inducing_points), "rows": len(job.X), "none": ""}[PEERS[peer].points],
-        "n_train": len(job.X),
-        "load": round(load, 1),
-        "date": provenance["date"],
-        "machine": f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores",
-    }
-    Y = data.sets.Y_test
+def run(python: str, peer: str, sets: Sets, job: dict[str, Any], cell: dict[str, Any]) -> tuple[Any, Any]:
+    """Fit one peer; return its row of the table and its curve."""
+    load_before = os.getloadavg()[0] if hasattr(os, "getloadavg") else np.nan
+    points = {"inducing": len(job["inducing_points"]), "rows": len(job["X"]), "none": ""}[PEERS[peer].points]
+    names = ("seconds", "cpu_seconds", "predict_seconds", "iterations", "evaluations", "stop", "bound", "output_bounds")
+    names += ("rmse", "nlpd", "error_mean", "error_median", "error_p99", "std_norm")
+    row = {**cell, "m": points, "n_train": len(job["X"]), **dict.fromkeys(names, "")}
+    row |= {"load": round(load_before, 1), "date": harness.provenance()["date"], "versions": ""}
+    row["machine"] = f"{platform.processor() or platform.machine()}, {os.cpu_count()} cores"
     try:
-        result = fit(python, peer, job)
-        if not (np.isfinite(result.mean).all() and np.isfinite(result.std).all()):
-            raise RuntimeError("predictions that are not finite")
+        result = work(python, peer, job, (2 + 4 * (job["n_checkpoints"] > 0)) * job["time_limit"] + 60)
     except RuntimeError as error:
-        return {name: str({**key, **values, "stop": f"failed: {error}"}.get(name, "")) for name in COLUMNS}, []
-    errors = np.linalg.norm(Y - result.mean[0], axis=1)
-    values |= {
-        "seconds": result.seconds[0],
-        "cpu_seconds": result.cpu_seconds[0],
-        "predict_seconds": result.predict_seconds,
-        "iterations": result.iterations,
-        "evaluations": result.evaluations,
-        "stop": result.stop,
-        "bound": result.bound[0],
-        "output_bounds": " ".join(f"{bound:.2f}" for bound in result.bounds),
-        **scores(Y, result.mean[0], result.std[0]),
-        "error_mean": errors.mean(),
-        "error_median": np.median(errors),
-        "error_p99": np.quantile(errors, 0.99),
-        "std_norm": std_norm(result.std[0]),
-        "versions": result.versions,
-    }
-    return {name: str({**key, **values}[name]) for name in COLUMNS}, curve_of(
-        result, Y, key | {"n_train": str(len(job.X))}
-    )
-
-
-def curve_of(result: Result, Y: np.ndarray, key: Row) -> list[Row]:
-    """Its bounds on the way, with RMSE and NLPD where it was looked at, and the end."""
-    _, n_bounds = result.curve.shape
-    # The first gains are large, the many later ones small; the last point is kept.
-    some = np.linspace(0, n_bounds - 1, min(n_bounds, _CURVE_POINTS)).round().astype(int)
-    some = np.union1d(some, np.arange(min(_CURVE_POINTS, n_bounds)))
-    points = [(*result.curve[:, i], {"rmse": "", "nlpd": ""}) for i in some]
-    for i in range(len(result.seconds)):
-        looked_at = scores(Y, result.mean[i], result.std[i])
-        points.append(
-            (result.seconds[i], result.cpu_seconds[i], result.bound[i], {n: f"{v:.6f}" for n, v in looked_at.items()})
-        )
-    return [
-        {
-            **key,
-            "seconds_so_far": f"{seconds:.4f}",
-            "cpu_seconds_so_far": f"{cpu_seconds:.4f}",
-            "bound_so_far": f"{bound:.3f}",
-            **{f"{name}_so_far": value for name, value in looked_at.items()},
-        }
-        for seconds, cpu_seconds, bound, looked_at in sorted(points, key=lambda point: point[:2])
+        return row | {"stop": f"failed: {error}"}, []
+    Y, mean, std = sets.Y_test, result.mean[0], result.std[0]
+    if not (np.isfinite(mean).all() and np.isfinite(std).all()):
+        return row | {"stop": "failed: predictions that are not finite"}, []
+    errors = np.linalg.norm(Y - mean, axis=1)
+    row |= {name: getattr(result, name) for name in ("predict_seconds", "iterations", "evaluations", "stop")}
+    row |= {"seconds": result.seconds[0], "cpu_seconds": result.cpu_seconds[0], "bound": result.bound[0]}
+    row |= {"output_bounds": " ".join(f"{bound:.2f}" for bound in result.bounds), **scores(Y, mean, std)}
+    row |= {"error_mean": errors.mean(), "error_median": np.median(errors), "error_p99": np.quantile(errors, 0.99)}
+    row |= {"std_norm": std_norm(std), "versions": result.versions}
+    # The first gains are large and the many later ones small. The last point is kept.
+    n, most = result.curve.shape[1], 150
+    some = np.union1d(np.linspace(0, n - 1, min(n, most)).round().astype(int), np.arange(min(most, n)))
+    curve = [(*result.curve[:, i], "", "") for i in some]
+    for i, (seconds, cpu_seconds, bound) in enumerate(
+        zip(result.seconds, result.cpu_seconds, result.bound, strict=True)
+    ):
+        looked_at = (f"{value:.6f}" for value in scores(Y, result.mean[i], result.std[i]).values())
+        curve.append((seconds, cpu_seconds, bound, *looked_at))
+    so_far = ("seconds", "cpu_seconds", "bound", "rmse", "nlpd")
+    return row, [
+        {**cell, "n_train": len(job["X"]), **{f"{name}_so_far": v for name, v in zip(so_far, point, strict=True)}}
+        for point in sorted(curve, key=lambda point: point[:2])
     ]
 
 
-class Table:
-    """A CSV of rows by key; written anew at each change, so that an interrupted run loses one fit at most."""
+# --- agreement -----------------------------------------------------------------------------------------------------
 
-    def __init__(self, path: Path, columns: tuple[str, ...]):
-        self.path, self.columns, self.rows = path, columns, harness.read(path)
-        if self.rows and set(self.rows[0]) != set(columns):
-            raise SystemExit(f"{path} has other columns, of another version: give another --output, or move it away.")
 
-    def of(self, key: Row) -> list[Row]:
-        return [row for row in self.rows if all(row[name] == value for name, value in key.items())]
+def cases() -> list[dict[str, Any]]:
+    """Return each kernel with 500 rows and 20 inducing points, and with 60 rows that are all inducing points."""
+    made = []
+    for kernel in ("rbf", "matern52"):
+        for n, m in ((500, 20), (60, 60)):
+            rng = np.random.RandomState(m)
+            X, X_test = rng.uniform(-2.0, 2.0, (n, 3)), rng.uniform(-2.0, 2.0, (50, 3))
+            y = np.sin(X).sum(axis=1) + 0.2 * rng.randn(n)
+            points = X if m == n else rng.uniform(-2.0, 2.0, (m, 3))
+            case = {"kernel": kernel, "X": X, "y": y, "X_test": X_test, "inducing_points": points}
+            made.append({**case, "lengthscales": np.array([0.6, 0.9, 1.2]), "signal": 1.7, "noise": 0.05})
+    return made
 
-    def replace(self, key: Row, rows: list[Row]) -> None:
-        """Put rows in place of those of the same key."""
-        self.rows = [row for row in self.rows if any(row[name] != key[name] for name in KEY)] + rows
-        harness.write(self.rows, self.columns, self.path)
+
+def expected(case: dict[str, Any]) -> tuple[float, np.ndarray, np.ndarray]:
+    """Compute bound (Titsias 2009, equation 9), mean and variance (equation 6, with noise) by dense matrices."""
+    X, y, Z, signal, noise = (case[name] for name in ("X", "y", "inducing_points", "signal", "noise"))
+
+    def covariance(A: np.ndarray, B: np.ndarray) -> np.ndarray:
+        r = cdist(A / case["lengthscales"], B / case["lengthscales"])
+        if case["kernel"] == "rbf":
+            return signal * np.exp(-0.5 * r**2)
+        return signal * (1.0 + np.sqrt(5.0) * r + 5.0 / 3.0 * r**2) * np.exp(-np.sqrt(5.0) * r)
+
+    Kmm, Kmn, Kms = (covariance(Z, other) for other in (Z, X, case["X_test"]))
+    Q = Kmn.T @ np.linalg.solve(Kmm, Kmn)
+    Q = 0.5 * (Q + Q.T)
+    bound = multivariate_normal(np.zeros(len(X)), Q + noise * np.eye(len(X))).logpdf(y)
+    bound -= 0.5 * (signal - np.diagonal(Q)).sum() / noise
+    precision = cho_factor(Kmm + Kmn @ Kmn.T / noise)
+    explained = np.einsum("ms,ms->s", Kms, np.linalg.solve(Kmm, Kms) - cho_solve(precision, Kms))
+    return float(bound), Kms.T @ cho_solve(precision, Kmn @ y) / noise, signal - explained + noise
+
+
+def check(pythons: dict[str, str]) -> None:
+    """Compare one peer of each library with dense matrices; exit with an error if a library disagrees."""
+    asked = {PEERS[peer].package: peer for peer in reversed(pythons) if PEERS[peer].at_fixed}
+    for package, peer in asked.items():
+        worst = 0.0
+        for case in cases():
+            if PEERS[peer].points == "rows" and len(case["inducing_points"]) < len(case["X"]):
+                continue
+            said, (bound, mean, variance) = work(pythons[peer], peer, case), expected(case)
+            apart = abs(said.bound / bound - 1.0), np.max(np.abs(said.mean - mean)) / np.max(np.abs(mean))
+            worst = max(worst, *apart, np.max(np.abs(said.variance / variance - 1.0)))
+        if not worst <= TOLERANCE:
+            raise SystemExit(f"{package} disagrees: {worst:.1e} from the dense matrices. Nothing was timed.")
+        print(f"{package} agrees with dense matrices to {worst:.0e} (jitter: {PEERS[peer].jitter})", flush=True)
+
+
+# --- tables and picture --------------------------------------------------------------------------------------------
+
+
+def time_to_reach(curve: pd.DataFrame, name: str, target: float, clock: str) -> float:
+    """Return seconds until the bound rose, or the NLPD fell, to a target; NaN if it never did."""
+    sign = -1.0 if name == "nlpd" else 1.0
+    points = curve.dropna(subset=f"{name}_so_far")
+    seconds, values = points[f"{clock}_so_far"].to_numpy(), sign * points[f"{name}_so_far"].to_numpy()
+    reached = np.flatnonzero(values >= sign * target)
+    if not len(reached):
+        return np.nan
+    i = reached[0]
+    if i == 0 or not values[i] > values[i - 1]:
+        return float(seconds[i])
+    share = (sign * target - values[i - 1]) / (values[i] - values[i - 1])
+    return float(np.exp(np.interp(share, (0.0, 1.0), np.log(np.maximum(seconds[i - 1 : i + 1], 1e-9)))))
+
+
+def first_seed(rows: pd.DataFrame, curves: pd.DataFrame) -> pd.DataFrame:
+    """Return a line per fit of one data set and seed, with times to the last bound and NLPD of GPflow's SGPR."""
+    reference = rows[(rows["peer"] == "GPflow SGPR") & (rows["sharing"] == "none")].dropna(subset="seconds")
+    lines = []
+    for row in rows.itertuples():
+        line = {"peer": row.peer, "sharing": row.sharing, "rows": row.n_train}
+        line["m"] = "" if pd.isna(row.m) else f"{row.m:.0f}"
+        line |= {"seconds": row.seconds, "cpu s": row.cpu_seconds}
+        line["iterations"] = "" if pd.isna(row.iterations) else f"{row.iterations:.0f}"
+        line["bound / row"] = "" if pd.isna(row.bound) else f"{row.bound / row.n_train:.4f}"
+        line |= {"RMSE": row.rmse, "NLPD": "" if pd.isna(row.nlpd) else f"{row.nlpd:.4f}"}
+        line |= dict.fromkeys(("to bound, s", "×", "× net", "× by cpu", "to NLPD, s"), np.nan)
+        same = reference[reference["n_train"] == row.n_train]
+        if len(same) and len(curves):
+            best = same.iloc[0]
+            own = curves[(curves["peer"] == row.peer) & (curves["sharing"] == row.sharing)]
+            bound = best["bound"] - 0.01  # the curve's bounds are rounded
+            to_bound, cpu = (time_to_reach(own, "bound", bound, clock) for clock in ("seconds", "cpu_seconds"))
+            first = curves[(curves["peer"] == "GPflow SGPR") & (curves["sharing"] == "none")]["seconds_so_far"]
+            line |= {"to bound, s": to_bound, "×": best["seconds"] / to_bound}
+            line["× net"] = (best["seconds"] - first.head(1).sum()) / to_bound
+            line["× by cpu"] = best["cpu_seconds"] / cpu
+            line["to NLPD, s"] = time_to_reach(own, "nlpd", best["nlpd"] + 1e-6, "seconds")
+        lines.append({**line, "load": str(row.load), "stop": " ".join(dict.fromkeys(row.stop.split()))})
+    return pd.DataFrame(lines)
+
+
+def all_seeds(rows: pd.DataFrame, what: str) -> pd.DataFrame:
+    """Return means ± standard errors over seeds, and the median of the seconds."""
+
+    def text(values: pd.Series) -> str:
+        error = f" ± {values.std() / np.sqrt(len(values)):.4f}" if len(values) > 1 else ""
+        return f"{values.mean():.4f}{error}"
+
+    found = rows.dropna(subset="seconds").groupby(["peer", "sharing"], sort=False)
+    lines = {what: found.size(), "RMSE": found["rmse"].apply(text), "NLPD": found["nlpd"].apply(text)}
+    return pd.DataFrame({**lines, "seconds": found["seconds"].median()}).reset_index()
+
+
+def tables_of(rows: pd.DataFrame, curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return two tables per data set: its first seed, and means over seeds if there are several."""
+    tables = {}
+    for name, own in rows.groupby("dataset", sort=False):
+        what, first = "split" if name in TABLES else "seed", own["seed"].min()
+        on_the_way = curves[(curves["dataset"] == name) & (curves["seed"] == first)] if len(curves) else curves
+        tables[f"{name}, {what} {first}"] = first_seed(own[own["seed"] == first], on_the_way)
+        if own["seed"].nunique() > 1:
+            tables[f"{name}, all"] = all_seeds(own, f"{what}s")
+    return tables
+
+
+def plot(rows: pd.DataFrame, curves: pd.DataFrame, path: Path) -> None:
+    """Draw bound per row and NLPD over processor time, of the first seed of each data set."""
+    curves = curves[[PEERS[peer].points != "none" for peer in curves["peer"]]]
+    names = list(rows["dataset"].unique())
+    size = (harness.WIDTH, 1.0 + 1.9 * len(names))
+    figure, grid = harness.pyplot().subplots(len(names), 2, figsize=size, squeeze=False, sharex="row")
+    palette = dict(zip(["skevgp", "GPflow SGPR", "GPyTorch SGPR", "GPJax SGPR"], harness.PALETTE, strict=False))
+    for panels, name in zip(grid, names, strict=True):
+        own = curves[(curves["dataset"] == name) & (curves["seed"] == curves["seed"].min())]
+        size = f"{name}, {rows[rows['dataset'] == name]['n_train'].max():,} rows"
+        for axes, measure in zip(panels, ("bound", "nlpd"), strict=True):
+            ends = []
+            for (peer, sharing), line in own.dropna(subset=f"{measure}_so_far").groupby(["peer", "sharing"]):
+                points = line.sort_values("cpu_seconds_so_far")
+                values = points[f"{measure}_so_far"]
+                if measure == "bound":
+                    values = values.cummax() / points["n_train"]
+                style = {
+                    "color": palette.get(peer, "#555555"),
+                    "linestyle": {"none": "-", "all": "--"}.get(sharing, ":"),
+                }
+                label = peer + {"none": "", "all": ", shared"}.get(sharing, f", sharing={sharing}")
+                axes.plot(points["cpu_seconds_so_far"], values, label=label, **style)
+                axes.plot(points["cpu_seconds_so_far"].iloc[-1], values.iloc[-1], "o", color=style["color"])
+                ends.append(values.iloc[-1])
+            harness.logarithmic(axes, "x")
+            axes.set(title=f"{size}: {'bound' if measure == 'bound' else 'test NLPD'}", ylabel="nats per row")
+            if ends:  # the way up to where the worst fit ended says little
+                low, room = min(ends), max(np.ptp(ends), 0.1)
+                limits = (low - room, max(ends) + 0.15 * room), (low - 0.15 * room, low + 2.0 * room)
+                axes.set_ylim(limits[measure == "nlpd"])
+    for axes in grid[-1]:
+        axes.set_xlabel("seconds of the processor, all threads")
+    harness.legend(figure, ncols=3)
+    harness.save_picture(figure, path)
+
+
+# --- command -------------------------------------------------------------------------------------------------------
 
 
 def arguments() -> argparse.Namespace:
     parser = harness.argument_parser(
-        __doc__, quick="small data in half a minute", seeds="seeds or splits 0, 1, ...; default: 1", in_processes=False
+        __doc__, quick="small data in half a minute", seeds="number of seeds or splits; default: 1", in_processes=False
     )
     parser.add_argument("--datasets", nargs="+", choices=DATASETS, metavar="NAME", help=f"of {', '.join(DATASETS)}")
     parser.add_argument("--data-folder", type=Path, help="with the tables; default: they are left out")
     parser.add_argument("--peers", nargs="+", choices=PEERS, metavar="PEER", help=f"of {', '.join(PEERS)}")
     parser.add_argument("--sharing", nargs="+", choices=("none", "all", "default"), help="default: all")
     parser.add_argument("--all-splits", action="store_true", help="other defaults: the tables, 10 splits, no curves")
-    said = "times before the end at which a fit of the first seed is looked at, 0 and more; default: 12"
+    said = "times before the end at which a fit of the first seed is looked at; default: 12"
     parser.add_argument("--checkpoints", type=int, help=said)
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch, or GPJax")
     parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
     options = parser.parse_args()
-    name = "splits" if options.all_splits else "against_peers"
-    for option, value in DEFAULTS["against_peers_quick" if options.quick else name].items():
+    options.name = "splits" if options.all_splits else "against_peers"
+    defaults = DEFAULTS["quick" if options.quick else options.name]
+    for option, value in zip(("datasets", "seeds", "checkpoints", "peers"), defaults, strict=True):
         if getattr(options, option) is None:
-            setattr(options, option, value)
-            if option == "datasets" and options.data_folder is None:
-                options.datasets = [name for name in value if name not in _TABLES]
-    known = QUICK if options.quick else DATASETS
-    options.datasets = {name: known[name] for name in options.datasets if name in known}
-    options.output = harness.output_path(options, name)
+            missing = TABLES if option == "datasets" and options.data_folder is None else ()
+            setattr(options, option, [one for one in value if one not in missing] if missing else value)
     return options
-
-
-def sharings(peer: str, dataset: DataSet, chosen: list[str] | None) -> list[str]:
-    """With one output there is nothing to share."""
-    if not dataset.several:
-        return ["none"]
-    return [sharing for sharing in PEERS[peer].sharing if chosen is None or sharing in chosen]
-
-
-def run_missing(
-    name: str, seed: int, pythons: dict[str, str], options: argparse.Namespace, table: Table, curves: Table
-) -> None:
-    """All fits of a data set that the tables do not have."""
-    dataset: DataSet = options.datasets[name]
-    keys = [
-        dict(zip(KEY, (peer, name, sharing, str(seed)), strict=True))
-        for peer in pythons
-        for sharing in sharings(peer, dataset, options.sharing)
-    ]
-    keys = [key for key in keys if options.redo or not table.of(key)]
-    data = Data.of(dataset, seed, options.data_folder) if keys else None
-    for key in keys:
-        peer = key["peer"]
-        options.agree()
-        rows = data.rows(PEERS[peer].points == "rows", seed)
-        job = Job(
-            data.sets.X[rows],
-            data.sets.Y[rows],
-            data.sets.X_test,
-            data.inducing_points,
-            data.lengthscales,
-            dataset.first_noise,
-            key["sharing"],
-            0 if PEERS[peer].own_rule and not options.quick else dataset.max_iter,
-            options.time_limit,
-            seed,
-            options.checkpoints if seed == 0 else 0,
-        )
-        print(f"{name}, seed {seed}: {peer}, sharing {key['sharing']} ...", end=" ", flush=True)
-        row, curve = run(pythons[peer], peer, data, job, key)
-        table.replace(key, [row])
-        curves.replace(key, curve)
-        said = "RMSE {:.4f}, NLPD {:.4f} in {:.2f} s,"
-        numbers = [float(row[name]) for name in ("rmse", "nlpd", "seconds") if row["seconds"]]
-        print(said.format(*numbers) if numbers else "", row["stop"], flush=True)
 
 
 def main() -> None:
     options = arguments()
-    try:
-        harness.pyplot()  # before the fits, not after them
-    except ImportError as problem:
-        raise SystemExit(f"No picture could be drawn ({problem}): pip install matplotlib") from problem
-    table = Table(options.output, COLUMNS)
-    curves = Table(options.output.with_name(f"{options.output.stem}_curves.csv"), CURVE_COLUMNS)
-    pythons = interpreters(options.peers, options.peer_python)
-    options.agree = cache(partial(agreement.check, pythons, work))  # once, before the first fit
-    for name in options.datasets:
-        for seed in range(options.seeds):
-            run_missing(name, seed, pythons, options, table, curves)
-    against_peers_report.draw(table.rows, curves.rows, options.output.with_suffix(".png"))
-    harness.write_report(against_peers_report.paragraphs(table.rows, curves.rows), options.output)
+    harness.pyplot()  # fail before the fits if matplotlib is missing
+    output = harness.output_path(options, options.name)
+    curves_output = output.with_name(f"{output.stem}_curves.csv")
+    pythons, checked = interpreters(options.peers, options.peer_python), False
+    known = QUICK if options.quick else DATASETS
+    for name, seed in ((name, seed) for name in options.datasets if name in known for seed in range(options.seeds)):
+        dataset, sets = known[name], None
+        for peer in pythons:
+            for sharing in PEERS[peer].sharing if dataset.several else ("none",):
+                cell = dict(zip(KEY, (peer, name, sharing, seed), strict=True))
+                values = tuple(map(str, cell.values()))
+                done = any(tuple(row[part] for part in KEY) == values for row in harness.read(output))
+                if (done and not options.redo) or (options.sharing and sharing not in options.sharing):
+                    continue
+                if not checked:
+                    check(pythons)
+                    checked = True
+                if sets is None:
+                    sets = dataset.load(seed, options.data_folder)
+                    start = EVGPRegressor(n_inducing=dataset.n_inducing, sharing="all", max_iter=0, random_state=seed)
+                    kernel = np.ravel(start.fit(sets.X, sets.Y).kernel_)[0]
+                rows: Any = slice(None)
+                if PEERS[peer].points == "rows" and len(sets.X) > SUBSET:
+                    rows = np.random.RandomState(seed).choice(len(sets.X), SUBSET, replace=False)
+                job = {
+                    "X": sets.X[rows],
+                    "Y": sets.Y[rows],
+                    "X_test": sets.X_test,
+                    "inducing_points": start.inducing_points_,
+                    "lengthscales": np.broadcast_to(kernel.k2.length_scale, sets.X.shape[1]),
+                    "noise": dataset.first_noise,
+                    "sharing": sharing,
+                    "max_iter": 0 if PEERS[peer].own_rule and not options.quick else dataset.max_iter,
+                    "time_limit": options.time_limit,
+                    "seed": seed,
+                    "n_checkpoints": options.checkpoints if seed == 0 else 0,
+                }
+                row, curve = run(pythons[peer], peer, sets, job, cell)
+                for path, new in ((output, [row]), (curves_output, curve)):
+                    if new:
+                        harness.make_way(values, KEY, list(new[0]), path)
+                        harness.append(new, path)
+                print(f"{name}, seed {seed}: {peer}, {sharing}: {row['seconds']} s, {row['stop']}", flush=True)
+    rows, curves = harness.frame(output), harness.frame(curves_output)
+    if len(curves):
+        plot(rows, curves, output.with_suffix(".png"))
+    harness.write_page("skevgp against other libraries", tables_of(rows, curves), output)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""What a Gaussian process package brings along: what pip installs, how large that is, and how much code it is itself.
+"""The size of Gaussian process packages: what pip installs with each, in MB, and how much code it is.
 
 Each package is installed by pip, alone, in an empty environment; the CSV has one row per package. Code is counted in
 lines of the package's own Python files that hold code (tests left out): no comments, no docstrings, no blank lines.
@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import ast
-import csv
 import io
 import json
 import os
@@ -22,6 +21,8 @@ import tempfile
 import tokenize
 from datetime import UTC, datetime
 from pathlib import Path
+
+import pandas as pd
 
 ROOT = Path(__file__).resolve().parents[2]
 # The distribution to install, and the module that it brings.
@@ -95,17 +96,13 @@ def main() -> None:
     parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=list(PACKAGES))
     parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".csv"))
     options = parser.parse_args()
-    rows = {}
-    if options.output.exists():
-        with options.output.open(encoding="utf-8") as file:
-            rows = {row["package"]: row for row in csv.DictReader(file)}
+    rows = pd.read_csv(options.output, dtype=str) if options.output.exists() else pd.DataFrame()
     for name in options.packages:
-        rows[name] = measured(name)
-        print(rows[name], flush=True)
-        with options.output.open("w", encoding="utf-8", newline="") as file:
-            writer = csv.DictWriter(file, list(rows[name]))
-            writer.writeheader()
-            writer.writerows(rows[each] for each in PACKAGES if each in rows)
+        row = pd.DataFrame([measured(name)])
+        print(row.to_string(), flush=True)
+        others = rows[rows["package"] != name] if len(rows) else rows
+        rows = pd.concat([others, row]).sort_values("package", key=lambda names: names.map(list(PACKAGES).index))
+        rows.to_csv(options.output, index=False)
 
 
 if __name__ == "__main__":

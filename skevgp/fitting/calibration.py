@@ -112,7 +112,6 @@ def _by_folds(
     wider, left_over = _WIDER if by.wide else 1.0, _left_over(model, values, statistics)
     s_low, s_high, at_bound = s_low / wider, s_high * wider, values["signal"]
     noises = variances(table["noise"], values["noise"], np.maximum(low, np.minimum(_LEFT_OVER * left_over, high)), high)
-    free = variances(table["signal"], at_bound, s_low, s_high)
     if by.groups is None:
         # Without noise, errors still fall where the signal rises, and std rises with it: the signal stays.
         most = np.where(values["noise"] <= _NOISELESS * low, at_bound, np.inf)
@@ -123,6 +122,7 @@ def _by_folds(
     found = list(rows.threads(VarianceSearch.best, searches))
     gone, dependent, still = 0, False, rows.is_constant()
     if by.groups is not None:
+        free = variances(table["signal"], at_bound, s_low, s_high)
         explained = (values["noise"] < (1.0 - _EXPLAINED) * rows.scatter()) & ~still
         groups = [by.groups[fold.predicted] for fold in folds]
         for o, own in enumerate(searches):

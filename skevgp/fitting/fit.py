@@ -152,8 +152,21 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     else:
         predictor = sparse.at_optimum(values, statistics, blocks=model.blocks)
     message = " ".join(part for part in messages if part)
-    one = FittedModel(sparse, model.table, values, statistics, predictor, fit.loss_curve, message, dependent, doubts)
-    one = replace(one, known_bound=bound, known_upper_bound=upper_bound, is_exact=is_exact)
+    one = FittedModel(
+        sparse,
+        model.table,
+        values,
+        statistics,
+        predictor,
+        fit.loss_curve,
+        message,
+        dependent,
+        0 if found is None else found.gone,
+        doubts,
+        known_bound=bound,
+        known_upper_bound=upper_bound,
+        is_exact=is_exact,
+    )
     return one if doubts is None else doubts.told(one)
 
 
@@ -172,6 +185,8 @@ class FittedModel:
     message: str
     # Whether neighbouring rows are alike.
     dependent: bool = False
+    # Number of outputs that predict held-out groups no better than the features alone.
+    gone: int = 0
     # Only for noise with heavy tails.
     doubts: RowDoubts | None = None
     # Only if they are more accurate than from the statistics.
@@ -257,6 +272,11 @@ class Fitted:
     def dependent(self) -> bool:
         """Whether neighbouring rows are alike."""
         return any(one.dependent for one in self.models)
+
+    @property
+    def gone(self) -> int:
+        """Number of outputs that predict held-out groups no better than the features alone."""
+        return sum(one.gone for one in self.models)
 
     @property
     def lower_bound(self) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -14,8 +15,10 @@ from ..utils.validation import check_real
 class Noise(StatefulEstimator):
     """A noise model with its options."""
 
-    # Whether rows have scales that the fit estimates. A subclass then has `row_scales`.
+    # Whether rows have scales that the fit estimates. A subclass then has the method `row_scales`, which returns q(τ)
+    # for a number of outputs and d = Σ_o E(y - g)² / (σ² v) of each row, (n,).
     heavy_tails: ClassVar[bool] = False
+    row_scales: Callable[[int, np.ndarray], RowScales]
 
     # Noise variance at the start of a fit. None: taken from the data.
     variance: float | None
@@ -26,23 +29,6 @@ class Noise(StatefulEstimator):
         """Raise an error if an option is out of range."""
         if self.variance is not None:
             check_real(self.variance, f"variance of {type(self).__name__}", minimum=0.0, strict=True)
-
-    def row_scales(self, n_outputs: int, distances: np.ndarray) -> RowScales:
-        """Return the noise scales of rows, q(τ).
-
-        Parameters
-        ----------
-        n_outputs : int
-            Number of outputs o.
-        distances : ndarray of shape (n_rows,)
-            d = Σ_o E(y - g)² / (σ² v) of each row.
-
-        Returns
-        -------
-        scales : RowScales
-            With E[τ] and the probability of being an outlier.
-        """
-        raise NotImplementedError
 
 
 class RowScales(Protocol):

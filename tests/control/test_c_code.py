@@ -1,14 +1,12 @@
 import ctypes
 import shutil
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
 
-import casadi as ca
 import numpy as np
 import pytest
 from sklearn.pipeline import make_union
 
-from skevgp import CoefPrior, ResidualRegressor
+from skevgp import CoefPrior
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 
 from .export_cases import MODELS, POLYNOMIAL, data, fitted, jacobians, predicted, sparse
@@ -88,99 +86,21 @@ def exported(tmp_path_factory):
     return model, compiled(model.to_c(tmp_path_factory.mktemp("c"), "arm", include_noise=False)[0])
 
 
-def test_the_noise_is_left_out_if_that_is_asked_for(exported):
+def test_noise_is_left_out_if_that_is_asked_for(exported):
     model, library = exported
     x = data(seed=1)[0][0]
     found = called(library, "arm", x, 3, "predict")
     np.testing.assert_allclose(found["variance"], predicted(model, x.reshape(1, -1), False)[1][0], rtol=1e-9)
 
 
-@pytest.mark.parametrize("left_out", SHAPES["jacobian"])
-def test_results_may_be_left_out(exported, left_out):
-    _, library = exported
-    x = data(seed=1)[0][0]
-    all_of_them, others = (called(library, "arm", x, 3, without=names) for names in ((), (left_out,)))
-    assert np.isnan(others.pop(left_out)).all()
-    for name, values in others.items():
-        np.testing.assert_array_equal(values, all_of_them[name])
-
-
-def test_threads_may_share_the_functions(exported):
-    _, library = exported
-    X = np.tile(data(seed=1)[0], (5, 1))
-    alone = [called(library, "arm", x, 3) for x in X]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda x: called(library, "arm", x, 3), X))
-    for one, other in zip(alone, together, strict=True):
-        for name in one:
-            np.testing.assert_array_equal(one[name], other[name])
-
-
-def test_casadi_loads_the_library(exported):
-    model, library = exported
-    x = data(seed=1)[0][0]
-    mean, _ = ca.external("arm", str(library))(x)
-    np.testing.assert_allclose(mean.full().ravel(), model.predict(x.reshape(1, -1))[0], rtol=1e-9)
-
-
-def test_a_program_needs_the_two_files_alone(tmp_path):
-    X, y = data()
-    model = ResidualRegressor(sparse()).fit(X, y)
-    source, header = model.to_c(tmp_path / "model.c", "change", jacobian=False)
-    assert "jacobian(" not in header.read_text()
-    (tmp_path / "main.c").write_text(
-        '#include <stdio.h>\n#include "model.h"\n'
-        "int main(void) {\n"
-        f"  double x[MODEL_N_FEATURES] = {{{', '.join(map(repr, X[0].tolist()))}}};\n"
-        "  double mean[MODEL_N_OUTPUTS], variance[MODEL_N_OUTPUTS];\n"
-        "  int i, failed = change_predict(x, mean, variance);\n"
-        '  for (i = 0; i < MODEL_N_OUTPUTS; ++i) printf("%.17g %.17g\\n", mean[i], variance[i]);\n'
-        "  return failed;\n}\n"
-    )
-    program = tmp_path / "main"
-    command = [COMPILER, *WARNINGS, "-o", program, tmp_path / "main.c", source, "-lm"]
-    subprocess.run(list(map(str, command)), check=True)
-    told = subprocess.run([str(program)], check=True, capture_output=True, text=True).stdout
-    mean, variance = predicted(model, X[:1])
-    np.testing.assert_allclose(
-        np.array(told.split(), dtype=float), np.stack([mean[0], variance[0]], 1).ravel(), rtol=1e-9
-    )
-
-
-def test_the_header_says_what_is_what(tmp_path):
-    pandas = pytest.importorskip("pandas")
-    X, y = data()
-    model = sparse().fit(pandas.DataFrame(X, columns=["q", "v", "a*/", "u", "w"]), y)
-    _, header = model.to_c(tmp_path, include_noise=False)
-    text = header.read_text()
-    assert "q, v, a* /, u, w" in text
-    assert "without the noise of y" in text
-    assert f"CasADi {ca.CasadiMeta.version()}" in text
-    assert "int evgp_predict(const double *x, double *mean, double *variance);" in text
-
-
-def test_files_may_be_called_otherwise_than_functions(tmp_path):
-    source, header = fitted(sparse()).to_c(tmp_path / "2dof-arm.c", "arm", jacobian=False)
-    compiled(source)
-    assert "-c 2dof-arm.c," in header.read_text()
-    assert "#define MODEL_2DOF_ARM_N_FEATURES 5" in header.read_text()
-
-
-def test_names_of_columns_do_not_end_or_begin_a_comment(tmp_path):
-    pandas = pytest.importorskip("pandas")
-    X, y = data()
-    source, _ = sparse().fit(pandas.DataFrame(X, columns=["/*", "*/", "/*/", "*/*", "w"]), y).to_c(tmp_path)
-    compiled(source)
-
-
 @pytest.mark.parametrize("name", ["int", "restrict", "sin", "fmaf", "x", "casadi_int", "NAN"])
-def test_a_name_that_is_taken_in_c_is_refused(name, tmp_path):
+def test_reserved_c_name_raises(name, tmp_path):
     with pytest.raises(ValueError, match=f"name='{name}' means something else in C"):
         fitted(sparse()).to_c(tmp_path, name)
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_that_is_not_there_is_told(tmp_path):
+def test_missing_folder_raises(tmp_path):
     model = fitted(sparse())
     with pytest.raises(ValueError, match=r"path=.*there is no folder .*missing"):
         model.to_c(tmp_path / "missing" / "model.c")

@@ -5,10 +5,9 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
-from sklearn.exceptions import NotFittedError
 from sklearn.preprocessing import PolynomialFeatures
 
-from skevgp import EVGPRegressor, ResidualRegressor
+from skevgp import EVGPRegressor
 
 from .cases import QUICK
 
@@ -21,7 +20,7 @@ def same(found, expected):
 
 
 @pytest.mark.parametrize("include_noise", [True, False])
-def test_it_says_what_the_estimator_says(model, data, include_noise):
+def test_compiled_model_predicts_like_estimator(model, data, include_noise):
     X, options = data[2], {"return_std": True, "include_noise": include_noise}
     compiled = model.compile(include_noise)
     mean, std = model.predict(X, **options)
@@ -37,25 +36,8 @@ def test_it_says_what_the_estimator_says(model, data, include_noise):
         np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-11)
 
 
-def test_one_row_has_no_axis_of_rows(model, data):
-    X, compiled = data[2], model.compile()
-    expected = compiled.value_and_jacobian(X, return_std=True)
-    for i, row in enumerate(X):
-        same(compiled.value_and_jacobian(row, return_std=True), [part[i] for part in expected])
-        same(compiled.predict(row, return_std=True), [expected[0][i], expected[2][i]])
-
-
-def test_one_output_has_no_axis_of_outputs(data):
-    X, Y, X_new = data
-    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, **QUICK).fit(X, Y[:, 0])
-    compiled = model.compile()
-    same(compiled.value_and_jacobian(X_new, return_std=True), model.value_and_jacobian(X_new, return_std=True))
-    assert [part.shape for part in compiled.value_and_jacobian(X_new[0], return_std=True)] == [(), (2,), (), (2,)]
-    assert [part.shape for part in compiled.predict(X_new[0], return_std=True)] == [(), ()]
-
-
 @pytest.mark.parametrize("n_inducing", [15, 100])
-def test_it_is_frozen_until_it_is_told_of_new_weights(data, n_inducing):
+def test_compiled_model_updates_on_request(data, n_inducing):
     """With points at all rows the fit is exact, and an update makes it a sparse one."""
     X, Y, X_new = data
     model = EVGPRegressor(PolynomialFeatures(1), n_inducing=n_inducing, **QUICK).fit(X[:100], Y[:100])
@@ -77,32 +59,3 @@ def test_threads_may_share_it_and_it_can_be_pickled(model, data):
     for i, each in enumerate(found):
         for one, other in zip(each, expected[i // 30], strict=True):
             np.testing.assert_array_equal(one, other)
-
-
-def test_of_a_residual_regressor_it_is_of_the_sum(data):
-    X, Y, X_new = data
-    model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0]).fit(X, Y)
-    compiled = model.compile()
-    same(compiled.value_and_jacobian(X_new, return_std=True), model.value_and_jacobian(X_new, return_std=True))
-    same(compiled.predict(X_new, return_std=True), model.predict(X_new, return_std=True))
-    model.partial_fit(X, Y + 1.0)
-    compiled.update(model)
-    same(compiled.predict(X_new, return_std=True), model.predict(X_new, return_std=True))
-
-
-def test_weights_of_another_fit_are_refused(data):
-    X, Y, X_new = data
-    model = EVGPRegressor(PolynomialFeatures(1), n_inducing=10, **QUICK).fit(X, Y)
-    compiled, before = model.compile(), model.predict(X_new)
-    for other in (EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y), model.fit(2.0 * X, Y)):
-        with pytest.raises(ValueError, match="model of the same fit"):
-            compiled.update(other)
-    with pytest.raises(NotFittedError):
-        compiled.update(EVGPRegressor())
-    same([compiled.predict(X_new)], [before])
-
-
-def test_before_a_fit_there_is_nothing_to_compile():
-    for model in (EVGPRegressor(), ResidualRegressor(EVGPRegressor())):
-        with pytest.raises(NotFittedError):
-            model.compile()

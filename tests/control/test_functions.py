@@ -7,8 +7,7 @@ import pytest
 from sklearn.gaussian_process.kernels import RBF, DotProduct, Matern, RationalQuadratic
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures
 
-from skevgp import BayesianMLPRegressor, CoefPrior, EGPRegressor, EVGPRegressor, ResidualRegressor
-from skevgp.kernels import FunctionKernel
+from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
 from skevgp.solvers import LBFGS
 
 from .cases import N_OUTPUTS, QUICK, D, own_features, quick
@@ -17,7 +16,7 @@ from .test_derivatives import close, differences
 N, N_PATHS = 1500, 20_000
 
 
-def test_they_have_the_posteriors_mean_and_covariance(model, data):
+def test_functions_have_posterior_mean_and_covariance(model, data):
     X = data[2]
     values = model.sample_functions(N, n_waves=1500)(X)
     assert values.shape == (N, len(X), N_OUTPUTS)
@@ -38,7 +37,7 @@ def test_they_have_the_posteriors_mean_and_covariance(model, data):
     [Matern([1.0, 1.0], nu=1.5), Matern([1.0, 1.0], nu=2.5), RationalQuadratic(1.0, 1.0), RBF([1.0, 1.0])],
     ids=["matern 3/2", "matern 5/2", "rational quadratic", "rbf"],
 )
-def test_the_variance_between_points_is_right_for_rough_functions_too(kernel):
+def test_variance_between_points_is_right_for_rough_functions_too(kernel):
     """What inducing points leave of a fitted kernel is far out in its spectrum."""
     rng = np.random.RandomState(0)
     X = rng.uniform(-2.0, 2.0, (150, 2))
@@ -49,14 +48,6 @@ def test_the_variance_between_points_is_right_for_rough_functions_too(kernel):
     assert 0.9 < np.median(ratio) < 1.1
     assert np.quantile(ratio, 0.05) > 0.75
     assert np.quantile(ratio, 0.95) < 1.3
-
-
-def test_many_rows_are_evaluated_piece_by_piece(data, monkeypatch):
-    X, Y, X_new = data
-    functions = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y).sample_functions(2, n_waves=50)
-    expected = functions(X_new)
-    monkeypatch.setattr("skevgp.control.functions._NUMBERS_OF_WAVES", 600)
-    np.testing.assert_allclose(functions(X_new), expected, rtol=1e-10, atol=1e-12)
 
 
 def test_jacobians_agree_with_differences(model, data):
@@ -72,68 +63,13 @@ def test_jacobians_agree_with_differences(model, data):
         np.testing.assert_allclose(one[1], jacobian[2], rtol=1e-9, atol=1e-9)
 
 
-def test_the_gradients_spread_as_the_gradients_posterior_says(model, data):
-    X = data[2][:4]
-    _, jacobians = model.sample_functions(N, n_waves=1500).value_and_jacobian(X)
-    gradient, std = model.predict_gradient(X, return_std=True)
-    assert np.abs((jacobians.mean(axis=0) - gradient) / std).max() < 6.0 / np.sqrt(N)
-    assert 0.9 < np.median(jacobians.std(axis=0) / std) < 1.1
-
-
-def test_shapes_of_one_row_and_one_output(data):
-    X, Y, X_new = data
-    functions = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y[:, 0]).sample_functions(2, n_waves=50)
-    assert functions(X_new).shape == (2, 9)
-    assert functions(X_new[0]).shape == (2,)
-    assert functions[1](X_new).shape == (9,)
-    assert functions[-1](X_new[0]).shape == ()
-    assert [part.shape for part in functions.value_and_jacobian(X_new)] == [(2, 9), (2, 9, D)]
-    assert [part.shape for part in functions[0].value_and_jacobian(X_new[0])] == [(), (D,)]
-    assert len(functions) == len(list(functions)) == len(functions[:5]) == 2
-    with pytest.raises(IndexError, match="There are 2 functions"):
-        functions[2]
-
-
-def test_the_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
+def test_same_seed_gives_the_same_functions_and_they_can_be_pickled(data):
     X, Y, X_new = data
     model = EVGPRegressor(n_inducing=10, **QUICK).fit(X, Y)
     one, other, third = (model.sample_functions(2, random_state=seed, n_waves=50) for seed in (0, 0, 1))
     np.testing.assert_array_equal(one(X_new), other(X_new))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(one))[1](X_new), other[1](X_new))
     assert not np.array_equal(one(X_new), third(X_new))
-
-
-def test_of_a_residual_regressor_they_are_of_the_sum(data):
-    X, Y, X_new = data
-    model = ResidualRegressor(EVGPRegressor(n_inducing=10, **QUICK), base=[1, 0, 0]).fit(X, Y)
-    functions = model.sample_functions(2, n_waves=50)
-    np.testing.assert_allclose(
-        functions(X_new), model.regressor_.sample_functions(2, n_waves=50)(X_new) + X_new[:, [1, 0, 0]]
-    )
-    close(functions.value_and_jacobian(X_new)[1][0], differences(functions[0], X_new), 1e-6)
-    assert not hasattr(ResidualRegressor(BayesianMLPRegressor()), "sample_functions")
-
-
-def test_what_cannot_be_is_refused_by_name(data):
-    X, Y, _ = data
-    model = EVGPRegressor(kernel=FunctionKernel(lambda X, Z: X @ Z.T), n_inducing=2, **QUICK).fit(X, Y)
-    with pytest.raises(ValueError, match="No functions can be drawn from a kernel with a Function"):
-        model.sample_functions()
-    for name in ("n", "n_waves"):
-        with pytest.raises(ValueError, match=name):
-            model.sample_functions(**{name: 0})
-
-
-def test_they_are_counted_by_integers(data):
-    X, Y, X_new = data
-    functions = EVGPRegressor(n_inducing=8, **QUICK).fit(X, Y).sample_functions(2, n_waves=5)
-    np.testing.assert_array_equal(functions[np.int64(-1)](X_new), functions[1](X_new))
-    assert len(functions[:1]) == 1
-    for wrong in (1.5, 1.0, "a", None):
-        with pytest.raises(TypeError, match="integer"):
-            functions[wrong]
-    with pytest.raises(IndexError, match="There are 2 functions; got the index 2"):
-        functions[2]
 
 
 # --- along a path ----------------------------------------------------------------------------------------------------
@@ -171,15 +107,3 @@ def test_along_a_given_path_they_have_the_posteriors_joint_covariance(followed):
     # A function is one: back at a row it has the value that it had.
     assert np.abs(values[:, 3] - values[:, 0]).max() < 1e-5 * size.max()
     assert np.abs(values[:, 4] - values[:, 1]).max() < 1e-2 * size.max()
-
-
-def test_rows_that_the_points_know_leave_nothing_to_draw():
-    rng = np.random.RandomState(0)
-    X = rng.uniform(-2.0, 2.0, (30, 1))
-    model = EVGPRegressor(inducing_init=X, max_iter=0).fit(X, np.sin(X[:, 0]))
-    step = model._posterior.functions().draw(50, 30, rng)
-    for row in X:
-        values = step(np.repeat(row[np.newaxis], 50, axis=0))
-        assert np.isfinite(values).all()
-        mean, std = model.predict(row[np.newaxis], return_std=True, include_noise=False)
-        assert (np.abs(values - mean) < 6.0 * std + 1e-6).all()

@@ -63,16 +63,6 @@ def slopes_by_differences(function, y, step=1e-5):
     return np.stack([(function(y + d) - function(y - d)) / (2.0 * step) for d in step * np.eye(y.shape[1])], axis=-1)
 
 
-def test_a_model_of_the_whole_step(recipe, rows):
-    X, plan = rows
-    model = EVGPRegressor(n_inducing=20, **QUICK).fit(X, following(X))
-    slopes, offsets, variances = Controller(recipe(model.compile())).linear_model(plan, 2)
-    mean, std = model.predict(plan, return_std=True)
-    np.testing.assert_allclose(np.einsum("nij,nj->ni", slopes, plan) + offsets, mean, rtol=0, atol=1e-10)
-    np.testing.assert_allclose(slopes, slopes_by_differences(model.predict, plan), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(variances, std.ravel() ** 2, rtol=1e-9)
-
-
 def test_one_output_beside_a_nominal_model(recipe, rows):
     """What gravity adds to the velocity, which the nominal model lacks: B lifts it into the state."""
     X, plan = rows

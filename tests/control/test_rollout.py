@@ -14,7 +14,7 @@ from sklearn.linear_model import LinearRegression
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import FunctionTransformer, StandardScaler
 
-from skevgp import BayesianMLPRegressor, EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
+from skevgp import EGPRegressor, EVGPRegressor, ResidualRegressor, rollout
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS
 
@@ -74,7 +74,12 @@ def test_after_one_step_samples_have_the_predictive_distribution(model, inputs, 
         assert kstest(found.samples[:, 0, state], norm(mean[0, state], std[0, state]).cdf).statistic < 1.95 / 100.0
 
 
-def test_the_mean_is_fed_back(model, inputs):
+def test_without_a_jacobian_differences_do(model, inputs):
+    ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
+    np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
+
+
+def test_mean_is_fed_back(model, inputs):
     found = rollout(model, Z0, inputs, method="mean")
     z = Z0
     for t, u in enumerate(inputs):
@@ -87,7 +92,7 @@ def test_the_mean_is_fed_back(model, inputs):
 
 
 @pytest.mark.parametrize("process_noise", ["learned", "none"])
-def test_the_linearised_covariance_goes_through_the_derivatives(sparse, inputs, process_noise):
+def test_linearised_covariance_goes_through_the_derivatives(sparse, inputs, process_noise):
     found = rollout(sparse, Z0, inputs, method="linearized", process_noise=process_noise)
     z, Sigma = Z0, np.zeros((2, 2))
     for t, u in enumerate(inputs):
@@ -98,36 +103,6 @@ def test_the_linearised_covariance_goes_through_the_derivatives(sparse, inputs, 
         np.testing.assert_allclose(found.mean[t], z, rtol=1e-10, atol=1e-10)
         np.testing.assert_allclose(found.covariance[t], Sigma, rtol=1e-8)
     np.testing.assert_allclose(found.std**2, np.einsum("tii->ti", found.covariance))
-
-
-def test_without_a_jacobian_differences_do(model, inputs):
-    ours, found = (rollout(each, Z0, inputs, method="linearized") for each in (model, _Hidden(model)))
-    np.testing.assert_allclose(found.covariance, ours.covariance, rtol=1e-4, atol=1e-8)
-
-
-@pytest.mark.parametrize("unit", [1e-7, 1e5])
-def test_differences_are_in_the_units_of_the_states(data, inputs, unit):
-    X, y = data
-    scales = np.array([unit, unit, 1.0])
-    model = GaussianProcessRegressor(
-        RBF([2.0, 2.0, 2.0] * scales) + WhiteKernel(1e-3), normalize_y=True, optimizer=None
-    )
-    model.fit(X * scales, y * unit)
-    same = GaussianProcessRegressor(RBF(2.0) + WhiteKernel(1e-3), normalize_y=True, optimizer=None).fit(X, y)
-    feedback = np.array([-0.5, -0.3])
-
-    def controlled(regressor, size):
-        return rollout(
-            regressor,
-            np.array(Z0) * size,
-            lambda z, t: np.tanh(z / size @ feedback)[:, np.newaxis],
-            n_steps=6,
-            method="linearized",
-        )
-
-    for ask in (lambda each, size: rollout(each, np.array(Z0) * size, inputs, method="linearized"), controlled):
-        found, expected = ask(model, unit), ask(same, 1.0)
-        np.testing.assert_allclose(found.std / unit, expected.std, rtol=1e-4)
 
 
 class _Hidden(BaseEstimator):
@@ -147,7 +122,7 @@ class _Hidden(BaseEstimator):
         return self.regressor.predict(X, return_std=return_std)
 
 
-def test_samples_of_one_function_spread_as_the_linearised_model_of_one_function(data, inputs):
+def test_function_samples_agree_with_linearisation(data, inputs):
     """Of a system that is linear and known but for its weights, errors add up from step to step, and do not average."""
     X, y = data
     kernel = ConstantKernel(1e-10, "fixed") * RBF(1.0, "fixed")
@@ -167,16 +142,6 @@ def test_samples_of_one_function_spread_as_the_linearised_model_of_one_function(
     assert (np.abs(anew.std[-1] / found.std[-1] - 1.0) > 0.2).any()
 
 
-def test_a_controller_is_the_inputs_that_it_gives(sparse, inputs):
-    for method in ("mean", "linearized", "sample"):
-        given = rollout(sparse, Z0, inputs, method=method, random_state=0)
-        asked = rollout(sparse, Z0, lambda z, t: inputs[t], n_steps=N_STEPS, method=method, random_state=0)
-        np.testing.assert_allclose(asked.mean, given.mean, rtol=1e-10)
-        np.testing.assert_allclose(asked.covariance, given.covariance, rtol=1e-8, atol=1e-20)
-    assert asked.inputs.shape == (100, N_STEPS, 1)
-    np.testing.assert_array_equal(asked.inputs, np.broadcast_to(inputs, asked.inputs.shape))
-
-
 def test_feedback_is_in_the_derivative(sparse):
     gain = np.array([[-1.0, -2.0]])
     found = rollout(sparse, Z0, lambda z, t: z @ gain.T, n_steps=2, method="linearized")
@@ -190,52 +155,6 @@ def test_feedback_is_in_the_derivative(sparse):
     np.testing.assert_allclose(found.covariance[1], A @ first @ A.T + np.diag(std[0] ** 2), rtol=1e-6)
     samples = rollout(sparse, Z0, lambda z, t: z @ gain.T, n_steps=2, n_samples=50, random_state=0)
     np.testing.assert_allclose(samples.inputs[:, 1], samples.samples[:, 0] @ gain.T, rtol=1e-12)
-
-
-@pytest.mark.parametrize("method", ["mean", "linearized", "sample"])
-def test_a_batch_is_one_after_the_other(sparse, inputs, method):
-    batch = np.array([Z0, [1.0, 1.0], [-1.5, 0.3]])
-    each = np.stack([inputs, 0.5 * inputs, -inputs])
-    found = rollout(sparse, batch, each, method=method, n_samples=2000, random_state=0)
-    assert found.mean.shape == (3, N_STEPS, 2)
-    assert found.covariance.shape == (3, N_STEPS, 2, 2)
-    for z0, U, mean, std in zip(batch, each, found.mean, found.std, strict=True):
-        alone = rollout(sparse, z0, U, method=method, n_samples=2000, random_state=1)
-        slack = {"rtol": 1e-8} if method != "sample" else {"atol": 6.0 * std.max() / np.sqrt(2000.0)}
-        np.testing.assert_allclose(mean, alone.mean, **slack)
-        np.testing.assert_allclose(std, alone.std, **slack)
-    np.testing.assert_array_equal(found.inputs, each)
-    common = rollout(sparse, batch, inputs, method=method, n_samples=5, random_state=0)
-    assert common.mean.shape == (3, N_STEPS, 2)
-
-
-def test_the_same_seed_gives_the_same_samples(model, inputs):
-    one, other, third = (rollout(model, Z0, inputs, n_samples=5, random_state=seed).samples for seed in (0, 0, 1))
-    np.testing.assert_array_equal(one, other)
-    assert not np.array_equal(one, third)
-    assert one.shape == (5, N_STEPS, 2)
-
-
-def test_one_particle_is_a_trajectory(sparse, inputs):
-    found = rollout(sparse, Z0, inputs[:, 0], n_samples=1, random_state=0)
-    np.testing.assert_array_equal(found.mean, found.samples[0])
-    np.testing.assert_array_equal(found.std, 0.0)
-
-
-def test_particles_that_do_not_fit_into_memory_at_once_follow_each_other(sparse, inputs, monkeypatch):
-    expected = rollout(sparse, Z0, inputs, n_samples=3000, random_state=0)
-    monkeypatch.setattr("skevgp.control.functions._NUMBERS_OF_PATHS", 500_000)
-    found = rollout(sparse, Z0, inputs, n_samples=3000, random_state=0)
-    slack = 6.0 * expected.std.max() / np.sqrt(3000.0)
-    np.testing.assert_allclose(found.mean, expected.mean, atol=slack)
-    np.testing.assert_allclose(found.std, expected.std, atol=slack)
-
-
-def test_names_of_columns_do_not_matter(data, inputs):
-    X, y = data
-    model = EVGPRegressor(n_inducing=10, **QUICK).fit(pd.DataFrame(X, columns=["angle", "speed", "torque"]), y)
-    for method in ("mean", "linearized", "sample"):
-        assert np.isfinite(rollout(model, Z0, inputs, method=method, n_samples=3, random_state=0).mean).all()
 
 
 def sine_of_polars(frame):
@@ -262,15 +181,6 @@ def test_maps_that_take_columns_by_name_see_them(data, inputs, residual, frame_o
         np.testing.assert_allclose(found.std, expected.std, rtol=1e-6, atol=1e-8)
 
 
-def test_a_system_without_inputs_and_with_one_state():
-    z = np.linspace(-1.0, 1.0, 40)[:, np.newaxis]
-    model = EVGPRegressor(n_inducing=10, **QUICK).fit(z, 0.9 * z[:, 0])
-    for method in ("mean", "linearized", "sample"):
-        found = rollout(model, [0.5], np.empty((7, 0)), method=method, random_state=0)
-        assert found.mean.shape == (7, 1)
-        np.testing.assert_allclose(found.mean[:, 0], 0.5 * 0.9 ** np.arange(1, 8), atol=0.05)
-
-
 @pytest.mark.parametrize(
     ("arguments", "options", "message"),
     [
@@ -294,34 +204,21 @@ def test_a_system_without_inputs_and_with_one_state():
     ],
 )
 @pytest.mark.parametrize("method", ["sample", "mean"])
-def test_what_cannot_be_is_refused_by_name(sparse, arguments, options, message, method):
+def test_invalid_arguments_raise(sparse, arguments, options, message, method):
     with pytest.raises(ValueError, match=message):
         rollout(sparse, *arguments, **{"method": method, **options})
 
 
-def test_regressors_that_will_not_do_are_named(data, inputs):
+def test_invalid_regressors_raise(data, inputs):
     with pytest.raises(NotFittedError):
         rollout(EVGPRegressor(), Z0, inputs)
     with pytest.raises(TypeError, match=r"LinearRegression.predict has no return_std"):
         rollout(LinearRegression().fit(*data), Z0, inputs)
 
 
-def test_a_system_that_runs_away_is_named(data):
+def test_system_that_runs_away_raises(data):
     X, _ = data
     model = EVGPRegressor(FunctionTransformer(), n_inducing=5, **QUICK).fit(X, 1e3 * X[:, :2])
     for method in ("sample", "mean", "linearized"):
         with pytest.raises(ValueError, match="States grow beyond 1e.100 at step"):
             rollout(model, Z0, np.zeros((60, 1)), method=method, n_samples=3, random_state=0)
-
-
-@pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-@pytest.mark.parametrize("residual", [False, True])
-def test_networks_are_followed(data, inputs, residual):
-    model = BayesianMLPRegressor((4,), max_iter=2, random_state=0)
-    model = (ResidualRegressor(model) if residual else model).fit(*data)
-    mean, std = model.predict(np.concatenate([Z0, inputs[0]])[np.newaxis], return_std=True)
-    for method in ("mean", "linearized"):
-        ahead = rollout(model, Z0, inputs, method=method)
-        np.testing.assert_allclose(ahead.mean[0], mean[0], rtol=1e-10)
-        np.testing.assert_allclose(ahead.std[0], std[0], rtol=1e-10)
-    assert rollout(model, Z0, inputs, n_samples=3, random_state=0).samples.shape == (3, N_STEPS, 2)

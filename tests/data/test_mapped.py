@@ -4,7 +4,6 @@ import pickle
 import tracemalloc
 
 import numpy as np
-import pandas as pd
 import pytest
 from sklearn.preprocessing import FunctionTransformer, PolynomialFeatures, StandardScaler
 
@@ -36,16 +35,9 @@ def mapped(feature_map=None, kernel_map=None, X=X, y=Y):
     return MappedRows(X, X, y, Maps(feature_map, kernel_map))
 
 
-def test_without_maps_the_kernel_sees_X_and_there_are_no_features():
-    raw = mapped()(slice(3, 7))
-    np.testing.assert_array_equal(raw.inputs, X[3:7])
-    assert raw.features.shape == (4, 0)
-    np.testing.assert_array_equal(raw.targets, Y[3:7])
-
-
 @pytest.mark.parametrize("rows", [slice(3, 7), np.array([9, 0, 9])], ids=str)
 @pytest.mark.parametrize("kept", [True, False])
-def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
+def test_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeypatch):
     if not kept:
         monkeypatch.setattr("skevgp.data.maps.MAPPED_BYTES", 0)
     scaler, trend = StandardScaler().fit(X), PolynomialFeatures(1).fit(X)
@@ -55,7 +47,7 @@ def test_the_kernel_sees_its_map_and_the_features_are_theirs(kept, rows, monkeyp
     np.testing.assert_array_equal(raw.targets, Y[rows])
 
 
-def test_what_fits_is_mapped_once_and_what_does_not_at_each_pass(monkeypatch):
+def test_maps_are_cached_if_memory_allows(monkeypatch):
     own = mapped(kept := Counting())
     for _ in range(3):
         own(slice(0, 400))
@@ -68,21 +60,9 @@ def test_what_fits_is_mapped_once_and_what_does_not_at_each_pass(monkeypatch):
     assert again.n_rows_ == 4 * 400
 
 
-def test_rows_and_targets_of_single_precision_become_double():
-    raw = mapped(X=X.astype(np.float32), y=Y.astype(np.float32))(slice(0, 5))
-    assert raw.inputs.dtype == raw.targets.dtype == np.float64
-
-
 def test_mapped_rows_can_be_sent_to_workers():
     own = mapped(PolynomialFeatures(1).fit(X))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(own))(slice(2, 4)).features, own(slice(2, 4)).features)
-
-
-def test_a_frame_is_for_the_maps():
-    frame = pd.DataFrame(X, columns=["a", "b"])
-    inputs, features = Maps(FunctionTransformer(lambda given: given[["b"]]), None).rows(frame, X, slice(0, 400))
-    np.testing.assert_array_equal(inputs, X)
-    np.testing.assert_array_equal(features, X[:, 1:])
 
 
 @pytest.fixture
@@ -98,7 +78,7 @@ def in_pieces(monkeypatch):
 
 @pytest.mark.parametrize("sharing", ["all", "none"])
 @pytest.mark.parametrize("solver", ["lbfgs", "adam"])
-def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver):
+def test_recomputed_maps_agree(request, sharing, solver):
     expected = model(sharing=sharing, solver=solver).fit(X, Y)
     request.getfixturevalue("in_pieces")
     pieces = model(sharing=sharing, solver=solver).fit(X, Y)
@@ -108,14 +88,14 @@ def test_what_is_made_again_at_each_pass_gives_the_same(request, sharing, solver
     assert pieces.lower_bound_ == pytest.approx(expected.lower_bound_, rel=1e-4 if atol else 1e-8)
 
 
-def test_a_map_whose_width_changes_from_piece_to_piece_is_named(in_pieces, monkeypatch):
+def test_map_whose_width_changes_from_piece_to_piece_raises(in_pieces, monkeypatch):
     monkeypatch.setattr("skevgp.data.maps.MAP_ROWS", 70)
     widening = FunctionTransformer(lambda rows: np.ones((len(rows), 1 if len(rows) == 70 else 2)))
     with pytest.raises(ValueError, match=r"same number of columns for all rows; they returned \(2, 1\) and \(2, 2\)"):
         model(feature_map=widening, kernel_map=None).fit(X, Y)
 
 
-def test_pieces_in_threads_have_the_same_bits(in_pieces):
+def test_pieces_in_threads_have_same_bits(in_pieces):
     fits = [model(n_jobs=n_jobs).fit(X, Y) for n_jobs in (1, 2, 3)]
     for other in fits[1:]:
         np.testing.assert_array_equal(other.predict(X_NEW), fits[0].predict(X_NEW))
@@ -156,21 +136,3 @@ def test_memory_does_not_grow_with_the_rows(little_memory, tmp_path):
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
     assert peaks[1] < 1.1 * peaks[0] + 2**20
-
-
-def test_memory_mapped_files_and_frames_give_the_same(tmp_path):
-    expected = model().fit(X, Y).predict(X_NEW)
-    np.save(tmp_path / "X.npy", X)
-    np.save(tmp_path / "Y.npy", Y)
-    mapped = [np.load(tmp_path / name, mmap_mode="r") for name in ("X.npy", "Y.npy")]
-    np.testing.assert_array_equal(model().fit(*mapped).predict(X_NEW), expected)
-    frame, new = (pd.DataFrame(rows, columns=["a", "b"]) for rows in (X, X_NEW))
-    # The order of a frame in memory is another, and so is the rounding.
-    np.testing.assert_allclose(model().fit(frame, Y).predict(new), expected, rtol=1e-8)
-
-
-def test_single_precision_is_computed_in_double():
-    X32, Y32 = X.astype(np.float32), Y.astype(np.float32)
-    single, double = model().fit(X32, Y32), model().fit(X32.astype(float), Y32.astype(float))
-    np.testing.assert_array_equal(single.predict(X_NEW), double.predict(X_NEW))
-    assert single.predict(X_NEW.astype(np.float32)).dtype == np.float64

@@ -8,7 +8,7 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
-from skevgp.data.threads import BlockMap, add, ordered_sum, single_threaded_libraries, thread_pool
+from skevgp.data.threads import BlockMap, single_threaded_libraries, thread_pool
 from skevgp.solvers import LBFGS
 
 
@@ -21,23 +21,6 @@ def threads():
 
 def numbers_of_threads():
     return {library["user_api"]: library["num_threads"] for library in threadpool_info()}
-
-
-def test_tuples_are_added_entry_by_entry():
-    total = add((1, np.ones(2), "a"), (2, np.ones(2), "b"))
-    assert total[::2] == (3, "ab")
-    np.testing.assert_array_equal(total[1], [2.0, 2.0])
-    with pytest.raises(ValueError, match="zip"):
-        add((1, 2), (1,))
-
-
-def test_sums_are_in_order():
-    assert ordered_sum(iter("abc")) == "abc"
-    assert ordered_sum([("a", 1), ("b", 2), ("c", 3)]) == ("abc", 6)
-
-
-def test_one_thread_is_the_callers():
-    assert set(BlockMap()(lambda part: get_ident(), range(3))) == {get_ident()}
 
 
 def test_several_threads_are_others_and_results_come_in_the_parts_order(threads):
@@ -68,7 +51,7 @@ def test_few_parts_are_under_way_at_once(threads):
         assert len(taken) <= done + 4
 
 
-def test_an_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
+def test_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
     seen = []
 
     def fails(part):
@@ -96,7 +79,7 @@ def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():
     assert numbers_of_threads() == before
 
 
-def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
+def test_nested_thread_limits_are_released_once():
     """Whichever came first."""
     second_is_in, first_is_out = Event(), Event()
 
@@ -121,16 +104,9 @@ def test_of_two_threads_the_last_to_leave_sets_the_libraries_free():
         assert numbers_of_threads() == before
 
 
-def test_libraries_are_set_free_after_an_error():
-    before = numbers_of_threads()
-    with pytest.raises(ZeroDivisionError), single_threaded_libraries():
-        raise ZeroDivisionError
-    assert numbers_of_threads() == before
-
-
 @pytest.mark.long
 @pytest.mark.filterwarnings("ignore::sklearn.exceptions.ConvergenceWarning")
-def test_fits_have_the_same_bits_in_any_thread():
+def test_fits_have_same_bits_in_any_thread():
     """Wherever BLAS and OpenMP were limited before, and for any n_jobs, k-means of restarts included."""
     rng = np.random.RandomState(0)
     rows = rng.randn(12_000, 4)

@@ -27,23 +27,13 @@ def test_few_rows_are_ordered_and_equal_ones_joined():
     np.testing.assert_array_equal(seen(Chosen.of(X[order], Y[order]), X[order], Y[order]), rows)
 
 
-def test_the_first_of_rows_that_were_joined_is_named_and_each_finds_its_own():
+def test_first_of_rows_that_were_joined_is_named_and_each_finds_its_own():
     once = Chosen.of(X, Y)
     for index, position in enumerate(once.positions):
         same = np.flatnonzero((np.hstack([X, Y]) == np.hstack([X, Y])[position]).all(axis=1))
         assert position == same[0]
         np.testing.assert_array_equal(np.flatnonzero(once.as_given(np.arange(once.n_rows)) == index), same)
     np.testing.assert_array_equal(np.sort(once.unmerged), np.arange(60))
-
-
-def test_rows_of_weight_0_are_left_out_and_have_nothing():
-    counts = RNG.randint(0, 3, 60).astype(float)
-    kept = counts > 0
-    again = np.repeat(np.arange(60), counts.astype(int))
-    weighted = Chosen.of(X, Y, counts)
-    np.testing.assert_array_equal(seen(weighted), seen(Chosen.of(X[again], Y[again]), X[again], Y[again]))
-    values = weighted.as_given(np.arange(weighted.n_rows, dtype=float))
-    np.testing.assert_array_equal(np.isnan(values), ~kept)
 
 
 def test_rows_of_other_labels_or_noise_are_others():
@@ -56,16 +46,6 @@ def test_rows_of_other_labels_or_noise_are_others():
     noisy = Chosen.of(X, Y, None, variance)
     np.testing.assert_array_equal(noisy.counts, apart.counts)
     np.testing.assert_allclose(noisy.precision, noisy.counts / variance[noisy.positions])
-
-
-def test_what_is_not_used_costs_nothing():
-    ordered = np.column_stack([np.arange(20.0), np.arange(20.0)])
-    for weights in (None, np.ones(20)):
-        chosen = Chosen.of(ordered, Y[:20], weights, weights)
-        assert chosen == Chosen(20)
-    backwards = Chosen.of(ordered[::-1], Y[:20])
-    np.testing.assert_array_equal(backwards.positions, np.arange(20)[::-1])
-    assert backwards.counts is None is backwards.precision
 
 
 @pytest.mark.parametrize("ordered", [True, False])
@@ -81,7 +61,7 @@ def test_many_rows_and_new_ones_stay_in_their_order(ordered, monkeypatch):
     np.testing.assert_array_equal(chosen.as_given(chosen.counts)[counts > 0], counts[counts > 0])
 
 
-def test_a_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
+def test_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
     zeros = np.array([[0.0], [-0.0], [1.0]])
     assert Chosen.of(zeros, np.array([-0.0, 0.0, 0.0])).n_rows == 2
     frame = pd.DataFrame({"x": [1.0, 0.0, 1.0, 1.0], "word": ["a", "b", "a", "b"]})
@@ -89,16 +69,3 @@ def test_a_negative_zero_is_zero_and_words_of_a_frame_are_told_apart():
     np.testing.assert_array_equal(chosen.positions, [1, 0, 3])
     np.testing.assert_array_equal(chosen.counts, [1.0, 2.0, 1.0])
     assert rows_of(frame, chosen.positions)["word"].tolist() == ["b", "a", "b"]
-
-
-@pytest.mark.parametrize("words", [[None, "None"], [1, "1"], [1, 1.0], [True, "True"], ["a", "a\0"]])
-def test_what_only_looks_alike_is_told_apart(words):
-    frame = pd.DataFrame({"word": pd.Series(words * 5, dtype=object)})
-    assert Chosen.of(frame, np.zeros(10)).n_rows == 2
-    assert Chosen.of(frame[::2], np.zeros(5)).n_rows == 1
-
-
-@pytest.mark.parametrize("dtype", ["category", "string", "datetime64[ns]", object])
-def test_columns_of_any_type_have_their_rows_told_apart(dtype):
-    frame = pd.DataFrame({"word": pd.Series(["2001-01-01", "2002-01-01", "2001-01-01"]).astype(dtype)})
-    assert Chosen.of(frame, np.zeros(3)).n_rows == 2

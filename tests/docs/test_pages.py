@@ -30,7 +30,7 @@ def name_of(page):
 
 @pytest.mark.long
 @pytest.mark.parametrize("page", WITH_CODE, ids=name_of)
-def test_a_page_runs_and_prints_what_it_says(page, tmp_path):
+def test_page_runs_and_prints_what_it_says(page, tmp_path):
     with warnings.catch_warnings():  # a page may silence one
         for block, printed in blocks.run(page, tmp_path):
             assert not blocks.differences(printed, block.output or ""), f"{page.name}:{block.line}"
@@ -100,49 +100,6 @@ def test_figures_of_the_prose_are_those_of_the_results(page, words, report, line
 
 # --- the tools themselves -----------------------------------------------------------------------------------------
 
-SMALL = """# Page
-
-```python
-x = 2
-print(x, 0.5)
-```
-
-```text
-2 0.50
-```
-
-Words between, so that this is no output:
-
-```text
-else
-```
-
-```python
-print(1 / 0)
-```
-"""
-
-
-def test_blocks_are_found_with_their_output():
-    first, output, other, last = blocks.blocks_of(SMALL)
-    assert (first.language, first.output, first.line) == ("python", "2 0.50\n", 3)
-    assert (output.language, other.language, last.language) == ("text", "text", "python")
-    assert last.output is None
-
-
-def test_a_page_without_code_has_no_blocks():
-    assert not list(blocks.blocks_of("# Words"))
-
-
-def test_an_error_in_a_page_names_its_line(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(SMALL)
-    found = blocks.run(page, tmp_path)
-    assert next(found)[1] == "2 0.5\n"
-    with pytest.raises(ZeroDivisionError) as caught:
-        next(found)
-    assert caught.traceback[-1].lineno + 1 == 19
-
 
 @pytest.mark.parametrize(
     ("printed", "said", "same"),
@@ -161,42 +118,3 @@ def test_an_error_in_a_page_names_its_line(tmp_path):
 )
 def test_numbers_are_compared_up_to_their_digits(printed, said, same):
     assert (blocks.differences(printed, said) == []) == same
-
-
-def test_tables_have_the_csvs_numbers():
-    parts = comparison.parts()
-    for row in comparison.rows_of(comparison.RESULTS / "against_peers.csv"):
-        assert row["peer"] in parts["peers"]
-    gpr = [row for row in comparison.rows_of(comparison.RESULTS / "against_gpr.csv") if row["model"] == "GPR"]
-    assert comparison.short(max(float(row["memory_mb"]) for row in gpr)) in parts["exact"].replace("*", "")
-    assert "scikit-learn" in parts["packages"]
-
-
-def test_the_best_are_bold_also_where_they_are_not_ours():
-    assert comparison.best([2.0, 1.0, 1.5]) == ["2.00", "**1.00**", "1.50"]
-    assert comparison.best([2.0, 1.0, 1.5], [True, False, True]) == ["2.00", "1.00", "**1.50**"]
-    bold = [line for line in comparison.peers().splitlines() if "GPflow" in line and "**" in line]
-    assert bold
-
-
-def test_seconds_beside_much_other_work_are_shown_and_not_compared(monkeypatch):
-    common = {"dataset": "airfoil", "sharing": "none", "n_train": "90", "m": "9", "rmse": "0.5", "nlpd": "0.7"}
-    rows = [
-        {**common, "peer": peer, "seconds": seconds, "cpu_seconds": cpu, "load": load}
-        for peer, seconds, cpu, load in (("A", "2", "3", "1.0"), ("B", "1", "8", "9.0"), ("C", "4", "2", "3.0"))
-    ]
-    monkeypatch.setattr(comparison, "rows_of", lambda path: rows)
-    clocks = [line.split(" | ")[5:7] for line in comparison.peers().splitlines()[2:]]
-    assert clocks == [["**2.00**", "3.00"], ["(1.00)", "8.00"], ["4.00", "**2.00**"]]
-
-
-def test_the_gallery_is_in_an_order_that_knows_all_examples():
-    from stories import ORDER, Order
-
-    files = sorted((DOCS.parent / "examples").glob("plot_*.py"), key=lambda path: Order("")(path.name))
-    assert [path.stem.removeprefix("plot_") for path in files] == ORDER
-
-
-def test_what_is_generated_is_not_kept():
-    ignored = (DOCS.parent / ".gitignore").read_text().split()
-    assert {"/docs/_build/", "/docs/generated/", "/docs/auto_examples/"} <= {*ignored}

@@ -1,19 +1,12 @@
-import pickle
-
 import numpy as np
 import pandas as pd
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
-from sklearn.base import clone
-from sklearn.exceptions import NotFittedError
 from sklearn.pipeline import make_pipeline
 from sklearn.preprocessing import StandardScaler
 
-from skevgp import EVGPRegressor
-from skevgp.datasets import make_dynamics
-from skevgp.features import AngleEncoder, InertiaForceGravity
-from skevgp.metrics import prediction_error
-from skevgp.robots import get_system, layout_of, load_robot
+from skevgp.features import AngleEncoder
+from skevgp.robots import layout_of
 
 NAMES = {
     "pendulum": ["sin(q)", "cos(q)", "dq/dt", "u_q"],
@@ -53,11 +46,6 @@ def test_all_revolute_positions_are_angles_also_continuous_ones(robot, n_angles)
     assert_array_equal(AngleEncoder(robot).fit_transform(X), encoded(X, set(range(n_angles))))
 
 
-@pytest.mark.parametrize("robot", [get_system("cartpole"), load_robot("cartpole")])
-def test_a_system_or_model_works_in_place_of_its_name(robot):
-    assert_array_equal(AngleEncoder(robot).fit_transform(rows(5)), AngleEncoder("cartpole").fit_transform(rows(5)))
-
-
 @pytest.mark.parametrize("angles", [["q2"], [1], np.array([1]), np.array(["q2"]), (np.int64(1),)])
 def test_angles_chosen_by_index_or_name_overrule_the_robots(angles):
     assert_array_equal(AngleEncoder("acrobot", angles=angles).fit_transform(rows(5)), encoded(rows(5), {1}))
@@ -70,11 +58,6 @@ def test_without_a_robot_the_order_of_the_columns_stays_whatever_that_of_angles(
     assert encoder.get_feature_names_out().tolist() == ["x0", "sin(x1)", "cos(x1)", "x2", "sin(x3)", "cos(x3)", "x4"]
 
 
-@pytest.mark.parametrize("encoder", [AngleEncoder(), AngleEncoder(angles=[]), AngleEncoder("acrobot", angles=[])])
-def test_without_angles_rows_pass_through(encoder):
-    assert_array_equal(encoder.fit_transform(rows(5)), rows(5))
-
-
 def test_data_frames_choose_angles_by_their_columns_and_name_the_result():
     frame = pd.DataFrame(rows(3), columns=["t", "heading", "speed"], index=range(10, 15))
     encoder = AngleEncoder(angles=["heading"]).set_output(transform="pandas").fit(frame)
@@ -84,16 +67,8 @@ def test_data_frames_choose_angles_by_their_columns_and_name_the_result():
     assert_array_equal(transformed, encoded(frame.to_numpy(), {1}))
 
 
-@pytest.mark.parametrize("angles", [["elbow"], ["q2"], [1]])
-def test_a_robots_data_frame_may_be_asked_by_its_own_or_the_robots_names(angles):
-    frame = pd.DataFrame(rows(5), columns=["shoulder", "elbow", "v1", "v2", "torque"])
-    encoder = AngleEncoder("acrobot", angles=angles).fit(frame)
-    assert_array_equal(encoder.transform(frame), encoded(rows(5), {1}))
-    assert encoder.get_feature_names_out()[1:3].tolist() == ["sin(elbow)", "cos(elbow)"]
-
-
 @pytest.mark.parametrize("angles", [["x"], [0], ["dtheta/dt"], [3], ["u_x"], [4], ["elbow"], [7], [-4], [True], [1.0]])
-def test_an_angle_that_is_no_revolute_position_lists_those_that_are(angles):
+def test_angle_that_is_no_revolute_position_lists_those_that_are(angles):
     message = r"angles=.* must be .* of revolute joints of the robot 'cartpole': \{1: 'theta'\}"
     with pytest.raises(ValueError, match=message):
         AngleEncoder("cartpole", angles=angles).fit(rows(5))
@@ -114,29 +89,18 @@ def test_angles_must_be_a_sequence(angles):
 
 
 @pytest.mark.parametrize("angles", [[0, 0], ["q1", "q1"], ["q1", 0]])
-def test_an_angle_named_twice_is_an_error(angles):
+def test_angle_named_twice_raises(angles):
     with pytest.raises(ValueError, match=r"angles=.* must not name a column twice"):
         AngleEncoder("acrobot", angles=angles).fit(rows(5))
 
 
-def test_a_wrong_number_of_columns_is_an_error():
-    with pytest.raises(ValueError, match=r"X has 4 columns, but AngleEncoder of the robot 'acrobot' needs 5: \['q1'"):
-        AngleEncoder("acrobot").fit(rows(4))
-
-
-def test_a_full_turn_changes_nothing():
-    turned = rows(5) + 2 * np.pi * np.array([1, -3, 0, 0, 0])
-    encoder = AngleEncoder("acrobot").fit(rows(5))
-    assert_allclose(encoder.transform(turned), encoder.transform(rows(5)), rtol=0, atol=1e-14)
-
-
 @pytest.mark.parametrize("robot", ["acrobot", "cartpole"])
-def test_the_inverse_gives_the_rows_back(robot):
+def test_inverse_gives_the_rows_back(robot):
     encoder = AngleEncoder(robot).fit(rows(5))
     assert_allclose(encoder.inverse_transform(encoder.transform(rows(5))), rows(5), rtol=1e-14, atol=1e-14)
 
 
-def test_the_inverse_gives_angles_above_minus_pi_and_up_to_pi():
+def test_inverse_gives_angles_above_minus_pi_and_up_to_pi():
     encoder = AngleEncoder(angles=[0]).fit([[0.0, 0.0]])
     X = np.array([[4.0, 9.0], [-4.0, -9.0], [np.pi, 0.0], [-np.pi, 0.0], [0.0, 1.0]])
     expected = [[4.0 - 2 * np.pi, 9.0], [2 * np.pi - 4.0, -9.0], [np.pi, 0.0], [np.pi, 0.0], [0.0, 1.0]]
@@ -144,84 +108,16 @@ def test_the_inverse_gives_angles_above_minus_pi_and_up_to_pi():
     assert encoder.inverse_transform([[-0.0, -1.0, 0.0]])[0, 0] == np.pi
 
 
-def test_the_inverse_heeds_no_positive_factor():
-    encoder = AngleEncoder(angles=[0]).fit([[0.0]])
-    assert_allclose(encoder.inverse_transform([[7.0 * np.sin(2.0), 7.0 * np.cos(2.0)]]), [[2.0]])
-
-
 @pytest.mark.parametrize("n_columns", [5, 8])
-def test_the_inverse_of_another_width_is_an_error(n_columns):
+def test_inverse_of_another_width_raises(n_columns):
     encoder = AngleEncoder("acrobot").fit(rows(5))
     with pytest.raises(ValueError, match=rf"X has {n_columns} columns, but AngleEncoder made 7: \['sin\(q1\)'"):
         encoder.inverse_transform(rows(n_columns))
 
 
-def test_the_inverse_takes_finite_numbers_only():
-    with pytest.raises(ValueError, match="contains NaN"):
-        AngleEncoder().fit(rows(2)).inverse_transform([[np.nan, 0.0]])
-
-
-@pytest.mark.parametrize("method", ["transform", "inverse_transform"])
-def test_it_must_be_fitted_first(method):
-    with pytest.raises(NotFittedError):
-        getattr(AngleEncoder("acrobot"), method)(rows(5))
-
-
-def test_a_pipeline_scales_what_was_encoded_and_inverts_it():
+def test_pipeline_scales_what_was_encoded_and_inverts_it():
     pipeline = make_pipeline(AngleEncoder("acrobot"), StandardScaler()).fit(rows(5))
     expected = StandardScaler().fit_transform(encoded(rows(5), {0, 1}))
     assert_allclose(pipeline.transform(rows(5)), expected, rtol=1e-14)
     assert pipeline.get_feature_names_out().tolist() == NAMES["acrobot"]
     assert_allclose(pipeline.inverse_transform(expected), rows(5), rtol=1e-12, atol=1e-12)
-
-
-def test_a_single_row_is_like_many():
-    encoder = AngleEncoder("acrobot").fit(rows(5))
-    assert_array_equal(np.vstack([encoder.transform(row[np.newaxis]) for row in rows(5)]), encoder.transform(rows(5)))
-
-
-def test_the_rows_are_left_as_they_are():
-    X = rows(5)
-    AngleEncoder("acrobot").fit(X).transform(X)
-    assert_array_equal(X, rows(5))
-
-
-def test_it_says_nothing_of_weights():
-    assert not hasattr(AngleEncoder("acrobot"), "coef_prior")
-
-
-@pytest.mark.parametrize("robot", ["acrobot", get_system("acrobot"), load_robot("acrobot"), None])
-def test_a_pickled_encoder_works_the_same(robot):
-    encoder = AngleEncoder(robot, angles=[1]).fit(rows(5))
-    assert_array_equal(pickle.loads(pickle.dumps(encoder)).transform(rows(5)), encoder.transform(rows(5)))
-
-
-def test_a_clone_has_the_same_parameters():
-    encoder = AngleEncoder("acrobot", angles=["q1"]).fit(rows(5))
-    copy = clone(encoder)
-    assert copy.get_params() == encoder.get_params()
-    assert not hasattr(copy, "n_features_in_")
-
-
-@pytest.mark.filterwarnings("ignore:The bound was still rising")
-def test_a_regressor_whose_kernel_knows_angles_errs_less_and_not_more_after_a_full_turn():
-    train, test = (make_dynamics("pendulum", n_trajectories=12, n_steps=40, random_state=seed) for seed in (0, 1))
-    errors = []
-    for kernel_map in (None, AngleEncoder("pendulum")):
-        model = EVGPRegressor(
-            InertiaForceGravity("pendulum"),
-            kernel_map=kernel_map,
-            n_inducing=10,
-            max_iter=60,
-            noise_cv=None,
-            random_state=0,
-        )
-        model.fit(train.data, train.target)
-        turned = model.predict(test.data + [2 * np.pi, 0.0, 0.0])
-        moved = turned - 2 * np.pi * model.coef_[:, 0]  # what is linear in q is not periodic
-        errors.append([prediction_error(test.target, mean) for mean in (model.predict(test.data), moved)])
-    (plain, plain_turned), (angles, angles_turned) = errors
-    assert model.inducing_points_.shape == (10, 4)
-    assert angles < 0.8 * plain
-    assert plain_turned > 2.0 * plain
-    assert_allclose(angles_turned, angles, rtol=1e-6)

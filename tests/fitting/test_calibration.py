@@ -1,6 +1,5 @@
 """Folds, what the others say of each, and where signal and noise predict it best."""
 
-import pickle
 from dataclasses import replace
 
 import numpy as np
@@ -10,12 +9,10 @@ from scipy.linalg import block_diag, solve_triangular
 from skevgp.data.rows import LocalSource, RawRows, Rows
 from skevgp.data.threads import BlockMap
 from skevgp.fitting.calibration import (
-    FEWEST_ROWS,
     PREDICTED_ROWS,
     CrossValidation,
     LeftOut,
     Seen,
-    Variance,
     VarianceSearch,
     calibrated,
     folds_in_order,
@@ -62,7 +59,7 @@ def test_random_folds_are_of_nearly_equal_length(n_rows, n_folds, found):
     assert all(len(fold.predicted) == len(fold.rows) for fold in folds)
 
 
-def test_of_many_rows_some_are_predicted_from_all():
+def test_many_rows_are_subsampled():
     n_rows = 10 * PREDICTED_ROWS
     for folds in (random_folds(n_rows, 4, rng()), folds_in_order(np.arange(n_rows)[::-1], 4, rng())):
         assert_parts(folds, n_rows)
@@ -91,20 +88,6 @@ def test_fewer_than_three_groups_are_left_out_in_blocks_of_which_the_inside_is_p
     for fold, expected in zip(folds, np.split(order, 4), strict=True):
         np.testing.assert_array_equal(fold.rows, np.sort(expected))
         np.testing.assert_array_equal(fold.predicted, np.sort(expected[7:-7]))
-
-
-@pytest.mark.parametrize(("sizes", "whole"), [((190, 5, 5), False), ((90, 60, 50), True)])
-def test_a_group_of_most_rows_is_cut(sizes, whole):
-    groups = np.repeat(np.arange(len(sizes)), sizes)
-    folds = of_groups(groups, 4)
-    assert_parts(folds, 200)
-    assert (max(len(fold.rows) for fold in folds) == max(sizes)) == whole
-    assert (sum(len(fold.predicted) for fold in folds) == 200) == whole
-
-
-def test_few_rows_are_left_alone():
-    assert CrossValidation(5).folds(np.arange(FEWEST_ROWS - 1), rng()) == []
-    assert len(CrossValidation(5).folds(np.arange(FEWEST_ROWS), rng())) == 5
 
 
 def _walks(n, columns):
@@ -144,7 +127,7 @@ GRID = np.stack(np.meshgrid(np.arange(30.0), np.arange(30.0)), axis=-1).reshape(
         *("correlated", "backwards", "powers", "a grid", "all the same"),
     ],
 )
-def test_a_path_is_no_sorted_table(inputs, expected):
+def test_path_is_no_sorted_table(inputs, expected):
     order = rng().permutation(len(inputs))
     kept = np.empty_like(inputs)
     kept[order] = inputs
@@ -264,28 +247,6 @@ def test_left_out_rows_are_predicted_as_by_refits_without_their_fold(family, sha
     )
 
 
-@pytest.mark.parametrize("joint", [True, False])
-@pytest.mark.parametrize("family", ["full", "diagonal"])
-def test_of_many_features_too(family, joint, monkeypatch):
-    """More of them than inducing points are not made diagonal at each ratio."""
-    monkeypatch.setattr("skevgp.fitting.calibration._MANY_FEATURES", 0)
-    model, rows, table = problem(family, p=7)
-    if joint:
-        reference = np.repeat(model.prior.reference[:1], 2, axis=0)
-        model = replace(model, prior=replace(model.prior, reference=reference, shared=True))
-    assert_as_refitted(model, table.values(table.start()), rows, parts(len(rows), 3), joint=joint)
-
-
-def test_what_is_kept_does_not_grow_with_the_ratios_that_were_tried():
-    model, rows, table = problem(p=7)
-    ((one, *_),) = left_out(model, table.values(table.start()), rows, parts(len(rows), 3))
-    sizes = []
-    for ratio in 2.0 ** np.arange(10):
-        one.predicted(0, ratio, np.ones(1))
-        sizes.append(len(pickle.dumps(one)))
-    assert sizes[-1] == sizes[0]
-
-
 @pytest.mark.parametrize("family", ["full", "diagonal"])
 def test_weights_of_rows_and_their_noise(family):
     model, rows, table = problem(family)
@@ -310,7 +271,7 @@ def test_correlated_weights_and_weights_that_outputs_share(family, shared, joint
 
 
 @pytest.mark.parametrize("noise", [1e-4, 1e-8])
-def test_a_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
+def test_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
     """Its sums over the other folds, as differences from those of all rows, would be rounding errors."""
     model, rows, table = problem(n=200)
     rows.features[:, 0] *= np.where(np.arange(200) < 40, 1e3, 1e-6)
@@ -327,20 +288,6 @@ def test_a_feature_of_one_fold_and_a_wide_prior_cost_no_digits(noise):
         error, variance = refitted(model, values, rows, [0], [1.0], [noise], np.isin(np.arange(200), fold))
         expected += np.sum(error**2 / variance)
     np.testing.assert_allclose(total, expected, rtol=1e-5)
-
-
-def test_without_a_signal_directions_that_rounding_lost_tell_nothing():
-    """0/0 of D⁻¹: what points that follow from each other have to say."""
-    model, rows, table = problem(n=20, m=6)
-    values = table.values_at_start()
-    (group, *_) = left_out(model, values, rows, parts(20, 2))
-    own = group[0]
-    found, spread = own.predicted(0, 0.0, 0.3)
-    own._eigenvalues[:2], own._at_zero[:2] = 0.0, 0.0
-    own._last.clear()
-    again, variance = own.predicted(0, 0.0, 0.3)
-    np.testing.assert_allclose(again, found, rtol=1e-12)
-    np.testing.assert_allclose(variance, spread, rtol=1e-12)
 
 
 # --- where signal and noise end ---------------------------------------------------------------------------------------
@@ -387,32 +334,6 @@ def test_nowhere_near_is_better(family, shared):
         assert search.loss(0.01 * signal, noise) > search.loss(signal, noise) + 0.01
 
 
-@pytest.mark.parametrize("which", ["signal", "noise"])
-def test_what_is_fixed_is_left_and_the_other_is_best_for_it(which):
-    model, rows, table, values = small()
-    search = search_of(0, model, rows, table.changed(which, fixed=True), values)
-    found = assert_best(search, **{f"{which}s": (1.0,)})
-    assert found[which == "noise"] == values[which][0]
-
-
-def test_at_a_limit_of_the_signal_the_noise_is_best():
-    search = search_of(0, *small())
-    highest = 0.3 * search.best()[0]
-    search = replace(search, signal=Variance(search.signal.at_bound, 1e-9, highest))
-    assert assert_best(search, signals=(1.0,), slack=1e-3)[0] == pytest.approx(highest)
-
-
-@pytest.mark.parametrize("fixed", [False, True])
-@pytest.mark.parametrize(("first", "lowest"), [(None, 0.5), (1e-7, 0.1)])
-def test_the_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):
-    model, rows, table, values = small()
-    table = table.changed("signal", fixed=True) if fixed else table
-    values = values if first is None else values | {"noise": np.full(2, first)}
-    search = search_of(0, model, rows, table, values)
-    search = replace(search, noise=search.noise._replace(low=lowest))
-    assert assert_best(search, signals=(1.0,), slack=1e-3)[1] >= lowest
-
-
 def test_variances_of_few_groups_are_larger_the_less_groups_agree():
     search = search_of(0, *small())
     rows = [fold.rows.residuals.shape[0] for fold in search.folds]
@@ -427,12 +348,15 @@ def test_variances_of_few_groups_are_larger_the_less_groups_agree():
     assert search.in_doubt(*search.best(), [np.full(n, i) for i, n in enumerate(rows)]) > few + 0.1
 
 
-def test_where_the_bound_was_is_a_prior_that_few_rows_move_less():
-    found = []
-    for n in (60, 600):
-        model, rows, table, values = small(n)
-        found.append(search_of(0, model, rows, table, values).best()[0] / values["signal"][0])
-    assert 1.0 < found[0] < found[1]
+@pytest.mark.parametrize("fixed", [False, True])
+@pytest.mark.parametrize(("first", "lowest"), [(None, 0.5), (1e-7, 0.1)])
+def test_noise_is_not_below_its_lowest_also_if_it_began_there(first, lowest, fixed):
+    model, rows, table, values = small()
+    table = table.changed("signal", fixed=True) if fixed else table
+    values = values if first is None else values | {"noise": np.full(2, first)}
+    search = search_of(0, model, rows, table, values)
+    search = replace(search, noise=search.noise._replace(low=lowest))
+    assert assert_best(search, signals=(1.0,), slack=1e-3)[1] >= lowest
 
 
 def calibrated_rows(model, rows, table, values, by, threads=None):
@@ -452,10 +376,3 @@ def test_bits_do_not_depend_on_the_number_of_threads(groups, monkeypatch):
     expected = calibrated_rows(*small(), by)
     np.testing.assert_array_equal(found.signal, expected.signal)
     np.testing.assert_array_equal(found.noise, expected.noise)
-
-
-def test_few_rows_and_what_is_fixed_are_left():
-    assert calibrated_rows(*small(49), CrossValidation(5)) is None
-    model, rows, table, values = small()
-    fixed = table.changed("signal", fixed=True).changed("noise", fixed=True)
-    assert calibrated_rows(model, rows, fixed, values, CrossValidation(5)) is None

@@ -1,15 +1,12 @@
 """The models of a problem: which outputs share what, where each starts, and what a search asks of one."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, Matern, WhiteKernel
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
-from skevgp.fitting import search
 from skevgp.fitting.inducing import MAX_SAMPLE, Placement
 from skevgp.fitting.model import partition_of
-from skevgp.fitting.search import FeaturesAlone, Fit, Search
+from skevgp.fitting.search import FeaturesAlone
 from skevgp.model.bounds import bounds_alone
 from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor
@@ -64,15 +61,12 @@ def test_groups_are_models_of_their_outputs():
     assert [columns for _, _, columns in told] == [range(0, 1), range(1, 2)]
 
 
-@pytest.mark.parametrize(
-    ("sharing", "n_threads", "share"), [("none", 1, 1.0), ("none", 2, 0.5), ("none", 9, 0.5), ("all", 2, 1.0)]
-)
-def test_fits_at_once_share_the_memory_and_start_alike(sharing, n_threads, share):
-    found = models(sharing=sharing, n_threads=n_threads)
-    assert {model.rows.share for model in found} == {share}
-    assert len({model.seed for model in found}) == 1
-    for model in found[1:]:
-        np.testing.assert_array_equal(model.table["inducing_points"].start, found[0].table["inducing_points"].start)
+@pytest.mark.parametrize("solver", [LBFGS(), Adam()])
+def test_noise_starts_where_the_rules_of_the_solver_say(solver):
+    model = model_of(solver=solver)
+    np.testing.assert_allclose(model.table["noise"].start, model.rules.first_noise * model.scatter)
+    np.testing.assert_allclose(model.table["noise"].lower, model.rules.lowest_noise * model.scatter)
+    assert model.sparse.jitter == model.rules.jitter
 
 
 @pytest.mark.parametrize(
@@ -87,33 +81,15 @@ def test_fits_at_once_share_the_memory_and_start_alike(sharing, n_threads, share
     ],
     ids=str,
 )
-def test_a_partition_has_one_order(sharing, n_outputs, partition):
+def test_partition_has_one_order(sharing, n_outputs, partition):
     assert partition_of(sharing, n_outputs) == partition
-
-
-@pytest.mark.parametrize(
-    "sharing",
-    [[[0, 1]], [[0, 1], [1, 2]], [[0, 1], [2], []], [[0, 1], [3]], [[-1, 0], [1]], [0, 1, 2], [[0.0, 1.0], [2.0]], []],
-    ids=str,
-)
-def test_what_is_no_partition_is_named(sharing):
-    with pytest.raises(ValueError, match=r"sharing=\[.*must be .* partition of the outputs.*each of range\(3\)"):
-        partition_of(sharing, 3)
 
 
 # --- where they start -------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("solver", [LBFGS(), Adam()])
-def test_the_noise_starts_where_the_rules_of_the_solver_say(solver):
-    model = model_of(solver=solver)
-    np.testing.assert_allclose(model.table["noise"].start, model.rules.first_noise * model.scatter)
-    np.testing.assert_allclose(model.table["noise"].lower, model.rules.lowest_noise * model.scatter)
-    assert model.sparse.jitter == model.rules.jitter
-
-
 @pytest.mark.parametrize("sharing", SHARING)
-def test_what_the_user_says_is_in_his_units(sharing):
+def test_starting_values_are_in_user_units(sharing):
     kernel = ConstantKernel(5.0, (1.0, 20.0)) * RBF([0.7, 0.9]) + WhiteKernel(0.3, (0.1, 1.0))
     unit = units_of().target_unit
     tables = [model.table for model in models(sharing=sharing, kernel=kernel)]
@@ -124,11 +100,6 @@ def test_what_the_user_says_is_in_his_units(sharing):
     np.testing.assert_allclose(limits * unit[:, np.newaxis] ** 2, [[0.1, 1.0]] * O)
     for table in tables:
         np.testing.assert_allclose(table["hyperparameters"].start, [0.7, 0.9])
-
-
-def test_a_kernel_that_is_none_is_named_before_anything_is_fitted():
-    with pytest.raises(ValueError, match=r"kernel: k\(X, X\) must be positive semi-definite"):
-        models(kernel=lambda A, B: A @ B.T - 10.0)
 
 
 _x = np.random.RandomState(0).randint(0, 5, (MAX_SAMPLE + 1, 1)).astype(float)
@@ -151,7 +122,7 @@ TWICE = {"X": np.vstack([X, X * (1.0 + 1e-15)]), "H": np.vstack([H, H]), "Y": np
     ],
     ids=["all", "kernel", "rounding", "given", "too few", "diagonal", "all but one", "next to the rows", "a sample's"],
 )
-def test_points_that_are_all_rows_stay(changes, stay):
+def test_points_at_all_rows_are_kept(changes, stay):
     """There the bound is the likelihood, and no other places are better. Rows that differ by rounding only are one.
 
     Of more rows than a sample has nobody has looked whether they are all.
@@ -170,46 +141,15 @@ def test_points_that_are_all_rows_stay(changes, stay):
 
 
 @pytest.mark.parametrize("sharing", SHARING)
-def test_a_fit_goes_on_where_another_ended(sharing):
+def test_fit_goes_on_where_another_ended(sharing):
     first = fitted(sharing=sharing)
     for model, before in zip(models(previous=first, sharing=sharing), first.models, strict=True):
         for name, value in before.values.items():
             np.testing.assert_allclose(model.warm[name], value, rtol=1e-10, err_msg=name)
 
 
-def test_values_go_over_to_the_units_of_other_targets():
-    first, other = fitted(), {"Y": 100.0 * Y}
-    (model,), before = models(previous=first, **other), first.models[0].values
-    ratio = units_of().target_unit ** 2 / units_of(**other).target_unit ** 2
-    for name in ("signal", "noise"):
-        expected = np.clip(before[name] * ratio, model.table[name].lower, model.table[name].upper)
-        np.testing.assert_allclose(model.warm[name], expected, rtol=1e-9)
-    np.testing.assert_allclose(model.warm["hyperparameters"], before["hyperparameters"])
-
-
-def test_another_kernel_takes_over_noise_and_points_only_and_given_points_are_the_users():
-    first = fitted()
-    (model,), before = models(previous=first, kernel=Matern([1.0, 2.0])), first.models[0].values
-    np.testing.assert_allclose(model.warm["hyperparameters"], [1.0, 2.0])
-    for name in ("noise", "inducing_points"):
-        np.testing.assert_allclose(model.warm[name], before[name])
-    (model,) = models(previous=first, placement=Placement(X[:8], 8))
-    np.testing.assert_allclose(model.warm["inducing_points"], [X[:8]])
-
-
-@pytest.mark.parametrize("most", [20, 8])
-def test_points_whose_number_was_found_count_as_placed(most):
-    """Though the table starts at them, as it does at first points; also where they are as many as first points."""
-    changes = {"placement": Placement("auto", 8, most), "max_iter": 100}
-    first = fitted(**changes)
-    (model,), (cold,) = models(previous=first, **changes), models(**changes)
-    assert model.placed
-    assert not cold.placed
-    np.testing.assert_allclose(model.table["inducing_points"].start, first.models[0].values["inducing_points"])
-
-
 @pytest.mark.parametrize("why", ["nothing before", "other sharing", "one output"])
-def test_a_fit_that_cannot_go_on_starts_cold(why):
+def test_fit_that_cannot_go_on_starts_cold(why):
     first = fitted(sharing="kernel")
     changes = {
         "nothing before": {},
@@ -219,32 +159,10 @@ def test_a_fit_that_cannot_go_on_starts_cold(why):
     assert all(model.warm is None for model in models(**changes))
 
 
-@pytest.mark.parametrize("X", [1e3 * X + 1e4, 1e-3 * X + 1e4, np.hstack([X, X[:, :1]])], ids=["wide", "narrow", "more"])
-def test_points_of_another_space_are_left_with_all_else(X):
-    """It then starts from the cold values, though some of the data's range is the same."""
-    (model,) = models(previous=fitted(), X=X)
-    for name, value in model.table.values_at_start().items():
-        np.testing.assert_array_equal(model.warm[name], value)
-
-
 # --- what a search asks -----------------------------------------------------------------------------------------------
 
 
-def test_a_model_knows_what_the_features_alone_explain():
-    """And a fit that ended below that is tried from elsewhere."""
-    model = model_of()
-    r = model.rows.some(np.arange(N)).targets
-    expected = bounds_alone(model.blocks.linear, model.sparse.prior, np.mean(r**2, axis=0), np.zeros(O)).sum()
-    assert model.bound_alone == pytest.approx(expected, rel=1e-10)
-    # The signal can be 1e-8 of the unit.
-    assert model.alone.bound == pytest.approx(expected, rel=1e-6)
-    np.testing.assert_allclose(model.alone.noise, np.mean(r**2, axis=0), rtol=1e-6)
-    values, own = model.table.values_at_start(), Search(model)
-    assert own.collapsed(Fit(values, model.alone.bound - 1.0))
-    assert not own.collapsed(Fit(values, model.alone.bound + 1.0))
-
-
-def test_where_features_may_hide_the_noise_it_is_known_which_suits_them(monkeypatch):
+def test_noise_start_with_many_features(monkeypatch):
     """With the signal at its lower limit, 1e-8 of the unit; if it is fixed, that depends on where the kernel ends."""
     monkeypatch.setattr("skevgp.fitting.model.may_hide_noise", lambda prior, n_rows: True)
     model = model_of()
@@ -256,47 +174,6 @@ def test_where_features_may_hide_the_noise_it_is_known_which_suits_them(monkeypa
     assert (found.hidden, found.most) == (True, -np.inf)
     fixed = model_of(kernel=ConstantKernel(4.0, "fixed") * RBF([1.0, 1.0])).alone
     assert fixed.most > fixed.bound
-
-
-@pytest.mark.parametrize("sharing", ["all", "kernel"])
-def test_places_follow_the_kernel_that_was_learned(sharing):
-    """Where one column does not matter, the greedy search spreads points over the other, alike for all groups."""
-    model = model_of(placement=Placement("auto", 8), sharing=sharing)
-    values = model.table.values_at_start()
-    placed = model.place(values | {"hyperparameters": np.array([0.5, 1e3])})
-    first, *others = placed["inducing_points"]
-    assert first.shape == (8, 2)
-    assert {tuple(point) for point in first} <= {tuple(row) for row in X}
-    assert np.abs(np.diff(np.sort(first[:, 0]))).min() > 0.1
-    assert len(others) == (sharing == "kernel")
-    for points in others:
-        np.testing.assert_array_equal(points, first)
-    assert placed["noise"] is values["noise"]
-    assert model_of().place is None
-
-
-def test_restarts_start_elsewhere_in_all():
-    model = model_of()
-    first, drawn = model.table.values_at_start(), model.restart()
-    for name in ("hyperparameters", "noise", "inducing_points"):
-        assert (drawn[name] != first[name]).any(), name
-    lower, upper = model.table.limits()
-    flat = model.table.started_at(drawn).start()
-    assert ((lower <= flat) & (flat <= upper)).all()
-
-
-def test_the_smaller_sample_is_part_of_the_larger_one(monkeypatch):
-    monkeypatch.setattr(search, "RULES", replace(search.RULES, sample=(15, 1), growth=2))
-    model = model_of(n_inducing=5)
-    assert model.samples == (15, 30)
-    fewer, again, more = (model.objective(model.table, size).blocks.linear for size in (15, 15, 30))
-    assert (fewer.n_rows, more.n_rows) == model.samples
-    np.testing.assert_array_equal(fewer.RR, again.RR)
-    assert (model.blocks.linear.RR >= more.RR).all()
-    assert (more.RR >= fewer.RR).all()
-    assert model.objective(model.table).blocks is model.blocks
-    # Points that are all rows are not fitted to a sample; nor are mini-batches.
-    assert model_of(n_inducing=N).samples == model_of(solver=Adam()).samples == ()
 
 
 # --- more inducing points ---------------------------------------------------------------------------------------------
@@ -320,13 +197,3 @@ def test_half_as_many_points_again_come_after_those_of_a_fit_as_far_as_they_may(
     assert growing(most=10, sharing=sharing).with_more(values).n_inducing == 10
     assert growing(most=8, sharing=sharing).with_more(values) is None
     assert model_of(sharing=sharing).with_more(values) is None
-
-
-@pytest.mark.parametrize("family", ["full", "diagonal"])
-def test_points_as_many_as_rows_become_the_rows(family):
-    model = growing(first=45, family=family)
-    more = model.with_more(model.table.values_at_start())
-    np.testing.assert_array_equal(more.table["inducing_points"].start, X[np.newaxis])
-    assert more.sparse.complete == (family == "full")
-    assert more.table["inducing_points"].free.any() == (family == "diagonal")
-    assert more.with_more(more.table.values_at_start()) is None

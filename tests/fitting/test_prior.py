@@ -24,7 +24,7 @@ def predictor(kernel=KERNEL, H=H, shared=False):
 
 
 @pytest.mark.parametrize("H", [H, NO_FEATURES], ids=["features", "none"])
-def test_it_is_the_dense_prior(H):
+def test_prior_is_dense_one(H):
     found, prior = predictor(H=H)
     mean, covariance = found.covariance(X, H)
     np.testing.assert_allclose(mean, H @ prior.mean.T, rtol=1e-12)
@@ -36,18 +36,6 @@ def test_it_is_the_dense_prior(H):
     np.testing.assert_array_equal(np.sqrt(np.einsum("oii->oi", found.coefficients()[1])), prior.scale)
 
 
-def test_outputs_that_share_weights_depend_on_each_other():
-    found, prior = predictor(shared=True)
-    covariance = found.covariance(X, H)[1]
-    jointly = found.jointly(covariance, X, H)
-    np.testing.assert_allclose(jointly[0::O, 1::O], (H * prior.scale[0] ** 2) @ H.T, rtol=1e-10, atol=1e-12)
-
-
-def test_noise_is_what_the_kernel_says_or_none():
+def test_prior_noise_is_kernel_noise():
     assert (predictor()[0].noise == 0.0).all()
     np.testing.assert_array_equal(predictor(KERNEL + WhiteKernel(0.7))[0].noise, [0.7, 0.7])
-
-
-def test_a_function_that_is_no_kernel_is_refused():
-    with pytest.raises(ValueError, match="positive semi-definite"):
-        predictor(lambda A, B: -1.0 - 0.0 * (A @ B.T))

@@ -7,24 +7,17 @@ import numpy as np
 import pytest
 
 from skevgp.fitting.search import (
-    MINI_BATCH_RULES,
-    RULES,
     FeaturesAlone,
     Fit,
     Rules,
-    Search,
     better,
-    drawn,
-    rules_of,
     search,
 )
 from skevgp.model.parameters import Parameter, ParameterTable
-from skevgp.solvers import LBFGS, Adam
 from skevgp.utils.monitor import Monitor
 
 OWN = Rules(first_noise=1e-4, other_starts=((0.5, 1.0), (2.0, 100.0)), much_noise=1e3, stage=100)
 PLACES = np.arange(4.0).reshape(1, 2, 2)
-NOISE = np.array([3.0, 7.0])
 
 
 def table(noise_fixed=False, kernel_fixed=False, widest_signal=None):
@@ -90,26 +83,20 @@ GOOD, COLLAPSED, UNFINISHED = {}, {"noise": 0.95}, {"converged": False}
 # --- other starts -----------------------------------------------------------------------------------------------------
 
 
-def test_a_good_fit_is_left_alone():
+def test_good_fit_is_left_alone():
     made, best = drive(model(), (5.0, GOOD))
     assert [start.until for start in made] == [1000]
     np.testing.assert_allclose(made[0].values["hyperparameters"], [2.0, 3.0])
     assert best.bound == 5.0
 
 
-def test_a_collapsed_fit_starts_again_elsewhere_until_one_learns():
+def test_collapsed_fit_starts_again_elsewhere_until_one_learns():
     made, best = drive(model(), (5.0, COLLAPSED), (4.0, COLLAPSED), (9.0, GOOD))
     np.testing.assert_allclose([start.values["hyperparameters"] for start in made], [[2.0, 3.0], [1.0, 1.5], [4.0, 6]])
     np.testing.assert_allclose([start.values["noise"] for start in made], [[1e-4] * 2, [1e-4] * 2, [1e-2] * 2])
     assert best.bound == 9.0
     # When nothing learns the best bound is kept.
     assert drive(model(), (5.0, COLLAPSED), (7.0, COLLAPSED), (6.0, COLLAPSED))[1].bound == 7.0
-
-
-def test_one_output_that_collapsed_is_enough():
-    own = Search(model())
-    assert own.collapsed(Fit({"noise": np.array([1e-4, 0.95])}, 5.0))
-    assert not own.collapsed(Fit({"noise": np.array([1e-4, 0.85])}, 5.0))
 
 
 @pytest.mark.parametrize(
@@ -119,18 +106,7 @@ def test_other_starts_need_a_noise_that_moves(changes):
     assert len(drive(model(**changes), (5.0, COLLAPSED))[0]) == 1
 
 
-def test_where_the_kernel_may_interpolate_a_high_noise_is_tried_too_but_not_twice():
-    made, best = drive(model(interpolates=True), (5.0, GOOD), (6.0, GOOD))
-    np.testing.assert_allclose(made[1].values["noise"], 0.1)
-    assert best.bound == 6.0
-    # And points, as many as rows, stay.
-    assert len(drive(model(interpolates=True, place=place), (5.0, GOOD), (4.0, GOOD))[0]) == 2
-    again = replace(OWN, other_starts=((1.0, OWN.much_noise), (2.0, 100.0)))
-    made, _ = drive(model(interpolates=True, rules=again), (5.0, COLLAPSED), (6.0, COLLAPSED), (4.0, COLLAPSED))
-    assert len({float(start.values["noise"][0]) for start in made}) == len(made) == 3
-
-
-def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
+def test_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
     """One of two outputs is enough; a limit of the user's has none beyond."""
     at_limit, inside = {"signal": [1.0, 1e3], "n_iter": 50}, {"signal": [1.0, 900.0], "n_iter": 50}
     wide = table(widest_signal=1e5)
@@ -149,38 +125,10 @@ def test_a_fit_that_ended_at_a_limit_goes_on_where_that_is_wider():
 # --- fits below the features alone ------------------------------------------------------------------------------------
 
 
-def test_a_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
+def test_kernel_that_explains_less_than_noise_alone_starts_again_once_it_has_ended():
     below = {"alone": FeaturesAlone(6.0)}
     assert len(drive(model(**below), (5.0, GOOD), (8.0, GOOD))[0]) == 2
     assert len(drive(model(**below), (5.0, UNFINISHED))[0]) == 1
-
-
-def test_what_stays_below_the_features_alone_starts_at_their_noise_at_last():
-    alone, below = FeaturesAlone(6.0, NOISE), [(5.0, GOOD), (4.0, GOOD), (3.0, GOOD)]
-    made, best = drive(model(alone=alone), *below, (6.5, GOOD))
-    np.testing.assert_array_equal(made[3].values["noise"], NOISE)
-    np.testing.assert_array_equal(made[3].values["hyperparameters"], made[0].values["hyperparameters"])
-    assert (made[3].values["signal"] < 1e-3 * NOISE).all()
-    assert best.bound == 6.5
-    # So little signal is little for the rows whose noise is the least, too.
-    made, _ = drive(model(alone=alone, mean_precision=1e4), *below, (6.5, GOOD))
-    assert (made[3].values["signal"] < 1e-7 * NOISE).all()
-    assert len(drive(model(alone=alone, rules=replace(OWN, last_start=False)), *below)[0]) == 3
-    made, _ = drive(model(alone=alone, table=table(noise_fixed=True)), (5.0, GOOD), (6.5, GOOD))
-    assert (made[1].values["signal"] < 1e-3 * NOISE).all()
-    # What is not below them has nothing to gain there.
-    assert len(drive(model(alone=alone), (7.0, COLLAPSED), (6.5, COLLAPSED), (6.2, COLLAPSED))[0]) == 3
-
-
-def test_what_has_not_ended_may_still_rise_unless_the_noise_is_hidden():
-    seen, hidden = FeaturesAlone(6.0, NOISE), FeaturesAlone(6.0, NOISE, hidden=True)
-    assert len(drive(model(alone=seen), (5.0, UNFINISHED))[0]) == 1
-    assert len(drive(model(alone=hidden), (5.0, UNFINISHED), (6.5, GOOD))[0]) == 2
-    # Where the kernel ends elsewhere it may be more, but not more than so much.
-    unknown = replace(hidden, most=8.0)
-    assert len(drive(model(alone=unknown), (7.0, GOOD), (6.5, GOOD))[0]) == 2
-    assert len(drive(model(alone=unknown), (8.0, GOOD))[0]) == 1
-    assert len(drive(model(alone=hidden), (7.0, GOOD))[0]) == 1
 
 
 # --- inducing points that are placed again ----------------------------------------------------------------------------
@@ -196,22 +144,6 @@ def test_points_are_placed_again_and_the_better_of_both_fits_goes_on(bounds, kep
     assert (made[1].after.bound, made[3].after.bound, best.bound) == (5.0, max(bounds[1:3]), 9.0)
 
 
-def test_a_first_stage_that_has_ended_is_not_prolonged_and_stages_end_with_max_iter():
-    made, best = drive(model(place=place), (5.0, GOOD), (4.0, GOOD))
-    assert [start.until for start in made] == [100, 200]
-    assert best.bound == 5.0
-    made, _ = drive(model(place=place, max_iter=110), *((bound, UNFINISHED) for bound in (5.0, 7.0, 6.0)))
-    assert [start.until for start in made] == [100, 110, 110]
-
-
-@pytest.mark.parametrize(
-    "changes", [{"max_iter": 100}, {"table": table(kernel_fixed=True)}, {"rules": replace(OWN, stage=None)}, {}]
-)
-def test_points_stay_where_there_is_no_second_stage(changes):
-    own = model(place=None if changes == {} else place, **changes)
-    assert len(drive(own, (5.0, UNFINISHED))[0]) == 1
-
-
 # --- restarts and fits from before ------------------------------------------------------------------------------------
 
 
@@ -224,51 +156,11 @@ def test_restarts_are_drawn_and_the_best_of_all_is_kept():
     assert best.bound == 8.0
 
 
-def test_a_restart_has_stages_of_its_own_and_the_last_start_comes_once_after_all():
-    made, best = drive(model(n_restarts=1, place=place), *((bound, GOOD) for bound in (5.0, 4.0, 3.0, 3.5)))
-    assert [start.until for start in made] == [100, 200, 100, 200]
-    # It goes on from the restart's first stage, though the fit before it was better.
-    assert (made[3].after.bound, best.bound) == (3.0, 5.0)
-    below = [(bound, GOOD) for bound in (5.0, 4.0, 3.0)]
-    made, best = drive(model(alone=FeaturesAlone(6.0, NOISE), n_restarts=2), *below, *below, *below, (6.5, GOOD))
-    assert [bool((start.values["noise"] == NOISE).all()) for start in made] == [False] * 9 + [True]
-    assert best.bound == 6.5
-
-
-@pytest.mark.parametrize(("moved", "placed"), [(1.0, False), (0.0, True), (0.0, False)])
-def test_points_that_another_fit_has_moved_are_not_placed_again(moved, placed):
-    """Those that the table has from it count as moved."""
-    warm = {"inducing_points": PLACES + moved, "noise": np.full(2, 0.3)}
-    stays = bool(moved) or placed
-    results = [(5.0, UNFINISHED)] if stays else [(5.0, GOOD), (4.0, GOOD)]
-    made, _ = drive(model(warm=warm, placed=placed, place=place), *results)
-    assert (made[0].until == 1000) == stays
-    np.testing.assert_array_equal(made[0].values["inducing_points"], PLACES + moved)
-    np.testing.assert_allclose(made[0].values["noise"], 0.3)
-
-
-def test_a_warm_start_that_leads_nowhere_is_left_for_a_cold_one():
-    warm = {"inducing_points": PLACES + 1.0, "noise": np.full(2, 0.3)}
-    made, best = drive(model(warm=warm, rules=replace(OWN, other_starts=())), (5.0, COLLAPSED), (4.0, GOOD))
-    np.testing.assert_allclose(made[1].values["noise"], 1e-4)
-    assert best.bound == 5.0
-
-
-def test_of_equal_fits_the_later_is_kept_and_any_is_better_than_none():
+def test_later_of_equal_fits_is_kept():
     first, second = Fit({}, 1.0), Fit({}, 1.0)
     assert better(first, second) is second
     assert better(None, Fit({}, -np.inf)).bound == -np.inf
     assert better(first, Fit({}, -np.inf)) is first
-
-
-def test_drawn_values_stay_within_limits_and_leave_what_is_fixed():
-    own, rng = table(kernel_fixed=True), np.random.RandomState(0)
-    values = [drawn(own, OWN, rng) for _ in range(50)]
-    noise = np.array([value["noise"] for value in values])
-    assert noise.min() >= 1e-4 / 30.0 * (1 - 1e-9)
-    assert noise.max() <= 1e-4 * 30.0 * (1 + 1e-9)
-    assert noise.max() / noise.min() > 30.0
-    np.testing.assert_allclose([value["hyperparameters"] for value in values], [[2.0, 3.0]] * 50)
 
 
 # --- interruption -----------------------------------------------------------------------------------------------------
@@ -281,15 +173,6 @@ def test_ctrl_c_ends_the_search_with_the_best_so_far():
     assert (best.n_rows, best.bound) == (1000, 2.0)
 
 
-def test_ctrl_c_while_points_are_placed_keeps_the_fit():
-    def interrupted(values):
-        raise KeyboardInterrupt
-
-    own = model(place=interrupted)
-    assert drive(own, (4.0, GOOD))[1].bound == 4.0
-    assert own.monitor.stopped
-
-
 def test_ctrl_c_before_any_fit_is_an_interrupt():
     def interrupted(start):
         raise KeyboardInterrupt
@@ -298,10 +181,21 @@ def test_ctrl_c_before_any_fit_is_an_interrupt():
         search(SimpleNamespace(**vars(model()) | {"minimise": interrupted}))
 
 
+def test_what_collapsed_on_a_sample_starts_again_on_more_rows():
+    own = model(rules=replace(OWN, other_starts=()), samples=(1000, 4000))
+    made, best = drive(own, *[(5.0, COLLAPSED)] * 4, (2.0, GOOD))
+    assert [start.n_rows for start in made] == [1000, 1000, 4000, 4000, None]
+    for cold in made[::2]:
+        np.testing.assert_allclose(cold.values["hyperparameters"], [2.0, 3.0])
+        np.testing.assert_allclose(cold.values["noise"], 1e-4)
+        assert cold.cold
+    assert best.bound == 2.0
+
+
 # --- samples of the rows ----------------------------------------------------------------------------------------------
 
 
-def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
+def test_fit_climbs_from_sample_to_sample_to_all_rows():
     each = [(5.0, UNFINISHED), (4.0, UNFINISHED), (6.0, GOOD), (4.5, GOOD), (3.0, UNFINISHED), (2.0, GOOD)]
     made, best = drive(model(samples=(1000, 4000), place=place), *each)
     # Two noises, points placed again and the old ones; then the better on more rows, and on all.
@@ -316,30 +210,12 @@ def test_a_fit_climbs_from_sample_to_sample_to_all_rows():
     assert (best.bound, best.n_rows) == (2.0, None)
 
 
-def test_what_collapsed_on_a_sample_starts_again_on_more_rows():
-    own = model(rules=replace(OWN, other_starts=()), samples=(1000, 4000))
-    made, best = drive(own, *[(5.0, COLLAPSED)] * 4, (2.0, GOOD))
-    assert [start.n_rows for start in made] == [1000, 1000, 4000, 4000, None]
-    for cold in made[::2]:
-        np.testing.assert_allclose(cold.values["hyperparameters"], [2.0, 3.0])
-        np.testing.assert_allclose(cold.values["noise"], 1e-4)
-        assert cold.cold
-    assert best.bound == 2.0
-
-
-def test_what_collapses_on_all_rows_only_starts_again_there():
+def test_collapse_on_all_rows_restarts():
     own = model(rules=replace(OWN, other_starts=(), much_noise=None), samples=(1000,))
     made, best = drive(own, (5.0, GOOD), (2.0, COLLAPSED), (3.0, GOOD))
     assert [start.n_rows for start in made] == [1000, None, None]
     np.testing.assert_allclose(made[2].values["noise"], 1e-4)
     assert best.bound == 3.0
-
-
-def test_few_iterations_are_the_most_on_a_sample_too_and_none_need_no_sample():
-    made, _ = drive(model(samples=(1000,), max_iter=7), *((bound, UNFINISHED) for bound in (5.0, 4.0, 2.0)))
-    assert [start.until for start in made] == [7, 7, 7]
-    made, _ = drive(model(samples=(1000,), max_iter=0), (5.0, GOOD))
-    assert [start.n_rows for start in made] == [None]
 
 
 @pytest.mark.parametrize(
@@ -356,8 +232,3 @@ def test_few_iterations_are_the_most_on_a_sample_too_and_none_need_no_sample():
 def test_samples_grow_until_they_are_half_of_the_rows_or_too_large_for_memory(n_rows, n_inducing, width, sizes):
     assert replace(OWN, sample=(1000, 20)).samples(n_rows, n_inducing, width) == sizes
     assert OWN.samples(n_rows, n_inducing, width) == ()
-
-
-def test_the_rules_are_those_of_a_solver_that_sees_all_rows_or_of_one_that_does_not():
-    assert rules_of(LBFGS()) is RULES
-    assert rules_of(Adam()) is MINI_BATCH_RULES

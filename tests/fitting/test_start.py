@@ -9,7 +9,7 @@ from skevgp.model.model import SparseModel
 from skevgp.model.parameters import ParameterTable
 
 from ..oracle import identity_rows, table_of
-from .cases import NO_FEATURES, H, N, X, Y, source_of, units_of
+from .cases import NO_FEATURES, H, X, Y, source_of, units_of
 
 
 @pytest.mark.parametrize("scale", [1.0, 1e-9])
@@ -21,12 +21,6 @@ def test_neighbours_of_a_smooth_function_are_alike_and_of_noise_are_not(scale):
     np.testing.assert_array_equal(alike, [True, True, False, False])
 
 
-def test_noise_is_seldom_alike():
-    rng = np.random.RandomState(0)
-    for n in (1, 2, 10, 50, 500):
-        assert not alike_neighbours(identity_rows(rng.randn(n, 3), rng.randn(n, 100))).any()
-
-
 @pytest.mark.parametrize(
     ("start", "first", "lower", "upper", "widest"),
     [
@@ -36,7 +30,7 @@ def test_noise_is_seldom_alike():
     ],
     ids=["no opinion", "in the user's units", "outside of the limits"],
 )
-def test_a_start_is_the_users_within_limits(start, first, lower, upper, widest):
+def test_start_is_the_users_within_limits(start, first, lower, upper, widest):
     own = parameter_of(start, "x", np.array([2.0]), np.array([1.0]), np.array([3.0]), 10.0, 9.0)
     assert (own.lower, own.upper, own.widest) == ([lower], [upper], widest)
     table = ParameterTable([own])
@@ -65,23 +59,8 @@ def test_starts_and_limits_follow_the_data_and_the_rules():
 
 # --- there and back between the user's units and the internal ones ---------------------------------------------------
 
-ROWS = source_of().take(np.arange(N))
 
-
-@pytest.mark.parametrize("features", [H, NO_FEATURES], ids=["features", "none"])
-@pytest.mark.parametrize("target_mean", [(0.0, 0.0), (3.0, -20.0)])
-def test_targets_come_back(target_mean, features):
-    units = units_of(H=features, target_mean=target_mean)
-    raw = source_of(H=features).take(np.arange(N))
-    internal = units.to_internal(raw)
-    assert internal.inputs is raw.inputs
-    assert internal.features is raw.features
-    back = units.target_mean + raw.features @ units.prior.offset.T + internal.targets * units.target_unit
-    np.testing.assert_allclose(back, Y, rtol=1e-12)
-    np.testing.assert_array_equal(units.rows(source_of(H=features)).some(np.arange(N)).targets, internal.targets)
-
-
-def test_the_features_leave_as_little_as_they_can_at_the_reference():
+def test_features_leave_as_little_as_they_can_at_the_reference():
     """Least squares of y on them, the priors being wide."""
     fitted = np.linalg.lstsq(H, Y, rcond=None)[0]
     left = np.sqrt(np.mean((Y - H @ fitted) ** 2, axis=0))

@@ -1,6 +1,5 @@
 import numpy as np
 import pytest
-from numpy.testing import assert_allclose
 
 from skevgp.identification.stiction import JointNoise, likeliest_noise, likeliest_velocity, noise_at
 
@@ -18,38 +17,11 @@ def test_at_rest_friction_is_uniform_and_at_speed_it_is_known():
     assert noise.of(np.array([1.0, -1.0])) == pytest.approx(0.01)
 
 
-def test_noise_is_found_where_the_rest_is_known():
-    errors, speed = drawn()
-    assert noise_at(errors, speed, 2.0, 0.02, 1e-9).variance == pytest.approx(0.01, rel=0.05)
-    assert noise_at(errors, speed, 0.0, 0.02, 1e-9).variance == pytest.approx(np.mean(errors**2), rel=1e-3)
-
-
 @pytest.mark.parametrize("velocity", [0.005, 0.02, 0.1])
-def test_the_velocity_is_found_too(velocity):
+def test_velocity_is_found_too(velocity):
     found = likeliest_noise(*drawn(velocity=velocity), coulomb=2.0, velocity=0.01, least=1e-9)
     assert found.velocity == pytest.approx(velocity, rel=0.1)
     assert found.variance == pytest.approx(0.01, rel=0.2)
-
-
-@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
-def test_units_do_not_matter(scale):
-    errors, speed = drawn(2000)
-    one, other = (likeliest_noise(s * errors, speed, s * 2.0, 0.01, 1e-9 * s**2) for s in (1.0, scale))
-    assert_allclose([other.variance, other.velocity], [scale**2 * one.variance, one.velocity], rtol=1e-2)
-
-
-def test_without_errors_there_is_hardly_any_noise():
-    for least in (1e-12, 1e-250):
-        noise = likeliest_noise(np.zeros(10), np.zeros(10), 1.0, 0.01, least)
-        assert least * 0.999 <= noise.variance <= 11.0 * least
-        assert noise_at(np.zeros(10), np.zeros(10), 0.0, 0.01, least).variance >= least * 0.999
-
-
-def test_a_start_nearby_ends_at_the_same_noise():
-    errors, speed = drawn()
-    cold = likeliest_noise(errors, speed, 2.0, 0.01, 1e-9)
-    warm = likeliest_noise(errors, speed, 2.0, 0.01, 1e-9, JointNoise(0.02, 2.0, 0.03))
-    assert_allclose(warm, cold, rtol=1e-2)
 
 
 @pytest.mark.parametrize("coulomb", [0.5, 2.0])
@@ -65,7 +37,7 @@ def test_noise_of_few_rows_that_move_is_larger_than_the_mean_square_of_all(coulo
 
 
 @pytest.mark.parametrize("velocity", [0.005, 0.03, 0.1])
-def test_the_velocity_of_mean_friction_is_found_from_what_another_one_leaves(velocity):
+def test_velocity_of_mean_friction_is_found_from_what_another_one_leaves(velocity):
     rng = np.random.default_rng(0)
     speed = 0.3 * rng.normal(size=5000)
     torque = 2.0 * np.tanh(speed / velocity) + 0.5 * speed + 0.1 * rng.normal(size=5000)

@@ -22,19 +22,6 @@ def test_sums_add_side_by_side():
     np.testing.assert_array_equal(total[1][1], [1.0, 1.0, 1.0])
 
 
-@pytest.mark.parametrize("centre", [None, CENTRE])
-def test_squares_are_of_centred_rows(centre):
-    squares = CentredSquares() if centre is None else CentredSquares(tuple(centre.tolist()))
-    x = X if centre is None else X - centre
-    np.testing.assert_array_equal(squares(X), np.vstack([x.T, np.ones(40), x.T**2]))
-    assert squares(X).flags["C_CONTIGUOUS"]
-
-
-def test_rows_as_they_are_are_not_copied():
-    assert as_they_are(X) is X
-    assert no_columns(X).shape == (40, 0)
-
-
 @pytest.mark.parametrize(
     ("covariance", "preparations"),
     [
@@ -43,7 +30,7 @@ def test_rows_as_they_are_are_not_copied():
         (Product((DotProduct(), Sum((RBF, DotProduct())), Constant())), (as_they_are, CentredSquares(), no_columns)),
     ],
 )
-def test_parts_share_what_is_the_same(covariance, preparations):
+def test_sums_share_prepared_rows(covariance, preparations):
     assert covariance.preparations == preparations
     centred = covariance.centred(CENTRE)
     assert {CentredSquares((3.0, -2.0))} | set(preparations) - {CentredSquares()} == set(centred.preparations)
@@ -80,9 +67,3 @@ def test_sums_and_products_are_those_of_the_parts(covariance, centre):
     found = at.matrix(), at.cross(prepared), np.broadcast_to(at.diagonal(prepared), 40)
     for actual, expected in zip(found, alone(covariance, hyperparameters), strict=True):
         np.testing.assert_allclose(actual, expected, rtol=1e-13)
-
-
-def test_equal_covariances_may_have_other_centres():
-    assert Sum((RBF, DotProduct())).centred(CENTRE) == Sum((RBF, DotProduct()))
-    assert Sum((RBF, DotProduct())) != Product((RBF, DotProduct()))
-    assert Stationary(Matern32(), 2) != MATERN

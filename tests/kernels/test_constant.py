@@ -5,7 +5,7 @@ from skevgp.kernels.constant import Constant
 from .cases import X, Z, random_bars
 
 
-def test_one_number_stands_for_all():
+def test_constant_diagonal_is_scalar():
     covariance = Constant()
     at, prepared = covariance.at(np.log([0.6]), Z), covariance.prepare(X)
     U = at.cross(prepared)
@@ -15,7 +15,7 @@ def test_one_number_stands_for_all():
     np.testing.assert_array_equal(at.matrix(), np.full((7, 7), U[0, 0]))
 
 
-def test_the_gradient_is_the_sum_of_all_and_none_moves_the_points():
+def test_gradient_is_the_sum_of_all_and_none_moves_the_points():
     cross_bar, diagonal_bar, K_bar = random_bars(7, 40)
     covariance = Constant()
     at, prepared = covariance.at(np.log([0.6]), Z), covariance.prepare(X)

@@ -5,7 +5,7 @@ from skevgp.kernels.dot_product import DotProduct
 from .cases import X, Z
 
 
-def test_it_is_of_the_rows_themselves_wherever_they_are():
+def test_dot_product_ignores_centre():
     """A centre, which helps covariances of differences, is none of its business."""
     covariance = DotProduct().centred(np.array([3.0, -2.0]))
     at, prepared = covariance.at(np.log([0.7]), Z + 1e3), covariance.prepare(X + 1e3)

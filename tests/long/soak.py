@@ -36,14 +36,11 @@ from skevgp.io import load, save
 from skevgp.kernels import FunctionKernel
 from skevgp.noise import Gaussian
 from skevgp.solvers import LBFGS, Adam
-from tests.long.torture import run
 
 # Bytes. Eleven rounds of a process that leaks nothing lay within 5 MB, the medians of their halves 1 MB apart. A leak
 # of r bytes in each of n rounds moves these medians by r n / 2: of 30 rounds, one of 0.3 MB a round is seen.
 SLACK = 4 * 2**20
 WARM_UP = 3
-# Random ones in a round.
-FITS = 30
 
 
 def resident():
@@ -159,14 +156,7 @@ def files(rng, folder):
     path.unlink()
 
 
-def nasty_fits(rng, folder):
-    """Random fits of `tests.long.torture`; those that are refused must hold on to nothing."""
-    first = rng.randint(2**31 - FITS)
-    _, defects, _ = run(range(first, first + FITS))
-    return defects
-
-
-JOBS = (fits, others, partial_fits, rollouts, files, nasty_fits)
+JOBS = (fits, others, partial_fits, rollouts, files)
 
 
 def state(folder):
@@ -188,14 +178,15 @@ def soak(seconds, tell=print):
         tempfile.tempdir = str(folder)  # temporary files of all that is called are seen
         try:
             while time.monotonic() - start < seconds or len(states) < WARM_UP + 4:
-                defects = [defect for job in JOBS for defect in job(rng, folder) or ()]
-                states.append(state(folder) | {"defects": defects})
+                for job in JOBS:
+                    job(rng, folder)
+                states.append(state(folder))
                 size = states[-1]["resident"]
                 tell(
                     f"round {len(states)}, {time.monotonic() - start:.0f} s: "
                     f"{'?' if size is None else f'{size / 2**20:.1f}'} MB, "
                     f"{len(states[-1]['open files'] or ())} open files, {states[-1]['threads']} threads, "
-                    f"{len(states[-1]['left behind'])} files left{''.join(f'; {defect}' for defect in defects)}"
+                    f"{len(states[-1]['left behind'])} files left"
                 )
         finally:
             tempfile.tempdir = before
@@ -204,7 +195,7 @@ def soak(seconds, tell=print):
 
 def leaks(states):
     """What is wrong, in words."""
-    counted, found = states[WARM_UP:], [defect for each in states for defect in each["defects"]]
+    counted, found = states[WARM_UP:], []
     first, last = counted[0], counted[-1]
     if first["open files"] is not None:
         new = set(last["open files"]) - set(first["open files"])

@@ -1,6 +1,5 @@
 from dataclasses import replace
 
-import autograd.numpy as anp
 import numpy as np
 import pytest
 from autograd import grad
@@ -30,56 +29,23 @@ from skevgp.solvers import LBFGS
 from skevgp.utils.linalg import Jitter, NotPositiveDefiniteError
 
 from ..oracle import (
+    Dense,
     at_the_fit,
     central_differences,
-    collapsed_bound,
-    dense_bounds,
     problem,
     relative_error,
     table_of,
+    values_of,
     whitened,
 )
 
 FAMILIES = ("full", "diagonal")
-SHARED = (True, False)
 
 
 def plain_loss(model, rows, table):
     """The loss per row as plain autograd of the flat vector."""
-
-    def loss(flat):
-        c = table.coordinates(flat)
-        bound = collapsed_bound(
-            anp.exp(c["hyperparameters"]),
-            anp.exp(c["signal"]),
-            anp.exp(c["noise"]),
-            c["inducing_points"] * table["inducing_points"].unit + table["inducing_points"].origin,
-            rows,
-            model.prior,
-            model.family,
-        )
-        return -bound / len(rows)
-
-    return loss
-
-
-@pytest.mark.parametrize("shared", SHARED)
-@pytest.mark.parametrize("family", FAMILIES)
-def test_bound_and_gradient_agree_with_plain_autograd(family, shared):
-    model, rows, table = problem(family, shared)
-    loss = plain_loss(model, rows, table)
-    value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())
-    np.testing.assert_allclose(value, loss(table.start()), rtol=1e-10)
-    assert relative_error(gradient, grad(loss)(table.start())) < 1e-9
-
-
-@pytest.mark.parametrize("shared", SHARED)
-@pytest.mark.parametrize("family", FAMILIES)
-def test_gradient_agrees_with_finite_differences(family, shared):
-    model, rows, table = problem(family, shared)
-    objective = BoundObjective(model, table, rows.blocks(model.kernel, 17))
-    _, gradient = objective(table.start())
-    assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start())) < 1e-5
+    dense = Dense(rows.raw, model.prior, model.family)
+    return lambda flat: -dense.bound(values_of(table, flat)) / len(rows)
 
 
 def test_gradient_with_one_lengthscale_for_all_columns():
@@ -111,17 +77,6 @@ def test_block_size_does_not_matter(family):
         value, gradient = BoundObjective(model, table, rows.blocks(model.kernel, size))(table.start())
         np.testing.assert_allclose(value, whole, rtol=1e-10)
         assert relative_error(gradient, whole_gradient) < 1e-10
-
-
-def test_residuals_from_statistics_agree_with_those_from_rows():
-    model, rows, table = problem()
-    values = table.values(table.start())
-    blocks = rows.blocks(model.kernel, 17)
-    (bound,) = bounds_at_optimum(list(model.groups_on(values, blocks)), "full")
-    _, V = whitened(values["hyperparameters"], values["inducing_points"][0], rows.inputs)
-    e = rows.residuals - V.T @ bound.weights[:6] - rows.features @ bound.weights[6:]
-    np.testing.assert_allclose(bound.residuals().squares, (e**2).sum(axis=0), rtol=1e-8)
-    np.testing.assert_allclose(bound.residuals().VE, V @ e, rtol=1e-6, atol=1e-8)
 
 
 def test_squares_from_statistics_are_never_negative_whatever_rounding_says():
@@ -157,14 +112,6 @@ def test_statistics_that_are_not_finite_raise_a_named_error():
         model.at_optimum(values, [statistics])
 
 
-def test_a_prior_knows_its_reference_and_its_outputs():
-    prior = CoefficientPrior(
-        np.array([[1.0, 2.0], [3.0, 4.0]]), np.full((2, 2), 10.0), np.array([[0.1, 0.0], [0.0, 0.2]])
-    )
-    np.testing.assert_allclose(prior.offset, [[2.0, 2.0], [3.0, 6.0]])
-    np.testing.assert_allclose(prior.outputs(slice(1, 2)).offset, [[3.0, 6.0]])
-
-
 def evidence(rows, prior, output, noise):
     """log N(r | -H c w₀, H Σ_β Hᵀ + σ² I) of an output."""
     H, r = rows.features * prior.scale[output], rows.residuals[:, output]
@@ -175,7 +122,7 @@ def evidence(rows, prior, output, noise):
 
 @pytest.mark.parametrize("p", [0, 3])
 @pytest.mark.parametrize("trace", [0.0, 7.0])
-def test_the_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p, trace):
+def test_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p, trace):
     """Less what the prior of f costs."""
     model, rows, _ = problem(p=p)
     noise, traces = np.array([0.3, 2.0]), np.array([trace, 2.0 * trace])
@@ -184,23 +131,7 @@ def test_the_bound_of_the_features_alone_is_the_evidence_of_linear_regression(p,
     np.testing.assert_allclose(bounds, expected, rtol=1e-10)
 
 
-def test_outputs_that_share_their_weights_have_one_evidence():
-    """That of all targets, one below the other."""
-    model, rows, _ = problem(p=3)
-    own = model.prior
-    prior = CoefficientPrior(*(one[:1].repeat(2, axis=0) for one in (own.mean, own.scale, own.reference)), shared=True)
-    noise = np.array([0.3, 2.0])
-    bounds = bounds_alone(rows.blocks(model.kernel, 17).linear, prior, noise, np.zeros(2))
-    H = np.vstack([rows.features * prior.scale[0]] * 2)
-    e = rows.residuals.T.ravel() + H @ prior.reference[0]
-    covariance = H @ H.T + np.diag(np.repeat(noise, len(rows)))
-    expected = -0.5 * (
-        len(e) * np.log(2 * np.pi) + np.linalg.slogdet(covariance)[1] + e @ np.linalg.solve(covariance, e)
-    )
-    assert bounds.sum() == pytest.approx(expected, rel=1e-10)
-
-
-def test_weights_that_outputs_share_are_known_where_rounding_hides_what_the_points_leave_of_them():
+def test_shared_weights_with_singular_precision():
     """The feature lies in the span of the points, with 1e16 times the noise: I + Σ(F - EᵀD⁻¹E) is not positive."""
     model, rows, table = problem(p=1)
     values = table.values_at_start() | {"noise": np.full(2, 1e-16)}
@@ -214,17 +145,8 @@ def test_weights_that_outputs_share_are_known_where_rounding_hides_what_the_poin
         assert (np.diagonal(q.root) > 0.0).all()
 
 
-@pytest.mark.parametrize("shared", SHARED)
-def test_the_papers_family_has_the_lower_bound(shared):
-    bounds = {}
-    for family in FAMILIES:
-        model, rows, table = problem(family, shared)
-        bounds[family] = -BoundObjective(model, table, rows.blocks(model.kernel, 17))(table.start())[0]
-    assert bounds["diagonal"] < bounds["full"]
-
-
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_noise_far_below_the_signal_costs_no_digits(family):
+def test_noise_far_below_the_signal_costs_no_digits(family):
     """1e8 in variance: e is summed row by row."""
     model, rows, table = problem(family)
     values = table.values_at_start() | {"noise": np.full(2, 1e-8)}
@@ -235,7 +157,7 @@ def test_a_noise_far_below_the_signal_costs_no_digits(family):
     assert relative_error(gradient, grad(loss)(small.start())) < 1e-5
 
 
-def test_a_precision_that_rounding_made_negative_counts_as_that_of_the_prior():
+def test_negative_precision_becomes_prior_precision():
     """q of independent values: B is no less than I."""
     own = Whitening.of(SquaredExponential(1), np.ones(1), np.linspace(0, 1e-4, 4)[:, np.newaxis])
     B = np.diag([1.0, -3e30, 2.0, 1.0, -5.0])
@@ -260,31 +182,6 @@ def bounds_of(model, rows, values, from_rows=True):
     return model.bound(values, statistics, seen), model.upper_bound(values, statistics, seen)
 
 
-@pytest.mark.parametrize("from_rows", [True, False])
-@pytest.mark.parametrize("p", [0, 3])
-@pytest.mark.parametrize("shared", SHARED)
-def test_the_log_likelihood_lies_between_the_bounds_and_these_are_those_of_dense_matrices(shared, p, from_rows):
-    model, rows, table = problem(shared=shared, p=p, n=150)
-    values = table.values_at_start()
-    found = bounds_of(model, rows, values, from_rows)
-    lower, exact, upper = dense_bounds(*dense_arguments(values), rows, model.prior)
-    np.testing.assert_allclose(found, (lower, upper), rtol=1e-9)
-    assert lower < exact < upper
-
-
-def dense_arguments(values):
-    return (values[name] for name in ("hyperparameters", "signal", "noise", "inducing_points"))
-
-
-def test_the_upper_bound_does_not_ask_for_the_family():
-    """It is of the likelihood, whatever q is."""
-    bounds = {}
-    for family in FAMILIES:
-        model, rows, table = problem(family)
-        bounds[family] = bounds_of(model, rows, table.values_at_start())[1]
-    assert bounds["diagonal"] == bounds["full"]
-
-
 def on_rows(copies=1, n=30, p=3):
     """A problem in which each distinct row is an inducing point."""
     model, rows, table = problem(n=n, m=2, d=3, p=p)
@@ -304,16 +201,7 @@ def test_with_points_at_all_rows_the_gradient_is_that_of_the_bound_whatever_a_ji
     assert relative_error(gradient, central_differences(lambda x: objective(x)[0], table.start())) < 1e-5
 
 
-@pytest.mark.parametrize("copies", [1, 3])
-@pytest.mark.parametrize("p", [0, 3])
-def test_with_points_at_all_rows_both_bounds_are_the_log_likelihood(p, copies):
-    model, rows, values = on_rows(copies, p=p)
-    lower, upper = bounds_of(model, rows, values)
-    exact = dense_bounds(*dense_arguments(values), rows, model.prior)[1]
-    np.testing.assert_allclose((lower, upper), exact, rtol=1e-8)
-
-
-def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
+def test_gradient_includes_jitter():
     """Three points on a line, of a linear kernel: K is singular, and a diagonal q's bound has the logarithm of what a
     jitter makes of its least eigenvalue. That is noisy: differences need wide steps."""
     x = np.append(np.zeros(7), [0.25, -0.25])[:, np.newaxis]
@@ -329,7 +217,7 @@ def test_the_gradient_knows_that_a_jitter_is_a_share_of_the_diagonal():
     assert 9 * objective(start)[1][0] == pytest.approx(slope, abs=0.1)
 
 
-def test_a_jitter_is_known_from_the_factor():
+def test_jitter_is_known_from_the_factor():
     model, _, values = on_rows()
     (whitening,) = model.whitenings(values)
     assert whitening.jitter() == 0.0
@@ -345,7 +233,7 @@ def test_with_points_at_all_rows_a_jitter_does_not_take_the_upper_bound_below_th
     rows.residuals[:] = 0.01 * np.random.RandomState(0).randn(*rows.residuals.shape)
     jittered = replace(model, jitter=Jitter(1e-6, 0.1))
     few = values | {"inducing_points": rows.inputs[np.newaxis, :3]}
-    exact = dense_bounds(*dense_arguments(few), rows, model.prior)[1]
+    exact = Dense(rows.raw, model.prior).likelihood(few)
     lower, upper = bounds_of(jittered, rows, values)
     assert lower < exact - 0.5
     # Nearer than with the trace, which holds for any points.
@@ -374,7 +262,7 @@ def longdouble_upper_bound(model, rows, values):
 
 
 @pytest.mark.parametrize("m", [6, 40])
-def test_a_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
+def test_noise_far_below_the_signal_costs_the_upper_bound_no_digits(m):
     model, rows, table = problem(m=m, d=1 if m == 6 else 3, n=120)
     values = table.values_at_start() | {
         "noise": np.full(2, 1e-8),
@@ -395,7 +283,7 @@ def test_errors_of_the_upper_bound_are_summed_row_by_row():
 
 @pytest.mark.parametrize("from_rows", [True, False])
 @pytest.mark.parametrize("weights_are_shared", [False, True])
-def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(weights_are_shared, from_rows):
+def test_loss_of_suboptimal_mean_is_known(weights_are_shared, from_rows):
     """The bound is quadratic in the mean."""
     model, rows, table = problem(shared=False)
     alike = {name: getattr(model.prior, name)[:1].repeat(2, axis=0) for name in ("mean", "scale", "reference")}
@@ -419,7 +307,7 @@ def test_what_means_that_are_not_the_least_squares_take_from_the_bound_is_known(
     assert value + lost_by_rounding(bounds, left) == pytest.approx(best, rel=1e-9)
 
 
-def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
+def test_upper_bound_corrects_suboptimal_mean(monkeypatch):
     """Means that something moved: the sum of squares that they leave is not the least, which the bound is made of."""
     model, rows, table = problem()
     values = table.values_at_start()
@@ -436,15 +324,3 @@ def test_the_upper_bound_counts_what_its_means_are_short_of(monkeypatch):
 
     monkeypatch.setattr("skevgp.model.bounds.bounds_at_optimum", moved)
     assert upper_bound(groups, blocks) == pytest.approx(expected, rel=1e-9)
-
-
-def test_the_sums_of_rows_that_are_gone_give_the_upper_bound_too():
-    model, rows, table = problem()
-    values = table.values_at_start()
-    parts = [
-        type(rows)(rows.inputs[own], rows.features[own], rows.residuals[own]) for own in (slice(25), slice(25, 60))
-    ]
-    first, second = (model.statistics(values, part.blocks(model.kernel, 20))[0] for part in parts)
-    assert model.upper_bound(values, [first + second]) == pytest.approx(bounds_of(model, rows, values)[1], rel=1e-9)
-    (group,) = model.groups_of(values, [first + second])
-    assert upper_bound([group]) == model.upper_bound(values, [first + second])

@@ -62,7 +62,7 @@ def dense_likelihood(lengthscales, signal, noise, model, Y):
 
 
 @pytest.mark.parametrize("vague", VAGUE.values(), ids=VAGUE)
-def test_the_likelihood_and_its_gradient_are_those_of_the_dense_formula(vague):
+def test_likelihood_and_its_gradient_are_those_of_the_dense_formula(vague):
     model, Y = problem(vague)
 
     def dense(logs):
@@ -84,7 +84,7 @@ def test_the_likelihood_and_its_gradient_are_those_of_the_dense_formula(vague):
     ],
     ids=["squared exponential", "sum"],
 )
-def test_the_gradient_is_that_of_finite_differences(vague, kernel, hyperparameters):
+def test_gradient_is_that_of_finite_differences(vague, kernel, hyperparameters):
     model, _ = problem(vague)
     model = ExactModel(kernel, model.prior, model.vague, model.rows)
     h = len(hyperparameters)
@@ -101,7 +101,7 @@ def test_the_gradient_is_that_of_finite_differences(vague, kernel, hyperparamete
 
 
 @pytest.mark.parametrize("vague", VAGUE.values(), ids=VAGUE)
-def test_the_reference_of_the_residuals_does_not_matter(vague):
+def test_reference_of_the_residuals_does_not_matter(vague):
     model, Y = problem(vague)
     moved = CoefficientPrior(model.prior.mean, model.prior.scale, model.prior.reference + 0.7)
     rows = RawRows(model.rows.inputs, model.rows.features, Y - model.rows.features @ moved.offset.T)
@@ -114,7 +114,7 @@ def test_the_reference_of_the_residuals_does_not_matter(vague):
 
 
 @pytest.mark.parametrize("vague", VAGUE.values(), ids=VAGUE)
-def test_the_posterior_is_that_of_a_dense_gaussian_of_values_and_weights(vague):
+def test_posterior_is_that_of_a_dense_gaussian_of_values_and_weights(vague):
     model, Y = problem(vague)
     rng = np.random.RandomState(3)
     X, H, x, h = model.rows.inputs, model.rows.features, rng.randn(6, D), rng.randn(6, P)
@@ -164,32 +164,19 @@ def test_more_features_than_rows_have_the_likelihood_of_as_many_as_rows(correlat
 
 
 @pytest.mark.parametrize("size", [1e9, 1e14])
-def test_a_wide_prior_of_the_last_of_many_features_costs_no_digits(size):
+def test_wide_prior_of_the_last_of_many_features_costs_no_digits(size):
     model, _ = problem(np.zeros((O, 40), dtype=bool), p=40)
     model.prior.scale[:, -1] = size
     expected = model.log_likelihoods(VALUES)
     np.testing.assert_allclose(model.with_fewer_features().log_likelihoods(VALUES), expected, rtol=1e-8)
 
 
-def test_of_no_more_features_than_rows_or_vague_or_shared_ones_all_are_kept():
+def test_features_are_kept_if_few_vague_or_shared():
     few, _ = problem(VAGUE["proper"])
     vague, _ = problem(np.arange(O * 40).reshape(O, 40) == 0, p=40)
     many, _ = problem(np.zeros((O, 40), dtype=bool), p=40)
     for model in (few, vague, replace(many, prior=replace(many.prior, shared=True))):
         assert model.with_fewer_features() is model
-
-
-def test_without_features_it_is_a_gaussian_process():
-    model, Y = problem(np.zeros((O, 0), dtype=bool), p=0)
-    expected = 0.0
-    for o in range(O):
-        K = VALUES["signal"][o] * squared_exponential(model.rows.inputs, model.rows.inputs, VALUES["hyperparameters"])
-        K += VALUES["noise"][o] * np.eye(N)
-        expected -= 0.5 * (Y[:, o] @ np.linalg.solve(K, Y[:, o]) + np.linalg.slogdet(K)[1] + N * LOG_2PI)
-    assert model.log_likelihood(VALUES)[0] == pytest.approx(expected, rel=1e-12)
-    coef, covariance = model.predictor(VALUES).coefficients()
-    assert coef.shape == (O, 0)
-    assert covariance.shape == (O, 0, 0)
 
 
 def test_badly_scaled_vague_features_keep_their_digits():

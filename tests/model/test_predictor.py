@@ -83,24 +83,6 @@ def test_novelty_where_f_is_known_without_data():
     np.testing.assert_allclose(predictor.novelty(inputs, np.empty((4, 0))), expected, rtol=1e-6, atol=1e-12)
 
 
-@pytest.mark.parametrize("shared", [True, False])
-def test_the_covariances_diagonal_is_the_variance(shared):
-    predictor = some_posterior(shared)[0]
-    _, variance = predictor.predict(X_NEW, H_NEW, return_variance=True)
-    _, covariance = predictor.covariance(X_NEW, H_NEW)
-    np.testing.assert_allclose(np.einsum("nno->no", covariance), variance, rtol=1e-9)
-    np.testing.assert_allclose(covariance, covariance.transpose(1, 0, 2), rtol=1e-12, atol=1e-13)
-
-
-def test_outputs_with_weights_of_their_own_are_independent():
-    predictor = some_posterior()[0]
-    _, covariance = predictor.covariance(X_NEW, H_NEW)
-    jointly = predictor.jointly(covariance, X_NEW, H_NEW).reshape(11, O, 11, O)
-    assert predictor.common(X_NEW, H_NEW).shape == (0, 11, O)
-    for i, j in np.ndindex(O, O):
-        np.testing.assert_array_equal(jointly[:, i, :, j], covariance[:, :, i] if i == j else 0.0)
-
-
 def test_each_output_sees_its_own_rows():
     predictor = some_posterior(shared=False)[0]
     inputs, features = (np.stack([rows, rows[::-1] + 0.5], axis=1) for rows in (X_NEW, H_NEW))
@@ -120,40 +102,6 @@ def test_each_group_prepares_rows_for_its_own_kernel():
     found = replace(predictor, groups=(first, elsewhere)).predict(X_NEW, H_NEW, return_variance=True)
     for part, expected in zip(found, predictor.predict(X_NEW, H_NEW, return_variance=True), strict=True):
         np.testing.assert_allclose(part, expected, rtol=1e-9, atol=1e-10)
-
-
-def test_no_variance_without_being_asked():
-    predictor = some_posterior()[0]
-    mean, variance = predictor.predict(X_NEW, H_NEW)
-    assert variance is None
-    np.testing.assert_array_equal(mean, predictor.predict(X_NEW, H_NEW, return_variance=True)[0])
-
-
-@pytest.mark.parametrize("shared", [True, False])
-def test_weights_are_those_of_the_dense_gaussian(shared):
-    predictor, mean, covariance, _, model = some_posterior(shared)
-    found_mean, found = predictor.coefficients()
-    prior = model.prior
-    np.testing.assert_allclose(found_mean, prior.mean + prior.scale * (prior.reference + mean[:, M:]), rtol=1e-12)
-    scales = prior.scale[:, :, np.newaxis] * prior.scale[:, np.newaxis]
-    np.testing.assert_allclose(found, scales * covariance[:, M:, M:], rtol=1e-10, atol=1e-12)
-
-
-def test_far_from_the_points_the_prior_is_left():
-    """Mean hᵀβ, and s² besides the variance of the weights."""
-    predictor = some_posterior()[0]
-    coef, cov = predictor.coefficients()
-    mean, variance = predictor.predict(X_NEW + 1e3, H_NEW, return_variance=True)
-    np.testing.assert_allclose(mean, H_NEW @ coef.T, rtol=1e-12)
-    np.testing.assert_allclose(variance, predictor.signal + np.einsum("np,opq,nq->no", H_NEW, cov, H_NEW), rtol=1e-12)
-
-
-def test_the_intercept_is_part_of_the_mean_only():
-    predictor = some_posterior()[0]
-    raised = replace(predictor, intercept=np.array([5.0, -1.0]))
-    (mean, variance), (higher, same) = (own.predict(X_NEW, H_NEW, return_variance=True) for own in (predictor, raised))
-    np.testing.assert_allclose(higher - mean, np.tile([5.0, -1.0], (11, 1)), rtol=1e-12)
-    np.testing.assert_array_equal(variance, same)
 
 
 @pytest.mark.parametrize("shared", [True, False])
@@ -198,7 +146,7 @@ def test_predictors_of_single_outputs_are_joined_each_to_its_own(order):
     np.testing.assert_array_equal(joined.intercept, intercept)
 
 
-def test_it_is_frozen_and_keeps_no_row():
+def test_predictor_is_frozen_and_keeps_no_rows():
     predictor = some_posterior()[0]
     with pytest.raises(FrozenInstanceError):
         predictor.noise = np.zeros(O)
@@ -215,22 +163,14 @@ def problem_of(n):
 
 
 @pytest.mark.parametrize("shared", [True, False])
-def test_a_pickle_predicts_the_same_bits(shared):
+def test_pickle_predicts_same_bits(shared):
     predictor = some_posterior(shared)[0]
     again = pickle.loads(pickle.dumps(predictor))
     for found, expected in zip(again.covariance(X_NEW, H_NEW), predictor.covariance(X_NEW, H_NEW), strict=True):
         np.testing.assert_array_equal(found, expected)
 
 
-def test_single_rows_are_those_of_all_rows():
-    predictor = some_posterior()[0]
-    mean, variance = predictor.predict(X_NEW, H_NEW, return_variance=True)
-    rows = [predictor.predict(X_NEW[[i]], H_NEW[[i]], return_variance=True) for i in range(11)]
-    np.testing.assert_allclose(np.vstack([row[0] for row in rows]), mean, rtol=1e-10, atol=1e-12)
-    np.testing.assert_allclose(np.vstack([row[1] for row in rows]), variance, rtol=1e-10)
-
-
-def test_so_many_rows_at_once_that_memory_stays_small():
+def test_block_size_limits_memory():
     predictor = some_posterior()[0]
     assert predictor.rows_at_once == 4096
     large = replace(predictor.groups[0], mean=np.zeros((100, 10_000)))
@@ -241,30 +181,10 @@ def test_so_many_rows_at_once_that_memory_stays_small():
     assert replace(predictor, groups=(middle, middle)).rows_at_once * 2000 <= 2**20
 
 
-def test_q_at_the_prior_predicts_the_prior():
-    """N(0, I) in whitened coordinates, and no reference: k(x, x'), and hᵀΣh' of the weights."""
-    model, _, table = problem()
-    prior = CoefficientPrior(model.prior.mean, model.prior.scale, np.zeros((O, P)))
-    values = table.values_at_start()
-    own = SparseModel(model.kernel, prior, "full", model.groups)
-    predictor = own.predictor(values, list(own.whitenings(values)), [np.zeros(M + P)] * O, [np.eye(M + P)] * O)
-    mean, covariance = predictor.covariance(X_NEW, H_NEW)
-    np.testing.assert_allclose(mean, H_NEW @ prior.mean.T, atol=1e-14)
-    for o in range(O):
-        H = H_NEW * prior.scale[o]
-        k = values["signal"][o] * squared_exponential(X_NEW, X_NEW, values["hyperparameters"])
-        np.testing.assert_allclose(covariance[:, :, o], k + H @ H.T, atol=1e-10)
-
-
 ROOT = np.array([[[2.0, 0.0], [1.0, 0.5]], [[1.0, 0.2], [0.0, 3.0]]])
 PRIOR = CoefficientPrior(
     np.array([[1.0, 2.0], [3.0, 4.0]]), np.sqrt(np.sum(ROOT**2, axis=2)), np.array([[0.1, 0.0], [0.0, 0.2]]), ROOT
 )
-
-
-def test_the_offset_is_where_the_reference_is():
-    for o in range(2):
-        np.testing.assert_allclose(PRIOR.offset[o], PRIOR.mean[o] + ROOT[o] @ PRIOR.reference[o])
 
 
 def test_independent_weights_have_a_diagonal_root():
@@ -282,11 +202,3 @@ def test_outputs_and_units_of_a_prior():
         scaled.roots() @ scaled.roots().transpose(0, 2, 1),
         ROOT @ ROOT.transpose(0, 2, 1) * np.array([100.0, 0.01])[:, np.newaxis, np.newaxis],
     )
-
-
-def test_a_prior_in_other_units():
-    prior = CoefficientPrior(np.ones((2, 3)), np.full((2, 3), 2.0), np.full((2, 3), 5.0))
-    scaled = prior.scaled(np.array([10.0, 0.1]))
-    np.testing.assert_allclose(scaled.mean[:, 0], [10.0, 0.1])
-    np.testing.assert_allclose(scaled.scale[:, 0], [20.0, 0.2])
-    np.testing.assert_array_equal(scaled.reference, prior.reference)

@@ -7,10 +7,10 @@ import pytest
 
 from skevgp.kernels.dot_product import DotProduct
 from skevgp.kernels.stationary import SquaredExponential
-from skevgp.model.statistics import StatisticsGradient, SufficientStatistics, Whitening, collect, errors, pull_back
+from skevgp.model.statistics import StatisticsGradient, Whitening, collect, errors, pull_back
 from skevgp.utils.linalg import JITTER, Jitter
 
-from ..oracle import ArrayRows, central_differences, problem, relative_error, squared_exponential
+from ..oracle import ArrayRows, central_differences, relative_error, squared_exponential
 
 RNG = np.random.RandomState(0)
 N, M, D, P, O = 60, 6, 2, 3, 2  # noqa: E741
@@ -52,23 +52,7 @@ def test_whitened_rows_agree_with_a_solve():
     np.testing.assert_allclose(V, np.linalg.solve(L, U), rtol=1e-8, atol=1e-10)
 
 
-def test_whitened_rows_go_where_one_says():
-    out = np.empty((M, N))
-    _, V = whitening().project(KERNEL.prepare(X), out=out)
-    assert V is out
-    np.testing.assert_array_equal(V, whitening().project(KERNEL.prepare(X))[1])
-
-
-def test_what_the_points_leave_of_a_row_agrees_with_a_solve():
-    L, U = dense()
-    expected = 1.0 - np.einsum("mn,mn->n", U, np.linalg.solve(L @ L.T, U))
-    own, prepared = whitening(), KERNEL.prepare(X)
-    left = own.unexplained(prepared, own.project(prepared)[1])
-    np.testing.assert_allclose(left, expected, rtol=1e-8, atol=1e-12)
-    assert (left > 0.0).any()
-
-
-def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
+def test_unexplained_variance_is_not_negative():
     """Nor of any row within a long lengthscale, whatever rounding says."""
     prepared = KERNEL.prepare(Z)
     own = whitening()
@@ -79,7 +63,7 @@ def test_nothing_is_left_of_a_row_that_is_a_point_and_never_less_than_nothing():
         assert (left >= 0.0).all()
 
 
-def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
+def test_unexplained_variance_is_not_biased():
     """Of one point it is 1 - exp(-(x - z)² / ℓ²), here 1e-12 and more: right to a unit of 1, on average."""
     x = np.linspace(1e-6, 1e-4, 2000)[:, np.newaxis]
     kernel = SquaredExponential(1)
@@ -88,18 +72,8 @@ def test_what_is_left_of_a_row_is_not_shifted_by_rounding():
     assert abs(shift.mean()) < np.finfo(float).eps
 
 
-@pytest.mark.parametrize("n", [1, 7])
-def test_solved_rows_are_the_projected_ones(n):
-    own, prepared = whitening(), KERNEL.prepare(X[:n])
-    P = np.zeros((M + 1, n))
-    V = own.solve(prepared, out=P[:M])
-    np.testing.assert_allclose(P[:M], own.project(prepared)[1], rtol=1e-10, atol=1e-10)
-    assert np.shares_memory(V, P)
-    assert not P[M].any()
-
-
 @pytest.mark.parametrize(("kernel", "size"), [(SquaredExponential(3), 1.0), (DotProduct(), 1e3)], ids=["near 1", "1e6"])
-def test_of_most_rows_that_are_points_rounding_leaves_nothing_either(kernel, size):
+def test_rows_at_points_have_no_unexplained_variance(kernel, size):
     """It would leave about a half of them something, whatever the variance is."""
     nothing = []
     for seed in range(100):
@@ -118,18 +92,6 @@ def test_there_is_a_jitter_only_where_the_points_need_one():
     assert np.isfinite(own.L_inv).all()
     K = squared_exponential(twice, twice, LENGTHSCALES)
     np.testing.assert_allclose(own.L @ own.L.T, K + JITTER.size * np.eye(2 * M), atol=1e-14)
-
-
-def test_rounding_is_no_jitter_whatever_the_variance():
-    """Of points far from the origin, where a linear covariance is large."""
-    kernel = DotProduct()
-    for seed in range(20):
-        points = 1e3 * (np.eye(D) + 0.1 * np.random.RandomState(seed).randn(D, D))
-        own = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points)
-        assert own.jitter() == 0.0
-        jittered = Whitening.of(kernel, np.ones(kernel.n_hyperparameters), points, Jitter(1e-3, 2.0))
-        largest = np.diagonal(kernel.at(np.zeros(kernel.n_hyperparameters), points).matrix()).max()
-        assert jittered.jitter() == pytest.approx(1e-3 * largest, rel=1e-9)
 
 
 def test_gradients_in_the_factor_are_pulled_back():
@@ -154,28 +116,6 @@ def test_gradients_in_whitened_rows_are_pulled_back():
 # --- the first pass ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("size", [1, 17, 60])
-def test_the_first_pass_collects_the_sums(size):
-    L, U = dense()
-    V = np.linalg.solve(L, U)
-    found = collect(blocks(size), whitening(), slice(0, O))
-    assert found.n_rows == N
-    expected = {"VV": V @ V.T, "VH": V @ H, "VR": V @ R, "HH": H.T @ H, "HR": H.T @ R, "RR": np.sum(R**2, axis=0)}
-    expected["unexplained"] = N - np.sum(V**2)
-    for name, value in expected.items():
-        np.testing.assert_allclose(getattr(found, name), value, rtol=1e-8, atol=1e-9, err_msg=name)
-
-
-@pytest.mark.parametrize("output", range(O))
-def test_sums_of_some_outputs_are_among_those_of_all(output):
-    every, own = (collect(blocks(), whitening(), outputs) for outputs in (slice(0, O), slice(output, output + 1)))
-    for name in STATISTICS:
-        expected = getattr(every, name)
-        if name in ("VR", "HR", "RR"):
-            expected = expected[..., [output]]
-        np.testing.assert_allclose(getattr(own, name), expected, rtol=1e-12, atol=1e-12, err_msg=name)
-
-
 def test_sums_add_and_fade():
     whole = collect(blocks(), whitening(), slice(0, O))
     halves = [
@@ -188,7 +128,7 @@ def test_sums_add_and_fade():
         np.testing.assert_array_equal(getattr(faded, name), 0.25 * getattr(whole, name))
 
 
-def test_summing_whitened_rows_keeps_digits_that_whitening_the_sums_would_lose():
+def test_whitened_sums_keep_digits():
     """Points so near to each other that K has a condition of 1e10; the oracle is a QR factorisation of L."""
     points = np.linspace(-1.0, 1.0, M)[:, np.newaxis] * [0.35, 0.0]
     own = Whitening.of(KERNEL, np.ones(D), points)
@@ -227,7 +167,7 @@ def flat(gradients):
 
 
 @pytest.mark.parametrize("size", [1, 17, 60])
-def test_the_second_pass_is_the_gradient_of_the_first(size):
+def test_second_pass_is_the_gradient_of_the_first(size):
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     statistics = collect(blocks(size), own, outputs)
     found, _ = pull_back(blocks(size), own, outputs, statistics, gradient, np.zeros((M + P, O)))
@@ -239,7 +179,7 @@ def test_the_second_pass_is_the_gradient_of_the_first(size):
     assert relative_error(flat(found), central_differences(value, THETA)) < 1e-7
 
 
-def test_a_jitter_moves_with_the_diagonal():
+def test_jitter_moves_with_the_diagonal():
     """Of a kernel whose diagonal depends on its hyperparameters and points; at the origin of one it is 0."""
     kernel, points = DotProduct(), Z.copy()
     points[0] = 0.0
@@ -257,17 +197,7 @@ def test_a_jitter_moves_with_the_diagonal():
     assert Whitening.of(KERNEL, LENGTHSCALES, np.empty((0, D))).jitter() == 0.0
 
 
-def test_errors_without_features_have_no_sums_over_them():
-    """And with them the sums are as long as these are many."""
-    own = whitening()
-    left = errors(blocks(), own, slice(0, O), RNG.randn(M + P, O))
-    assert left.VE.shape == (M, O)
-    assert left.HE.shape == (P, O)
-    none = errors(blocks(rows=ArrayRows(X, np.empty((N, 0)), R)), own, slice(0, O), RNG.randn(M, O))
-    assert none.HE.shape == (0, O)
-
-
-def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
+def test_errors_of_mean_replace_residuals():
     gradient, own, outputs = some_gradient(), whitening(), slice(0, O)
     weights = RNG.randn(M + P, O)
     V = own.project(KERNEL.prepare(X))[1]
@@ -284,7 +214,7 @@ def test_what_the_mean_leaves_over_takes_the_place_of_the_residuals():
 
 
 @pytest.mark.parametrize("output", range(O))
-def test_the_second_pass_of_one_output_sees_no_other(output):
+def test_second_pass_of_one_output_sees_no_other(output):
     outputs, weights, gradient = slice(output, output + 1), RNG.randn(M + P, O), some_gradient()
     own = whitening()
     alone = replace(gradient, VE=gradient.VE[:, outputs])
@@ -297,7 +227,7 @@ def test_the_second_pass_of_one_output_sees_no_other(output):
     np.testing.assert_allclose(residuals.VE, all_residuals.VE[:, outputs], rtol=1e-9, atol=1e-11)
 
 
-def test_what_the_first_pass_left_serves_the_second_and_no_other_whitening():
+def test_second_pass_uses_cached_whitening():
     """Kept blocks give the bits of those made again; those of other points are not mistaken for one's own."""
     gradient, outputs, weights = some_gradient(), slice(0, O), np.zeros((M + P, O))
     kept, made = blocks(), blocks()
@@ -315,13 +245,3 @@ def test_what_the_first_pass_left_serves_the_second_and_no_other_whitening():
     assert made[0].kept is None
     for part, expected in zip(pull_back(made, own, outputs, statistics, gradient, weights)[0], first[0], strict=True):
         np.testing.assert_array_equal(part, expected)
-
-
-def test_statistics_of_a_model_are_those_of_its_points():
-    model, rows, table = problem(shared=False)
-    values = table.values_at_start()
-    found = model.statistics(values, rows.blocks(model.kernel, 17))
-    assert [type(own) for own in found] == [SufficientStatistics] * 2
-    for own, outputs, points in zip(found, model.groups, values["inducing_points"], strict=True):
-        at = Whitening.of(model.kernel, values["hyperparameters"], points)
-        np.testing.assert_array_equal(own.VR, collect(rows.blocks(model.kernel, 17), at, outputs).VR)

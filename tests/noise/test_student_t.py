@@ -10,7 +10,7 @@ DISTANCES = np.array([0.0, 0.5, 4.0, 25.0, 35.0, 40.0, 400.0, 1e6])
 
 
 @pytest.mark.parametrize("o", [1, 3])
-def test_the_evidence_is_the_integral_over_the_scale(o, monkeypatch):
+def test_evidence_is_the_integral_over_the_scale(o, monkeypatch):
     monkeypatch.setattr(mixture, "_SHARE", 0.1)
     nu, width = mixture._NU, mixture._WIDTH
     prior = gamma(0.5 * nu, scale=2.0 / (width**2 * nu))
@@ -21,7 +21,7 @@ def test_the_evidence_is_the_integral_over_the_scale(o, monkeypatch):
 
 
 @pytest.mark.parametrize("o", [1, 3])
-def test_its_slope_is_the_expected_scale(o):
+def test_evidence_gradient_is_expected_scale(o):
     step = 1e-5 * (1.0 + DISTANCES)
     above, below = (StudentTScales(o, DISTANCES + sign * step).evidence for sign in (1.0, -1.0))
     np.testing.assert_allclose((above - below) / step, -StudentTScales(o, DISTANCES).mean, rtol=1e-4)

@@ -225,13 +225,18 @@ def one_or_more(draw, Y):
 
 @st.composite
 def learned_cases(draw, most_outputs=3, known_maps=False, given_maps=None):
-    """Models that learn kernel, noise and inducing points, for a few iterations."""
     X, Y, X_new = draw(data(most_rows=30, most_outputs=most_outputs))
-    o, given = Y.shape[1], draw(maps(Y.shape[1], known_maps) if given_maps is None else given_maps)
+    return Case(draw(learned_models(X, Y.shape[1], known_maps, given_maps)), X, Y, X_new)
+
+
+@st.composite
+def learned_models(draw, X, o, known_maps=False, given_maps=None):
+    """Models that learn kernel, noise and inducing points, for a few iterations."""
+    given = draw(maps(o, known_maps) if given_maps is None else given_maps)
     kernel = draw(st.one_of(st.none(), kernels(X.shape[1])))
     parameters = {**given, "kernel": kernel, "normalize_y": draw(st.booleans()), "random_state": 0}
     if draw(st.integers(0, 4)) == 4:
-        return Case(EGPRegressor(**parameters, max_iter=4), X, Y, X_new)
+        return EGPRegressor(**parameters, max_iter=4)
     own = has_rows_of_outputs(given)
     parameters |= {"sharing": draw(sharings(o, own)), "n_inducing": draw(st.sampled_from([1, 5, 40]))}
     posterior = draw(st.sampled_from(["full", "diagonal"]))
@@ -250,7 +255,7 @@ def learned_cases(draw, most_outputs=3, known_maps=False, given_maps=None):
         parameters["solver"] = Adam(batch_size=10, natural_gradient=True)
     elif kind == "restarts":
         parameters["solver"] = LBFGS(n_restarts=1, posterior=posterior)
-    return Case(EVGPRegressor(**parameters, max_iter=4), X, Y, X_new)
+    return EVGPRegressor(**parameters, max_iter=4)
 
 
 # --- What is compared.

@@ -8,7 +8,6 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -126,22 +125,6 @@ def test_files_and_pickles_hold_the_model_to_the_bit(case):
         assert copy.get_params().keys() == model.get_params().keys()
 
 
-@given(fixed_cases())
-def test_how_rows_lie_in_memory_does_not_matter(case):
-    model, X = case.fitted(), case.X_new
-    wide = np.zeros((2 * len(X), 2 * X.shape[1]))
-    wide[::2, ::2] = X
-    for rows in (np.asfortranarray(X), wide[::2, ::2], X[::-1].copy()[::-1], X.tolist()):
-        for found, expected in zip(
-            model.predict(rows, return_std=True), model.predict(X, return_std=True), strict=True
-        ):
-            np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9 * size_of(model, case))
-    names = [f"x{i}" for i in range(X.shape[1])]
-    framed = case.fitted(X=pd.DataFrame(case.X, columns=names)).predict(pd.DataFrame(X, columns=names), return_std=True)
-    for found, expected in zip(framed, model.predict(X, return_std=True), strict=True):
-        assert_near(found, expected, size_of(model, case), 1e-9)
-
-
 @st.composite
 def dynamics(draw):
     """Models of the next state of as many states as there are outputs, and inputs."""
@@ -152,7 +135,7 @@ def dynamics(draw):
 
 
 @given(dynamics(), st.sampled_from(["mean", "linearized"]), st.sampled_from(["learned", "none"]))
-def test_the_first_step_of_a_rollout_is_the_prediction(case, method, noise):
+def test_first_step_of_a_rollout_is_the_prediction(case, method, noise):
     model, o = case.fitted(), case.Y.shape[1]
     x = case.X_new[[0]]
     ahead = rollout(model, x[0, :o], x[:, o:], method=method, process_noise=noise)
@@ -165,7 +148,7 @@ def test_the_first_step_of_a_rollout_is_the_prediction(case, method, noise):
 
 
 @given(fixed_cases(known_maps=True))
-def test_a_residual_regressor_is_the_model_of_the_change(case):
+def test_residual_regressor_is_the_model_of_the_change(case):
     Y = columns_of(case.Y)[:, : case.X.shape[1]]
     o = Y.shape[1]
     if isinstance(case.model, EVGPRegressor):

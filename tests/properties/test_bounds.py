@@ -56,7 +56,7 @@ def test_more_points_bring_the_bounds_together(case, draws):
 
 @fewer(2)
 @given(fixed_cases(exact=False, most_outputs=1), st.integers(0, 10), st.booleans())
-def test_the_bound_of_any_q_is_below_that_of_the_best(case, n_steps, natural):
+def test_bound_of_any_q_is_below_that_of_the_best(case, n_steps, natural):
     """Adam's q, after a few steps, and q at its optimum for the same points, kernel and noise."""
     posterior = "full" if natural else case.model.solver.posterior
     adam = Adam(batch_size=len(case.X), natural_gradient=natural, posterior=posterior)

@@ -1,5 +1,4 @@
 import numpy as np
-import pinocchio
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.optimize import least_squares
@@ -10,8 +9,6 @@ from skevgp.robots import (
     load_robot,
     nearest_consistent,
     physical_consistency,
-    pseudo_inertia,
-    with_parameters,
 )
 
 UR10 = inertial_parameters(load_robot("ur10"))
@@ -52,7 +49,7 @@ def by_cholesky_factors(mean, covariance, seed):
     )
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_start_of_a_local_solver_gets_nearer(seed):
     mean, covariance = one_link(seed)
     assert physical_consistency(mean)[0] < 0.0
@@ -63,37 +60,14 @@ def test_no_start_of_a_local_solver_gets_nearer(seed):
     assert distance(found, mean, covariance) < nearest * (1.0 + 1e-5)
 
 
-@pytest.mark.parametrize("seed", range(3))
-def test_no_way_to_another_robot_that_can_be_gets_nearer(seed):
-    """The problem is convex: what is nearest has no direction down towards any other admissible point."""
-    mean, covariance = estimate(seed)
-    found = nearest_consistent(mean, covariance, margin=1e-8)
-    gradient = np.linalg.solve(covariance, (found - mean).ravel())
-    factors = np.random.default_rng(seed).normal(size=(2000, 6, 4, 4)) * 10.0 ** np.random.default_rng(1).uniform(
-        -3.0, 1.0, (2000, 6, 1, 1)
-    )
-    others = np.concatenate([[UR10], from_pseudo_inertia(factors @ factors.swapaxes(-2, -1))])
-    slopes = (others - found).reshape(len(others), -1) @ gradient
-    assert slopes.min() > -1e-5 * np.abs(slopes).max()
-    assert distance(found, mean, covariance) > 1.0
-
-
-def test_it_is_nearer_than_a_repair_link_by_link():
-    mean, covariance = estimate(0)
-    values, vectors = np.linalg.eigh(pseudo_inertia(mean))
-    clipped = from_pseudo_inertia((vectors * np.maximum(values, 1e-6)[:, None]) @ vectors.swapaxes(-2, -1))
-    found = nearest_consistent(mean, covariance)
-    assert distance(found, mean, covariance) < 0.5 * distance(clipped, mean, covariance)
-
-
 @pytest.mark.parametrize("covariance", [np.eye(60), np.zeros((60, 60))], ids=["free", "pinned"])
-def test_a_consistent_mean_is_returned_as_it_is(covariance):
+def test_consistent_mean_is_returned_as_it_is(covariance):
     found = nearest_consistent(UR10, covariance)
     assert_array_equal(found, UR10)
     assert not np.shares_memory(found, UR10)
 
 
-def test_the_margin_is_kept_and_a_wider_one_costs_more():
+def test_margin_is_kept_and_a_wider_one_costs_more():
     mean, covariance = estimate(1)
     found = [nearest_consistent(mean, covariance, margin=margin) for margin in (1e-8, 1e-4, 1e-2)]
     consistency = [physical_consistency(parameters).min() for parameters in found]
@@ -101,42 +75,10 @@ def test_the_margin_is_kept_and_a_wider_one_costs_more():
     assert np.all(np.diff([distance(parameters, mean, covariance) for parameters in found]) > 0.0)
 
 
-def test_a_consistent_link_that_nothing_ties_to_others_stays():
-    mean, covariance = UR10.copy(), np.diag(SIZES**2)
-    mean[3, 4] = 5.0
-    found = nearest_consistent(mean, covariance)
-    others = [0, 1, 2, 4, 5]
-    assert_allclose(found[others], mean[others], rtol=1e-6, atol=1e-9)
-    assert abs(found[3, 4] - 5.0) > 0.1
-
-
 # --- what the data know --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("known", [1e-4, 1e-6, 1e-8])
-def test_torques_that_are_well_known_stay(known):
-    """Directions that trajectories show have a small variance, those that they do not show the prior's."""
-    model, rng = load_robot("ur10"), np.random.default_rng(0)
-    data = model.createData()
-    rows = [pinocchio.computeJointTorqueRegressor(model, data, *rng.uniform(-2.0, 2.0, (3, 6))) for _ in range(100)]
-    regressor = np.concatenate(rows)
-    values, vectors = np.linalg.eigh(regressor.T @ regressor / len(rows) * np.outer(SIZES, SIZES))
-    seen = values > 1e-8 * values[-1]
-    assert 30 <= seen.sum() <= 45
-    deviations = np.where(seen, known, 1.0)
-    factor = SIZES[:, None] * vectors * deviations
-    mean = UR10 + (factor @ rng.normal(size=60)).reshape(UR10.shape)
-    assert physical_consistency(mean).min() < -0.1
-    found = nearest_consistent(mean, factor @ factor.T)
-    assert physical_consistency(found).min() > 0.0
-    torque = regressor @ mean.ravel()
-    moved = regressor @ (found - mean).ravel()
-    assert np.sqrt(np.mean(moved**2)) < 10.0 * known * np.sqrt(np.mean(torque**2)) + 1e-12
-    assert np.abs(found - mean).max() > 0.01
-
-
-@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e4])
-@pytest.mark.parametrize("kind", ["plain", "stiff", "flat", "pinned"])
+@pytest.mark.parametrize(("kind", "scale"), [("plain", 1e-6), ("stiff", 1.0), ("flat", 1e4), ("pinned", 1e-6)])
 def test_scales_do_not_matter_however_far_apart_deviations_are(kind, scale):
     deviations = np.ones(60)
     deviations[:20] = {"stiff": 1e-8, "flat": 1e4}.get(kind, 1.0)
@@ -148,54 +90,6 @@ def test_scales_do_not_matter_however_far_apart_deviations_are(kind, scale):
     assert physical_consistency(found).min() > 0.0
     assert_allclose(found / scale, nearest_consistent(mean, covariance), rtol=1e-5, atol=1e-6 * np.abs(mean).max())
     assert_array_equal(found.ravel()[keep == 0.0], (mean * scale).ravel()[keep == 0.0])
-
-
-@pytest.mark.parametrize("pinned", [slice(0, 60), slice(20, 30), slice(20, 21)], ids=["all", "link", "mass"])
-def test_what_is_pinned_where_nothing_can_be_moves_all_the_same(pinned):
-    mean, keep = UR10.copy(), np.ones(60)
-    mean[2, 0], keep[pinned] = -1.0, 0.0
-    covariance = np.diag(SIZES**2 * keep)
-    found = nearest_consistent(mean, covariance)
-    assert physical_consistency(found).min() > 0.0
-    assert found[2, 0] < UR10[2, 0]
-
-
-def test_links_that_are_no_bodies_stay_none():
-    mean, covariance = estimate(0)
-    mean[4], keep = 0.0, np.ones(60)
-    keep[40:50] = 0.0
-    found = nearest_consistent(mean, covariance * np.outer(keep, keep))
-    assert_array_equal(found[4], 0.0)
-    assert physical_consistency(np.delete(found, 4, axis=0)).min() > 0.0
-    with_parameters(load_robot("ur10"), found)
-
-
-@pytest.mark.parametrize(
-    "mean", [np.zeros((2, 10)), -np.ones((2, 10)), np.full((2, 10), 1e-30)], ids=["0", "-", "tiny"]
-)
-def test_a_mean_that_says_nothing_has_an_answer(mean):
-    assert physical_consistency(nearest_consistent(mean, np.eye(20))).min() > 0.0
-
-
-@pytest.mark.filterwarnings("ignore::skevgp.exceptions.RobotModelWarning")
-@pytest.mark.parametrize("name", ["icub", "romeo_small"])
-def test_robots_whose_files_no_body_can_have(name):
-    mean = inertial_parameters(load_robot(name))
-    assert physical_consistency(mean).min() < 0.0
-    found = nearest_consistent(mean, np.diag((0.1 * np.abs(mean).ravel() + 1e-3) ** 2))
-    assert physical_consistency(found).min() > 0.0
-
-
-@pytest.mark.parametrize("seed", range(12))
-def test_covariances_of_all_kinds_have_an_answer(seed):
-    """Singular ones too, whose deviations differ by up to 1e8 beside pinned parameters."""
-    rng = np.random.default_rng(seed)
-    n = 10 * rng.integers(1, 5)
-    factor = 10.0 ** rng.uniform(-3, 1, (n, 1)) * rng.normal(size=(n, n)) * 10.0 ** -rng.uniform(0, 8, n)
-    factor[rng.random(n) < [0.0, 0.1, 0.5, 0.9][seed % 4]] = 0.0
-    scale = 10.0 ** rng.uniform(-6, 4)
-    found = nearest_consistent(rng.normal(size=(n // 10, 10)) * scale, factor @ factor.T * scale**2)
-    assert physical_consistency(found).min() > 0.0
 
 
 # --- arguments -----------------------------------------------------------------------------------------------------
@@ -213,6 +107,6 @@ def test_covariances_of_all_kinds_have_an_answer(seed):
         ({"margin": 0.2}, r"margin must be in \(0, 0\.1\]; got 0\.2"),
     ],
 )
-def test_wrong_arguments_are_named(changed, message):
+def test_invalid_arguments_raise(changed, message):
     with pytest.raises(ValueError, match=message):
         nearest_consistent(**{"mean": np.ones((1, 10)), "covariance": np.eye(10), **changed})

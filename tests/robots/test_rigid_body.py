@@ -14,7 +14,7 @@ def model_and_configurations(name, n=4):
 
 
 @pytest.mark.parametrize("name", ROBOTS)
-def test_the_mass_matrix_is_that_of_the_composite_rigid_body_algorithm(name):
+def test_mass_matrix_is_that_of_the_composite_rigid_body_algorithm(name):
     model, configurations = model_and_configurations(name)
     for q in configurations:
         expected = pinocchio.crba(model, model.createData(), q)
@@ -29,12 +29,3 @@ def test_accelerations_by_force_are_the_inverse_mass_matrix_times_the_force(name
         np.linalg.solve(pinocchio.crba(model, model.createData(), row), f) for row, f in zip(q, force, strict=True)
     ]
     assert_allclose(RigidBody(model).accelerations_by_force(q, force), expected, rtol=1e-8, atol=1e-10)
-
-
-def test_the_model_keeps_its_gravity():
-    model, q = model_and_configurations("iiwa14")
-    body = RigidBody(model)
-    before = body.gravity(q)
-    body.accelerations_by_force(q, q)
-    assert_allclose(body.gravity(q), before, rtol=0)
-    assert model.gravity.linear[2] == -9.81

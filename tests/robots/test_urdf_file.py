@@ -1,4 +1,4 @@
-"""What of a URDF file Pinocchio is given; `tests/long/hostile_files.py` damages such files thousands of times."""
+"""What of a URDF file Pinocchio is given; `tests/properties/test_nasty_data.py` damages such files."""
 
 import warnings
 from itertools import pairwise
@@ -39,7 +39,7 @@ def load(tmp_path):
     return load
 
 
-def test_of_all_robots_pinocchio_makes_the_same_model():
+def test_parsed_urdf_equals_pinocchio():
     for path in _collection().values():
         assert pinocchio.buildModelFromXML(checked_urdf(path).text) == pinocchio.buildModelFromUrdf(str(path)), path
 
@@ -51,6 +51,15 @@ def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
     text = checked_urdf(path).text
     assert not any(word in text for word in ("mesh", "passwd", "visual", "transmission", "colour", "<!--"))
     assert pinocchio.buildModelFromXML(text) == pinocchio.buildModelFromUrdf(str(path))
+
+
+@pytest.mark.parametrize("kind", ["fixed", "revolute"])
+def test_world_need_not_be_declared(load, kind):
+    """As Drake has it."""
+    joints = joint("world", "a", kind), joint("a", "b")
+    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
+    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
+        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
 
 
 @pytest.mark.parametrize(
@@ -106,36 +115,27 @@ def test_nothing_but_the_tree_and_its_numbers_is_handed_over(tmp_path):
         ('<robot name="arm"', "<robot", "<robot> has no name"),
     ],
 )
-def test_what_lacks_or_is_no_number_is_named(load, old, new, message):
+def test_missing_or_invalid_number_raises(load, old, new, message):
     """Pinocchio itself would take a mass that is no number for 0."""
     assert old in ARM
     with pytest.raises(ValueError, match=rf"arm\.urdf' is not a URDF that can be read: .*{message}"):
         load(ARM.replace(old, new, 1))
 
 
-@pytest.mark.parametrize("kind", ["fixed", "revolute"])
-def test_the_world_need_not_be_declared(load, kind):
-    """As Drake has it."""
-    joints = joint("world", "a", kind), joint("a", "b")
-    assert load(robot("ab", *joints)) == load(robot(["world", "a", "b"], *joints))
-    with pytest.raises(ValueError, match="the joint 'to_world' has the child link 'world', which is not there"):
-        load(robot("ab", joint("a", "b"), joint("b", "world", kind)))
-
-
-def test_links_in_a_circle_are_told(load):
+def test_links_in_a_circle_raise(load):
     """Pinocchio leaves them out, and makes a robot of the rest."""
     with pytest.raises(ValueError, match=r"it has links in a circle: \['c', 'd'\]"):
         load(robot("abcd", joint("a", "b"), joint("c", "d"), joint("d", "c")))
 
 
-def test_a_joint_without_limits_is_told(load):
+def test_joint_without_limits_raises(load):
     text = robot("ab", joint("a", "b")).replace('<limit effort="1" velocity="1"/>', "")
     with pytest.raises(ValueError, match="the joint 'to_b' has no <limit>, which a revolute one needs"):
         load(text)
     assert load(text.replace("revolute", "continuous")).nv == 1
 
 
-def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
+def test_too_long_chain_raises(load):
     """Pinocchio goes from joint to joint by recursion: one of 5000 ends the interpreter."""
 
     def chain(n, kind):
@@ -149,7 +149,7 @@ def test_a_long_arm_is_a_robot_and_an_endless_one_is_told(load):
         load(robot(["base", *map(str, range(301))], *[joint("base", str(i)) for i in range(301)]))
 
 
-def test_what_is_nested_deeply_is_told(load):
+def test_deeply_nested_urdf_raises(load):
     """Writing goes from element to element by recursion."""
     with pytest.raises(ValueError, match="it has elements more than 100 deep in each other"):
         load(b'<robot name="r">' + b"<x>" * 101 + b"</x>" * 101 + b"</robot>")
@@ -175,7 +175,7 @@ def warned(load, text):
     return model, [str(one.message) for one in caught]
 
 
-def test_a_negative_limit_of_effort_is_unknown(load):
+def test_negative_limit_of_effort_is_unknown(load):
     """A limit of 0 would be a joint without a motor."""
     model, messages = warned(
         load, robot("abc", joint("a", "b"), joint("b", "c")).replace('"1" velocity', '"-5" velocity', 1)
@@ -187,7 +187,7 @@ def test_a_negative_limit_of_effort_is_unknown(load):
     assert np.isfinite(RigidBodyRegressor(model).coef_prior(2)[1]).all()
 
 
-def test_a_file_is_warned_of_once(load):
+def test_file_is_warned_of_once(load):
     names = [f"l{number}" for number in range(8)]
     text = robot(names, *map(joint, names[:-1], names[1:])).replace('effort="1"', 'effort="-1"')
     (message,) = warned(load, text)[1]
@@ -195,45 +195,11 @@ def test_a_file_is_warned_of_once(load):
     assert message.endswith("(3 more are like these.)")
 
 
-@pytest.mark.parametrize("kind", ["revolute", "continuous", "prismatic"])
-def test_a_negative_limit_of_velocity_is_not_used(load, kind):
-    text = robot("ab", joint("a", "b", kind)).replace('velocity="1"', 'velocity="-1"')
-    model, messages = warned(load, text)
-    assert len(messages) == 1
-    assert '<limit velocity="-1">; a limit of velocity must be 0 or above' in messages[0]
-    assert_array_equal(model.velocityLimit, [0.0])
-
-
-def test_limits_of_position_in_the_wrong_order_are_not_used(load):
-    text = robot("ab", joint("a", "b")).replace("<limit", '<limit lower="3" upper="-3"')
-    model, messages = warned(load, text)
-    assert "'to_b' has <limit> with lower=3 above upper=-3; its limits of position are not used" in messages[0]
-    assert_array_equal(model.lowerPositionLimit, model.upperPositionLimit)
-    assert warned(load, text.replace("revolute", "continuous"))[1] == []
-
-
-@pytest.mark.parametrize("other", ["none", "to_b", ""])
-def test_a_joint_that_mimics_none_is_warned_of(load, other):
-    """Joints that mimic move on their own, so that it does not matter."""
-    text = robot("abc", joint("a", "b").replace("</joint>", '<mimic joint="{}"/></joint>'), joint("b", "c"))
-    model, messages = warned(load, text.format(other))
-    assert model.nv == 2
-    assert len(messages) == 1
-    assert f"The joint 'to_b' has <mimic joint=\"{other}\">, which is not another joint of the file" in messages[0]
-    assert warned(load, text.format("to_c"))[1] == []
-
-
-@pytest.mark.parametrize("limit", ['effort="0" velocity="0"', 'lower="0" upper="0" effort="0" velocity="0"'])
-def test_limits_of_zero_are_unknown_ones(load, limit):
-    """Exporters of CAD programs write them."""
-    assert warned(load, robot("ab", joint("a", "b")).replace('effort="1" velocity="1"', limit))[1] == []
-
-
 BODY = """<link name="{}"><inertial><mass value="{}"/>
 <inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
 
 
-def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
+def test_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     text = f'<robot name="r"><link name="a"/>{BODY.format("b", 2)}{BODY.format("c", -0.5)}{joint("a", "b")}{{}}</robot>'
     model, messages = warned(load, text.format(joint("b", "c", "fixed")))
     assert "The link 'c' has <mass value=\"-0.5\">" in messages[0]
@@ -243,22 +209,9 @@ def test_a_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
 
 
 @pytest.mark.parametrize("masses", [(2, -2), (2, -2, 3), (-0.5, 2), (2, -2.5, 3), (0.3, -0.1, -0.2)])
-def test_negative_masses_that_pinocchio_cannot_add_are_refused(load, masses):
+def test_negative_masses_that_pinocchio_cannot_add_raise(load, masses):
     """It divides by the sum after each link, and by some 1e-16 in place of a sum of 0."""
     bodies = "".join(BODY.format(link, mass) for link, mass in zip("bcd", masses, strict=False))
     welds = "".join(joint("b", link, "fixed") for link, _ in zip("cd", masses[1:], strict=False))
     with pytest.raises(ValueError, match=r"the link '.' has <mass value=\"-.*first of them, 'b', which is"):
         load(f'<robot name="r"><link name="a"/>{bodies}{joint("a", "b")}{welds}</robot>')
-
-
-def test_a_joint_may_have_the_name_of_pinocchios_root(load):
-    text = robot("abc", joint("a", "b", name="universe"), joint("b", "c"))
-    model, _ = warned(load, text.replace('"1" velocity', '"-5" velocity', 1))
-    assert_array_equal(effort_limits(model), [[-np.inf, -1.0], [np.inf, 1.0]])
-
-
-@pytest.mark.parametrize("of", ["gazebo", "transmission"])
-def test_what_simulators_and_controllers_read_may_be_in_xacro(load, of):
-    plain = robot("ab", joint("a", "b"))
-    text = plain.replace("</robot>", f'<{of}><xacro:thing xmlns:xacro="http://x"/></{of}></robot>')
-    assert load(text) == load(plain)

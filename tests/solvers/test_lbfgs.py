@@ -63,19 +63,13 @@ def test_lbfgs_comes_back_from_where_the_function_cannot_be_evaluated(failure):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_stall_is_not_the_end(seed):
+def test_stall_is_not_the_end(seed):
     """In a bent valley of twenty columns three small steps in a row may lie far from the minimum at 0."""
     free = (np.full(20, -np.inf), np.full(20, np.inf))
     start = np.random.RandomState(seed).uniform(-2.0, 2.0, 20)
     minimum = lbfgs(lambda x: (rosen(x), rosen_der(x)), start, free, 1000, 0.03)
     assert minimum.converged
     assert minimum.loss < 1.0
-
-
-def test_a_start_that_cannot_be_evaluated_has_not_converged():
-    minimum = lbfgs(lambda x: (np.nan, np.zeros(2)), np.zeros(2), FREE, 50, 1e-6)
-    assert not minimum.converged
-    assert minimum.loss == np.inf
 
 
 def test_ctrl_c_keeps_the_best_point_so_far():
@@ -94,23 +88,6 @@ def test_ctrl_c_keeps_the_best_point_so_far():
     assert rosenbrock(minimum.x)[0] < rosenbrock(np.array([-1.0, 2.0]))[0]
 
 
-def cliff(height):
-    """A gentle slope down to 1, and beyond that a loss which rises at once to any height."""
-
-    def loss(x):
-        beyond = np.maximum(x - 1.0, 0.0)
-        return float((-x + height * beyond**2).sum()), -1.0 + 2.0 * height * beyond
-
-    return loss
-
-
-@pytest.mark.parametrize("height", [1e3, 1e6, 1e9, 1e12])
-def test_a_loss_far_off_does_not_end_the_way(height):
-    minimum = lbfgs(cliff(height), np.zeros(2), FREE, 300, 1e-6)
-    np.testing.assert_allclose(minimum.x, 1.0 + 0.5 / height, atol=1e-4)
-    assert minimum.converged
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_rounding_errors_do_not_end_the_way(seed):
     """A loss with errors far above the tolerance, as near a singular matrix: the best is as good as they allow."""
@@ -123,28 +100,7 @@ def test_rounding_errors_do_not_end_the_way(seed):
     assert lbfgs(rough, np.array([-1.0, 2.0]), FREE, 500, 1e-12).loss < 1e-6
 
 
-def test_starts_that_gain_without_an_iteration_come_to_an_end():
-    """A loss that is lower at each look, wherever that is: as rounding errors may make it, for ever."""
-    looks = []
-
-    def sinking(x):
-        looks.append(x)
-        assert len(looks) < 10_000
-        return -1.0 * len(looks), np.zeros(2)
-
-    minimum = lbfgs(sinking, np.zeros(2), FREE, 20, 1e-9)
-    assert not minimum.converged
-    assert minimum.loss == -len(looks)
-
-
-@pytest.mark.parametrize("alike", [None, np.arange(2)], ids=["no units", "units"])
-def test_limits_hold_in_whatever_units(alike):
-    limits = np.full(2, -2.0), np.full(2, 0.5)
-    minimum = lbfgs(rosenbrock, np.array([-1.0, 0.2]), limits, 200, 1e-12, alike=alike)
-    np.testing.assert_allclose(minimum.x, [0.5, 0.25], atol=1e-4)
-
-
-def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
+def test_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near():
     def valley(x):
         return rosen(x), rosen_der(x)
 
@@ -157,14 +113,6 @@ def test_a_tolerance_that_is_a_share_of_the_gain_ends_a_long_way_sooner_and_near
     assert origin - near.loss > 0.97 * (origin - full.loss)
 
 
-def test_a_tolerance_has_a_least_value():
-    assert Tolerance(0.1).at(-5.0) == 0.1
-    assert Tolerance(0.1, 0.5, 3.0).at(1.0) == 1.0
-    assert Tolerance(0.1, 0.5, 3.0).at(4.0) == 0.1
-    assert Tolerance(0.1, 0.5, 3.0).at(np.nan) == 0.1
-    assert Tolerance(0.1, 0.5, 3.0).at(-np.inf) == 0.1
-
-
 # --- units of coordinates from the curvature of a loss ----------------------------------------------------------------
 
 EACH = np.arange(4)
@@ -174,7 +122,7 @@ def quadratic(H):
     return lambda x: (0.5 * float(x @ H @ x), H @ x)
 
 
-def test_the_diagonal_of_a_quadratic_is_found_exactly_whatever_the_number_of_probes():
+def test_diagonal_of_a_quadratic_is_found_exactly_whatever_the_number_of_probes():
     curvature = np.array([1.0, 4.0, 0.01, 25.0])
     for n_probes in (1, 8):
         units = curvature_units(quadratic(np.diag(curvature)), np.ones(4), EACH, n_probes)
@@ -185,29 +133,6 @@ def test_coordinates_that_are_alike_have_one_unit_also_where_the_curvature_is_ne
     H = np.diag([1.0, 3.0, -2.0, -6.0])
     units = curvature_units(quadratic(H), np.ones(4), np.array([7, 7, 2, 2]), 3)
     np.testing.assert_allclose(units, [2**-0.5, 2**-0.5, 0.5, 0.5], rtol=1e-6)
-
-
-def test_other_entries_of_the_hessian_do_not_make_units_longer_in_the_mean():
-    rng = np.random.RandomState(0)
-    A = rng.randn(60, 60)
-    H = A @ A.T + 10.0 * np.eye(60)
-    units = curvature_units(quadratic(H), rng.randn(60), np.zeros(60, dtype=int), 8)
-    assert 0.5 * np.diag(H).mean() ** -0.5 < units[0] < 1.05 * np.diag(H).mean() ** -0.5
-
-
-def test_a_flat_coordinate_has_a_long_unit_and_not_an_endless_one():
-    units = curvature_units(quadratic(np.diag([0.0, 1e-12, 1.0, 1e8])), np.ones(4), EACH, 2)
-    np.testing.assert_allclose(units, [100.0, 100.0, 1.0, 0.1], rtol=1e-6)
-
-
-@pytest.mark.parametrize("gradient", [NotPositiveDefiniteError("no"), np.nan, np.inf])
-def test_where_the_loss_cannot_be_evaluated_units_are_one(gradient):
-    def objective(x):
-        if isinstance(gradient, Exception):
-            raise gradient
-        return 0.0, np.full(4, gradient)
-
-    np.testing.assert_array_equal(curvature_units(objective, np.ones(4), EACH, 2), np.ones(4))
 
 
 def test_with_units_a_badly_scaled_valley_is_a_few_iterations_long():

@@ -8,8 +8,6 @@ from skevgp.datasets import load_log
 
 from .cases import BY_NUMBER, irregular_times, motion, table_of, write_table
 
-NO_VELOCITY = {name: columns for name, columns in BY_NUMBER.items() if name != "velocity"}
-
 
 @pytest.fixture
 def load(tmp_path):
@@ -30,7 +28,7 @@ def errors(log, t0):
 
 
 @pytest.mark.parametrize("repeated", [False, True], ids=["once", "repeated rows"])
-def test_a_motion_written_down_irregularly_is_recovered(load, repeated):
+def test_motion_written_down_irregularly_is_recovered(load, repeated):
     t = irregular_times()
     table = table_of(np.sort(np.r_[t, t[::7]]) if repeated else t)
     log = load(table)
@@ -39,32 +37,12 @@ def test_a_motion_written_down_irregularly_is_recovered(load, repeated):
     assert_array_equal(np.less(errors(log, t[0]), [2e-4, 2e-4, 2e-3, 2e-3]), True)
 
 
-def test_of_rows_with_the_same_time_the_first_one_stays(load):
-    table = table_of(irregular_times())
-    wrong = np.insert(table, 501, table[500] + np.r_[0.0, np.full(7, 9.0)], axis=0)
-    assert_array_equal(load(wrong).data, load(table).data)
-
-
 @pytest.mark.parametrize("dt", [0.004, 0.01, 0.03, 0.1])
-def test_the_grid_has_the_step_that_is_asked_for(load, dt):
+def test_grid_has_the_step_that_is_asked_for(load, dt):
     t = irregular_times()
     log = load(table_of(t), dt=dt, cutoff=4.5)
     assert_allclose(np.diff(log.time), dt, rtol=1e-9)
     assert_array_equal(np.less(errors(log, t[0]), [2e-4, 2e-4, 3e-3, 3e-3]), True)
-
-
-def test_velocities_that_are_not_recorded_are_slopes_of_positions(load):
-    t = irregular_times()
-    log = load(table_of(t), columns=NO_VELOCITY)
-    assert log.recordings[0].raw.velocity is None
-    assert_array_equal(np.less(errors(log, t[0]), [2e-4, 2e-3, 1e-2, 2e-3]), True)
-
-
-def test_recorded_accelerations_are_taken(load):
-    t = irregular_times()
-    table = np.hstack([table_of(t)[:, :6], motion(t)[2] + 1.0])
-    log = load(table, columns={**BY_NUMBER, "acceleration": [6, 7]})
-    assert_allclose(log.data[:, 4:] - 1.0, motion(log.time + t[0])[2], atol=0.01)
 
 
 def waves(t, frequency):
@@ -75,31 +53,13 @@ def waves(t, frequency):
 
 
 @pytest.mark.parametrize("frequency", [1.0, 3.0, 5.0, 8.0, 12.0])
-def test_the_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
+def test_filter_delays_nothing_and_is_butterworths_squared(load, frequency):
     t = np.arange(0.0, 20.0, 0.002)
     log = load(waves(t, frequency), dt=0.01, cutoff=5.0)
     phase = 2.0 * np.pi * frequency * log.time[:, np.newaxis]
     weights = np.linalg.lstsq(np.hstack([np.sin(phase), np.cos(phase)]), log.target[:, 0], rcond=None)[0]
     # The bilinear transform, with which the digital filter is made, bends frequencies: on a grid of 2 ms by little.
     assert_allclose(weights, [1.0 / (1.0 + (frequency / 5.0) ** 8), 0.0], atol=0.005)
-
-
-def test_what_a_coarse_grid_cannot_show_does_not_alias(load):
-    """19 Hz on a grid of 0.05 s would be 1 Hz."""
-    log = load(waves(np.arange(0.0, 20.0, 0.002), 19.0), dt=0.05, cutoff=None)
-    assert np.abs(log.target[:, 0]).max() < 0.01
-
-
-def test_without_a_filter_the_recorded_values_stay(load):
-    t = np.arange(0.0, 5.0, 0.01)
-    table = table_of(t) + 0.01 * np.random.RandomState(0).randn(len(t), 8)
-    table[:, 0] = t
-    log = load(table, dt=None, cutoff=None)
-    rows = slice(1, -1)  # accelerations of the first and last would be one-sided
-    assert_allclose(log.time, t[rows], atol=1e-9)
-    assert_allclose(log.data[:, :4], table[rows][:, [1, 2, 4, 5]], atol=1e-9)
-    assert_allclose(log.data[:, 4:], (table[2:, 4:6] - table[:-2, 4:6]) / 0.02, atol=1e-6)
-    assert_allclose(log.target, table[rows, 6:8], atol=1e-9)
 
 
 def test_regular_times_may_stay_and_be_filtered(load):
@@ -137,15 +97,6 @@ def test_nothing_leaks_across_a_gap(load):
     assert (log.time[log.pieces == 1] > gap[1]).all()
 
 
-def test_what_is_a_gap_can_be_said(load):
-    t = np.delete(irregular_times(), slice(1000, 1010))
-    table = table_of(t)
-    assert len(np.unique(load(table).pieces)) == 2
-    log = load(table, max_gap=0.1)
-    assert len(np.unique(log.pieces)) == 1
-    assert errors(log, t[0])[0] < 1e-3
-
-
 @pytest.mark.parametrize("n_rows", [1, 2, 20])
 def test_pieces_too_short_for_the_filter_are_left_out(load, n_rows):
     t = irregular_times()
@@ -178,17 +129,6 @@ def test_rest_is_cut_at_the_ends_and_between(load):
     assert 0 < slow.sum() < 50  # the rest of 0.3 s
 
 
-def test_no_rest_is_cut_if_nothing_is_too_slow(load):
-    log = load(resting(np.arange(0.0, 20.0, 0.01), (8.0, 10.0)), rest_velocity=0.0)
-    assert len(np.unique(log.pieces)) == 1
-
-
-def test_how_long_rest_is_can_be_said(load):
-    table = resting(np.arange(0.0, 20.0, 0.01), (8.0, 10.0))
-    assert len(np.unique(load(table, rest_velocity=0.02, rest_time=3.0).pieces)) == 1
-    assert len(np.unique(load(table, rest_velocity=0.02, rest_time=1.0).pieces)) == 2
-
-
 def spoilt(row, column, value):
     table = table_of(irregular_times())
     table[row, column] = value
@@ -213,13 +153,6 @@ def spoilt(row, column, value):
         (table_of(np.arange(0.0, 9.0, 0.01)), {"dt": 1e-5}, r"dt=1e-05 s is far below the recording's step of 0.01 s"),
     ],
 )
-def test_what_cannot_be_processed_is_told_with_the_files_name(load, table, arguments, message):
+def test_unprocessable_log_raises(load, table, arguments, message):
     with pytest.raises(ValueError, match=f"log.csv: .*{message}"):
         load(table, **arguments)
-
-
-def test_rows_that_come_late_are_put_in_order(load):
-    table = table_of(irregular_times())
-    mixed = table.copy()
-    mixed[[500, 501]] = mixed[[501, 500]]
-    assert_array_equal(load(mixed).data, load(table).data)

@@ -1,0 +1,208 @@
+"""The paper's Figure 7: what the weights of the physics features have learned.
+
+The CSV has a row per weight: its prior, its posterior and its least squares estimate. In the paper, the weights of
+positions on velocities of the acrobot turn negative without features of gravity, to imitate it.
+
+    python benchmarks/paper/figure7.py                                     # the acrobot, four seeds: hours of one core
+    python benchmarks/paper/figure7.py --quick                             # few rows and iterations: a minute
+    python benchmarks/paper/figure7.py --systems pendulum cartpole iiwa14  # into the same file
+    python benchmarks/paper/figure7.py --settings paper --max-iter 2000    # instead of 16000 steps of Adam
+
+The settings are those of table4.py. With Adam a fit of the acrobot takes 2 to 6 minutes of one core, in skevgp's
+setting half a minute.
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+import sys
+import time
+import warnings
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
+
+import numpy as np
+import pandas as pd
+from sklearn.exceptions import ConvergenceWarning
+from threadpoolctl import threadpool_limits
+
+import harness
+from harness import figure_of
+from paper.models import QUICK_TRAJECTORIES, SYSTEMS, Fit, build
+from skevgp.datasets import make_dynamics
+
+SETTINGS = {
+    "paper": "paper's setting",
+    "author": "author's starts",
+    "author-100": "author's starts, prior scale 100",
+    "skevgp": "skevgp's setting",
+}
+MODELS = ("EVGP-IF", "EVGP-IFG")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One fit."""
+
+    system: str
+    model: str
+    setting: str
+    seed: int
+    size: str
+    max_iter: int | None = field(compare=False)
+
+
+def run(cell: Cell) -> list[dict[str, Any]]:
+    """Fit, and return a row per weight."""
+    n_trajectories = QUICK_TRAJECTORIES if cell.size == "quick" else None
+    train = make_dynamics(cell.system, n_trajectories, random_state=cell.seed)
+    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter))
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        start = time.process_time()
+        regressor.fit(train.data, train.target, groups=train.groups)
+        seconds = time.process_time() - start
+        mean = regressor.predict(train.data)
+    H = regressor.feature_map_.transform(train.data)
+    tables = {
+        "prior_mean": regressor.coef_prior_mean_,
+        "prior_std": regressor.coef_prior_scale_,
+        "mean": regressor.coef_,
+        "std": regressor.coef_std_,
+        "least_squares": np.linalg.lstsq(H, train.target)[0].T,
+        "least_squares_of_gp": np.linalg.lstsq(H, mean - H @ regressor.coef_.T)[0].T,
+    }
+    return [
+        {
+            **{name: getattr(cell, name) for name in ("system", "model", "setting", "seed", "size")},
+            "output": output,
+            "feature": feature,
+            **{name: values[o, j] for name, values in tables.items()},
+            "max_iter": "" if regressor.max_iter is None else regressor.max_iter,
+            "n_iter": regressor.n_iter_,
+            "fit_seconds": seconds,
+            **harness.provenance(),
+        }
+        for o, output in enumerate(train.target_names)
+        for j, feature in enumerate(regressor.feature_map_.get_feature_names_out())
+    ]
+
+
+def table_of(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return the weights that would imitate gravity and those of gravity, means ± standard errors over seeds."""
+
+    def text(values: pd.Series) -> str:
+        error = f" ± {figure_of(values.std() / np.sqrt(len(values)))}" if len(values) > 1 else ""
+        return f"{values.mean():+.3f}{error}"
+
+    outputs = list(rows["output"].unique())
+    half = len(outputs) // 2
+    lines = []
+    for setting, model, (velocity, position) in itertools.product(
+        SETTINGS, MODELS, zip(outputs[half:], outputs[:half], strict=True)
+    ):
+        own = rows[(rows["setting"] == setting) & (rows["model"] == model) & (rows["output"] == velocity)]
+        for feature in own["feature"].unique():
+            if feature == position or feature.startswith("sin("):
+                weight = own[own["feature"] == feature]
+                lines.append(
+                    {
+                        "setting": SETTINGS[setting],
+                        "model": model,
+                        "entry": f"({velocity}, {feature})",
+                        "b": text(weight["mean"]),
+                        "std": weight["std"].mean(),
+                        "least squares": text(weight["least_squares"]),
+                        "GP": text(weight["least_squares_of_gp"]),
+                    }
+                )
+    return pd.DataFrame(lines)
+
+
+def pretty(name: str) -> str:
+    """Write a column as the paper does: dq1/dt -> q̇₁, u_q2 -> u₂, sin(q1 + q2) -> sin₁₂."""
+    for pattern, replacement in (
+        (r"sin\(q(\d) \+ q(\d)\)", r"\\sin_{\1\2}"),
+        (r"sin\(q(\d)\)", r"\\sin_\1"),
+        (r"sin\((\w+)\)", r"\\sin \1"),
+        (r"d(q\d*|theta|x)/dt", r"\\dot \1"),
+        (r"^u_[a-z]+$", "u"),
+        (r"^u_q(\d)$", r"u_\1"),
+        (r"q(\d)", r"q_\1"),
+        (r"theta", r"\\theta"),
+        (r"gravity", "g"),
+    ):
+        name = re.sub(pattern, replacement, name)
+    return f"${name}$"
+
+
+def plot(rows: pd.DataFrame, path: Path) -> None:
+    """Draw heat maps of prior, least squares and posterior, a column of panels per model; means over seeds."""
+    from matplotlib.colors import LogNorm, SymLogNorm
+
+    settings = [setting for setting in SETTINGS if (rows["setting"] == setting).any()]
+    lines = [("prior mean", settings[0], "prior_mean"), ("least squares", settings[0], "least_squares")]
+    lines += [(f"{what}, {SETTINGS[s]}", s, value) for what, value in (("b", "mean"), ("std", "std")) for s in settings]
+    outputs = list(rows["output"].unique())
+    size = (harness.WIDTH, 0.4 + len(lines) * (0.45 + 0.3 * len(outputs)))
+    models = [model for model in MODELS if (rows["model"] == model).any()]
+    figure, grid = harness.pyplot().subplots(len(lines), len(models), figsize=size, squeeze=False)
+    stds = rows.loc[rows["std"] > 0, "std"]
+    styles = {
+        False: {"cmap": "RdBu_r", "norm": SymLogNorm(0.05, vmin=-1.0, vmax=1.0)},
+        True: {"cmap": "Greys", "norm": LogNorm(stds.min(), 10.0 * stds.max())},
+    }
+    for line, (title, setting, value) in zip(grid, lines, strict=True):
+        for axes, model in zip(line, models, strict=True):
+            own = rows[(rows["setting"] == setting) & (rows["model"] == model)]
+            means = own.groupby(["output", "feature"], sort=False)[value].mean().unstack(sort=False)
+            picture = axes.imshow(means, aspect="auto", **styles[value == "std"])
+            axes.set_xticks(range(means.shape[1]), map(pretty, means.columns), fontsize=8)
+            axes.set_yticks(range(means.shape[0]), map(pretty, means.index), fontsize=8)
+            axes.grid(False)
+            axes.set_title(f"{model}: {title}")
+            if means.shape[1] <= 12:
+                for (o, j), mean in np.ndenumerate(means):
+                    dark = np.mean(picture.cmap(picture.norm(mean))[:3]) < 0.5
+                    text = f"{mean:.0e}" if 0.0 < abs(mean) < 5e-4 else f"{mean:.3g}"
+                    axes.text(j, o, text, ha="center", va="center", fontsize=7, color="w" if dark else "k")
+    figure.suptitle(f"{rows['system'].iloc[0]}: means over {rows['seed'].nunique()} seeds; b, std: posterior")
+    harness.save_picture(figure, path)
+
+
+def main() -> None:
+    parser = harness.argument_parser(
+        __doc__,
+        quick="12 trajectories, few iterations and one seed",
+        seeds="number of seeds; default: 4, quick 1",
+        systems=SYSTEMS,
+        default_systems=["acrobot"],
+    )
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: both")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS), help="default: all")
+    parser.add_argument("--max-iter", type=int, help="default: the regressor's")
+    options = parser.parse_args()
+    size = "quick" if options.quick else "full"
+    output = harness.output_path(options, "beta")
+    seeds = range(options.seeds or (1 if options.quick else 4))
+    cells = [
+        Cell(system, model, setting, seed, size, options.max_iter)
+        for system, seed, setting, model in itertools.product(options.systems, seeds, options.settings, options.models)
+    ]
+    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
+    rows, tables = harness.frame(output, size=size), {}
+    for system, own in rows.groupby("system"):
+        tables[system] = table_of(own)
+        authors = own["setting"].str.startswith("author")
+        for end, part in (("", own[~authors]), ("_author", own[authors])):
+            if len(part):
+                plot(part, output.with_name(f"{output.stem}_{system}{end}.png"))
+    harness.write_page("The learned weights of the physics features", tables, output, n_failures)
+
+
+if __name__ == "__main__":
+    main()

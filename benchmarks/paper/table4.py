@@ -1,0 +1,265 @@
+"""The paper's Table 4: the test results of every system and model, beside the paper's numbers.
+
+A model of seed s learns from data of random state s and is tested on 1000 + s.
+
+    python benchmarks/paper/table4.py               # everything, four seeds: days of one core
+    python benchmarks/paper/table4.py --quick       # fewer rows and iterations, one seed: a few minutes
+    python benchmarks/paper/table4.py --systems iiwa14 --settings paper --max-iter 1000  # half an hour per fit
+    python benchmarks/paper/table4.py --noise 0.01  # on training and test targets; in another file
+    python benchmarks/paper/table4.py --angles wrapped --systems pendulum cartpole acrobot --settings paper
+
+There are two cartpoles. ``cartpole_damped`` has damping on both joints, as Drake's had in Python when the paper was
+written. Angles are raw, or wrapped to [-pi, pi) in the inputs, with the targets moved along.
+
+Settings: "paper" (Adam, diagonal posterior, inducing points per output), "author" and "author-100" (the solver and the
+starts of the author's library, with a prior scale of 1 or 100), "skevgp" (defaults), "skevgp-angles" (the kernel sees
+sines and cosines of angles) and, for EVGP on iiwa14, "skevgp-nominal" (further features from a model of the arm whose
+inertial parameters are wrong by up to 20 %).
+
+With Adam a fit takes up to 5 minutes of one core for the pendulum and the cartpole, 2 to 16 for the acrobot, and 2 to 3
+hours for iiwa14. In the other settings it takes seconds to minutes, for iiwa14 up to an hour.
+"""
+
+from __future__ import annotations
+
+import itertools
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
+
+import numpy as np
+import pandas as pd
+from sklearn.utils import Bunch
+
+import harness
+from harness import figure_of
+from paper.models import (
+    MODELS,
+    PROMISED,
+    PUBLISHED,
+    QUICK_TRAJECTORIES,
+    SETTINGS,
+    SYSTEMS,
+    Fit,
+    fitted_row,
+    has,
+    limited,
+)
+from skevgp.datasets import make_dynamics
+
+MARKERS = dict(zip(SETTINGS, "svPo^D", strict=True))
+COLOURS = dict(zip(SETTINGS, np.array(harness.PALETTE)[[4, 1, 5, 0, 2, 3]], strict=True))
+N_SEEDS = 4
+
+
+@dataclass(frozen=True)
+class Cell:
+    """One fit. ``noise`` is the share of each training target's standard deviation."""
+
+    system: str
+    model: str
+    setting: str
+    seed: int
+    angles: str
+    noise: float
+    size: str
+    max_iter: int | None = field(compare=False)
+
+
+@lru_cache(maxsize=1)
+def data(system: str, seed: int, noise: float, size: str, angles: str) -> tuple[Bunch, Bunch]:
+    """Return a training and a test set with the same noise."""
+    n_trajectories = QUICK_TRAJECTORIES if size == "quick" else None
+    wrap = angles == "wrapped"
+    train = make_dynamics(system, n_trajectories, noise=noise, wrap_angles=wrap, random_state=seed)
+    test = make_dynamics(system, n_trajectories, wrap_angles=wrap, random_state=1000 + seed)
+    states = train.trajectories[:, 1:].reshape(train.target.shape)
+    test.target += noise * states.std(axis=0) * np.random.RandomState(2000 + seed).standard_normal(test.target.shape)
+    return train, test
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Fit one model on one training set and evaluate it on one test set."""
+    train, test = data(cell.system, cell.seed, cell.noise, cell.size, cell.angles)
+    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
+    return fitted_row(fit, train, test, angles=cell.angles, noise=cell.noise)
+
+
+def groups_of(rows: pd.DataFrame) -> Iterator[tuple[str, str, str, str, pd.DataFrame]]:
+    """Yield (case, system, model, setting, rows) in the paper's order; a case is a system and its angles."""
+    found = dict(list(rows.groupby(["system", "angles", "model", "setting"])))
+    for setting, system, angles, model in itertools.product(SETTINGS, SYSTEMS, ("raw", "wrapped"), MODELS):
+        if (system, angles, model, setting) in found:
+            own = found[system, angles, model, setting].sort_values("seed")
+            yield system + ", wrapped" * (angles == "wrapped"), system, model, setting, own
+
+
+def marks(own: pd.DataFrame) -> str:
+    """Return an asterisk if a limit ended a fit, a dagger if an output was not learned, and the number of seeds."""
+    said = "\\*" * bool(own.apply(limited, axis=1).any()) + "†" * bool((own["unlearned"] > 0).any())
+    return said + (f" ({len(own)})" if len(own) != N_SEEDS else "")
+
+
+def overview(rows: pd.DataFrame, noisy: bool) -> pd.DataFrame:
+    """Return mean Errors, all rows / rows inside the training range; of noisy data CR-2. A column per setting."""
+    lines: dict[tuple[str, str], dict[str, str]] = {}
+    for case, system, model, setting, own in groups_of(rows):
+        published = PUBLISHED.loc[system, model]
+        said = f"{published.cr2 if noisy else published.error:.3f}"
+        if noisy:
+            text = figure_of(own["cr2"].mean())
+        else:
+            means = own["error_mean"].mean(), own["error_inside"].mean(skipna=False)
+            text = " / ".join(figure_of(mean) for mean in means if np.isfinite(mean))
+        line = lines.setdefault((case, model), {"system": case, "model": model, "in the paper": said})
+        line[f"ours: {setting}"] = text + marks(own)
+    cases = [system + end for system in SYSTEMS for end in ("", ", wrapped")]
+    order = sorted(lines, key=lambda line: (cases.index(line[0]), list(MODELS).index(line[1])))
+    columns = [f"ours: {setting}" for setting in SETTINGS if (rows["setting"] == setting).any()]
+    return pd.DataFrame([lines[line] for line in order])[["system", "model", "in the paper", *columns]].fillna("")
+
+
+def calibration(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return shares of the targets within intervals that promise them."""
+    names = {"0.5": "within_0.5", "0.8": "within_0.8", "0.95": "within_0.95"}
+    names |= {"CR-1: 0.683": "cr1", "CR-2: 0.954": "cr2", "CR-3: 0.997": "cr3"}
+    lines = []
+    for case, _, model, setting, own in groups_of(rows):
+        means = own[list(names.values())].mean(skipna=False)
+        texts = [f"{mean:.3f}" if np.isfinite(mean) else "" for mean in means]
+        lines.append({"promised": f"{case} {model} {setting}{marks(own)}", **dict(zip(names, texts, strict=True))})
+    return pd.DataFrame(lines)
+
+
+def details(rows: pd.DataFrame, wanted: str) -> pd.DataFrame:
+    """Return all columns of the paper's table, ours / the paper's, for one setting."""
+    lines = []
+    for case, system, model, setting, own in groups_of(rows):
+        if setting != wanted:
+            continue
+        paper, mean, errors = PUBLISHED.loc[system, model], own.mean(numeric_only=True), own["error_mean"]
+        inside = own["error_inside"].mean(skipna=False)
+        counts = ", ".join(map(str, sorted(own["n_parameters"].unique())))
+        lines.append(
+            {
+                "system": case,
+                "model": model,
+                "seeds": len(own),
+                "Error": f"{figure_of(errors.mean())} / {paper.error:.3f}",
+                "median seed": errors.median(),
+                "largest": errors.max(),
+                "inside": f"{figure_of(inside)} ({mean['inside']:.1%})" if np.isfinite(inside) else "",
+                "outside": mean["error_outside"],
+                "median row": mean["error_median"],
+                "99 % of rows": mean["error_p99"],
+                "‖STD‖": f"{figure_of(mean['std_norm'])} / {paper.std_norm:.3f}",
+                **{f"CR-{k}": f"{mean[f'cr{k}']:.3f} / {paper[f'cr{k}']:.3f}" for k in (1, 2, 3)},
+                "NLPD": f"{mean['nlpd']:.2f}",
+                "parameters": f"{counts} / {paper.n_parameters:.0f}",
+                "iterations": f"{own['n_iter'].median():.0f}",
+                "seconds": f"{mean['fit_seconds']:.1f}",
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def plot_errors(rows: pd.DataFrame, path: Path) -> None:
+    """Draw a panel per system: bars of the paper, a marker for each setting."""
+    systems = [system for system in SYSTEMS if (rows["system"] == system).any()]
+    n_lines = -(-len(systems) // 2)
+    figure, grid = harness.pyplot().subplots(n_lines, 2, figsize=(harness.WIDTH, 2.4 + 2.9 * n_lines), squeeze=False)
+    places = np.arange(len(MODELS))
+    for axes, system in zip(grid.flat, systems, strict=False):
+        papers = PUBLISHED.loc[system]["error"].reindex(list(MODELS))
+        axes.hlines(papers, places - 0.42, places + 0.42, color="black", label="in the paper")
+        for _, _, model, setting, own in groups_of(rows[(rows["system"] == system) & (rows["angles"] == "raw")]):
+            offset = 0.16 * (list(SETTINGS).index(setting) - 2.5)
+            place, colour, values = list(MODELS).index(model) + offset, COLOURS[setting], own["error_mean"]
+            unsure = own.apply(limited, axis=1).any() or (own["unlearned"] > 0).any()
+            style = {"color": colour, "markerfacecolor": "white" if unsure else colour, "linestyle": ""}
+            axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
+            axes.plot(place, values.mean(), MARKERS[setting], label=f"ours: {setting}", **style)
+            axes.plot(place, own["error_inside"].mean(), "_", color=colour, markersize=12)
+        axes.set_xticks(places, list(MODELS), fontsize=8)
+        axes.set(title=system, ylabel="test Error (SI units)", yscale="log")
+    for axes in grid.flat[len(systems) :]:
+        axes.set_axis_off()
+    title = "large: mean; small: each data set; dash: mean inside the training range\n"
+    harness.legend(figure, ncols=4, title=title + "hollow: a fit ended by a limit, or an output was not learned")
+    harness.save_picture(figure, path)
+
+
+def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
+    """Draw a panel per system and setting: the share that intervals hold less the share that they promise."""
+    # Old rows have no such shares.
+    rows = rows[(rows["angles"] == "raw") & rows[f"within_{PROMISED[0]}"].notna()]
+    panels = rows.groupby("system", sort=False)["setting"].unique()
+    systems = [system for system in SYSTEMS if system in panels]
+    n_columns = max(map(len, panels))
+    size = {"figsize": (harness.WIDTH, 1.1 + 1.7 * len(systems)), "squeeze": False}
+    figure, grid = harness.pyplot().subplots(len(systems), n_columns, sharex=True, sharey=True, **size)
+    for line, system in zip(grid, systems, strict=True):
+        settings = [setting for setting in SETTINGS if setting in panels[system]]
+        for axes in line[len(settings) :]:
+            axes.set_axis_off()
+        for axes, setting in zip(line, settings, strict=False):
+            own = rows[(rows["system"] == system) & (rows["setting"] == setting)]
+            axes.axhline(0.0, color="black", label="as promised")
+            for model, colour in zip(MODELS, harness.PALETTE, strict=False):
+                held = own[own["model"] == model][[f"within_{share}" for share in PROMISED]].mean()
+                axes.plot(PROMISED, held.to_numpy() - PROMISED, "o-", color=colour, markersize=4, label=model)
+            axes.set_title(f"{system}, {setting}")
+        line[0].set_ylabel("held - promised")
+    harness.legend(figure, ncols=3, title="share promised: horizontal; means over data sets")
+    harness.save_picture(figure, path)
+
+
+def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page."""
+    noisy = bool((rows["noise"] > 0).any())
+    settings = [setting for setting in SETTINGS if (rows["setting"] == setting).any()]
+    return {
+        "CR-2" if noisy else "Error": overview(rows, noisy),
+        "calibration": calibration(rows),
+        **{f"setting {setting}": details(rows, setting) for setting in settings},
+    }
+
+
+def main() -> None:
+    parser = harness.argument_parser(
+        __doc__,
+        quick="12 trajectories, few iterations and one seed",
+        seeds="number of seeds; default: 4, quick 1",
+        systems=SYSTEMS,
+    )
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
+    parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=SETTINGS, help="default: all")
+    parser.add_argument("--angles", nargs="+", choices=("raw", "wrapped"), default=["raw"], help="default: raw")
+    parser.add_argument("--noise", type=float, default=0.0, help="as a share of each training target's std; default: 0")
+    parser.add_argument("--max-iter", type=int, help="of an EVGP; default: the regressor's")
+    parser.add_argument("--limited", action="store_true", help="fit again what a limit of iterations ended")
+    options = parser.parse_args()
+    size, noise = "quick" if options.quick else "full", options.noise
+    output = harness.output_path(options, f"results_table{f'_noise{noise:g}' if noise else ''}")
+    n_seeds = options.seeds or (1 if options.quick else N_SEEDS)
+    cells = [
+        Cell(system, model, setting, seed, angles, noise, size, options.max_iter)
+        for system, seed, angles, model, setting in itertools.product(
+            options.systems, range(n_seeds), options.angles, options.models, options.settings
+        )
+        if has(system, model, setting, angles)
+    ]
+    again = limited if options.limited else None
+    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since, again=again)
+    rows = harness.frame(output, size=size, noise=noise)
+    (plot_reliability if noise else plot_errors)(rows, output.with_suffix(".png"))
+    harness.write_page("The results: Table 4 of the paper, and ours", tables_of(rows), output, n_failures)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,662 @@
+"""Torques of robots: real arms on trajectories that were not seen, and what is identified of a simulated arm.
+
+    python benchmarks/robots.py real --data ../data            # a quarter of an hour of one core
+    python benchmarks/robots.py real --data ../data --quick    # a split per arm, few rows and iterations: a minute
+    python benchmarks/robots.py identification                 # 50 runs, each without and with a filter: minutes
+    python benchmarks/robots.py identification --quick         # two runs of few rows: seconds
+
+*real*: the folder has a folder of logs per arm. Arms without logs are left out. No row of the logs is written anywhere.
+
+- ur10e: ur10e.urdf, and tables ur-DATE-NAME.csv.gz without a header, of time, positions, velocities and motor currents
+  of six joints (columns 1, 2-7, 8-13 and 14-19). Files whose names end in "load" (not "unload") have a load. Files that
+  never move are passed over. All others are tests, except those that a fit is trained on.
+- ur10: ur10_exciting_trajectory.db3 (JointState) and validation_trajectory.db3 (JointTrajectory), for the URDF "ur10"
+  of example-robot-data.
+
+A second CSV has the load and the friction that were found.
+
+*identification*: a simulated arm whose masses, centres of mass and inertias differ from the model's by up to 20 %
+(`perturb_robot`), with Coulomb and viscous friction, follows two trajectories of half a minute at 100 Hz. Torques have
+noise of 2 % of their scatter. Data are given as they are, or written to a file that `load_log` reads with a filter of
+5 Hz. `InverseDynamics` is asked for weights whose posterior variance is below a quarter of the prior's (in
+eigen-directions of the posterior, in units of the prior), and for torques on other trajectories.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import time
+import warnings
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from sklearn.base import BaseEstimator, RegressorMixin
+from sklearn.ensemble import HistGradientBoostingRegressor, RandomForestRegressor
+from sklearn.multioutput import MultiOutputRegressor
+from sklearn.utils import Bunch
+from threadpoolctl import threadpool_limits
+
+import harness
+from harness import figure_of
+from skevgp import EVGPRegressor, InverseDynamics
+from skevgp.datasets import load_log, load_robot, perturb_robot
+from skevgp.features import RigidBodyRegressor
+from skevgp.metrics import containing_ratios, negative_log_predictive_density
+
+INTERVAL = 1.959963984540054  # of 95 %, in standard deviations
+
+
+# --- real arms -----------------------------------------------------------------------------------------------------
+
+SIGNALS: dict[str, Any] = {"dt": 0.01, "cutoff": 5.0}
+COLUMNS = {"time": 0, "position": range(1, 7), "velocity": range(7, 13), "current": range(13, 19)}
+# Torque per current, N m / A, of a catalogue (De Luca), as the logs' README has them.
+GAINS = (14.87, 13.26, 11.13, 10.62, 11.03, 11.47)
+# First and last row, from 1, in which the arm moves along its trajectory. Other files: all rows not at rest.
+MOVING = {
+    "20sec_8harm": (320, 2310),
+    "30sec_12harm": (635, 3510),
+    "40sec_12harm": (500, 4460),
+    "50sec_12harm": (355, 5090),
+    "14harm50sec": (195, 4966),
+    "14harm50secLoad": (308, 5071),
+    "ptp_10_points": (700, 4200),
+}
+# The only recording of the ur10, in thirds that are groups.
+UR10 = {
+    "exciting 1/3": (0.0, 9.2),
+    "exciting 2/3": (9.2, 18.4),
+    "exciting 3/3": (18.4, None),
+    "validation": None,
+}
+# Training logs of each fit.
+SPLITS = {
+    "ur10e": {
+        "three": ("20sec_8harm", "30sec_12harm", "40sec_12harm"),
+        "one: 30sec_12harm": ("30sec_12harm",),
+        "one: 20sec_8harm": ("20sec_8harm",),
+        "one: 40sec_12harm": ("40sec_12harm",),
+    },
+    "ur10": {
+        "whole": ("exciting 1/3", "exciting 2/3", "exciting 3/3"),
+        "two thirds": ("exciting 1/3", "exciting 2/3"),
+    },
+}
+# Logs that no fit is tested on, so that all fits of an arm have the same tests.
+TRAINING = {"ur10e": SPLITS["ur10e"]["three"], "ur10": ()}
+# Logs with a load, without it, and the load's mass if it is known, kg.
+LOADS = (("14harm50secLoad", "14harm50sec", 2.805), ("load", "unload", None))
+LEAST_SQUARES, EVGP = "least squares", "EVGP"
+MODELS = (
+    "CAD",
+    LEAST_SQUARES,
+    "least squares, prior",
+    "GP",
+    "least squares, then GP",
+    EVGP,
+    "gradient boosting",
+    "random forest",
+)
+
+
+@dataclass(frozen=True)
+class Real:
+    """One fit to a real arm."""
+
+    robot: str
+    split: str
+    model: str
+    size: str
+    folder: Path = field(compare=False)
+
+
+@dataclass(frozen=True)
+class Question:
+    """The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+"."""
+
+    robot: str
+    trained: str
+    loaded: str
+    gain_scale: float
+    size: str
+    folder: Path = field(compare=False)
+
+
+def paths_of(robot: str, folder: Path) -> dict[str, Path]:
+    """Return the files of the logs by name."""
+    if robot == "ur10":
+        files = [folder / robot / f"{name}_trajectory.db3" for name in ("ur10_exciting", "validation")]
+        named = {name: files[name == "validation"] for name in UR10}
+        return {name: path for name, path in named.items() if path.exists()}
+    found = {}
+    for path in sorted((folder / robot).glob("*.csv.gz")):
+        found[re.sub(r"^ur-\d\d_\d\d_\d\d[-_]", "", path.name.removesuffix(".csv.gz"))] = path
+    return found
+
+
+@lru_cache
+def log_of(robot: str, name: str, folder: Path) -> Bunch:
+    """Read a log."""
+    path = paths_of(robot, folder)[name]
+    if robot == "ur10":
+        return load_log(path, keep=UR10[name], **SIGNALS)
+    first, last = MOVING.get(name, (1, None))
+    return load_log(path, columns=COLUMNS, gains=GAINS, keep=slice(first - 1, last), **SIGNALS)
+
+
+@lru_cache
+def moving(robot: str, folder: Path) -> tuple[str, ...]:
+    """Return names of the logs in which the arm moves."""
+    names = []
+    for name in paths_of(robot, folder):
+        try:
+            log_of(robot, name, folder)
+        except ValueError as problem:
+            if "at rest" not in str(problem):
+                raise
+        else:
+            names.append(name)
+    return tuple(names)
+
+
+def has_load(name: str) -> bool:
+    return name.lower().endswith("load") and not name.lower().endswith("unload")
+
+
+def splits_of(robot: str, folder: Path, size: str) -> dict[str, tuple[str, ...]]:
+    """Return the splits whose training logs exist; in a quick run only the first."""
+    there = moving(robot, folder)
+    found = {split: names for split, names in SPLITS[robot].items() if set(names) <= set(there)}
+    return dict(list(found.items())[: 1 if size == "quick" else None])
+
+
+def tests_of(robot: str, split: str, folder: Path) -> list[str]:
+    """Return the names of the test logs."""
+    taken = {*TRAINING[robot], *SPLITS[robot][split]}
+    return [name for name in moving(robot, folder) if name not in taken and not has_load(name)]
+
+
+def rows_of(robot: str, names: Sequence[str], folder: Path, size: str) -> Bunch:
+    """Return rows of several logs. Each log is a group. A quick run takes every tenth row."""
+    logs = [log_of(robot, name, folder) for name in names]
+    step = 10 if size == "quick" else 1
+    return Bunch(
+        data=np.concatenate([log.data[::step] for log in logs]),
+        target=np.concatenate([log.target[::step] for log in logs]),
+        groups=np.concatenate([np.full(len(log.data[::step]), number) for number, log in enumerate(logs)]),
+    )
+
+
+def urdf_of(robot: str, folder: Path) -> str:
+    return str(folder / robot / "ur10e.urdf") if robot == "ur10e" else robot
+
+
+class LinearTorques(RegressorMixin, BaseEstimator):
+    """Rigid-body features with the weights of the URDF or of least squares; std is that of the training errors."""
+
+    def __init__(self, robot: Any, least_squares: bool = True):
+        self.robot = robot
+        self.least_squares = least_squares
+
+    def fit(self, X: np.ndarray, y: np.ndarray) -> LinearTorques:
+        self.features_ = RigidBodyRegressor(self.robot).fit(X)
+        H = self.features_.transform(X)
+        self.coef_ = self.features_.coef_prior(y.shape[1])[0]
+        if self.least_squares:
+            self.coef_ = np.linalg.lstsq(H.reshape(y.size, -1), y.ravel(), rcond=None)[0]
+        self.std_ = np.sqrt(np.mean((y - H @ self.coef_) ** 2, axis=0))
+        return self
+
+    def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
+        mean = self.features_.transform(X) @ self.coef_
+        return (mean, np.broadcast_to(self.std_, mean.shape)) if return_std else mean
+
+
+class LinearThenGP(RegressorMixin, BaseEstimator):
+    """Least squares, and a Gaussian process of all columns on the residual, which gives the std."""
+
+    def __init__(self, linear: LinearTorques, regressor: EVGPRegressor):
+        self.linear = linear
+        self.regressor = regressor
+
+    def fit(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray | None = None) -> LinearThenGP:
+        self.linear.fit(X, y)
+        self.regressor.fit(X, y - self.linear.predict(X), groups=groups)
+        return self
+
+    def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
+        mean = self.linear.predict(X)
+        if not return_std:
+            return mean + self.regressor.predict(X)
+        more, std = self.regressor.predict(X, return_std=True)
+        return mean + more, std
+
+
+def model_of(name: str, robot: str, quick: bool) -> tuple[Any, bool, bool]:
+    """Return a regressor with its defaults, whether it has a std, and whether its fit takes groups."""
+    short = {"max_iter": 5} if quick else {}
+    gp = EVGPRegressor(n_inducing=10 if quick else 100, random_state=0, **short)
+    if name == "CAD":
+        return LinearTorques(robot, least_squares=False), False, False
+    if name == LEAST_SQUARES:
+        return LinearTorques(robot), True, False
+    if name == "least squares, prior":
+        return InverseDynamics(robot, n_inducing=0), True, True
+    if name == "GP":
+        return gp, True, True
+    if name == "least squares, then GP":
+        return LinearThenGP(LinearTorques(robot), gp), True, True
+    if name == EVGP:
+        return arm_of(robot, quick), True, True
+    if name == "gradient boosting":
+        return MultiOutputRegressor(HistGradientBoostingRegressor(random_state=0, **short)), False, False
+    trees = {"n_estimators": 5} if quick else {}
+    return MultiOutputRegressor(RandomForestRegressor(random_state=0, **trees)), False, False
+
+
+def arm_of(robot: str, quick: bool, gain_scale: float = 0.0) -> InverseDynamics:
+    short = {"max_iter": 5, "n_inducing": 10} if quick else {}
+    return InverseDynamics(robot, gain_scale=gain_scale, random_state=0, **short)
+
+
+def run_real(cell: Real) -> list[dict[str, Any]]:
+    """Fit a model and evaluate each joint on each test file. ``fit_seconds`` is processor time of one thread."""
+    robot = urdf_of(cell.robot, cell.folder)
+    train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], cell.folder, cell.size)
+    model, has_band, by_groups = model_of(cell.model, robot, cell.size == "quick")
+    reference = LinearTorques(robot).fit(train.data, train.target)
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        start = time.process_time()
+        model.fit(train.data, train.target, **({"groups": train.groups} if by_groups else {}))
+        seconds = time.process_time() - start
+        rows = []
+        for name in tests_of(cell.robot, cell.split, cell.folder):
+            test = rows_of(cell.robot, [name], cell.folder, cell.size)
+            base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
+            mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
+            for joint in range(test.target.shape[1]):
+                rows.append(
+                    {
+                        **{key: getattr(cell, key) for key in ("robot", "split", "model", "size")},
+                        "test": name,
+                        "joint": joint + 1,
+                        **measures(test.target[:, [joint]], mean[:, [joint]], None if std is None else std[:, [joint]]),
+                        "ratio": np.mean((mean - test.target)[:, joint] ** 2) / base[joint],
+                        "n_train": len(train.data),
+                        "n_test": len(test.data),
+                        "fit_seconds": seconds,
+                        **harness.provenance(),
+                    }
+                )
+    return rows
+
+
+def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dict[str, Any]:
+    """Return scores of one joint (n, 1); empty without a std."""
+    error = {"nmse": np.mean((mean - truth) ** 2) / truth.var()}
+    if std is None:
+        return {**error, **dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")}
+    shares = containing_ratios(truth, mean, std)
+    bands = dict(zip(("cr1", "cr2", "cr3"), shares, strict=True))
+    return {**error, "nlpd": negative_log_predictive_density(truth, mean, std), **bands}
+
+
+def ask(question: Question) -> list[dict[str, Any]]:
+    """Return what was identified, with standard deviations."""
+    train = rows_of(question.robot, question.trained.split("+"), question.folder, question.size)
+    arm = arm_of(urdf_of(question.robot, question.folder), question.size == "quick", question.gain_scale)
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        arm.fit(train.data, train.target, groups=train.groups)
+        if question.loaded:
+            loaded = rows_of(question.robot, [question.loaded], question.folder, question.size)
+            load = arm.estimate_payload(loaded.data, loaded.target)
+            names = ["mass", *(f"com {axis}" for axis in "xyz")]
+            values, stds = np.r_[load.mass, load.com], np.r_[load.mass_std, load.com_std]
+        else:
+            keep = [name.startswith(("viscous", "coulomb")) for name in arm.coef_names_]
+            names, values, stds = arm.coef_names_[keep], arm.coef_[keep], arm.coef_std_[keep]
+    return [
+        {
+            **{key: getattr(question, key) for key in ("robot", "trained", "loaded", "gain_scale", "size")},
+            "name": name,
+            "value": value,
+            "std": std,
+            **harness.provenance(),
+        }
+        for name, value, std in zip(names, values, stds, strict=True)
+    ]
+
+
+def questions_of(folder: Path, size: str) -> list[Question]:
+    """Return questions of loads, from the log without the load alone and with training logs, and of friction."""
+    there = moving("ur10e", folder)
+    splits = splits_of("ur10e", folder, size)
+    questions = []
+    for loaded, empty, _ in LOADS:
+        if {loaded, empty} <= set(there):
+            more = splits.get("three", ()) if size == "full" else ()
+            sets = [(empty,), (empty, *more)] if more else [(empty,)]
+            questions += [
+                Question("ur10e", "+".join(names), loaded, scale, size, folder)
+                for names in sets
+                for scale in (0.0, 0.1)
+            ]
+    return questions + [Question("ur10e", "+".join(names), "", 0.0, size, folder) for names in splits.values()]
+
+
+def geometric(values: pd.Series) -> float:
+    return float(np.exp(np.mean(np.log(values))))
+
+
+def pooled(rows: pd.DataFrame, name: str) -> float:
+    """Return the mean over all test rows of all files; NaN without intervals."""
+    return float(np.average(rows[name], weights=rows["n_test"]))
+
+
+def shown(value: float, digits: int) -> str:
+    return "" if np.isnan(value) else f"{value:.{digits}f}"
+
+
+def split_tables(rows: pd.DataFrame, first: bool) -> dict[str, pd.DataFrame]:
+    """Return errors over those of least squares, CR-2 of each joint, and nMSE of each test file, or lost ones."""
+    least = rows.loc[rows.groupby(["test", "joint"])["nmse"].idxmin()]
+    models = {model: own for model in MODELS if len(own := rows[rows["model"] == model])}
+    summary, bands, errors, lost = [], [], [], []
+    for model, own in models.items():
+        wins = f"{(least['model'] == model).sum()} of {len(least)}"
+        line = {"": model, "ratio": geometric(own["ratio"])}
+        line |= {f"joint {joint}": ratio for joint, ratio in own.groupby("joint")["ratio"].mean().items()}
+        line |= {"best of all": wins, "NLPD": shown(pooled(own, "nlpd"), 2)}
+        line |= {f"CR-{k}": shown(pooled(own, f"cr{k}"), 3) for k in (1, 2, 3)}
+        summary.append({**line, "seconds": f"{own['fit_seconds'].iloc[0]:.1f}"})
+        if own["cr2"].notna().all():
+            shares = {f"joint {joint}": shown(pooled(part, "cr2"), 3) for joint, part in own.groupby("joint")}
+            bands.append({"": model, **shares})
+    for test, here in rows.groupby("test", sort=False):
+        table = here.pivot(index="model", columns="joint", values="nmse")
+        for model in models:
+            best = table.loc[model] == table.min()
+            texts = {
+                f"joint {joint}": f"**{figure_of(value)}**" if best[joint] else figure_of(value)
+                for joint, value in table.loc[model].items()
+            }
+            errors.append({"test": test, "": model, **texts})
+    for row in rows[rows["model"] == EVGP].itertuples():
+        best = least[(least["test"] == row.test) & (least["joint"] == row.joint)].iloc[0]
+        if best["model"] != EVGP:
+            line = {"test": row.test, "joint": row.joint, "least": best["model"], "its nMSE": best["nmse"]}
+            lost.append({**line, "EVGP's": row.nmse, "ratio": f"{row.ratio:.2f}"})
+    last = {"errors": errors} if first else {"lost": lost}
+    return {name: pd.DataFrame(lines) for name, lines in ({"": summary, "CR-2": bands} | last).items()}
+
+
+def real_tables(rows: pd.DataFrame, found: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page."""
+    short, tables = [], {}
+    for robot, splits in SPLITS.items():
+        there = [split for split in splits if ((rows["robot"] == robot) & (rows["split"] == split)).any()]
+        for number, split in enumerate(there):
+            own = rows[(rows["robot"] == robot) & (rows["split"] == split)]
+            for name, table in split_tables(own, number == 0).items():
+                tables[", ".join(filter(None, (robot, split, name)))] = table
+            own = own[own["model"] == EVGP]
+            shares = [pooled(part, "cr2") for _, part in own.groupby("joint")]
+            line = {"arm": robot, "trained on": split, "ratio": f"{geometric(own['ratio']):.3f}"}
+            line |= {"worst joint": f"{own.groupby('joint')['ratio'].mean().max():.2f}"}
+            line |= {"CR-2 of joints": f"{min(shares):.3f} to {max(shares):.3f}"}
+            short.append({**line, "seconds": f"{own['fit_seconds'].iloc[0]:.0f}"})
+    tables = {"in short": pd.DataFrame(short), **tables}
+    known, loads, frictions = {loaded: mass for loaded, _, mass in LOADS}, [], []
+    for row in found[found["name"] == "mass"].itertuples() if len(found) else ():
+        low, high, mass = row.value - INTERVAL * row.std, row.value + INTERVAL * row.std, known[row.loaded]
+        line = {"log": row.loaded, "arm known from": row.trained.replace("+", " + ")}
+        line |= {"gain_scale": str(row.gain_scale), "mass, kg": f"{row.value:.3f}", "std": f"{row.std:.3f}"}
+        line |= {"95 %": f"{low:.3f} to {high:.3f}", "width": f"{high - low:.3f}"}
+        line |= {"true": "" if mass is None else f"{mass:.3f}"}
+        loads.append({**line, "inside": "" if mass is None else "yes" if low <= mass <= high else "no"})
+    if len(found):
+        for trained, own in found[found["loaded"].isna()].groupby("trained", sort=False):
+            for term in ("coulomb", "viscous"):
+                terms = own[own["name"].str.startswith(term)]
+                texts = [f"{v:.2f} ± {INTERVAL * s:.2f}" for v, s in zip(terms["value"], terms["std"], strict=True)]
+                line = {"": term, "known from": trained.replace("+", " + ")}
+                frictions.append(line | {f"joint {joint}": text for joint, text in enumerate(texts, start=1)})
+    return tables | {"loads": pd.DataFrame(loads), "friction": pd.DataFrame(frictions)}
+
+
+def plot_real(rows: pd.DataFrame, path: Path) -> None:
+    """Draw ratios of each joint and test file, and shares within two standard deviations, a panel per split."""
+    splits = [(robot, split) for robot in SPLITS for split in SPLITS[robot]]
+    present = set(zip(rows["robot"], rows["split"], strict=True))
+    splits = [one for one in splits if one in present]
+    size = (harness.WIDTH, 0.9 + 1.7 * len(splits))
+    figure, axes = harness.pyplot().subplots(len(splits), 2, figsize=size, sharex="col", squeeze=False)
+    for (ratios, shares), (robot, split) in zip(axes, splits, strict=True):
+        own = rows[(rows["robot"] == robot) & (rows["split"] == split)]
+        names = [model for model in MODELS if (own["model"] == model).any()]
+        banded = [model for model in names if own.loc[own["model"] == model, "cr2"].notna().all()]
+        names.remove(LEAST_SQUARES)
+        for panel, models in ((ratios, names), (shares, banded)):
+            for place, model in enumerate(models):
+                mine = own[own["model"] == model]
+                values = mine["ratio"]
+                if panel is shares:
+                    values = [pooled(part, "cr2") for _, part in mine.groupby("joint")]
+                color = harness.PALETTE[model == EVGP]
+                panel.plot(values, place + np.linspace(-0.25, 0.25, len(values)), ".", color=color, alpha=0.6)
+            panel.set(yticks=range(len(models)), yticklabels=models, ylim=(len(models) - 0.5, -0.5))
+        ratios.axvline(1.0, color="0.5", linewidth=0.8)
+        ratios.set_xscale("log")
+        shares.axvspan(0.9, 0.99, color="0.9", zorder=0)
+        shares.axvline(0.954, color="0.5", linewidth=0.8)
+        ratios.set_title(f"{robot}, trained on {split}", loc="left")
+    axes[-1, 0].set_xlabel("error / least squares'\n(each file and joint)")
+    axes[-1, 1].set_xlabel("share of rows within ± 2 std\n(each joint; gray: 90 to 99 %)")
+    harness.save_picture(figure, path)
+
+
+def real(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
+    """Measure, and return tables and the number of failures."""
+    if options.data is None:
+        raise SystemExit("--data is needed: a folder with the folders ur10e and ur10, or one of them")
+    folder = options.data.resolve()
+    cells = [
+        Real(robot, split, model, size, folder)
+        for robot in SPLITS
+        for split in splits_of(robot, folder, size)
+        if tests_of(robot, split, folder)
+        for model in MODELS
+    ]
+    if not cells:
+        raise SystemExit(f"{options.data} has no logs of {' or '.join(SPLITS)}")
+    n_failures = harness.run_missing(cells, run_real, output, options.jobs, since=options.since)
+    second = output.with_name(f"{output.stem}_parameters.csv")
+    n_failures += harness.run_missing(questions_of(folder, size), ask, second, options.jobs, since=options.since)
+    rows, found = (harness.frame(path, size=size) for path in (output, second))
+    plot_real(rows, output.with_suffix(".png"))
+    return real_tables(rows, found), n_failures
+
+
+# --- a simulated arm -----------------------------------------------------------------------------------------------
+
+ROBOT, ERROR, NOISE = "ur10", 0.2, 0.02
+FILTERS = {"none": None, "5 Hz": 5.0}
+# Trajectories: base frequency in rad/s, number of harmonics, seconds, step.
+BASE, HARMONICS, SECONDS, STEP = 2.0 * np.pi * 0.03, 8, 30.0, 0.01
+# Coulomb friction (N m) and viscous friction (N m s/rad) as shares of the largest torque, or of 100 N m if less.
+FRICTION, LARGEST = (0.02, 0.1), 100.0
+STICTION = RigidBodyRegressor().stiction_velocity
+TOLD = 0.25  # a share of the prior's variance
+
+
+@dataclass(frozen=True)
+class Simulated:
+    """One simulated arm, and the cutoff of the filter."""
+
+    cutoff: str
+    seed: int
+    size: str
+
+
+def trajectory(rng: np.random.Generator, n_joints: int, size: str) -> np.ndarray:
+    """Return rows [q, q̇, q̈] of sums of sines."""
+    t = np.arange(0.0, SECONDS / (3.0 if size == "quick" else 1.0), STEP)
+    waves = BASE * np.arange(1, HARMONICS + 1)
+    a, b = rng.normal(size=(2, HARMONICS, n_joints)) / (1.5 * np.arange(1, HARMONICS + 1)[:, np.newaxis])
+    sines, cosines = np.sin(np.outer(t, waves)), np.cos(np.outer(t, waves))
+    q = sines @ a + cosines @ b
+    v = (cosines * waves) @ a - (sines * waves) @ b
+    return np.hstack([q, v, -(sines * waves**2) @ a - (cosines * waves**2) @ b])
+
+
+def arm(cell: Simulated) -> Bunch:
+    """Return the nominal model, the true weights, training data, and test data without noise and filter."""
+    rng = np.random.default_rng(cell.seed)
+    nominal = load_robot(ROBOT)
+    true = perturb_robot(nominal, ERROR, random_state=cell.seed)
+    largest = np.minimum(nominal.upperEffortLimit, LARGEST)
+    viscous, coulomb = (rng.uniform(*FRICTION, nominal.nv) * largest for _ in range(2))
+    links = np.concatenate([link.toDynamicParameters() for link in list(true.inertias)[1:]])
+    zero = np.zeros(nominal.nv)
+    weights = np.concatenate([links, viscous, coulomb, zero, zero])
+    features = RigidBodyRegressor(true).fit(np.zeros((1, 3 * nominal.nv)))
+
+    def rows(noise: float) -> tuple[np.ndarray, np.ndarray]:
+        X = trajectory(rng, nominal.nv, cell.size)
+        torque = features.transform(X) @ weights
+        return X, torque + noise * torque.std(axis=0) * rng.normal(size=torque.shape)
+
+    parts = [rows(NOISE) for _ in range(2)]
+    if FILTERS[cell.cutoff] is not None:
+        parts = [filtered(X, y, FILTERS[cell.cutoff]) for X, y in parts]
+    train = [np.concatenate(one) for one in zip(*parts, strict=True)]
+    groups = np.repeat(np.arange(len(parts)), [len(X) for X, _ in parts])
+    test = [np.concatenate(one) for one in zip(*(rows(0.0) for _ in range(2)), strict=True)]
+    return Bunch(nominal=nominal, weights=weights, data=train[0], target=train[1], groups=groups, test=test)
+
+
+def filtered(X: np.ndarray, y: np.ndarray, cutoff: float | None) -> tuple[np.ndarray, np.ndarray]:
+    """Write a log without accelerations and read it by `load_log`."""
+    n = y.shape[1]
+    table = np.column_stack([STEP * np.arange(len(X)), X[:, : 2 * n], y])
+    columns = {"time": 0, "position": range(1, n + 1), "velocity": range(n + 1, 2 * n + 1)}
+    columns["effort"] = range(2 * n + 1, 3 * n + 1)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "log.csv"
+        np.savetxt(file, table, delimiter=",")
+        return load_log(file, columns=columns, dt=STEP, cutoff=cutoff, rest_velocity=0.0, return_X_y=True)
+
+
+def root_of(covariance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return C with C Cᵀ = covariance, without its columns of zeros, and its pseudo-inverse."""
+    scale = np.sqrt(np.diag(covariance))
+    eigenvalues, vectors = np.linalg.eigh(covariance / np.outer(scale, scale))
+    kept = eigenvalues > 1e-10 * eigenvalues.max()
+    spread, vectors = np.sqrt(eigenvalues[kept]), vectors[:, kept]
+    return scale[:, np.newaxis] * vectors * spread, (vectors / spread).T / scale
+
+
+def told(arm: Bunch, model: InverseDynamics) -> tuple[np.ndarray, np.ndarray]:
+    """Return errors of identified combinations in standard deviations, and these as shares of the prior's."""
+    _, covariance = model.feature_map_.coef_prior(arm.target.shape[1])
+    _, whitening = root_of(covariance)
+    variances, directions = np.linalg.eigh(whitening @ model.coef_cov_ @ whitening.T)
+    std = np.sqrt(np.maximum(variances, 0.0))
+    known = (variances < TOLD) & (variances > 0.0)
+    error = directions.T @ whitening @ (model.coef_ - arm.weights)
+    return error[known] / std[known], std[known]
+
+
+def run_simulated(cell: Simulated) -> dict[str, Any]:
+    """Identify one arm. ``fit_seconds`` is processor time of one thread."""
+    one = arm(cell)
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        start = time.process_time()
+        model = InverseDynamics(one.nominal, n_inducing=0).fit(one.data, one.target, groups=one.groups)
+        seconds = time.process_time() - start
+    z, width = told(one, model)
+    X, truth = one.test
+    H = model.feature_map_.transform(X)
+    scatter = truth.std(axis=0)
+    missed = rms(H @ model.coef_ - truth) / scatter
+    # Without friction: torques of the identified links alone.
+    links = 10 * truth.shape[1]
+    of_links = H[:, :, :links] @ (model.coef_ - one.weights)[:links]
+    return {
+        **asdict(cell),
+        "n_rows": len(one.data),
+        "n_told": len(z),
+        "covered": np.sum(np.abs(z) <= INTERVAL),
+        "squares": np.sum(z**2),
+        "width": np.median(width),
+        "torque_error": np.sqrt(np.mean(missed**2)),
+        "torque_error_worst": missed.max(),
+        "links_error_worst": (rms(of_links) / scatter).max(),
+        "cad_error_worst": (rms(H @ model.coef_prior_mean_ - truth) / scatter).max(),
+        "correlation_time": np.mean(model.correlation_time_),
+        "fit_seconds": seconds,
+        **harness.provenance(),
+    }
+
+
+def rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(values**2, axis=0))
+
+
+def identification_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the table of the page: a line per filter."""
+    lines = []
+    for cutoff, own in rows.fillna({"cutoff": "none"}).groupby("cutoff", sort=False):
+        shares = own["covered"] / own["n_told"]
+        torques = {"torques": "torque_error_worst", "links' torques": "links_error_worst"}
+        torques |= {"CAD's torques": "cad_error_worst"}
+        lines.append(
+            {
+                "filter": cutoff,
+                "runs": len(own),
+                "combinations": f"{own['n_told'].mean():.1f}",
+                "within 95 %": f"{own['covered'].sum() / own['n_told'].sum():.3f}",
+                "of runs": f"{shares.min():.2f} to {shares.max():.2f}",
+                "rms z": f"{np.sqrt(own['squares'].sum() / own['n_told'].sum()):.2f}",
+                "width": own["width"].mean(),
+                **{header: f"{own[name].median():.2%} ({own[name].max():.2%})" for header, name in torques.items()},
+                "correlation time": f"{own['correlation_time'].mean():.1f}",
+                "seconds": f"{own['fit_seconds'].mean():.1f}",
+            }
+        )
+    return {"identification": pd.DataFrame(lines)}
+
+
+def identification(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
+    """Measure, and return the table and the number of failures."""
+    seeds = range(options.seeds or (2 if options.quick else 50))
+    cells = [Simulated(cutoff, seed, size) for seed in seeds for cutoff in FILTERS]
+    n_failures = harness.run_missing(cells, run_simulated, output, options.jobs, since=options.since)
+    return identification_tables(harness.frame(output, size=size)), n_failures
+
+
+def main() -> None:
+    parser = harness.argument_parser(
+        __doc__, quick="few rows, iterations and trees", seeds="number of simulated arms; default: 50, quick 2"
+    )
+    parser.add_argument("part", choices=("real", "identification"))
+    parser.add_argument("--data", type=Path, help="of real arms: a folder with the folders ur10e and ur10")
+    options = parser.parse_args()
+    is_real, size = options.part == "real", "quick" if options.quick else "full"
+    output = harness.output_path(options, "real_arms" if is_real else "identification")
+    tables, n_failures = (real if is_real else identification)(options, output, size)
+    title = "Torques of real arms" if is_real else "What is identified of a simulated arm"
+    harness.write_page(title, tables, output, n_failures)
+
+
+if __name__ == "__main__":
+    main()

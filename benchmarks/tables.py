@@ -1,0 +1,500 @@
+"""Tables of data: other models, and the number of inducing points that n_inducing="auto" finds.
+
+    python benchmarks/tables.py models      # some hours of one core
+    python benchmarks/tables.py models --sets diabetes friedman1-2000 --seeds 1
+    python benchmarks/tables.py inducing    # hours of one core
+    python benchmarks/tables.py inducing --sets toy-200 linear-5 --jobs 2
+    python benchmarks/tables.py models --quick  # two small sets, one seed
+
+*models*: EVGPRegressor, scikit-learn's exact Gaussian process, gradient boosting and Bayesian ridge regression, by
+RMSE, NLPD, CRPS, coverage of 90 % intervals and time, on scikit-learn's own sets and on made ones. "boxes" and "houses"
+are as trees like them; the latter is a set like California's houses, with prices that jump between districts. All
+models have their defaults, and see columns and targets of variance one. Models of a set and seed are fitted one after
+the other in one process with one thread, so that ratios of times are of the same run. Also fills the tables of
+docs/guide/boosting.md.
+
+*inducing*: on twenty sets of at most 3,000 rows, which were chosen before any of them was run, the held-out NLPD of
+``n_inducing="auto"`` against that of the exact `EGPRegressor` with its own kernel. The number of points is compared
+with the smallest of a grid (10, 15, 23, 34, ...) whose fit comes within 0.02 nats per row of the exact one. The default
+of 100 points is there too. Is the upper bound above the exact log marginal likelihood at the same parameters?
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pandas as pd
+from scipy.stats import norm
+from sklearn.base import RegressorMixin, TransformerMixin
+from sklearn.datasets import load_diabetes, make_friedman1, make_friedman2, make_friedman3
+from sklearn.ensemble import HistGradientBoostingRegressor
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from sklearn.linear_model import BayesianRidge
+from sklearn.model_selection import cross_val_predict
+from sklearn.preprocessing import StandardScaler
+from threadpoolctl import threadpool_limits
+
+import harness
+from skevgp import EGPRegressor, EVGPRegressor
+from skevgp.datasets import make_dynamics, make_toy
+from skevgp.features import InertiaForceGravity
+from skevgp.metrics import containing_ratios, crps, negative_log_predictive_density
+from skevgp.noise import Gaussian
+
+PAGE = Path(__file__).parents[1] / "docs" / "guide" / "boosting.md"
+COVERAGE = 0.9
+HALF_WIDTH = float(norm.ppf(0.5 + COVERAGE / 2))
+EXACT_ROWS = 2000  # up to here there are the exact model and "auto"
+SMALLEST_STD = 1e-3  # of predictions by quantiles, which may meet or cross, as a share of that of y
+ENOUGH = 0.02  # nats per row of held-out NLPD that may be lost against the exact model
+N_TEST = 1000
+GRID = tuple(int(np.ceil(10 * 1.5**k)) for k in range(13))
+
+
+# --- data ----------------------------------------------------------------------------------------------------------
+
+
+class Data(NamedTuple):
+    """Training rows, held-out rows, and the feature map if there is one."""
+
+    X: np.ndarray
+    y: np.ndarray
+    X_test: np.ndarray
+    y_test: np.ndarray
+    feature_map: TransformerMixin | None = None
+
+
+Draw = Callable[[int, np.random.RandomState], tuple[np.ndarray, np.ndarray]]
+
+
+def drawn(draw: Draw, n_rows: int, seed: int) -> Data:
+    """Draw training rows and held-out rows."""
+    X, y = draw(n_rows + N_TEST, np.random.RandomState(seed))
+    # Some sets are sorted.
+    order = np.random.RandomState(1000 + seed).permutation(len(X))
+    (train, test), y = (order[:n_rows], order[n_rows:]), y / y[order[:n_rows]].std(axis=0)
+    return Data(X[train], y[train], X[test], y[test])
+
+
+def toy(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    return make_toy(n, random_state=rng, return_X_y=True)
+
+
+def sines(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """Return a sum of eight sines, one of each column, with noise."""
+    X = rng.uniform(-2.0, 2.0, (n, 8))
+    return X, np.sin(2.0 * X).sum(axis=1) + 0.3 * rng.randn(n)
+
+
+def waves(n_columns: int, n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    X, y, _ = next(harness.noisy_waves(n, n_columns, rng))
+    return X, y
+
+
+def linear(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    X = rng.randn(n, 5)
+    return X, X @ rng.randn(5) + 0.5 * rng.randn(n)
+
+
+def nothing(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    return rng.randn(n, 3), rng.randn(n)
+
+
+def steps(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    X = rng.uniform(0.0, 10.0, (n, 1))
+    return X, np.floor(X[:, 0]) % 3.0 + 0.1 * rng.randn(n)
+
+
+def chirp(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    X = rng.uniform(0.0, 6.0, (n, 1))
+    return X, np.sin(X[:, 0] ** 2) + 0.1 * rng.randn(n)
+
+
+def diabetes(seed: int) -> Data:
+    X, y = load_diabetes(return_X_y=True)
+    order = np.random.RandomState(seed).permutation(len(X))
+    train, test = order[:300], order[300:]
+    y = y / y[train].std()
+    return Data(X[train], y[train], X[test], y[test])
+
+
+def dynamics(system: str, n_rows: int, noise: float, with_features: bool, seed: int) -> Data:
+    """Return the change of the last velocity over a step. Held-out rows are of other trajectories."""
+    parts: list[np.ndarray] = []
+    for random_state, n in ((seed, n_rows), (1000 + seed, N_TEST)):
+        bunch = make_dynamics(system, -(-n // 25), 25, noise=noise, random_state=random_state)
+        last = bunch.target.shape[1] - 1
+        y = bunch.target[:, last] if with_features else bunch.target[:, last] - bunch.data[:, last]
+        chosen = np.sort(np.random.RandomState(seed).permutation(len(y))[:n])
+        parts += [bunch.data[chosen], y[chosen]]
+    unit = parts[1].std() if not with_features else 1.0
+    feature_map = InertiaForceGravity(system, outputs=[last]) if with_features else None
+    return Data(parts[0], parts[1] / unit, parts[2], parts[3] / unit, feature_map)
+
+
+def houses(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """Return houses like California's: prices jump between districts, columns are skewed, few prices reach 5."""
+    place, age = rng.uniform(0.0, 6.0, (n, 2)), rng.randint(1, 53, n)
+    income, people = np.exp(1.2 + 0.45 * rng.randn(n)), np.exp(7.0 + 0.7 * rng.randn(n))
+    rooms = np.exp(1.6 + 0.1 * income / 3 + 0.3 * rng.randn(n))
+    bedrooms, household = rooms / 5.0 * np.exp(0.1 * rng.randn(n)), np.exp(1.0 + 0.3 * rng.randn(n))
+    district = rng.randn(6, 6)[*place.astype(int).T]
+    price = 0.4 * income - 0.3 * np.log(household) + 0.6 * district + 0.01 * age * (place[:, 0] < 2.0)
+    price = np.minimum(price * np.exp(0.15 * rng.randn(n)), 5.0)
+    return np.column_stack([income, age, rooms, bedrooms, people, household, place]), price
+
+
+def boxes(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
+    """Return ten columns. Inside each of forty boxes of three columns, y is higher or lower by a constant."""
+    X, y = rng.uniform(0.0, 1.0, (n, 10)), 0.3 * rng.randn(n)
+    for _ in range(40):
+        columns = rng.choice(10, 3, replace=False)
+        y += rng.randn() * ((X[:, columns] > rng.uniform(0.2, 0.8, 3)) == (rng.rand(3) > 0.5)).all(axis=1)
+    return X, y
+
+
+def friedman(make: Callable[..., Any], noise: float, n: int, rng: np.random.RandomState) -> tuple[Any, Any]:
+    return make(n, noise=noise, random_state=rng)
+
+
+INDUCING_SETS: dict[str, Callable[[int], Data]] = {
+    "toy-200": partial(drawn, toy, 200),
+    "toy-1000": partial(drawn, toy, 1000),
+    "friedman1": partial(drawn, lambda n, rng: make_friedman1(n, noise=1.0, random_state=rng), 800),
+    "friedman1-quiet": partial(drawn, lambda n, rng: make_friedman1(n, noise=0.1, random_state=rng), 800),
+    "friedman2": partial(drawn, lambda n, rng: make_friedman2(n, random_state=rng), 800),
+    "friedman3": partial(drawn, lambda n, rng: make_friedman3(n, noise=0.1, random_state=rng), 800),
+    "sines-8": partial(drawn, sines, 800),
+    "diabetes": diabetes,
+    "waves-2": partial(drawn, partial(waves, 2), 1000),
+    "waves-6": partial(drawn, partial(waves, 6), 1000),
+    "linear-5": partial(drawn, linear, 600),
+    "nothing-3": partial(drawn, nothing, 500),
+    "steps-1": partial(drawn, steps, 400),
+    "chirp-1": partial(drawn, chirp, 600),
+    "pendulum": partial(dynamics, "pendulum", 600, 0.0, False),
+    "pendulum-ifg": partial(dynamics, "pendulum", 600, 0.01, True),
+    "cartpole": partial(dynamics, "cartpole", 800, 0.01, False),
+    "acrobot": partial(dynamics, "acrobot", 800, 0.0, False),
+    "acrobot-ifg": partial(dynamics, "acrobot", 800, 0.01, True),
+    "iiwa14": partial(dynamics, "iiwa14", 800, 0.0, False),
+}
+# Friedman's own standard deviations of the noise (1991); the quiet one has none.
+FRIEDMAN = {
+    "friedman1": partial(friedman, make_friedman1, 1.0),
+    "friedman2": partial(friedman, make_friedman2, 125.0),
+    "friedman3": partial(friedman, make_friedman3, 0.1),
+}
+MODEL_SETS: dict[str, Callable[[int], Data]] = {
+    "diabetes": diabetes,
+    "toy-200": partial(drawn, toy, 200),
+    **{f"{name}-{n}": partial(drawn, draw, n) for n in (800, 2000) for name, draw in FRIEDMAN.items()},
+    "friedman2-quiet-800": partial(drawn, partial(friedman, make_friedman2, 0.0), 800),
+    "sines-800": partial(drawn, sines, 800),
+    "sines-2000": partial(drawn, sines, 2000),
+    "houses-2000": partial(drawn, houses, 2000),
+    "houses-20000": partial(drawn, houses, 20_000),
+    "boxes-2000": partial(drawn, boxes, 2000),
+}
+# --- other models --------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Drawing:
+    """All models of a drawing of a set."""
+
+    name: str
+    seed: int
+
+
+class Predicted(NamedTuple):
+    """Mean, standard deviation, and interval."""
+
+    mean: np.ndarray
+    std: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+def gaussian(regressor: Any, data: Data) -> tuple[Any, Callable[[], Predicted]]:
+    """Fit a regressor with ``return_std``."""
+    regressor.fit(data.X, data.y)
+
+    def predict() -> Predicted:
+        mean, std = regressor.predict(data.X_test, return_std=True)
+        return Predicted(mean, std, mean - HALF_WIDTH * std, mean + HALF_WIDTH * std)
+
+    return regressor, predict
+
+
+def boosted(data: Data, seed: int, folds: bool) -> tuple[None, Callable[[], Predicted]]:
+    """Fit boosting for the mean; std comes from two quantiles, or from the errors of five folds."""
+    make = partial(HistGradientBoostingRegressor, random_state=seed)
+    mean_model = make().fit(data.X, data.y)
+    if folds:
+        std = np.sqrt(np.mean((data.y - cross_val_predict(make(), data.X, data.y, cv=5)) ** 2))
+    else:
+        levels = (0.5 - COVERAGE / 2, 0.5 + COVERAGE / 2)
+        ends = [make(loss="quantile", quantile=level).fit(data.X, data.y) for level in levels]
+
+    def predict() -> Predicted:
+        mean = mean_model.predict(data.X_test)
+        if folds:
+            return Predicted(mean, np.full(len(mean), std), mean - HALF_WIDTH * std, mean + HALF_WIDTH * std)
+        low, high = (end.predict(data.X_test) for end in ends)
+        return Predicted(mean, np.maximum((high - low) / (2 * HALF_WIDTH), SMALLEST_STD), low, high)
+
+    return None, predict
+
+
+def exact(n_columns: int) -> RegressorMixin:
+    """Return an exact GP with bounds for data without noise, which starts at little noise as skevgp does."""
+    signal = ConstantKernel(1.0, (1e-6, 1e9)) * RBF(np.ones(n_columns), (1e-3, 1e6))
+    return GaussianProcessRegressor(signal + WhiteKernel(1e-2, (1e-10, 10.0)), normalize_y=True, random_state=0)
+
+
+Fitting = Callable[[Data, int], tuple[Any, Callable[[], Predicted]]]
+MODELS: dict[str, Fitting] = {
+    "EVGP, auto": lambda data, seed: gaussian(
+        EVGPRegressor(n_inducing="auto", normalize_y=True, random_state=seed), data
+    ),
+    "EVGP, 100": lambda data, seed: gaussian(EVGPRegressor(normalize_y=True, random_state=seed), data),
+    "GPR": lambda data, seed: gaussian(exact(data.X.shape[1]), data),
+    "boosting, quantiles": lambda data, seed: boosted(data, seed, folds=False),
+    "boosting, folds": lambda data, seed: boosted(data, seed, folds=True),
+    "BayesianRidge": lambda data, seed: gaussian(BayesianRidge(), data),
+}
+# With more rows than EXACT_ROWS the others would take hours.
+LARGE = tuple(name for name in MODELS if name not in ("GPR", "EVGP, auto"))
+
+
+def standardised(data: Data) -> Data:
+    """Scale columns to mean 0 and variance 1 on the training rows."""
+    scaler = StandardScaler().fit(data.X)
+    return data._replace(X=scaler.transform(data.X), X_test=scaler.transform(data.X_test))
+
+
+def measured(model: str, data: Data, seed: int) -> dict[str, Any]:
+    """Fit a model and return its scores."""
+    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        wall, start = time.perf_counter(), time.process_time()
+        regressor, predict = MODELS[model](data, seed)
+        seconds, wall_seconds = time.process_time() - start, time.perf_counter() - wall
+        start = time.process_time()
+        mean, std, low, high = predict()
+        predict_seconds = time.process_time() - start
+    return {
+        "model": model,
+        "m": len(regressor.inducing_points_) if isinstance(regressor, EVGPRegressor) else "",
+        "rmse": float(np.sqrt(np.mean((data.y_test - mean) ** 2))),
+        "nlpd": negative_log_predictive_density(data.y_test, mean, std),
+        "crps": crps(data.y_test, mean, std),
+        "coverage": float(np.mean((low <= data.y_test) & (data.y_test <= high))),
+        "width": float(np.mean(high - low)),
+        "within_2_std": float(containing_ratios(data.y_test, mean, std, k=2)[0]),
+        "seconds": round(seconds, 3),
+        "wall_seconds": round(wall_seconds, 3),
+        "predict_seconds": round(predict_seconds, 4),
+        "warning": str(caught[0].message).splitlines()[0][:120] if caught else "",
+    }
+
+
+def run_models(cell: Drawing) -> list[dict[str, Any]]:
+    data = standardised(MODEL_SETS[cell.name](cell.seed))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        for model in MODELS:  # imports and first allocations are not timed
+            MODELS[model](data._replace(X=data.X[:30], y=data.y[:30]), 0)[1]()
+    own = {"name": cell.name, "seed": cell.seed, "n_rows": len(data.X)}
+    models = MODELS if len(data.X) <= EXACT_ROWS else LARGE
+    return [{**own, **measured(model, data, cell.seed), **harness.provenance()} for model in models]
+
+
+def scores(rows: pd.DataFrame, names: list[str]) -> pd.DataFrame:
+    """Return means over seeds of all models of some sets; the best ones in bold."""
+    means = rows.groupby(["name", "model"]).mean(numeric_only=True)
+    lines = []
+    for name in names:
+        own = means.loc[name]
+        for model in [model for model in MODELS if model in own.index]:
+            line = {"set": name, "model": model}
+            for header, value in (("RMSE", "rmse"), ("NLPD", "nlpd"), ("CRPS", "crps")):
+                text, best = f"{own.loc[model, value]:.3f}", own[value].min() + 5e-4
+                line[header] = f"**{text}**" if own.loc[model, value] <= best else text
+            line |= {"coverage": f"{own.loc[model, 'coverage']:.3f}", "width": f"{own.loc[model, 'width']:.2f}"}
+            lines.append({**line, "seconds": own.loc[model, "seconds"]})
+    return pd.DataFrame(lines)
+
+
+def against_exact(rows: pd.DataFrame) -> pd.DataFrame:
+    """Return what "auto" loses against GPR, and the share of its time."""
+    means = rows.groupby(["model", "name"]).mean(numeric_only=True)
+    lines = []
+    for name in MODEL_SETS:
+        if name.startswith(("houses", "boxes")) or ("GPR", name) not in means.index:
+            continue
+        exact, auto = means.loc["GPR", name], means.loc["EVGP, auto", name]
+        lost = auto["nlpd"] - exact["nlpd"]
+        lines.append(
+            {
+                "set": name,
+                "NLPD of GPR": f"{exact['nlpd']:.3f}",
+                "auto's, more": f"{lost:+.3f}",
+                f"within {ENOUGH}": "yes" if lost <= ENOUGH else "no",
+                "points": f"{auto['m']:.0f}",
+                "s, GPR": exact["seconds"],
+                "s, auto": auto["seconds"],
+                "ratio": f"{auto['seconds'] / exact['seconds']:.2f}",
+                "ratio on the wall": f"{auto['wall_seconds'] / exact['wall_seconds']:.2f}",
+            }
+        )
+    return pd.DataFrame(lines)
+
+
+def tables_of_models(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return the tables of the page."""
+    return {"models": scores(rows, [n for n in MODEL_SETS if n in set(rows["name"])]), "auto": against_exact(rows)}
+
+
+def guide(page: str, rows: pd.DataFrame) -> str:
+    """Fill the tables of the guide's page: "auto", or the names of sets."""
+    marked = [line.split("table: ")[1].removesuffix(" -->") for line in page.splitlines() if "<!-- table: " in line]
+    tables = {name: against_exact(rows) if name == "auto" else scores(rows, name.split()) for name in marked}
+    return harness.filled(page, tables)
+
+
+# --- inducing points -----------------------------------------------------------------------------------------------
+
+FITS = ("exact", "100", "auto", "grid")
+
+
+@dataclass(frozen=True)
+class Fit:
+    """A model on a drawing of a set."""
+
+    name: str
+    seed: int
+    model: str
+
+
+def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:
+    """Fit a model; return it with its scores."""
+    common = {"feature_map": data.feature_map, "normalize_y": data.feature_map is None, "random_state": seed}
+    regressor: Any
+    if model == "exact":
+        regressor = EGPRegressor(**common)
+    else:
+        n_inducing: Any = "auto" if model == "auto" else int(model)
+        # The exact model does not calibrate.
+        regressor = EVGPRegressor(**common, n_inducing=n_inducing, noise_cv=None)
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        start = time.process_time()
+        regressor.fit(data.X, data.y)
+        seconds = time.process_time() - start
+        mean, std = regressor.predict(data.X_test, return_std=True)
+    sparse = model != "exact"
+    return regressor, {
+        "model": model,
+        "m": len(regressor.inducing_points_) if sparse else len(data.X),
+        "n_iter": regressor.n_iter_,
+        "seconds": round(seconds, 3),
+        "nlpd": negative_log_predictive_density(data.y_test, mean, std),
+        "lower": regressor.lower_bound_ if sparse else regressor.log_marginal_likelihood_value_,
+        "upper": regressor.upper_bound_ if sparse else "",
+    }
+
+
+def likelihood_of(regressor: EVGPRegressor, data: Data) -> float:
+    """Return the exact log marginal likelihood at a sparse model's parameters."""
+    exact = EGPRegressor(
+        data.feature_map,
+        regressor.kernel_,
+        noise=Gaussian(variance=regressor.noise_variance_),
+        normalize_y=data.feature_map is None,
+        max_iter=0,
+    )
+    return exact.fit(data.X, data.y).log_marginal_likelihood_value_
+
+
+def run_inducing(cell: Fit) -> dict[str, Any]:
+    """Fit one model. "grid" is the smallest of the grid that is good enough."""
+    data = INDUCING_SETS[cell.name](cell.seed)
+    if cell.model == "grid":
+        _, exact = fitted(data, "exact", cell.seed)
+        seconds = 0.0
+        for m in GRID:
+            regressor, row = fitted(data, str(m), cell.seed)
+            seconds += row["seconds"]
+            if m >= len(data.X) or row["nlpd"] <= exact["nlpd"] + ENOUGH:
+                break
+        row |= {"seconds": seconds}
+    else:
+        regressor, row = fitted(data, cell.model, cell.seed)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        likelihood = row["lower"] if cell.model == "exact" else likelihood_of(regressor, data)
+    own = {"name": cell.name, "seed": cell.seed, "n_rows": len(data.X)}
+    return {**own, **row, "model": cell.model, "likelihood": likelihood, **harness.provenance()}
+
+
+def tables_of_inducing(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+    """Return NLPD lost against the exact model, numbers of points and times, and counts of sets."""
+    means = rows.groupby(["model", "name"]).mean(numeric_only=True)
+    lines, near, lean = [], 0, 0
+    for name in [name for name in INDUCING_SETS if ("auto", name) in means.index]:
+        exact, hundred, auto, grid = (means.loc[model, name] for model in FITS)
+        ratio, lost = auto["m"] / grid["m"], auto["nlpd"] - exact["nlpd"]
+        near, lean = near + int(lost <= ENOUGH), lean + int(ratio <= 2.0)
+        line = {"set": name, "rows": f"{exact['m']:.0f}", "NLPD, exact": f"{exact['nlpd']:.3f}"}
+        line |= {"lost, m = 100": f"{hundred['nlpd'] - exact['nlpd']:.3f}", "lost, auto": f"{lost:.3f}"}
+        line |= {"smallest m": f"{grid['m']:.0f}", "auto's m": f"{auto['m']:.0f}", "ratio": f"{ratio:.2f}"}
+        seconds = {"s, exact": exact, "s, m = 100": hundred, "s, auto": auto}
+        lines.append({**line, **{header: f"{own['seconds']:.1f}" for header, own in seconds.items()}})
+    sparse = rows.dropna(subset="upper")
+    covered = sparse["upper"] >= sparse["likelihood"] - 1e-6 * sparse["likelihood"].abs()
+    counts = {
+        f"sets within {ENOUGH} nats per row of the exact model": f"{near} of {len(lines)}",
+        "sets with at most twice the smallest number of the grid that is": f"{lean} of {len(lines)}",
+        "fits whose upper bound covers the exact log marginal likelihood": f"{covered.sum()} of {len(sparse)}",
+    }
+    return {"inducing": pd.DataFrame(lines), "counts": pd.DataFrame(counts.items(), columns=["", "count"])}
+
+
+def main() -> None:
+    parser = harness.argument_parser(
+        __doc__, quick="two small sets, one seed", seeds="number of seeds; default: 3, quick 1"
+    )
+    parser.add_argument("part", choices=("models", "inducing"))
+    known = sorted({*MODEL_SETS, *INDUCING_SETS})
+    parser.add_argument("--sets", nargs="+", choices=known, metavar="SET", help=f"of {', '.join(known)}; default: all")
+    options = parser.parse_args()
+    models = options.part == "models"
+    output = harness.output_path(options, "tabular" if models else "auto_inducing")
+    sets, quick = (MODEL_SETS, ("diabetes", "toy-200")) if models else (INDUCING_SETS, ("linear-5", "toy-200"))
+    names = [name for name in options.sets or (quick if options.quick else sets) if name in sets]
+    seeds = range(options.seeds or (1 if options.quick else 3))
+    cells: list[Any] = [Drawing(name, seed) for seed in seeds for name in names]
+    if not models:
+        cells = [Fit(name, seed, model) for seed in seeds for model in FITS for name in names]
+    run = run_models if models else run_inducing
+    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
+    rows = harness.frame(output)
+    if models and options.output is None and not options.quick:
+        PAGE.write_text(guide(PAGE.read_text(), rows))
+    tables = tables_of_models(rows) if models else tables_of_inducing(rows)
+    title = "Tables of data" if models else "Inducing points that are chosen"
+    harness.write_page(title, tables, output, n_failures)
+
+
+if __name__ == "__main__":
+    main()
