@@ -57,12 +57,12 @@ class Dense:
     parameter tables. Row i has the weight w (`counts`) and the noise variance σ² v (`counts / precision`).
     """
 
-    def __init__(self, rows, prior, family="full", exact=False):
+    def __init__(self, rows, prior, family="full", exact=False, tight=False):
         self.X, self.H, targets = rows.inputs, rows.features, rows.targets
         ones = np.ones(len(self.X))
         self.counts = ones if rows.counts is None else rows.counts
         self.precision = ones if rows.precision is None else rows.precision
-        self.prior, self.family, self.exact = prior, family, exact
+        self.prior, self.family, self.exact, self.tight = prior, family, exact, tight
         self.outputs = range(len(prior.scale))
         self.residuals = targets + self.linear(self.H, prior.offset - prior.mean)
 
@@ -109,18 +109,26 @@ class Dense:
     def likelihood(self, values):
         return self.log_density(values, self.total(values, self.k))
 
-    def traces(self, values):
-        """Of what the inducing points leave of each output's covariance, per unit of noise."""
+    def left(self, values):
+        """Of each row's variance, what the inducing points do not explain, over its noise: of each output, times σ²."""
         inputs = [own(self.X, o) for o in self.outputs]
         left = (self.k(values, o, X, X) - self.sparse_k(values, o, X, X) for o, X in enumerate(inputs))
-        return [self.precision @ anp.diag(each) for each in left]
+        return [self.precision / self.counts * anp.diag(each) for each in left]
+
+    def traces(self, values):
+        return [self.counts @ each for each in self.left(values)]
+
+    def charge(self, values):
+        """Twice the nats that the bound loses for what the inducing points do not explain."""
+        over_noise = [each / values["noise"][o] for o, each in enumerate(self.left(values))]
+        return sum(self.counts @ (anp.log(1.0 + each) if self.tight else each) for each in over_noise)
 
     def bound(self, values):
         """The lower bound of the family; the likelihood if the model is exact."""
         if self.exact:
             return self.likelihood(values)
-        lost = sum(t / values["noise"][o] for o, t in enumerate(self.traces(values)))
-        return self.log_density(values, self.total(values, self.sparse_k)) - 0.5 * (lost + self.gap(values))
+        lost = self.charge(values) + self.gap(values)
+        return self.log_density(values, self.total(values, self.sparse_k)) - 0.5 * lost
 
     def upper_bound(self, values):
         """Of rows that count once, and weights of each output."""

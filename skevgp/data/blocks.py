@@ -49,10 +49,10 @@ class Block:
     roots: np.ndarray | None = None
     # Σ w log v.
     log_variance: float = 0.0
-    # Whether there is memory for ``kept``: the whitening, k(X_m, X), [V; Hᵀ; rᵀ] and the unexplained variance (n,) of
-    # the first pass, for the second.
+    # Whether there is memory for ``kept``: the whitening, k(X_m, X), [V; Hᵀ; rᵀ] and, for the tight bound, the
+    # slope (n,) of the charge of the first pass, for the second.
     may_keep: bool = False
-    kept: tuple[Any, np.ndarray, np.ndarray, np.ndarray] | None = None
+    kept: tuple[Any, np.ndarray, np.ndarray, np.ndarray | None] | None = None
 
     @property
     def features(self) -> np.ndarray:

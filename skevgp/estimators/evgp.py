@@ -453,7 +453,7 @@ class EVGPRegressor(GaussianProcess):
             problem,
             sharing=self.sharing,
             family=solver.posterior,
-            tight=solver.bound == "tight" and not noise.heavy_tails,
+            tight=solver.bound == "tight",
             placement=Placement.of(self.inducing_init, self.n_inducing, most, problem.n_columns),
             solver=solver,
             max_iter=solver.default_max_iter if self.max_iter is None else self.max_iter,

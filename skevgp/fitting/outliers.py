@@ -68,7 +68,8 @@ class RowDoubts:
         doubts = replace(self, scales=self.scales.at((look.errors**2 / predicted).sum(axis=1)))
         for _ in range(_TURNS):
             new = plain.updated(doubts.weigh(rows))
-            before, look = doubts, look_at(rows, of_residuals(new.predictor))
+            tau = doubts.scales.mean / noise[:, np.newaxis] if fitted.sparse.tight else None
+            before, look = doubts, look_at(rows, of_residuals(new.predictor), tau)
             doubts = replace(self, scales=self.scales.at(look.distances(noise)))
             if not doubts.differ_from(before):
                 break
@@ -123,7 +124,8 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     """
     noise = fit.values["noise"]
     for _ in range(_TURNS):
-        look = look_at(rows, predictor_at(model, fit.values))
+        tau = doubts.scales.mean / noise[:, np.newaxis] if model.sparse.tight else None
+        look = look_at(rows, predictor_at(model, fit.values), tau)
         factor = np.where(model.table["noise"].free, look.clean_variance() / noise, 1.0)
         before, doubts = doubts, RowDoubts(doubts.scales.at(look.distances(noise)), factor)
         model = replace(model, rows=doubts.weigh(rows))
@@ -184,8 +186,14 @@ class Look:
             variance = np.maximum(self.counts[kept] @ squares[kept] / self.counts[kept].sum(), np.finfo(float).tiny)
 
 
-def look_at(rows: Rows, predictor: Predictor) -> Look:
-    """Predict each row by a predictor of residuals, in one pass."""
+def look_at(rows: Rows, predictor: Predictor, tau: np.ndarray | None = None) -> Look:
+    """Predict each row by a predictor of residuals, in one pass.
+
+    For the tight bound, ``tau`` (o, n) is E[τ]/σ² of each output and row.
+    """
+    # The charge of the tight bound, -½ log(1 + τ d/(σ² v)), is convex in E[τ] (see `model.bounds.BoundAtOptimum`). Its
+    # tangent at the present E[τ] is below it. The tangent has the slope -½ d' / (σ² v) with d' = d / (1 + τ d/(σ² v)).
+    # So the best q(τ) for d' in place of d raises the bound.
 
     def of(first: int) -> tuple[np.ndarray, ...]:
         some = rows.some(np.arange(first, min(first + _ROWS_AT_ONCE, len(rows))))
@@ -193,6 +201,10 @@ def look_at(rows: Rows, predictor: Predictor) -> Look:
         counts = variance = np.ones(len(mean))
         if some.counts is not None and some.precision is not None:
             counts, variance = some.counts, some.counts / some.precision
+        if tau is not None and latent is not None:
+            d = predictor.unexplained(some.inputs, some.features)
+            x = d * tau[:, first : first + len(d)].T / variance[:, np.newaxis]
+            latent = np.maximum(latent - d * (x / (1.0 + x)), 0.0)
         return some.targets - mean, np.zeros_like(mean) if latent is None else latent, variance, counts
 
     parts = rows.threads(of, range(0, len(rows), _ROWS_AT_ONCE))

@@ -249,15 +249,17 @@ class BoundAtOptimum:
     # of P and r are multiplied by √ω, and Σ w log v is added to N log 2πσ².
     #
     # The last term is the charge of Titsias (2009) for the variance d_i = s² (k̃ - |v(x)|²) of row i that the inducing
-    # points do not explain. It comes from q(f|u) = p(f|u). The tight bound (Titsias 2025, arXiv 2502.08730; Bui, Ashman
-    # & Turner 2025, arXiv 2502.04750) lets q(f|u) have its own variances: f_i given u has variance a_i d_i and the mean
-    # of p(f|u). Row i then contributes
+    # points do not explain. It comes from q(f|u) = p(f|u), which has the covariance R² in units of the noise. R (n, n)
+    # is symmetric. The tight bound (Titsias 2025, arXiv 2502.08730; Bui, Ashman & Turner 2025, arXiv 2502.04750) takes
+    # R diag(a) R in its place, with the same mean. With x_i = (R²)_ii = d_i / (σ² v_i), the terms with a are
     #
-    #     -½ a_i d_i / (σ² v_i) + ½ (log a_i - a_i + 1),   highest at   a_i = 1 / (1 + d_i / (σ² v_i)),
+    #     -½ Tr(R diag(a) R) - KL[q(f|u) || p(f|u)] = ½ Σ (log a_i - a_i + 1 - a_i x_i).
     #
-    # which is -½ log(1 + d_i / (σ² v_i)) ≥ -½ d_i / (σ² v_i). All other terms, and so q(v, w), are the same. A row of
-    # weight w counts w times. With x_i = d_i / (σ² v_i), the derivative in d_i is -½ (w_i / (σ² v_i)) / (1 + x_i), and
-    # in log s² it is -½ Σ w_i x_i / (1 + x_i), and minus that in log σ².
+    # Their maximum is -½ Σ log(1 + x_i) ≥ -½ Σ x_i, at a_i = 1 / (1 + x_i). All other terms, and so q(v, w), are the
+    # same. A row of weight w counts w times. The derivative in d_i is -½ (w_i / (σ² v_i)) / (1 + x_i). In log s² it is
+    # -½ Σ w_i x_i / (1 + x_i), and minus that in log σ².
+    #
+    # The tight bound is at most the log likelihood, but unlike the other one it may fall if a point is added.
     #
     # If e is summed row by row, as in `statistics.pull_back`, no digits cancel at any signal-to-noise ratio.
 

@@ -195,6 +195,11 @@ class Predictor:
         mean += self.intercept
         return mean, self.in_order(variances).T if return_variance else None
 
+    def unexplained(self, inputs: np.ndarray, features: np.ndarray) -> np.ndarray:
+        """The part s² (k̃(x, x) - |v|²) (n, o) of the variance that the inducing points do not explain."""
+        pairs = zip(self.groups, self.projected(inputs, features), strict=True)
+        return self.in_order(np.outer(group.signal, own.unexplained) for group, own in pairs).T
+
     def covariance(
         self, inputs: np.ndarray, features: np.ndarray, noise: np.ndarray | float = 0.0
     ) -> tuple[np.ndarray, np.ndarray]:

@@ -161,7 +161,7 @@ class StatisticsGradient:
     VH: np.ndarray
     # (m, o): the gradient in V e, where e = r - [V; Hᵀ]ᵀ weights.
     VE: np.ndarray
-    # The gradient in Σ (k(x, x) - |v|²). With ``ratio``, that of a row is multiplied by a mean of its 1 / (1 + x).
+    # The gradient in Σ (k(x, x) - |v|²). With ``ratio``, that of a row is multiplied by its slope (see `_charge`).
     unexplained: float
     # (m, m): Lᵀ L̄, where L̄ is the gradient in L itself (see `cholesky_pullback`).
     factor: np.ndarray
@@ -207,14 +207,22 @@ def _first_pass(
     U, P = _projected(block, whitening, outputs)
     V, linear = P[: len(U)], P[len(U) :]
     unexplained = whitening.unexplained(block.prepared, V, block.roots)
-    charge: Any = 0.0
-    if ratio is not None:
-        # (o, n): x of each output and row. ``unexplained`` has the factor ω, x has 1 / v = ω / w.
-        x = np.multiply.outer(ratio, unexplained if block.counts is None else unexplained / block.counts)
-        counts = np.ones(len(unexplained)) if block.counts is None else block.counts
-        charge = np.array([np.log1p(x) @ counts, (x / (1.0 + x)) @ counts])
-    block.kept = (whitening, U, P, unexplained) if block.may_keep else None
+    charge, slope = (0.0, None) if ratio is None else _charge(ratio, unexplained, block.counts)
+    block.kept = (whitening, U, P, slope) if block.may_keep else None
     return V @ V.T, V @ linear.T, unexplained.sum(), charge
+
+
+def _charge(ratio: np.ndarray, unexplained: np.ndarray, counts: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The charge (2, o) of rows in the tight bound, and the mean slope (n,) of Σ_o log(1 + x) in each row.
+
+    The slope of an output is 1 / (1 + x). In the mean it has the weight ``ratio`` (o,).
+    """
+    # (o, n): x of each output and row. ``unexplained`` has the factor ω = w / v, and x has the factor 1 / v.
+    x = np.multiply.outer(ratio, unexplained if counts is None else unexplained / counts)
+    slopes = 1.0 / (1.0 + x)
+    each = np.array([np.log1p(x), x * slopes])
+    charge = each.sum(axis=2) if counts is None else each @ counts
+    return charge, ratio @ slopes / ratio.sum()
 
 
 def _projected(block: Block, whitening: Whitening, outputs: slice) -> tuple[np.ndarray, np.ndarray]:
@@ -293,10 +301,10 @@ def _second_pass(
     block, outputs = block.of(outputs)
     # Kept arrays stay until the next first pass replaces them: freed memory would be given back to the system.
     if block.kept is not None and block.kept[0] is whitening:
-        _, U, P, unexplained = block.kept
+        _, U, P, slope = block.kept
     else:
         U, P = _projected(block, whitening, outputs)
-        unexplained = None
+        slope = None
     # eᵀ (o, n) replaces rᵀ in [V; Hᵀ; rᵀ].
     k = len(weights)
     e = np.subtract(block.residuals[:, outputs].T, weights.T @ P[:k], out=P[k:])
@@ -308,18 +316,15 @@ def _second_pass(
     VgV: Any = 0.0
     if ratio is not None and unexplained_bar != 0.0:
         V = P[: len(U)]
-        if unexplained is None:
-            unexplained = whitening.unexplained(block.prepared, V, block.roots)
-        # (n,): ḡ_i = ḡ Σ_o ratio_o / (1 + x_io) / Σ_o ratio_o.
-        x = np.multiply.outer(ratio, unexplained if block.counts is None else unexplained / block.counts)
-        shrunk = unexplained_bar / ratio.sum() * (ratio @ (1.0 / (1.0 + x)))
-        # A product with its own transpose costs half of another one.
-        root = np.sqrt(2.0 * np.abs(shrunk))
+        if slope is None:
+            _, slope = _charge(ratio, whitening.unexplained(block.prepared, V, block.roots), block.counts)
+        # With V' = V diag(√|2 ḡ|): V' V'ᵀ, a product with its own transpose, costs half of another one.
+        root, sign = np.sqrt(np.abs(2.0 * unexplained_bar) * slope), np.sign(unexplained_bar)
         scaled = V * root
-        VgV = np.sign(unexplained_bar) * (scaled @ scaled.T)
-        extra = triangular_product(whitening.L_inv, scaled, np.empty(scaled.shape), transposed=True)
-        extra *= np.sign(unexplained_bar) * (root if block.roots is None else root * block.roots)
-        U_bar -= extra
-        diagonal_bar = shrunk * omega
+        VgV = sign * (scaled @ scaled.T)
+        back_of_charge = triangular_product(whitening.L_inv, scaled, np.empty(scaled.shape), transposed=True)
+        back_of_charge *= sign * root if block.roots is None else sign * root * block.roots
+        U_bar -= back_of_charge
+        diagonal_bar = unexplained_bar * slope * omega
     rows_bar = whitening.covariance.cross_pullback(block.prepared, U, U_bar, diagonal_bar)
     return rows_bar, np.einsum("on,on->o", e, e), P[: len(U)] @ e.T, VgV

@@ -45,8 +45,7 @@ class Adam(MiniBatchSolver):
         Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
     bound : {"tight", "titsias"}, default="titsias"
         Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025),
-        which is never lower. Predictions at the same parameters are the same. With heavy-tailed noise, the bound is
-        always ``"titsias"``.
+        which is never lower. Predictions at the same parameters are the same.
     tol : float or "auto", default="auto"
         Tolerance in nats; ``"auto"`` is 0.01. Adam begins its last steps when the median loss over a third of the steps
         changes by less than this, or by no more than chance.

@@ -48,8 +48,7 @@ class LBFGS(Solver):
         Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
     bound : {"tight", "titsias"}, default="titsias"
         Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025),
-        which is never lower. Predictions at the same parameters are the same. With heavy-tailed noise, the bound is
-        always ``"titsias"``.
+        which is never lower. Predictions at the same parameters are the same.
     tol : float or "auto", default="auto"
         Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
         and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.

@@ -21,7 +21,11 @@ X_NEW, H_NEW = RNG.randn(7, 2), RNG.randn(7, 3)
 # Groups of outputs with points of their own, weights that the outputs share, weights of the rows, number of features.
 SETTINGS = [each for each in product((1, 2), (False, True), (False, True), (0, 3)) if each[3] or not each[1]]
 # A diagonal posterior has no shared weights.
-SPARSE = [(family, *each) for family in ("full", "diagonal") for each in SETTINGS if family == "full" or not each[1]]
+SPARSE = [
+    (family, tight, *each)
+    for family, tight, each in product(("full", "diagonal"), (False, True), SETTINGS)
+    if family == "full" or not each[1]
+]
 
 
 def setting(family, n_groups, shared, weighted, p):
@@ -59,15 +63,19 @@ def assert_predictions(predictor, dense, values, p):
     assert_allclose(jointly, joint, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize(("family", "n_groups", "shared", "weighted", "p"), SPARSE)
-def test_sparse_model_is_dense_one(family, n_groups, shared, weighted, p):
+@pytest.mark.parametrize(("family", "tight", "n_groups", "shared", "weighted", "p"), SPARSE)
+def test_sparse_model_is_dense_one(family, tight, n_groups, shared, weighted, p):
     model, raw, table = setting(family, n_groups, shared, weighted, p)
-    dense, values, blocks = Dense(raw, model.prior, family), table.values_at_start(), blocks_of(raw, model.kernel)
+    model, dense = replace(model, tight=tight), Dense(raw, model.prior, family, tight=tight)
+    values, blocks = table.values_at_start(), blocks_of(raw, model.kernel)
     statistics = model.statistics(values, blocks)
     lower, likelihood = dense.bound(values), dense.likelihood(values)
     assert model.bound(values, statistics, blocks) == pytest.approx(lower, rel=1e-8)
     assert model.bound(values, statistics) == pytest.approx(lower, rel=1e-8)
     assert lower < likelihood < model.upper_bound(values, statistics, blocks)
+    if tight:
+        loose = replace(model, tight=False)
+        assert loose.bound(values, loose.statistics(values, blocks), blocks) < lower
     if not weighted and not shared:
         for seen in (blocks, None):
             assert model.upper_bound(values, statistics, seen) == pytest.approx(dense.upper_bound(values), rel=1e-8)

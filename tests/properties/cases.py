@@ -170,6 +170,7 @@ def sharings(draw, n_outputs, per_output=False):
 # --- Models.
 
 
+BOUNDS = st.sampled_from(["titsias", "tight"])
 NOISES = st.sampled_from([0.1, 1.0, 0.001])
 
 
@@ -190,7 +191,7 @@ def fixed_models(draw, X, n_outputs, *, exact=None, smooth=False, known_maps=Fal
         return EGPRegressor(**parameters)
     parameters["sharing"] = draw(sharings(n_outputs, has_rows_of_outputs(given)))
     posterior = "full" if share else draw(st.sampled_from(["full", "diagonal"]))
-    parameters["solver"] = LBFGS(posterior=posterior)
+    parameters["solver"] = LBFGS(posterior=posterior, bound=draw(BOUNDS))
     parameters["inducing_init"] = draw(points(X))
     parameters["n_inducing"] = 6
     return EVGPRegressor(**parameters)
@@ -240,7 +241,8 @@ def learned_models(draw, X, o, known_maps=False, given_maps=None):
     own = has_rows_of_outputs(given)
     parameters |= {"sharing": draw(sharings(o, own)), "n_inducing": draw(st.sampled_from([1, 5, 40]))}
     posterior = draw(st.sampled_from(["full", "diagonal"]))
-    parameters["solver"] = LBFGS(posterior=posterior)
+    bound = draw(BOUNDS)
+    parameters["solver"] = LBFGS(posterior=posterior, bound=bound)
     parameters["inducing_init"] = draw(st.sampled_from(["auto", "k-means", "greedy"]))
     kind = draw(st.sampled_from(["lbfgs", "student-t", "input noise", "adam", "natural", "restarts"]))
     if own and kind in ("adam", "natural"):
@@ -250,11 +252,11 @@ def learned_models(draw, X, o, known_maps=False, given_maps=None):
     elif kind == "input noise":
         parameters["noise"] = Gaussian(inputs=0.1)
     elif kind == "adam":
-        parameters["solver"] = Adam(batch_size=10, posterior=posterior)
+        parameters["solver"] = Adam(batch_size=10, posterior=posterior, bound=bound)
     elif kind == "natural":
-        parameters["solver"] = Adam(batch_size=10, natural_gradient=True)
+        parameters["solver"] = Adam(batch_size=10, natural_gradient=True, bound=bound)
     elif kind == "restarts":
-        parameters["solver"] = LBFGS(n_restarts=1, posterior=posterior)
+        parameters["solver"] = LBFGS(n_restarts=1, posterior=posterior, bound=bound)
     return EVGPRegressor(**parameters, max_iter=4)
 
 

@@ -42,6 +42,8 @@ def test_bounds_are_ordered(case):
             case.with_model(solver=LBFGS(posterior=own)).fitted().lower_bound_ for own in ("diagonal", "full")
         )
         assert_in_order(diagonal, full, likelihood)
+    loose, tight = (case.with_model(solver=LBFGS(bound=own)).fitted().lower_bound_ for own in ("titsias", "tight"))
+    assert_in_order(loose, tight, likelihood)
 
 
 @given(fixed_cases(exact=False), st.data())
@@ -49,7 +51,7 @@ def test_more_points_bring_the_bounds_together(case, draws):
     points = draws.draw(tables(7, case.X.shape[1]))
     m = draws.draw(st.integers(1, 6))
     few, many = (
-        case.with_model(solver=LBFGS(posterior="full"), inducing_init=own).fitted() for own in (points[:m], points)
+        case.with_model(solver=LBFGS(bound="titsias"), inducing_init=own).fitted() for own in (points[:m], points)
     )
     assert_in_order(few.lower_bound_, many.lower_bound_, many.upper_bound_, few.upper_bound_)
 
@@ -59,11 +61,14 @@ def test_more_points_bring_the_bounds_together(case, draws):
 def test_bound_of_any_q_is_below_that_of_the_best(case, n_steps, natural):
     """Adam's q, after a few steps, and q at its optimum for the same points, kernel and noise."""
     posterior = "full" if natural else case.model.solver.posterior
-    adam = Adam(batch_size=len(case.X), natural_gradient=natural, posterior=posterior)
+    bound = case.model.solver.bound
+    adam = Adam(batch_size=len(case.X), natural_gradient=natural, posterior=posterior, bound=bound)
     any_q = case.with_model(solver=adam, max_iter=n_steps, noise_cv=None).fitted()
     kernel = any_q.kernel_ + sk.WhiteKernel(any_q.noise_variance_, "fixed")
     best = case.with_model(kernel=kernel, inducing_init=any_q.inducing_points_)
-    bounds = [best.with_model(solver=LBFGS(posterior=own)).fitted().lower_bound_ for own in (posterior, "full")]
+    bounds = [
+        best.with_model(solver=LBFGS(posterior=own, bound=bound)).fitted().lower_bound_ for own in (posterior, "full")
+    ]
     assert_in_order(
         any_q.lower_bound_, *bounds, exact_of(best.model).fit(case.X, case.Y).log_marginal_likelihood_value_
     )
