@@ -11,7 +11,6 @@ from skevgp import CoefPrior, EVGPRegressor, ResidualRegressor
 from skevgp.data.dataset import Dataset
 from skevgp.fitting.noisy_inputs import look_at_slopes
 from skevgp.noise import Gaussian
-from skevgp.noise.gaussian import own_variance
 from skevgp.solvers import LBFGS
 
 
@@ -36,12 +35,6 @@ def test_input_noise_of_linear_function():
     assert found.noise_variance_ == pytest.approx(0.012, rel=0.4)
     covariance = np.diag([0.1**2, 0.05**2])
     np.testing.assert_allclose(variance_by_inputs(found, X, y, covariance), by_inputs, rtol=0.15)
-
-
-def test_own_variance_is_what_the_noise_of_inputs_leaves():
-    squares, counts, variance = np.array([1.0, 2.0, 3.0]), np.array([1.0, 1.0, 2.0]), np.array([0.01, 0.02, 0.005])
-    assert own_variance(squares, 0.0 * squares, counts, variance) == pytest.approx(350.0, rel=1e-3)
-    assert own_variance(4.0 * variance + 0.3, np.full(3, 0.3), counts, variance) == pytest.approx(4.0, rel=1e-3)
 
 
 def test_variance_by_inputs_is_that_of_the_jacobian(monkeypatch):
