@@ -3,8 +3,8 @@
     python benchmarks/control.py rollouts                    # three systems, five models, two seeds: hours of one core
     python benchmarks/control.py rollouts --models EVGP-IFG  # one model: twenty minutes
     python benchmarks/control.py rollouts --systems iiwa14 --models EVGP-IFG  # not among the three
-    python benchmarks/control.py swing_up                    # hours of one core
-    python benchmarks/control.py swing_up --systems pendulum --seconds 1.5 3 --noises 0
+    python benchmarks/control.py swing_up --seeds 10         # hours of one core
+    python benchmarks/control.py swing_up --systems pendulum --models evgp-ifg
     python benchmarks/control.py tracking                    # a quarter of an hour of one core
     python benchmarks/control.py swing_up --quick            # the pendulum, one seed: half a minute
 
@@ -32,7 +32,6 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -44,9 +43,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import norm
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import computed_torque as arms
 import harness
@@ -57,15 +54,9 @@ from paper.models import Fit, build, fitted_part, groups_of
 from skevgp import CoefPrior, EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
 from skevgp.datasets.plant import Plant
-from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
 from skevgp.robots import RigidBody
 from skevgp.solvers import LBFGS
-
-
-def size_of(options: Any) -> str:
-    return "quick" if options.quick else "full"
-
 
 # --- rollouts ------------------------------------------------------------------------------------------------------
 
@@ -84,6 +75,8 @@ MAIN = "EVGP-IFG"
 ROLLOUT_NOISES, SHARES = ("0.0", "0.01"), ("1", "0.1")
 HORIZONS = (1, 10, 50, 100)
 TEST_TRAJECTORIES, PARTICLES, ITERATIONS = 40, 100, 300
+# Of the page's lines.
+ORDERS = {"system": ROLLOUT_SYSTEMS, "model": ROLLOUT_MODELS, "noise": ("none", "1 %"), "share": SHARES}
 # Name of each method, and arguments of `rollout`.
 METHODS: dict[str, dict[str, str]] = {
     "consistent": {},
@@ -188,50 +181,41 @@ def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
     model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, cell.max_iter))
     if cell.n_inducing:
         model.set_params(**{"regressor__n_inducing" if cell.model == "RES-VGP" else "n_inducing": cell.n_inducing})
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        start = time.process_time()
-        model.fit(train.data, train.target, **groups_of(model, train))
-        seconds = time.process_time() - start
-        found = {method: rolled_out(model, method, test, cell) for method in methods_of(cell.model)}
-    fitted = fitted_part(model)
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups_of(model, train)))
+    fitted, rows = fitted_part(model), []
     common = {
         "n_rows": len(train.data),
         "n_iter": fitted.n_iter_,
         "noise_std": np.median(np.sqrt(fitted.noise_variance_) / train.scatter),
         "fit_seconds": seconds,
+        "max_iter": cell.max_iter,
     }
-    return [
-        {
-            **{name: getattr(cell, name) for name in Rollout.__dataclass_fields__ if name != "max_iter"},
-            **{"method": method, "steps": step},
-            **measures(test.trajectories[:, 1:], ahead, step, train.scatter),
-            **common,
-            "rollout_seconds": taken,
-            "max_iter": cell.max_iter,
-            **harness.provenance(),
-        }
-        for method, (ahead, taken) in found.items()
-        for step in HORIZONS
-    ]
+    for method in methods_of(cell.model):
+        ahead, taken = rolled_out(model, method, test, cell)
+        for step in HORIZONS:
+            found = measures(test.trajectories[:, 1:], ahead, step, train.scatter)
+            rows.append({"method": method, "steps": step, **found, **common, "rollout_seconds": taken})
+    return rows
 
 
 def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bunch, float]:
-    """Return the rollout, NaN if the learned system is unstable, and processor seconds."""
+    """Return the rollout, NaN if the learned system is unstable, and processor seconds of one thread."""
     n, n_states = len(test.trajectories), test.target.shape[1]
     inputs = test.data[:, n_states:].reshape(n, -1, test.data.shape[1] - n_states)
     options = {"n_samples": 10 if cell.size == "quick" else PARTICLES, "random_state": cell.seed, **METHODS[method]}
-    start = time.process_time()
-    try:
-        ahead = rollout(
-            Independent(model) if method == "independent" else model, test.trajectories[:, 0], inputs, **options
-        )
-    except ValueError as problem:
-        if "unstable" not in str(problem):
-            raise
-        nothing = np.full(test.trajectories[:, 1:].shape, np.nan)
-        ahead = Bunch(mean=nothing, std=nothing)
-    return ahead, time.process_time() - start
+    nothing = np.full(test.trajectories[:, 1:].shape, np.nan)
+    ahead = Bunch(mean=nothing, std=nothing)
+    model = Independent(model) if method == "independent" else model
+
+    def roll() -> None:
+        try:
+            ahead.update(rollout(model, test.trajectories[:, 0], inputs, **options))
+        except ValueError as problem:
+            if "unstable" not in str(problem):
+                raise
+
+    seconds, _ = harness.timed(roll)
+    return ahead, seconds
 
 
 def sizes(system: str, model: str) -> tuple[int, ...]:
@@ -246,62 +230,53 @@ def sizes(system: str, model: str) -> tuple[int, ...]:
 
 def rollout_cells(options: Any) -> list[Rollout]:
     """Return the cells. The largest models come last, and other seeds after all systems."""
-    seeds = range(options.seeds or (1 if options.quick else 2))
     systems = ("pendulum",) if options.quick else options.systems or DEFAULT_SYSTEMS
+    max_iter = 20 if options.quick else ITERATIONS
     return [
-        Rollout(system, model, m, noise, share, seed, size_of(options), 20 if options.quick else ITERATIONS)
-        for seed, model, number in itertools.product(seeds, options.models or ROLLOUT_MODELS, (0, 1))
+        Rollout(system, model, m, noise, share, seed, options.size, max_iter)
+        for seed, model, number in itertools.product(options.seeds, options.models or ROLLOUT_MODELS, (0, 1))
         for system in systems
         for m in sizes(system, model)[number : number + 1]
         for noise, share in itertools.product(ROLLOUT_NOISES, SHARES)
     ]
 
 
-def rollout_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def rollout_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return position errors, calibration, and in how many fits of the main model intervals are calibrated."""
     rows = rows.assign(noise=rows["noise"].map(lambda noise: f"{100 * noise:g} %" if noise else "none"))
     rows["share"] = rows["share"].map("{:g}".format)
-    setting = ["system", "n_inducing", "model", "noise", "share"]
-    orders = [list(ROLLOUT_SYSTEMS), list(ROLLOUT_MODELS), ["none", "1 %"], list(SHARES)]
-
-    def place(found: tuple[Any, ...]) -> tuple[int, ...]:
-        system, m, model, noise, share = found
-        known = [order.index(name) for order, name in zip(orders, (system, model, noise, share), strict=True)]
-        return known[0], m or sys.maxsize, *known[1:]
-
+    rows = rows.assign(
+        size=rows["n_inducing"].replace(0, sys.maxsize),  # networks after all numbers of points
+        **{name: pd.Categorical(rows[name], order) for name, order in ORDERS.items()},
+    )
     errors, bands, promises = [], [], []
-    for found, own in sorted(rows.groupby(setting), key=lambda item: place(item[0])):
-        system, m, model, noise, share = found
+    for found, own in rows.groupby(["system", "size", "model", "noise", "share"], observed=True):
+        system, _, model, noise, share = found
+        m = own["n_inducing"].iloc[0]
         line = {"": f"{system} m={m}" if m else system, "model": model, "noise": noise, "share": share}
         means = own.groupby(["method", "steps"]).mean(numeric_only=True)
-        fed_back, particles = means.loc["mean"], means.loc[particles_of(model)]
-        columns = {
-            f"after {step}": f"{figure_of(row['error_median'])} ({figure_of(row['error_p90'])})"
-            for step, row in fed_back.iterrows()
-        }
-        last = {"particles' mean: 1": particles["error_median"].iloc[0], "100": particles["error_median"].iloc[-1]}
-        errors.append({**line, "seeds": own["seed"].nunique(), **columns, **last})
+        fed_back, particles = means.loc["mean"], means.loc[particles_of(model)]["error_median"]
+        texts = fed_back["error_median"].map(figure_of) + fed_back["error_p90"].map(lambda p90: f" ({figure_of(p90)})")
+        last = {"particles' mean: 1": particles.iloc[0], "100": particles.iloc[-1]}
+        errors.append({**line, "seeds": own["seed"].nunique(), **texts.rename("after {}".format), **last})
         for method in list(METHODS)[:-1] if model == MAIN else [particles_of(model)]:
-            cr2 = {f"CR-2: {step}": f"{value:.2f}" for step, value in means.loc[method]["cr2"].items()}
-            crps = {f"CRPS: {step}": value for step, value in means.loc[method]["crps"].items()}
-            bands.append({**line, "particles": method, **cr2, **crps})
-    main = rows[rows["model"] == MAIN]
-    for noise, share, method in itertools.product(("none", "1 %"), SHARES, ("consistent", "consistent, no noise")):
-        own = main[(main["noise"] == noise) & (main["share"] == share)].set_index([*setting, "seed", "steps"])
-        if own.empty:
-            continue
-        particles, others = (own[own["method"] == name] for name in (method, "independent"))
-        most = 1.0 if noise == "none" else 0.99
-        tests = {f"CR-2 from 0.9 to {most:g}": particles["cr2"].between(0.9, most)}
-        tests["CRPS no worse than independent"] = particles["crps"] <= others["crps"].loc[particles.index]
-        for name, held in tests.items():
-            counts = held.groupby("steps").agg(["sum", "size"])
-            columns = {f"after {step}": f"{row['sum']} of {row['size']}" for step, row in counts.iterrows()}
-            promises.append({"noise": noise, "share": share, "particles": method, "": name, **columns})
-    return {
-        name: pd.DataFrame(lines)
-        for name, lines in zip(("position errors", "intervals", "fits"), (errors, bands, promises), strict=True)
-    }
+            cr2, crps = (means.loc[method][name] for name in ("cr2", "crps"))
+            columns = {**cr2.map("{:.2f}".format).rename("CR-2: {}".format), **crps.rename("CRPS: {}".format)}
+            bands.append({**line, "particles": method, **columns})
+    cells = ["system", "n_inducing", "seed", "steps"]
+    for (noise, share), own in rows[rows["model"] == MAIN].groupby(["noise", "share"], observed=True):
+        by_method = own.set_index(["method", *cells])
+        for method in ("consistent", "consistent, no noise"):
+            particles, others = by_method.loc[method], by_method.loc["independent"]
+            most = 1.0 if noise == "none" else 0.99
+            tests = {f"CR-2 from 0.9 to {most:g}": particles["cr2"].between(0.9, most)}
+            tests["CRPS no worse than independent"] = particles["crps"] <= others["crps"].loc[particles.index]
+            for name, held in tests.items():
+                counts = held.groupby("steps").agg(["sum", "size"]).astype(str)
+                columns = (counts["sum"] + " of " + counts["size"]).rename("after {}".format)
+                promises.append({"noise": noise, "share": share, "particles": method, "": name, **columns})
+    tables = {"position errors": errors, "intervals": bands, "fits": promises}
+    return {name: pd.DataFrame(lines) for name, lines in tables.items()}
 
 
 # --- swing-ups -----------------------------------------------------------------------------------------------------
@@ -368,9 +343,7 @@ def firm(system: str) -> dict[str, np.ndarray]:
 def run_swing_up(cell: SwingUp) -> dict[str, Any]:
     """Learn, and swing up. Seconds are processor time of one thread."""
     task = mpc.TASKS[cell.system]
-    with threadpool_limits(1), warnings.catch_warnings():
-        for expected in (ConvergenceWarning, DependentRowsWarning):
-            warnings.simplefilter("ignore", expected)
+    with harness.one_thread():
         start = time.process_time()
         if cell.model == "truth":
             model, noise = Truth(cell.system), 0.0
@@ -384,13 +357,11 @@ def run_swing_up(cell: SwingUp) -> dict[str, Any]:
         end = time.process_time()
     away = np.flatnonzero(found.distance >= mpc.NEAR)
     return {
-        **{name: getattr(cell, name) for name in SwingUp.__dataclass_fields__},
         "success": found.success,
         "last_distance": found.distance[-mpc.LAST :].max(),
         "upright_from": mpc.DT * (away[-1] + 1),
         "fit_seconds": middle - start,
         "control_seconds": end - middle,
-        **harness.provenance(),
     }
 
 
@@ -399,11 +370,11 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     if options.quick:
         return [SwingUp("pendulum", model, 3.0, 0.0, mpc.LENGTH, 0, "quick") for model in ("evgp-ifg", "gp")]
     models, systems, found = options.models or SWING_UPS, options.systems or SYSTEMS, []
-    for seed in range(options.seeds or 10):
+    for seed in options.seeds:
         for system in systems:
             if seed < TRUTHS and "truth" in models:
                 found.append(SwingUp(system, "truth", 0.0, 0.0, 0, seed, "full"))
-            some = itertools.product(options.lengths, options.noises, options.seconds, models)
+            some = itertools.product(LENGTHS, NOISES, SECONDS, models)
             found += [
                 SwingUp(system, model, seconds, noise, length, seed, "full")
                 for length, noise, seconds, model in some
@@ -412,7 +383,7 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     return found
 
 
-def swing_up_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def swing_up_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return successes of so many seeds, for each number of seconds of data."""
     seconds, lines = sorted(rows.loc[rows["model"] != "truth", "seconds"].unique()), []
     for (system, model, noise, length), own in rows.groupby(["system", "model", "noise", "length"]):
@@ -601,9 +572,7 @@ def broken_limits(
 def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
     """Log, learn, track, and move fast. Return a row for each number."""
     size, seed, body = SIZES[cell.size], 1000 * cell.seed + round(10 * cell.payload), RigidBody(load_robot("iiwa14"))
-    with threadpool_limits(1), warnings.catch_warnings():
-        for expected in (ConvergenceWarning, DependentRowsWarning):
-            warnings.simplefilter("ignore", expected)
+    with harness.one_thread():
         arm = arms.make_arm(cell.payload, seed)
         log = arms.track(arm, ComputedTorque(body, arms.waves(size.n_runs, size.seconds, seed + 100)), seed=0)
         rows = arms.log_of(log)
@@ -614,20 +583,16 @@ def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
             *step_costs(body, models, cases["waves"], size.calls),
             *broken_limits(arm, body, models[BOTH], rows[0], size.n_moves, share, seed + 300),
         ]
-    own = {name: getattr(cell, name) for name in Tracking.__dataclass_fields__}
-    return [
-        {**own, "measure": measure, "model": model, "case": case, "value": value, **harness.provenance()}
-        for measure, model, case, value in found
-    ]
+    return [dict(zip(("measure", "model", "case", "value"), one, strict=True)) for one in found]
 
 
 def tracking_cells(options: Any) -> list[Tracking]:
     if options.quick:
         return [Tracking(2.0, 0, "quick")]
-    return [Tracking(payload, seed, "full") for seed in range(options.seeds or 2) for payload in PAYLOADS]
+    return [Tracking(payload, seed, "full") for seed in options.seeds for payload in PAYLOADS]
 
 
-def tracking_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return errors (mrad), errors by load, microseconds of a step, and broken limits."""
     by_arm = rows.set_index(["measure", "model", "case", "payload", "seed"])["value"].sort_index()
     errors, loads, costs, limits = [], [], [], []
@@ -684,23 +649,17 @@ PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title
 
 
 def main() -> None:
-    parser = harness.argument_parser(
-        __doc__, quick="one system, little data, one seed", seeds="number of seeds; default: 2, of swing-ups 10"
-    )
+    parser = harness.argument_parser(__doc__, quick="one system, little data, one seed", seeds=2)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--systems", nargs="+", choices=ROLLOUT_SYSTEMS, help="default: all, of rollouts the first 3")
     models = [*ROLLOUT_MODELS, *SWING_UPS]
     parser.add_argument("--models", nargs="+", choices=models, help="default: all")
-    parser.add_argument("--seconds", nargs="+", type=float, default=SECONDS, help="of data; default: %(default)s")
-    parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="on states; default: %(default)s")
-    parser.add_argument("--lengths", nargs="+", type=int, default=LENGTHS, help="of trajectories; default: %(default)s")
-    options = parser.parse_args()
+    options = harness.parse(parser)
     cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, options.part)
     jobs = 1 if options.part == "tracking" else options.jobs  # it measures wall time
-    n_failures = harness.run_missing(cells(options), run, output, jobs, since=options.since)
-    rows = harness.frame(output)
-    harness.write_page(title, tables_of(rows[rows["size"] == size_of(options)]), output, n_failures)
+    n_failures = harness.run_missing(cells(options), run, output, jobs)
+    harness.write_page(title, tables_of(harness.frame(output, size=options.size)), output, n_failures)
 
 
 if __name__ == "__main__":

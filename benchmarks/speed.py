@@ -42,17 +42,16 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF
 from threadpoolctl import threadpool_limits
 
 import harness
+from harness import figure_of
 from peers.adapters import microseconds
 from peers.against_peers import work
 from skevgp import EVGPRegressor
@@ -82,8 +81,8 @@ def latency_cells(options: Any) -> list[Latency]:
     pythons = {"skevgp": sys.executable, "scikit-learn": sys.executable}
     if options.peer_python:
         pythons |= dict.fromkeys(("GPflow", "GPyTorch"), options.peer_python)
-    size, rounds = ("quick", 1) if options.quick else ("full", 3)
-    return [Latency(library, turn, size, python) for turn in range(rounds) for library, python in pythons.items()]
+    rounds = range(1 if options.quick else 3)
+    return [Latency(library, turn, options.size, python) for turn in rounds for library, python in pythons.items()]
 
 
 def compiled_calls(model: Any, X: np.ndarray, name: str) -> dict[str, Callable[[], object]]:
@@ -129,20 +128,18 @@ def run_latency(cell: Latency) -> list[dict[str, Any]]:
     given = {"X": X, "Y": Y, "inducing_points": X[rng.permutation(2000)[: 10 if quick else 100]]}
     given |= {"ahead": rng.uniform(-2.0, 2.0, (50, 6)), "seconds": 0.0 if quick else 0.5}
     if cell.library == "skevgp":
-        with threadpool_limits(1), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with harness.one_thread():
             found = {name: microseconds(call, given["seconds"]) for name, call in calls_of_skevgp(given).items()}
     else:
         said = work(cell.python, OTHERS[cell.library], given, **ONE_THREAD)
         found = dict(zip(said.calls, said.microseconds, strict=True))
-    same = {"library": cell.library, "round": cell.round, "size": cell.size}
-    return [{**same, "call": name, "microseconds": value, **harness.provenance()} for name, value in found.items()]
+    return [{"call": name, "microseconds": value} for name, value in found.items()]
 
 
-def latency_table(rows: pd.DataFrame) -> pd.DataFrame:
+def latency_tables(rows: pd.DataFrame) -> harness.Tables:
     found = rows.groupby(["library", "call"], sort=False)["microseconds"].agg(["median", "min", "size"])
-    columns = {"median": "median", "min": "least round", "size": "rounds"}
-    return found.round(0).astype(int).rename(columns=columns).reset_index()
+    found = found.round(0).astype(int).set_axis(["median", "least round", "rounds"], axis=1)
+    return {"latency": found.reset_index()}
 
 
 # --- casadi --------------------------------------------------------------------------------------------------------
@@ -227,9 +224,7 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
     options = {"n_inducing": cell.m, "sharing": "all", "max_iter": 50, "random_state": 0}
     features_of = features[cell.features](name) if cell.features in features else None
     model = EVGPRegressor(features_of, kernel_map=AngleEncoder(name), **options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model.fit(data.data, y)
+    harness.timed(lambda: model.fit(data.data, y))
     X = make_dynamics(name, 10, 20, random_state=1).data
     row, x = X[0].copy(), ca.MX.sym("x", X.shape[1])
     start = time.perf_counter()
@@ -245,8 +240,6 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
     exact_mean, exact_std = model.predict(X, return_std=True)
     found_mean, found_variance = (found.full().T for found in function.map(len(X))(X.T))
     return {
-        "features": cell.features,
-        "m": len(model.inducing_points_),
         "build_ms": 1e3 * (built - start),
         "build_j_ms": 1e3 * (end - built),
         "f_us": least(buffered(function, row)),
@@ -259,7 +252,6 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
         "predict_us": least(lambda: model.predict(X[:1], return_std=True), 30),
         "mean_off": np.max(np.abs(found_mean - exact_mean) / scale),
         "std_off": np.max(np.abs(np.sqrt(found_variance) - exact_std) / scale),
-        **harness.provenance(),
         "casadi": ca.CasadiMeta.version(),
     }
 
@@ -328,21 +320,19 @@ def run_evaluation(cell: Evaluation) -> dict[str, Any]:
                 V @ V.T, L_inv.T @ (G @ V)
                 products.append(time.perf_counter() - start)
     return {
-        **{name: getattr(cell, name) for name in ("sweep", "name", "n", "m", "d", "outputs", "cores")},
         "evaluation_ms": 1e3 * np.median(evaluations),
         "floor_ms": 1e3 * np.median(products),
         "ratio": np.median(evaluations) / np.median(products),
         "evaluation_fastest_ms": 1e3 * min(evaluations),
         "floor_fastest_ms": 1e3 * min(products),
         "repeats": len(evaluations),
-        **{name: harness.provenance()[name] for name in ("versions", "machine")},
     }
 
 
-def evaluation_table(rows: pd.DataFrame) -> pd.DataFrame:
+def evaluation_tables(rows: pd.DataFrame) -> harness.Tables:
     columns = {"name": "data", "n": "rows", "m": "points", "outputs": "outputs", "cores": "cores"}
     columns |= {"evaluation_ms": "evaluation, ms", "floor_ms": "products, ms", "ratio": "ratio"}
-    return rows[list(columns)].rename(columns=columns).fillna({"data": ""})
+    return {"evaluation": rows[list(columns)].rename(columns=columns).fillna({"data": ""})}
 
 
 # --- rows ----------------------------------------------------------------------------------------------------------
@@ -436,8 +426,8 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             cluster.close()
         test = np.sort(np.random.RandomState(1).randint(cell.n_rows, size=min(cell.n_rows, 5000)))
         return {
-            **{"n_rows": cell.n_rows, "n_columns": 8, "n_inducing": 100, "engine": cell.engine},
-            "max_iter": cell.max_iter,
+            "n_columns": 8,
+            "n_inducing": 100,
             "evaluation_seconds": np.median(solver.seconds_),
             "n_evaluations": len(solver.seconds_),
             "fit_seconds": fit_seconds,
@@ -446,15 +436,14 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             "r2": model.score(*(array[test] for array in arrays)),
             "noise_sd": np.sqrt(model.noise_variance_),
             "converged": not caught,
-            **{name: harness.provenance()[name] for name in ("versions", "machine")},
         }
 
 
-def rows_table(rows: pd.DataFrame) -> pd.DataFrame:
+def rows_tables(rows: pd.DataFrame) -> harness.Tables:
     seconds = rows.pivot(index="n_rows", columns="engine", values="evaluation_seconds")
     most = rows.groupby("n_rows")[["data_mb", "memory_mb"]].max()  # of all engines
     table = most.set_axis(["data, MB", "peak memory of the fit above the data, MB"], axis=1)
-    return table.join(seconds.add_prefix("seconds per evaluation: ")).rename_axis("rows").reset_index()
+    return {"rows": table.join(seconds.add_prefix("seconds per evaluation: ")).rename_axis("rows").reset_index()}
 
 
 # --- million -------------------------------------------------------------------------------------------------------
@@ -495,8 +484,6 @@ def run_million(cell: Million) -> dict[str, Any]:
         noise = float(np.mean(np.square(y)))
         mean, std = model.predict(X_test, return_std=True)
         return {
-            "n_rows": cell.n_rows,
-            "fit": cell.fit,
             "n_iter": model.n_iter_,
             "seconds": seconds,
             "cpu_seconds": cpu_seconds,
@@ -505,26 +492,17 @@ def run_million(cell: Million) -> dict[str, Any]:
             "noise_alone_per_row": -0.5 * (np.log(2.0 * np.pi * noise) + 1.0),
             "nlpd": negative_log_predictive_density(y_test, mean, std),
             "warned": bool(caught),
-            **harness.provenance(),
         }
 
 
-def million_table(rows: pd.DataFrame) -> pd.DataFrame:
+def million_tables(rows: pd.DataFrame) -> harness.Tables:
     gained = rows["bound_per_row"] - rows["noise_alone_per_row"]
-    reference = gained[rows["fit"] == "reference"]
-    share = 100.0 * gained / (reference.iloc[0] if len(reference) else np.nan)
-    return pd.DataFrame(
-        {
-            "fit": rows["fit"],
-            "iterations": rows["n_iter"],
-            "s": rows["seconds"].map("{:.0f}".format),
-            "CPU s": rows["cpu_seconds"].map("{:.0f}".format),
-            "MB above the data": rows["memory_mb"].map("{:.0f}".format),
-            "bound per row": rows["bound_per_row"].map("{:.4f}".format),
-            "gained": share.map("{:.2f} %".format),
-            "NLPD": rows["nlpd"].map("{:.4f}".format),
-        }
-    )
+    share = 100.0 * gained / gained.where(rows["fit"] == "reference").max()
+    columns = {"fit": rows["fit"], "iterations": rows["n_iter"]}
+    for header, name in {"s": "seconds", "CPU s": "cpu_seconds", "MB above the data": "memory_mb"}.items():
+        columns[header] = rows[name].map("{:.0f}".format)
+    columns |= {"bound per row": rows["bound_per_row"].map("{:.4f}".format), "gained": share.map("{:.2f} %".format)}
+    return {"million": pd.DataFrame({**columns, "NLPD": rows["nlpd"].map("{:.4f}".format)})}
 
 
 # --- checkout ------------------------------------------------------------------------------------------------------
@@ -587,12 +565,10 @@ def run_checkout(cell: Checkout) -> dict[str, Any]:
     job = json.dumps([cell.job, INDUCING[cell.job], 3 if cell.quick else None, cell.seed])
     environment = os.environ | {"PYTHONPATH": str(cell.folder)}
     options = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
-    said = json.loads(subprocess.run([sys.executable, "-c", FIT, job], **options).stdout.splitlines()[-1])
-    known = {name: getattr(cell, name) for name in ("job", "checkout", "commit", "seed", "repeat")}
-    return {**known, **said, **harness.provenance()}
+    return json.loads(subprocess.run([sys.executable, "-c", FIT, job], **options).stdout.splitlines()[-1])
 
 
-def checkout_table(rows: pd.DataFrame) -> pd.DataFrame:
+def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return medians of times, the median of their ratios, and means of the rest: this / other."""
     names = ["seconds", "cpu_seconds", "n_iter", "bound", "error", "nlpd"]
     rows = rows.drop_duplicates(["job", "checkout", "seed", "repeat"], keep="last")  # of the last run
@@ -602,48 +578,26 @@ def checkout_table(rows: pd.DataFrame) -> pd.DataFrame:
         line = {"this / other": job, "pairs": len(own)}
         for name in names:
             this, other = (own[name][which].median() for which in ("this", "other"))
-            line[name] = f"{harness.figure_of(float(this))} / {harness.figure_of(float(other))}"
+            line[name] = f"{figure_of(float(this))} / {figure_of(float(other))}"
             if "seconds" in name:
                 line[f"ratio of {name}"] = f"{(own[name]['this'] / own[name]['other']).median():.3f}"
         lines.append(line)
-    return pd.DataFrame(lines)
-
-
-def one_table(make: Callable[[pd.DataFrame], pd.DataFrame], name: str, rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    return {name: make(rows)}
+    return {"checkout": pd.DataFrame(lines)}
 
 
 PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables, title
-    "latency": (
-        "latency",
-        latency_cells,
-        run_latency,
-        partial(one_table, latency_table, "latency"),
-        "What a control loop waits for",
-    ),
+    "latency": ("latency", latency_cells, run_latency, latency_tables, "What a control loop waits for"),
     "casadi": ("casadi_latency", casadi_cells, run_casadi, casadi_tables, "A prediction by CasADi and in C"),
     "evaluation": (
         "evaluation_cost",
         evaluation_cells,
         run_evaluation,
-        partial(one_table, evaluation_table, "evaluation"),
+        evaluation_tables,
         "One evaluation of the bound and its gradient",
     ),
-    "rows": ("scaling", rows_cells, run_rows, partial(one_table, rows_table, "rows"), "Time and memory over rows"),
-    "million": (
-        "many_rows",
-        million_cells,
-        run_million,
-        partial(one_table, million_table, "million"),
-        "1,000,000 rows",
-    ),
-    "checkout": (
-        "checkout",
-        checkout_cells,
-        run_checkout,
-        partial(one_table, checkout_table, "checkout"),
-        "This checkout against another",
-    ),
+    "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
+    "million": ("many_rows", million_cells, run_million, million_tables, "1,000,000 rows"),
+    "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 
 
@@ -653,10 +607,10 @@ def main() -> None:
     parser.add_argument("--peer-python", help="of latency: a Python that has GPflow and GPyTorch")
     parser.add_argument("--fits", nargs="+", choices=FITS, help="of million; default: all but the reference")
     parser.add_argument("--other", type=Path, help="of checkout: folder of the other checkout; default: this one")
-    options = parser.parse_args()
+    options = harness.parse(parser)
     name, cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, name)
-    n_failures = harness.run_missing(cells(options), run, output, fresh=True, since=options.since)
+    n_failures = harness.run_missing(cells(options), run, output, fresh=True)
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 
 
