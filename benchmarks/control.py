@@ -32,8 +32,9 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,8 @@ import harness
 import mpc
 from computed_torque import DT, ComputedTorque
 from harness import figure_of
+from paper.models import SIZES as PAPERS_SIZES
+from paper.models import SYSTEMS as PAPERS_SYSTEMS
 from paper.models import Fit, build, fitted_part, groups_of
 from skevgp import CoefPrior, EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
@@ -137,11 +140,6 @@ def particles_of(model: str) -> str:
     return "independent" if model == "RES-DBNN" else "consistent"
 
 
-def methods_of(model: str) -> list[str]:
-    """Return all methods for the main model, and two for the others."""
-    return list(METHODS) if model == MAIN else [particles_of(model), "mean"]
-
-
 def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """Return the CRPS of samples (n, ...), whose mean does not depend on n (Ferro 2014)."""
     n = len(samples)
@@ -190,7 +188,7 @@ def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
         "fit_seconds": seconds,
         "max_iter": cell.max_iter,
     }
-    for method in methods_of(cell.model):
+    for method in METHODS if cell.model == MAIN else (particles_of(cell.model), "mean"):
         ahead, taken = rolled_out(model, method, test, cell)
         for step in HORIZONS:
             found = measures(test.trajectories[:, 1:], ahead, step, train.scatter)
@@ -220,12 +218,9 @@ def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bun
 
 def sizes(system: str, model: str) -> tuple[int, ...]:
     """Return the numbers of inducing points."""
-    if model.startswith("EVGP"):
-        return ROLLOUT_SYSTEMS[system]
     if model == "RES-DBNN":
         return (0,)
-    regressor = build(Fit(system, model, ROLLOUT_MODELS[model], 0, "full", 0))
-    return (getattr(regressor, "regressor", regressor).n_inducing,)
+    return ROLLOUT_SYSTEMS[system] if model.startswith("EVGP") else (PAPERS_SIZES[model][PAPERS_SYSTEMS.index(system)],)
 
 
 def rollout_cells(options: Any) -> list[Rollout]:
@@ -369,18 +364,14 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     """Return the cells, seed by seed, so that the page is complete after each seed."""
     if options.quick:
         return [SwingUp("pendulum", model, 3.0, 0.0, mpc.LENGTH, 0, "quick") for model in ("evgp-ifg", "gp")]
-    models, systems, found = options.models or SWING_UPS, options.systems or SYSTEMS, []
-    for seed in options.seeds:
-        for system in systems:
-            if seed < TRUTHS and "truth" in models:
-                found.append(SwingUp(system, "truth", 0.0, 0.0, 0, seed, "full"))
-            some = itertools.product(LENGTHS, NOISES, SECONDS, models)
-            found += [
-                SwingUp(system, model, seconds, noise, length, seed, "full")
-                for length, noise, seconds, model in some
-                if model != "truth"
-            ]
-    return found
+    cells = []
+    for seed, system in itertools.product(options.seeds, options.systems or SYSTEMS):
+        for model in options.models or SWING_UPS:
+            sizes = itertools.product(SECONDS, NOISES, LENGTHS)
+            if model == "truth":
+                sizes = [(0.0, 0.0, 0)] if seed < TRUTHS else []
+            cells += [SwingUp(system, model, *size, seed, "full") for size in sizes]
+    return cells
 
 
 def swing_up_tables(rows: pd.DataFrame) -> harness.Tables:
@@ -411,8 +402,6 @@ CONTROLLERS = {
     GP: "+ GP of the residual, without physics",
 }
 CASES = ("waves", "slow waves", "moves")
-# Number of timed steps.
-CALLS = 1000
 
 
 @dataclass(frozen=True)
@@ -424,49 +413,33 @@ class Tracking:
     size: str
 
 
-@dataclass(frozen=True)
-class Size:
-    """Size of the log and of models, and numbers of references and moves."""
-
-    n_runs: int = 6
-    seconds: float = 10.0
-    n_inducing: int = 40
-    n_inducing_gp: int = 100
-    max_iter: int | None = None
-    n_references: int = 4
-    n_moves: int = 100
-    calls: int = CALLS
-
-
-SIZES = {"full": Size(), "quick": Size(3, 4.0, 10, 20, 30, 1, 20, 50)}
+# Size of the log and of models, and numbers of references, moves and timed steps.
+SIZES = {
+    "full": Bunch(runs=6, seconds=10.0, m=40, m_gp=100, max_iter=None, references=4, moves=100, calls=1000),
+    "quick": Bunch(runs=3, seconds=4.0, m=10, m_gp=20, max_iter=30, references=1, moves=20, calls=50),
+}
 
 
 class WithoutPhysics:
     """The nominal model, and a Gaussian process of all columns for the residual torque of each joint."""
 
-    def __init__(self, body: RigidBody, n_inducing: int, seed: int, max_iter: int | None):
-        self._body = body
-        self.model = EVGPRegressor(n_inducing=n_inducing, max_iter=max_iter, solver=LBFGS(tol=10.0), random_state=seed)
-
-    def fit(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray) -> WithoutPhysics:
-        self.model.fit(X, y - self._forces(X), groups=groups)
-        return self
+    def __init__(self, body: RigidBody, log: tuple[np.ndarray, ...], **options: Any):
+        self.forces = lambda X: body.forces(*np.split(X, 3, axis=1))
+        X, y, groups = log
+        self.model = EVGPRegressor(solver=LBFGS(tol=10.0), **options).fit(X, y - self.forces(X), groups=groups)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        return self._forces(X) + self.model.predict(X)
-
-    def _forces(self, X: np.ndarray) -> np.ndarray:
-        return self._body.forces(*np.split(X, 3, axis=1))
+        return self.forces(X) + self.model.predict(X)
 
 
-def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Size, seed: int) -> dict[str, Any]:
+def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Bunch, seed: int) -> dict[str, Any]:
     """Fit all models to the same log."""
     X, y, groups = log
-    options = {"max_rows": 1500, "max_iter": size.max_iter, "random_state": seed}
+    options = {"max_iter": size.max_iter, "random_state": seed}
     return {
         WEIGHTS: arms.learner(n_inducing=0).fit(X, y, groups=groups),
-        BOTH: arms.learner(n_inducing=size.n_inducing, **options).fit(X, y, groups=groups),
-        GP: WithoutPhysics(body, size.n_inducing_gp, seed, size.max_iter).fit(X, y, groups),
+        BOTH: arms.learner(n_inducing=size.m, max_rows=1500, **options).fit(X, y, groups=groups),
+        GP: WithoutPhysics(body, log, n_inducing=size.m_gp, **options),
     }
 
 
@@ -481,33 +454,33 @@ def references(n: int, seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def tracking_errors(
-    arm: arms.Arm, body: RigidBody, models: dict[str, Any], cases: dict[str, np.ndarray]
-) -> Iterator[tuple[str, str, str, float]]:
+Numbers = Iterator[tuple[str, str, str, float]]  # measure, model, case, value
+
+
+def controllers_of(body: RigidBody, models: dict[str, Any], reference: np.ndarray) -> dict[str, ComputedTorque]:
+    """Return a controller per model, which knows its torques along the reference in advance."""
+    integral = ComputedTorque(body, reference, ki=400.0)
+    ahead = {name: arms.missed_by(body, model, reference) for name, model in models.items()}
+    learned = {name: ComputedTorque(body, reference, missed) for name, missed in ahead.items()}
+    return {NOMINAL: ComputedTorque(body, reference), "integral": integral, **learned}
+
+
+def tracking_errors(arm: arms.Arm, body: RigidBody, models: dict[str, Any], cases: dict[str, np.ndarray]) -> Numbers:
     """Yield root mean square errors over joints and steps, mrad."""
     for case, reference in cases.items():
-        controllers = {NOMINAL: ComputedTorque(body, reference), "integral": ComputedTorque(body, reference, ki=400.0)}
-        for name, model in models.items():
-            controllers[name] = ComputedTorque(body, reference, arms.missed_by(body, model, reference))
-        for name, controller in controllers.items():
+        for name, controller in controllers_of(body, models, reference).items():
             error = arms.track(arm, controller, seed=1).error
             yield "error", name, case, 1e3 * float(np.sqrt(np.mean(error**2)))
 
 
-def step_costs(
-    body: RigidBody, models: dict[str, Any], reference: np.ndarray, calls: int
-) -> Iterator[tuple[str, str, str, float]]:
+def step_costs(body: RigidBody, models: dict[str, Any], reference: np.ndarray, calls: int) -> Numbers:
     """Yield microseconds of a step of one arm. Controllers alternate, so that all run under the same load."""
     reference = reference[:, :1]
-    ahead = {name: arms.missed_by(body, model, reference) for name, model in models.items()}
-    known = {
-        NOMINAL: ComputedTorque(body, reference),
-        "integral": ComputedTorque(body, reference, ki=400.0),
-        **{name: ComputedTorque(body, reference, missed) for name, missed in ahead.items()},
+    asked = {
+        name: ComputedTorque(body, reference, partial(arms.missed_by, body, models[name])) for name in (WEIGHTS, BOTH)
     }
-    asked = {name: ComputedTorque(body, reference, _one_row(body, models[name])) for name in (WEIGHTS, BOTH)}
     asked[GP] = ComputedTorque(body, reference, models[GP].model.compile().predict)
-    for when, controllers in (("ahead", known), ("in the loop", asked)):
+    for when, controllers in (("ahead", controllers_of(body, models, reference)), ("in the loop", asked)):
         names, taken = list(controllers), {name: [] for name in controllers}
         for call in range(calls):
             step = call % len(reference)
@@ -528,13 +501,9 @@ def step_costs(
         yield "batch", name, "per row", 1e6 * float(np.median(seconds)) / len(reference)
 
 
-def _one_row(body: RigidBody, model: Any) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda wanted: arms.missed_by(body, model, wanted)
-
-
 def broken_limits(
     arm: arms.Arm, body: RigidBody, model: Any, X: np.ndarray, n_moves: int, share: float, seed: int
-) -> Iterator[tuple[str, str, str, float]]:
+) -> Numbers:
     """Yield how many moves break a limit: at any joint and step, and where the plan comes closest to it.
 
     The latter also of those only in which the joint accelerates there no more than it did in the log, of rows X.
@@ -574,14 +543,14 @@ def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
     size, seed, body = SIZES[cell.size], 1000 * cell.seed + round(10 * cell.payload), RigidBody(load_robot("iiwa14"))
     with harness.one_thread():
         arm = arms.make_arm(cell.payload, seed)
-        log = arms.track(arm, ComputedTorque(body, arms.waves(size.n_runs, size.seconds, seed + 100)), seed=0)
+        log = arms.track(arm, ComputedTorque(body, arms.waves(size.runs, size.seconds, seed + 100)), seed=0)
         rows = arms.log_of(log)
-        models, cases = learn(rows, body, size, seed), references(size.n_references, seed + 200)
+        models, cases = learn(rows, body, size, seed), references(size.references, seed + 200)
         share = 0.35 if cell.payload <= 3.0 else 0.45  # with less the arm can hardly hold them
         found = [
             *tracking_errors(arm, body, models, cases),
             *step_costs(body, models, cases["waves"], size.calls),
-            *broken_limits(arm, body, models[BOTH], rows[0], size.n_moves, share, seed + 300),
+            *broken_limits(arm, body, models[BOTH], rows[0], size.moves, share, seed + 300),
         ]
     return [dict(zip(("measure", "model", "case", "value"), one, strict=True)) for one in found]
 
@@ -594,51 +563,44 @@ def tracking_cells(options: Any) -> list[Tracking]:
 
 def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return errors (mrad), errors by load, microseconds of a step, and broken limits."""
-    by_arm = rows.set_index(["measure", "model", "case", "payload", "seed"])["value"].sort_index()
-    errors, loads, costs, limits = [], [], [], []
-    for model, name in CONTROLLERS.items():
-        own, line = by_arm["error", model], {"": name}
-        line |= {case: own[case].median() for case in CASES}
-        ratios = own / by_arm["error", NOMINAL]
-        line["ratio"] = f"{ratios.median():.3f} ({ratios.min():.3f} to {ratios.max():.3f})"
-        errors.append(line)
-        by_load = own.groupby("payload").median()
-        loads.append({"": name, **{f"{load} kg": value for load, value in by_load.items()}})
+    values = rows.set_index(["measure", "case", "payload", "seed", "model"])["value"]
+    errors, steps = (values[measure].unstack()[list(CONTROLLERS)] for measure in ("error", "step"))
+    ratios = errors.div(errors[NOMINAL], axis=0)
+    table = errors.groupby("case").median().T[list(CASES)]
+    table["ratio"] = ratios.median().map("{:.3f} (".format)
+    table["ratio"] += ratios.min().map("{:.3f} to ".format) + ratios.max().map("{:.3f})".format)
+    loads = errors.groupby("payload").median().T.rename(columns="{} kg".format)
+    ahead, loop = steps.loc["ahead"], steps.loc["in the loop"]
+    ratios = loop.div(ahead[NOMINAL], axis=0).median()
+    columns = {
+        "step": ahead.median(),
+        "ratio": ahead.div(ahead[NOMINAL], axis=0).median().map("{:.2f}".format),
+        "batch, per row": values["batch"].groupby("model").median(),
+        "in the loop": loop.median(),
+        "ratio in the loop": ratios.map("{:.2f}".format).where(ratios.notna(), ""),
+    }
+    costs = pd.DataFrame(columns).loc[list(CONTROLLERS)]
+    found = {"errors": table, "errors by load": loads, "steps": costs}
+    tables = {name: own.rename(CONTROLLERS).reset_index(names="") for name, own in found.items()}
 
-        def cost(measure: str, case: str, model: str = model) -> pd.Series:
-            found = (measure, model, case)
-            return by_arm[found] if found in by_arm.index.droplevel([3, 4]) else pd.Series(dtype=float)
-
-        base, ahead, loop = by_arm["step", NOMINAL, "ahead"], cost("step", "ahead"), cost("step", "in the loop")
-        ratio = f"{(loop / base).median():.2f}" if len(loop) else ""
-        line = {"": name, "step": ahead.median(), "ratio": f"{(ahead / base).median():.2f}"}
-        line |= {"batch, per row": cost("batch", "per row").median(), "in the loop": loop.median()}
-        costs.append({**line, "ratio in the loop": ratio})
     promised = {"mean": "50 % where tightest", "mean + 2 std": "2.3 % where tightest"}
     promised["Boole"] = f"{1 - CHANCE:.0%} of moves"
-    for case, said in promised.items():
-        own = rows[(rows["case"] == case) & (rows["model"] == BOTH)].pivot_table(
-            index=["payload", "seed"], columns="measure", values="value"
-        )
-        n, logged = own["moves"].sum(), own["moves as logged"].sum()
-        weights = own["moves"].where(own["moves"] > 0.0)
-        means = ((own[name] * weights).sum() / weights.sum() for name in ("duration", "within 2 std"))
-        limits.append(
-            {
-                "planned with": case,
-                "moves": f"{n:.0f}",
-                "break a limit": f"{own['broken'].sum() / n:.1%}",
-                "where tightest": f"{own['broken where tightest'].sum() / n:.1%}",
-                "there as logged": f"{own['broken as logged'].sum() / logged:.1%} of {logged:.0f}",
-                "promised": said,
-                **{
-                    name: f"{mean:.{digits}f}"
-                    for name, mean, digits in zip(("duration", "within 2 std"), means, (2, 3), strict=True)
-                },
-            }
-        )
-    found = {"errors": errors, "errors by load": loads, "steps": costs, "limits": limits}
-    return {name: pd.DataFrame(lines) for name, lines in found.items()}
+    limits = rows[(rows["model"] == BOTH) & rows["case"].isin(promised)]
+    limits = limits.pivot(index=["case", "payload", "seed"], columns="measure", values="value")
+    sums = limits.groupby("case").sum().loc[list(promised)]
+    means = limits.mul(limits["moves"], axis=0).groupby("case").sum().div(sums["moves"], axis=0)
+    n, logged = sums["moves"], sums["moves as logged"]
+    columns = {
+        "moves": n.map("{:.0f}".format),
+        "break a limit": (sums["broken"] / n).map("{:.1%}".format),
+        "where tightest": (sums["broken where tightest"] / n).map("{:.1%}".format),
+        "there as logged": (sums["broken as logged"] / logged).map("{:.1%} of ".format) + logged.map("{:.0f}".format),
+        "promised": pd.Series(promised),
+        "duration": means["duration"].map("{:.2f}".format),
+        "within 2 std": means["within 2 std"].map("{:.3f}".format),
+    }
+    tables["limits"] = pd.DataFrame(columns).loc[list(promised)].reset_index(names="planned with")
+    return tables
 
 
 PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title

@@ -147,25 +147,11 @@ def key(cell: Any) -> dict[str, Any]:
 def run_missing(
     cells: Sequence[Any], run: Callable[[Any], Any], output: Path, jobs: int = 1, fresh: bool = False
 ) -> int:
-    """Run the cells that have no row in the CSV, in processes, and write each result as it arrives.
+    """Run the cells that have no row in the CSV, and write each result as it arrives; return the number of failures.
 
-    Parameters
-    ----------
-    cells : sequence of dataclass
-        Fields that are compared are columns of the CSV.
-    run : callable
-        Function cell -> the other columns of its row, or a list of them for several rows; at the top level of a module.
-    output : Path
-        The CSV.
-    jobs : int, default=1
-        Number of processes.
-    fresh : bool, default=False
-        Whether each cell has a process of its own, for measurements of memory.
-
-    Returns
-    -------
-    n_failures : int
-        Number of cells that raised an error.
+    ``cells`` are dataclasses, whose fields that are compared are columns of the CSV. ``run``, at the top level of a
+    module, returns the other columns of a cell's row, or a list of them for several rows. Cells run in so many
+    processes; a ``fresh`` one for each cell is for measurements of memory.
     """
     pyplot()  # fail before the fits if matplotlib is missing
     cells = list(dict.fromkeys(cells))
