@@ -60,13 +60,9 @@ Part = tuple[np.ndarray, np.ndarray]
 def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
     """Return training and test trajectories with the same noise, and the groups of the former."""
     n = 6 if cell.size == "quick" else SYSTEMS[cell.data][1]
-    everything = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
-    train = everything.groups < n
-    return (
-        (everything.data[train], everything.target[train]),
-        (everything.data[~train], everything.target[~train]),
-        everything.groups[train],
-    )
+    whole = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
+    train, test = ((whole.data[rows], whole.target[rows]) for rows in (whole.groups < n, whole.groups >= n))
+    return train, test, whole.groups[whole.groups < n]
 
 
 def table(cell: Cell) -> tuple[Part, Part]:

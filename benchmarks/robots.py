@@ -150,16 +150,17 @@ def log_of(robot: str, name: str, folder: Path) -> Bunch:
 @lru_cache
 def moving(robot: str, folder: Path) -> tuple[str, ...]:
     """Return names of the logs in which the arm moves."""
-    names = []
-    for name in paths_of(robot, folder):
+
+    def moves(name: str) -> bool:
         try:
             log_of(robot, name, folder)
         except ValueError as problem:
             if "at rest" not in str(problem):
                 raise
-        else:
-            names.append(name)
-    return tuple(names)
+            return False
+        return True
+
+    return tuple(filter(moves, paths_of(robot, folder)))
 
 
 def has_load(name: str) -> bool:
@@ -264,34 +265,25 @@ def run_real(cell: Real) -> list[dict[str, Any]]:
     groups = {"groups": train.groups} if by_groups else {}
     seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups))
     rows = []
-    with harness.one_thread():
-        for name in tests_of(cell.robot, cell.split, cell.folder):
-            test = rows_of(cell.robot, [name], cell.folder, cell.size)
-            base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
-            mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
-            for joint in range(test.target.shape[1]):
-                rows.append(
-                    {
-                        "test": name,
-                        "joint": joint + 1,
-                        **measures(test.target[:, [joint]], mean[:, [joint]], None if std is None else std[:, [joint]]),
-                        "ratio": np.mean((mean - test.target)[:, joint] ** 2) / base[joint],
-                        "n_train": len(train.data),
-                        "n_test": len(test.data),
-                        "fit_seconds": seconds,
-                    }
-                )
+    for name in tests_of(cell.robot, cell.split, cell.folder):
+        test = rows_of(cell.robot, [name], cell.folder, cell.size)
+        base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
+        mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
+        for joint, least in enumerate(base):
+            own = [None if values is None else values[:, [joint]] for values in (test.target, mean, std)]
+            row = {"test": name, "joint": joint + 1, **measures(*own)}
+            row["ratio"] = np.mean((mean - test.target)[:, joint] ** 2) / least
+            rows.append({**row, "n_train": len(train.data), "n_test": len(test.data), "fit_seconds": seconds})
     return rows
 
 
 def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dict[str, Any]:
     """Return scores of one joint (n, 1); empty without a std."""
-    error = {"nmse": np.mean((mean - truth) ** 2) / truth.var()}
-    if std is None:
-        return {**error, **dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")}
-    shares = containing_ratios(truth, mean, std)
-    bands = dict(zip(("cr1", "cr2", "cr3"), shares, strict=True))
-    return {**error, "nlpd": negative_log_predictive_density(truth, mean, std), **bands}
+    found = dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")
+    if std is not None:
+        found = {"nlpd": negative_log_predictive_density(truth, mean, std)}
+        found |= dict(zip(("cr1", "cr2", "cr3"), containing_ratios(truth, mean, std), strict=True))
+    return {"nmse": np.mean((mean - truth) ** 2) / truth.var(), **found}
 
 
 def ask(question: Question) -> list[dict[str, Any]]:
@@ -314,18 +306,12 @@ def ask(question: Question) -> list[dict[str, Any]]:
 
 def questions_of(folder: Path, size: str) -> list[Question]:
     """Return questions of loads, from the log without the load alone and with training logs, and of friction."""
-    there = moving("ur10e", folder)
-    splits = splits_of("ur10e", folder, size)
-    questions = []
+    splits, questions = splits_of("ur10e", folder, size), []
     for loaded, empty, _ in LOADS:
-        if {loaded, empty} <= set(there):
+        if {loaded, empty} <= set(moving("ur10e", folder)):
             more = splits.get("three", ()) if size == "full" else ()
-            sets = [(empty,), (empty, *more)] if more else [(empty,)]
-            questions += [
-                Question("ur10e", "+".join(names), loaded, scale, size, folder)
-                for names in sets
-                for scale in (0.0, 0.1)
-            ]
+            for trained in dict.fromkeys([(empty,), (empty, *more)]):
+                questions += [Question("ur10e", "+".join(trained), loaded, scale, size, folder) for scale in (0.0, 0.1)]
     return questions + [Question("ur10e", "+".join(names), "", 0.0, size, folder) for names in splits.values()]
 
 

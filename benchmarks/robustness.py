@@ -1,12 +1,11 @@
 """Does a fit ever fail, and does its result depend on the random state?
 
-    python benchmarks/robustness.py                  # everything: an hour on one core
-    python benchmarks/robustness.py --parts nasty    # 500 random data sets: no error, no NaN, std > 0
-    python benchmarks/robustness.py --parts seeds    # ten random states on the same data: spread of bounds
-    python benchmarks/robustness.py --quick          # a few of each
+    python benchmarks/robustness.py          # an hour on one core
+    python benchmarks/robustness.py --quick  # a few of each part
 
-The CSV also has the parts "jitter" (the noise-free nasty sets with fixed jitters) and "inducing" (k-means against
-greedy inducing points). These investigations are finished; their script is benchmarks/robustness.py at commit 36f3be5.
+The part "nasty" has 500 random data sets: no error, no NaN, std > 0. "seeds" has ten random states on the same data:
+the spread of bounds. The CSV also has the parts "jitter" (the noise-free nasty sets with fixed jitters) and "inducing"
+(k-means against greedy inducing points), which are finished; their script stands at commit 36f3be5.
 """
 
 from __future__ import annotations
@@ -16,7 +15,7 @@ import traceback
 import warnings
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -41,8 +40,7 @@ class Cell:
     seed: int
 
 
-@dataclass(frozen=True)
-class Data:
+class Data(NamedTuple):
     """A training and a test set, the arguments of EVGPRegressor, and what is special about a nasty set."""
 
     X: np.ndarray
@@ -191,41 +189,36 @@ def run(cell: Cell) -> dict[str, Any]:
     return {name: found.get(name, "") for name in COLUMNS}
 
 
-def cells_of(parts: list[str], quick: bool) -> list[Cell]:
-    """Return the cells of some parts."""
-    cells = []
-    if "nasty" in parts:
-        cells += [Cell("nasty", nasty(seed).case, "max_iter=100", seed) for seed in range(6 if quick else 500)]
-    if "seeds" in parts:
-        cases = [] if quick else [f"pendulum-{name}" for name in ("VGP", "RES-VGP", "IF", "IFG")]
-        dimensions, noises = (range(1, 3), (1e-3,)) if quick else (range(1, 11), (0.0, 1e-3, 0.1))
-        cases += [f"smooth-{dimension}d-noise-{noise:g}" for dimension in dimensions for noise in noises]
-        cells += [Cell("seeds", case, "n_restarts=0", seed) for case in cases for seed in range(2 if quick else 10)]
-    return cells
+def cells_of(quick: bool) -> list[Cell]:
+    """Return the cells of both parts."""
+    cells = [Cell("nasty", nasty(seed).case, "max_iter=100", seed) for seed in range(6 if quick else 500)]
+    cases = [] if quick else [f"pendulum-{name}" for name in ("VGP", "RES-VGP", "IF", "IFG")]
+    dimensions, noises = (range(1, 3), (1e-3,)) if quick else (range(1, 11), (0.0, 1e-3, 0.1))
+    cases += [f"smooth-{dimension}d-noise-{noise:g}" for dimension in dimensions for noise in noises]
+    return cells + [Cell("seeds", case, "n_restarts=0", seed) for case in cases for seed in range(2 if quick else 10)]
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     """Return failures of each part, and the spread of bounds over random states."""
     failed = rows["outcome"] != "ok"
-    counts = rows.assign(failed=failed).groupby("part")["failed"].agg(["size", "sum"])
-    tables = {"fits": counts.set_axis(["fits", "failed"], axis=1).reset_index()}
+    counts = failed.groupby(rows["part"]).agg(["size", "sum"]).set_axis(["fits", "failed"], axis=1)
     seeds = rows[~failed & (rows["part"] == "seeds") & (rows["variant"] == "n_restarts=0")].groupby("case", sort=False)
-    bounds = seeds["bound_per_row"].agg(["min", "median", "max"])
     spread = seeds["gain_per_row"].agg(lambda gains: np.ptp(gains) / abs(np.median(gains)))
-    share, error = seeds["noise_share"].max(), seeds["error"].median()
-    bounds = bounds.assign(spread=spread.map("{:.2%}".format), error=error, share=share)
-    header = {"min": "least bound per row", "max": "largest", "share": "noise / noise alone"}
-    tables["seeds"] = bounds.rename(columns=header).reset_index()
-    return tables
+    columns = {
+        "least bound per row": seeds["bound_per_row"].min(),
+        "median": seeds["bound_per_row"].median(),
+        "largest": seeds["bound_per_row"].max(),
+        "spread": spread.map("{:.2%}".format),
+        "error": seeds["error"].median(),
+        "noise / noise alone": seeds["noise_share"].max(),
+    }
+    return {"fits": counts.reset_index(), "seeds": pd.DataFrame(columns).reset_index()}
 
 
 def main() -> None:
-    parser = harness.argument_parser(__doc__, quick="a few fits of each part")
-    parts = ["nasty", "seeds"]
-    parser.add_argument("--parts", nargs="+", choices=parts, default=parts, help="default: all")
-    options = harness.parse(parser)
+    options = harness.parse(harness.argument_parser(__doc__, quick="a few fits of each part"))
     output = harness.output_path(options, "robustness")
-    n_failures = harness.run_missing(cells_of(options.parts, options.quick), run, output, options.jobs)
+    n_failures = harness.run_missing(cells_of(options.quick), run, output, options.jobs)
     title = "Fits of nasty data, and of other random states"
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 

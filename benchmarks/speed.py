@@ -12,17 +12,16 @@
 With --quick each takes seconds.
 
 *latency*: 100 inducing points, 6 columns, 4 outputs that share them, one thread; medians over half a second. skevgp
-also has groups of one output, and the cartpole with its features. The peers are those of peers/adapters.py.
+also has groups of one output, and the cartpole with its features.
 
-*casadi*: the four states, one group of outputs, without features, with IFG and with nominal dynamics; the kernel sees
-sine and cosine of the angle. Processor time, the least of several rounds. CasADi is called through its buffers and C
-through ctypes.
+*casadi*: one group of outputs, without features, with IFG and with nominal dynamics. Processor time, the least of
+several rounds. CasADi is called through its buffers and C through ctypes.
 
 *evaluation*: the dense products are ``L_inv @ U``, ``V @ V.T``, ``G @ V`` and ``L_inv.T @ (G @ V)`` over all rows.
 Evaluation and products alternate; medians are compared, on one core and on all.
 
-*rows*: fits of 8 iterations to 8 columns with 100 inducing points, from a memory-mapped file on one and two threads,
-and by Dask on two workers. Memory is the peak above that before the fit.
+*rows*: 8 iterations to 8 columns with 100 inducing points, from a memory-mapped file on one and two threads, and by
+Dask on two workers. Memory is the peak above that before the fit.
 
 *million*: L-BFGS with its defaults, natural gradients on mini-batches for some epochs, and L-BFGS with a thousand
 iterations as the reference, of whose gain over noise alone the others have a share. (The reference in the CSV did not
@@ -42,6 +41,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -85,19 +85,6 @@ def latency_cells(options: Any) -> list[Latency]:
     return [Latency(library, turn, options.size, python) for turn in rounds for library, python in pythons.items()]
 
 
-def compiled_calls(model: Any, X: np.ndarray, name: str) -> dict[str, Callable[[], object]]:
-    """Return calls of a compiled model."""
-    fast, row = model.compile(), X[0]
-    return {
-        f"{name}: row, mean": lambda: fast.predict(row),
-        f"{name}: row, mean and std": lambda: fast.predict(row, return_std=True),
-        f"{name}: row, mean and Jacobian": lambda: fast.value_and_jacobian(row),
-        f"{name}: row, mean, std and both Jacobians": lambda: fast.value_and_jacobian(row, return_std=True),
-        f"{name}: horizon, mean and std": lambda: fast.predict(X, return_std=True),
-        f"{name}: horizon, mean and Jacobian": lambda: fast.value_and_jacobian(X),
-    }
-
-
 def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
     """Return calls of one model, of one in four groups, and of the cartpole."""
     X, Y, Z, ahead = (given[name] for name in ("X", "Y", "inducing_points", "ahead"))
@@ -110,11 +97,23 @@ def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
     options = {"n_inducing": len(Z), "sharing": "all", "max_iter": 0, "random_state": 0}
     system = EVGPRegressor(InertiaForceGravity("cartpole"), kernel_map=AngleEncoder("cartpole"), **options)
     system.fit(train.data, train.target)
-    calls = {"predict: row, mean and std": lambda: one.predict(ahead[:1], return_std=True)}
-    calls |= compiled_calls(one, ahead, "compiled")
-    calls |= compiled_calls(four, ahead, "compiled, four groups")
-    calls |= compiled_calls(system, train.data[: len(ahead)], "compiled, cartpole with features")
-    fast = system.compile()
+    calls: dict[str, Callable[[], object]] = {
+        "predict: row, mean and std": lambda: one.predict(ahead[:1], return_std=True)
+    }
+    for name, model, rows in (
+        ("compiled", one, ahead),
+        ("compiled, four groups", four, ahead),
+        ("compiled, cartpole with features", system, train.data[: len(ahead)]),
+    ):
+        fast, row = model.compile(), rows[0]
+        calls |= {
+            f"{name}: row, mean": partial(fast.predict, row),
+            f"{name}: row, mean and std": partial(fast.predict, row, return_std=True),
+            f"{name}: row, mean and Jacobian": partial(fast.value_and_jacobian, row),
+            f"{name}: row, mean, std and both Jacobians": partial(fast.value_and_jacobian, row, return_std=True),
+            f"{name}: horizon, mean and std": partial(fast.predict, rows, return_std=True),
+            f"{name}: horizon, mean and Jacobian": partial(fast.value_and_jacobian, rows),
+        }
     calls["partial_fit of 10 rows"] = lambda: system.partial_fit(train.data[:10], train.target[:10])
     calls["new weights into the compiled predictor"] = lambda: fast.update(system)
     return calls
@@ -177,13 +176,11 @@ def buffered(function: Any, *given: np.ndarray) -> Callable[[], None]:
         buffer.set_arg(i, memoryview(values))
     for i, values in enumerate(results):
         buffer.set_res(i, memoryview(values))
-    kept = buffer, given, results  # the call only points to them
 
-    def run() -> None:
-        assert kept
+    def run(*kept: Any) -> None:
         call()
 
-    return run
+    return partial(run, buffer, given, results)  # the call only points to them
 
 
 def times_of_c(model: Any, row: np.ndarray) -> dict[str, Any]:
@@ -542,22 +539,15 @@ class Checkout:
     quick: bool = field(compare=False)
 
 
-def commit_of(folder: Path) -> str:
-    """Return the commit of a checkout, with "-dirty" if files differ from it."""
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-
-
 def checkout_cells(options: Any) -> list[Checkout]:
     here = Path(__file__).resolve().parents[1]
-    folders = {"this": here, "other": (options.other or here).resolve()}
-    jobs, seeds = (["pendulum"], 1) if options.quick else (list(INDUCING), 4)
-    return [
-        Checkout(job, name, commit_of(folder), seed, 0, folder, options.quick)
-        for job in jobs
-        for seed in range(seeds)
-        for name, folder in folders.items()
-    ]
+    jobs, seeds, cells = (["pendulum"], 1, []) if options.quick else (list(INDUCING), 4, [])
+    for name, folder in {"this": here, "other": (options.other or here).resolve()}.items():
+        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+        commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+        for job in jobs:
+            cells += [Checkout(job, name, commit, seed, 0, folder, options.quick) for seed in range(seeds)]
+    return sorted(cells, key=lambda cell: (jobs.index(cell.job), cell.seed))  # in pairs
 
 
 def run_checkout(cell: Checkout) -> dict[str, Any]:

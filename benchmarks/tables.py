@@ -381,18 +381,14 @@ class Fit:
 def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:
     """Fit a model; return it with its scores."""
     common = {"feature_map": data.feature_map, "normalize_y": data.feature_map is None, "random_state": seed}
-    regressor: Any
-    if model == "exact":
-        regressor = EGPRegressor(**common)
-    else:
+    sparse = model != "exact"
+    regressor: Any = EGPRegressor(**common)
+    if sparse:  # without calibration, as the exact model
         n_inducing: Any = "auto" if model == "auto" else int(model)
-        # The exact model does not calibrate.
         regressor = EVGPRegressor(**common, n_inducing=n_inducing, noise_cv=None)
     seconds, _ = harness.timed(lambda: regressor.fit(data.X, data.y))
     mean, std = regressor.predict(data.X_test, return_std=True)
-    sparse = model != "exact"
     return regressor, {
-        "model": model,
         "m": len(regressor.inducing_points_) if sparse else len(data.X),
         "n_iter": regressor.n_iter_,
         "seconds": round(seconds, 3),
@@ -430,7 +426,7 @@ def run_inducing(cell: Fit) -> dict[str, Any]:
         regressor, row = fitted(data, cell.model, cell.seed)
     with harness.one_thread():
         likelihood = row["lower"] if cell.model == "exact" else likelihood_of(regressor, data)
-    return {"n_rows": len(data.X), **row, "model": cell.model, "likelihood": likelihood}
+    return {"n_rows": len(data.X), **row, "likelihood": likelihood}
 
 
 def tables_of_inducing(rows: pd.DataFrame) -> harness.Tables:

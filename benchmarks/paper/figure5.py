@@ -120,8 +120,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, path: Path) -> pd.DataF
         axes.label_outer()
     harness.legend(figure, ncols=5)
     harness.save_picture(figure, path)
-    x = data.data[:, 0]
-    inside = (GRID[:, 0] >= x.min()) & (GRID[:, 0] <= x.max())
+    inside = (GRID[:, 0] >= data.data.min()) & (GRID[:, 0] <= data.data.max())
     lines = []
     for name, exact in EXACT.items():
         line = {"": name}

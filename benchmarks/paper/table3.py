@@ -136,13 +136,10 @@ def seconds_of(cell: Cell, X: np.ndarray, Y: np.ndarray, points: np.ndarray) -> 
         solver = Adam(BATCH, callback=lambda *_: times.append(time.process_time()), posterior="diagonal")
         EVGPRegressor(inducing_init=points, max_iter=30, random_state=0, **PAPER | {"solver": solver}).fit(X, Y)
         return list(np.diff(times))
-    layers, seconds = (cell.n_units,) * cell.n_layers, []
+    layers = (cell.n_units,) * cell.n_layers
     network = BayesianMLPRegressor(layers, batch_size=NETWORK_BATCH, max_iter=1, n_samples=1, random_state=0)
-    for _ in range(4):
-        start = time.process_time()
-        network.fit(X, Y)
-        seconds.append((time.process_time() - start) / -(-cell.n_rows // NETWORK_BATCH))
-    return seconds[1:]
+    n_steps = -(-cell.n_rows // NETWORK_BATCH)
+    return [harness.timed(lambda: network.fit(X, Y))[0] / n_steps for _ in range(4)][1:]
 
 
 def run(cell: Cell) -> dict[str, Any]:

@@ -216,14 +216,13 @@ def run(python: str, peer: str, sets: Sets, job: dict[str, Any], cell: dict[str,
 def cases() -> list[dict[str, Any]]:
     """Return each kernel with 500 rows and 20 inducing points, and with 60 rows that are all inducing points."""
     made = []
-    for kernel in ("rbf", "matern52"):
-        for n, m in ((500, 20), (60, 60)):
-            rng = np.random.RandomState(m)
-            X, X_test = rng.uniform(-2.0, 2.0, (n, 3)), rng.uniform(-2.0, 2.0, (50, 3))
-            y = np.sin(X).sum(axis=1) + 0.2 * rng.randn(n)
-            points = X if m == n else rng.uniform(-2.0, 2.0, (m, 3))
-            case = {"kernel": kernel, "X": X, "y": y, "X_test": X_test, "inducing_points": points}
-            made.append({**case, "lengthscales": np.array([0.6, 0.9, 1.2]), "signal": 1.7, "noise": 0.05})
+    for kernel, (n, m) in itertools.product(("rbf", "matern52"), ((500, 20), (60, 60))):
+        rng = np.random.RandomState(m)
+        X, X_test = rng.uniform(-2.0, 2.0, (n, 3)), rng.uniform(-2.0, 2.0, (50, 3))
+        y = np.sin(X).sum(axis=1) + 0.2 * rng.randn(n)
+        points = X if m == n else rng.uniform(-2.0, 2.0, (m, 3))
+        case = {"kernel": kernel, "X": X, "y": y, "X_test": X_test, "inducing_points": points}
+        made.append({**case, "lengthscales": np.array([0.6, 0.9, 1.2]), "signal": 1.7, "noise": 0.05})
     return made
 
 
