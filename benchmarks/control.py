@@ -42,7 +42,6 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))  # for
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
 from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.utils import Bunch
 
@@ -58,6 +57,7 @@ from skevgp import CoefPrior, EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
 from skevgp.datasets.plant import Plant
 from skevgp.features import InertiaForceGravity
+from skevgp.metrics import crps
 from skevgp.robots import RigidBody
 from skevgp.solvers import LBFGS
 
@@ -148,26 +148,21 @@ def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     return np.abs(samples - truth).mean(axis=0) - spread
 
 
-def crps_of_normal(truth: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the CRPS of a normal distribution (Gneiting & Raftery 2007)."""
-    z = (truth - mean) / std
-    return std * (z * (2.0 * norm.cdf(z) - 1.0) + 2.0 * norm.pdf(z) - 1.0 / np.sqrt(np.pi))
-
-
 def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) -> dict[str, float]:
     """Return scores after some steps, of states (n, steps, 2 n_joints) with this scatter, positions first."""
     true, mean, std = (values[:, step - 1] / scatter for values in (truth, ahead.mean, ahead.std))
     errors, n_joints = np.abs(true - mean), len(scatter) // 2
     positions = np.sqrt(np.mean(errors[:, :n_joints] ** 2, axis=1))
+    score = np.nan  # of an unstable system
     if "samples" in ahead:
-        crps = crps_of_samples(true, np.moveaxis(ahead.samples[:, :, step - 1], 1, 0) / scatter)
-    else:
-        crps = crps_of_normal(true, mean, std)
+        score = crps_of_samples(true, np.moveaxis(ahead.samples[:, :, step - 1], 1, 0) / scatter).mean()
+    elif np.isfinite(mean).all():
+        score = crps(true, mean, std) / len(scatter)
     return {
         "error_median": np.median(positions),
         "error_p90": np.quantile(positions, 0.9),
         **{f"cr{k}": np.mean(errors <= k * std) for k in (1, 2, 3)},
-        "crps": crps.mean(),
+        "crps": score,
         # 0.674 if standard deviations are calibrated.
         "errors_in_std": np.median(errors / std),
     }
@@ -255,8 +250,8 @@ def rollout_tables(rows: pd.DataFrame) -> harness.Tables:
         last = {"particles' mean: 1": particles.iloc[0], "100": particles.iloc[-1]}
         errors.append({**line, "seeds": own["seed"].nunique(), **texts.rename("after {}".format), **last})
         for method in list(METHODS)[:-1] if model == MAIN else [particles_of(model)]:
-            cr2, crps = (means.loc[method][name] for name in ("cr2", "crps"))
-            columns = {**cr2.map("{:.2f}".format).rename("CR-2: {}".format), **crps.rename("CRPS: {}".format)}
+            cr2, scores = (means.loc[method][name] for name in ("cr2", "crps"))
+            columns = {**cr2.map("{:.2f}".format).rename("CR-2: {}".format), **scores.rename("CRPS: {}".format)}
             bands.append({**line, "particles": method, **columns})
     cells = ["system", "n_inducing", "seed", "steps"]
     for (noise, share), own in rows[rows["model"] == MAIN].groupby(["noise", "share"], observed=True):

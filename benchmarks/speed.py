@@ -253,7 +253,7 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
     }
 
 
-def casadi_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def casadi_tables(rows: pd.DataFrame) -> harness.Tables:
     columns = {"f": "f_us", "J": "j_us", "f and J": "f_and_j_us", "all": "all_us", "f of parameters": "parametric_us"}
     columns |= {"C: f": "c_f_us", "C: mean and J": "c_j_us", "C: all": "c_all_us", "`predict`": "predict_us"}
     once = {"build, ms": "build_ms", "build J, ms": "build_j_ms", "parameters, µs": "parameters_us"}
@@ -387,15 +387,14 @@ def lazy(path: Path, shape: tuple[int, ...]) -> Any:
 
     rows = max(min(CHUNK, shape[0] // 4), 1)
 
+    @dask.delayed
     def piece(first: int) -> np.ndarray:
         return np.array(np.load(path, mmap_mode="r")[first : first + rows])
 
-    return da.concatenate(
-        [
-            da.from_delayed(dask.delayed(piece)(first), (min(rows, shape[0] - first), *shape[1:]), dtype=np.float64)
-            for first in range(0, shape[0], rows)
-        ]
-    )
+    firsts = range(0, shape[0], rows)
+    sizes = [(min(rows, shape[0] - first), *shape[1:]) for first in firsts]
+    pieces = zip(firsts, sizes, strict=True)
+    return da.concatenate([da.from_delayed(piece(first), size, dtype=np.float64) for first, size in pieces])
 
 
 def run_rows(cell: Rows) -> dict[str, Any]:
@@ -410,9 +409,9 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
             client = distributed.Client(cluster)
             X, y = (lazy(path, array.shape) for path, array in zip(paths, arrays, strict=True))
-        solver, n_jobs = Timed(), 2 if cell.engine.startswith("2") else 1
-        options = {"max_iter": cell.max_iter, "noise_cv": None, "n_jobs": n_jobs, "random_state": 0}
-        model = EVGPRegressor(n_inducing=100, solver=solver, **options)
+        solver = Timed()
+        options = {"max_iter": cell.max_iter, "noise_cv": None, "random_state": 0}
+        model = EVGPRegressor(n_inducing=100, solver=solver, n_jobs=2 if cell.engine.startswith("2") else 1, **options)
         with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")
             start = time.perf_counter()

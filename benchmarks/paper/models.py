@@ -58,9 +58,14 @@ class Fit:
     max_iter: int | None
 
 
-SYSTEMS = ("pendulum", "cartpole", "cartpole_damped", "acrobot", "iiwa14")
-# Iterations of L-BFGS, steps of Adam and epochs of the network in a quick run.
-LBFGS_STEPS, ADAM_STEPS, EPOCHS = (300, 200, 200, 50, 10), (2000, 1000, 1000, 100, 2), (400, 200, 200, 100, 3)
+QUICK = {  # iterations of L-BFGS, steps of Adam and epochs of the network in a quick run
+    "pendulum": (300, 2000, 400),
+    "cartpole": (200, 1000, 200),
+    "cartpole_damped": (200, 1000, 200),
+    "acrobot": (50, 100, 100),
+    "iiwa14": (10, 2, 3),
+}
+SYSTEMS = tuple(QUICK)
 # The network learns until rows held back gain nothing.
 UNTIL_FLAT: dict[str, Any] = {"early_stopping": True, "n_iter_no_change": 30, "max_iter": 1000}
 
@@ -99,7 +104,7 @@ def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> E
         arguments = {"kernel_map": AngleEncoder(fit.system)}
     iterations = fit.max_iter
     if iterations is None and fit.size == "quick":
-        iterations = (ADAM_STEPS if fit.setting in ADAM else LBFGS_STEPS)[SYSTEMS.index(fit.system)]
+        iterations = QUICK[fit.system][fit.setting in ADAM]
     return EVGPRegressor(features, n_inducing=n_inducing, max_iter=iterations, random_state=fit.seed, **arguments)
 
 
@@ -109,7 +114,7 @@ def residual_network(fit: Fit, hidden_layer_sizes: tuple[int, int]) -> ResidualR
         hidden_layer_sizes,
         prior_scale=1.0 if fit.setting == "paper" else None,
         random_state=fit.seed,
-        **({"max_iter": EPOCHS[SYSTEMS.index(fit.system)]} if fit.size == "quick" else UNTIL_FLAT),
+        **({"max_iter": QUICK[fit.system][2]} if fit.size == "quick" else UNTIL_FLAT),
     )
     if fit.setting == "skevgp-angles":
         network = make_pipeline(AngleEncoder(fit.system), network)

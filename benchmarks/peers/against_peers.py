@@ -332,7 +332,7 @@ def all_seeds(rows: pd.DataFrame, what: str) -> pd.DataFrame:
     return table.assign(seconds=found["seconds"].median()).reset_index()
 
 
-def tables_of(rows: pd.DataFrame, curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame, curves: pd.DataFrame) -> harness.Tables:
     """Return two tables per data set: its first seed, and means over seeds if there are several."""
     tables = {}
     for name, own in rows.groupby("dataset", sort=False):
