@@ -12,7 +12,8 @@ with their rows shuffled or sorted by a column, and tested on held-out rows.
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,17 +42,8 @@ TABLES = {
 MOST_ROWS, ITERATIONS = 12_000, 100
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows."""
-
-    data: str
-    variant: str
-    noise: str
-    seed: int
-    noise_cv: str
-    size: str
-    folder: Path | None = field(compare=False)
+# One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows.
+Cell = namedtuple("Cell", "data variant noise seed noise_cv size")
 
 
 Part = tuple[np.ndarray, np.ndarray]
@@ -65,14 +57,14 @@ def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
     return train, test, whole.groups[whole.groups < n]
 
 
-def table(cell: Cell) -> tuple[Part, Part]:
+def table(cell: Cell, folder: Path | None) -> tuple[Part, Part]:
     """Return training rows in the order of the variant, and test rows; columns are standardised."""
     rng = np.random.RandomState(cell.seed)
     if cell.data in TABLES:
         rows = rng.permutation(np.column_stack(TABLES[cell.data](cell.seed)))
         test = np.arange(len(rows)) >= 2 * len(rows) // 3
     else:
-        files = (f"{cell.folder}/{cell.data}/{name}.csv.gz" for name in ("data", "test_mask"))
+        files = (f"{folder}/{cell.data}/{name}.csv.gz" for name in ("data", "test_mask"))
         rows, masks = (np.loadtxt(file, delimiter=",") for file in files)
         test = masks[:, cell.seed].astype(bool)
     train, test = rng.permutation(rows[~test])[:MOST_ROWS], rows[test]
@@ -83,7 +75,7 @@ def table(cell: Cell) -> tuple[Part, Part]:
     return (train[:, :-1], train[:, -1]), (test[:, :-1], test[:, -1])
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, folder: Path | None) -> dict[str, Any]:
     """Fit one model and evaluate it on the test rows. ``fit_seconds`` is processor time of one thread."""
     noise_cv = None if cell.noise_cv == "None" else int(cell.noise_cv)
     max_iter = 10 if cell.size == "quick" else ITERATIONS
@@ -95,7 +87,7 @@ def run(cell: Cell) -> dict[str, Any]:
         features, n_inducing = InertiaForceGravity(cell.data), SYSTEMS[cell.data][0]
         model = EVGPRegressor(features, kernel_map=kernel_map, n_inducing=n_inducing, **settings)
     else:
-        train, (X, y) = table(cell)
+        train, (X, y) = table(cell, folder)
         model = EVGPRegressor(n_inducing=256 if len(train[0]) > 10_000 else 100, **settings)
     seconds, caught = harness.timed(lambda: model.fit(*train, groups=groups))
     mean, std = model.predict(X, return_std=True)
@@ -164,12 +156,12 @@ def main() -> None:
     settings = [*itertools.product(systems, ("", "angles"), NOISES)]
     settings += [(name, variant, "") for name in tables for variant in variants(name, options.folder)]
     cells = [
-        Cell(data, variant, noise, seed, noise_cv, options.size, options.folder)
+        Cell(data, variant, noise, seed, noise_cv, options.size)
         for seed in options.seeds
         for data, variant, noise in settings
         for noise_cv in ("None", "5")
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run, folder=options.folder), output, options.jobs)
     rows = harness.frame(output, size=options.size)
     harness.write_page("Standard deviations that hold", tables_of(rows), output, n_failures)
 

@@ -32,8 +32,8 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from collections import namedtuple
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -90,18 +90,8 @@ METHODS: dict[str, dict[str, str]] = {
 }
 
 
-@dataclass(frozen=True)
-class Rollout:
-    """One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories."""
-
-    system: str
-    model: str
-    n_inducing: int
-    noise: str
-    share: str
-    seed: int
-    size: str
-    max_iter: int = field(compare=False)
+# One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories.
+Rollout = namedtuple("Rollout", "system model n_inducing noise share seed size")
 
 
 class Independent(RegressorMixin, BaseEstimator):
@@ -171,7 +161,8 @@ def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) ->
 def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
     """Fit one model and roll it out by all methods. ``fit_seconds`` is processor time of one thread."""
     train, test = data(cell)
-    model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, cell.max_iter))
+    max_iter = 20 if cell.size == "quick" else ITERATIONS
+    model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, max_iter))
     if cell.n_inducing:
         model.set_params(**{"regressor__n_inducing" if cell.model == "RES-VGP" else "n_inducing": cell.n_inducing})
     seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups_of(model, train)))
@@ -181,7 +172,7 @@ def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
         "n_iter": fitted.n_iter_,
         "noise_std": np.median(np.sqrt(fitted.noise_variance_) / train.scatter),
         "fit_seconds": seconds,
-        "max_iter": cell.max_iter,
+        "max_iter": max_iter,
     }
     for method in METHODS if cell.model == MAIN else (particles_of(cell.model), "mean"):
         ahead, taken = rolled_out(model, method, test, cell)
@@ -221,9 +212,8 @@ def sizes(system: str, model: str) -> tuple[int, ...]:
 def rollout_cells(options: Any) -> list[Rollout]:
     """Return the cells. The largest models come last, and other seeds after all systems."""
     systems = ("pendulum",) if options.quick else options.systems or DEFAULT_SYSTEMS
-    max_iter = 20 if options.quick else ITERATIONS
     return [
-        Rollout(system, model, m, noise, share, seed, options.size, max_iter)
+        Rollout(system, model, m, noise, share, seed, options.size)
         for seed, model, number in itertools.product(options.seeds, options.models or ROLLOUT_MODELS, (0, 1))
         for system in systems
         for m in sizes(system, model)[number : number + 1]
@@ -279,17 +269,8 @@ TRUTHS = 3  # number of seeds, which differ in the first plans only
 SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
 
 
-@dataclass(frozen=True)
-class SwingUp:
-    """One run. The truth has no data, and no noise."""
-
-    system: str
-    model: str
-    seconds: float
-    noise: float
-    length: int
-    seed: int
-    size: str
+# One run. The truth has no data, and no noise.
+SwingUp = namedtuple("SwingUp", "system model seconds noise length seed size")
 
 
 class Truth:
@@ -399,13 +380,8 @@ CONTROLLERS = {
 CASES = ("waves", "slow waves", "moves")
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """One arm, with its payload in kg."""
-
-    payload: float
-    seed: int
-    size: str
+# One arm, with its payload in kg.
+Tracking = namedtuple("Tracking", "payload seed size")
 
 
 # Size of the log and of models, and numbers of references, moves and timed steps.

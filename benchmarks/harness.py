@@ -8,7 +8,6 @@ hand; `write_page` replaces only the tables below its ``<!-- table: NAME -->`` l
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import platform
 import re
 import signal
@@ -139,24 +138,19 @@ def append(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     whole.replace(path)
 
 
-def key(cell: Any) -> dict[str, Any]:
-    """Return the fields by which cells are compared, which are columns of the CSV."""
-    return {field.name: getattr(cell, field.name) for field in dataclasses.fields(cell) if field.compare}
-
-
 def run_missing(
     cells: Sequence[Any], run: Callable[[Any], Any], output: Path, jobs: int = 1, fresh: bool = False
 ) -> int:
     """Run the cells that have no row in the CSV, and write each result as it arrives; return the number of failures.
 
-    ``cells`` are dataclasses, whose fields that are compared are columns of the CSV. ``run``, at the top level of a
-    module, returns the other columns of a cell's row, or a list of them for several rows. Cells run in so many
-    processes; a ``fresh`` one for each cell is for measurements of memory.
+    ``cells`` are named tuples, whose fields are columns of the CSV. ``run``, a function at the top level of a module,
+    returns the other columns of a cell's row, or a list of them for several rows. Cells run in so many processes; a
+    ``fresh`` one for each cell is for measurements of memory.
     """
     pyplot()  # fail before the fits if matplotlib is missing
     cells = list(dict.fromkeys(cells))
-    done = finished(output, list(key(cells[0]))) if cells else set()
-    missing = [cell for cell in cells if tuple(map(str, key(cell).values())) not in done]
+    done = finished(output, cells[0]._fields) if cells else set()
+    missing = [cell for cell in cells if tuple(map(str, cell)) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:
         return 0
@@ -170,8 +164,8 @@ def run_missing(
         pending = {pool.submit(run, cell): cell for cell in missing}
         try:
             for count, future in enumerate(as_completed(pending), start=1):
-                own = key(pending[future])
-                said = f"[{count}/{len(missing)}] {' '.join(map(str, own.values()))}"
+                cell = pending[future]
+                said = f"[{count}/{len(missing)}] {' '.join(map(str, cell))}"
                 try:
                     result = future.result()
                 except Exception as problem:  # the other cells go on
@@ -179,7 +173,7 @@ def run_missing(
                     said += f": failed: {type(problem).__name__}: {problem}"
                 else:
                     found = result if isinstance(result, list) else [result]
-                    append([{**own, **row, **provenance()} for row in found], output)
+                    append([{**cell._asdict(), **row, **provenance()} for row in found], output)
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)

@@ -26,9 +26,9 @@ from __future__ import annotations
 
 import re
 import tempfile
+from collections import namedtuple
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -102,27 +102,12 @@ MODELS = (
 )
 
 
-@dataclass(frozen=True)
-class Real:
-    """One fit to a real arm."""
-
-    robot: str
-    split: str
-    model: str
-    size: str
-    folder: Path = field(compare=False)
+# One fit to a real arm.
+Real = namedtuple("Real", "robot split model size")
 
 
-@dataclass(frozen=True)
-class Question:
-    """The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+"."""
-
-    robot: str
-    trained: str
-    loaded: str
-    gain_scale: float
-    size: str
-    folder: Path = field(compare=False)
+# The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+".
+Question = namedtuple("Question", "robot trained loaded gain_scale size")
 
 
 def paths_of(robot: str, folder: Path) -> dict[str, Path]:
@@ -256,17 +241,17 @@ def arm_of(robot: str, quick: bool, gain_scale: float = 0.0) -> InverseDynamics:
     return InverseDynamics(robot, gain_scale=gain_scale, random_state=0, **short)
 
 
-def run_real(cell: Real) -> list[dict[str, Any]]:
+def run_real(cell: Real, folder: Path) -> list[dict[str, Any]]:
     """Fit a model and evaluate each joint on each test file. ``fit_seconds`` is processor time of one thread."""
-    robot = urdf_of(cell.robot, cell.folder)
-    train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], cell.folder, cell.size)
+    robot = urdf_of(cell.robot, folder)
+    train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], folder, cell.size)
     model, has_band, by_groups = model_of(cell.model, robot, cell.size == "quick")
     reference = LinearTorques(robot).fit(train.data, train.target)
     groups = {"groups": train.groups} if by_groups else {}
     seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups))
     rows = []
-    for name in tests_of(cell.robot, cell.split, cell.folder):
-        test = rows_of(cell.robot, [name], cell.folder, cell.size)
+    for name in tests_of(cell.robot, cell.split, folder):
+        test = rows_of(cell.robot, [name], folder, cell.size)
         base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
         mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
         for joint, least in enumerate(base):
@@ -286,14 +271,14 @@ def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dic
     return {"nmse": np.mean((mean - truth) ** 2) / truth.var(), **found}
 
 
-def ask(question: Question) -> list[dict[str, Any]]:
+def ask(question: Question, folder: Path) -> list[dict[str, Any]]:
     """Return what was identified, with standard deviations."""
-    train = rows_of(question.robot, question.trained.split("+"), question.folder, question.size)
-    arm = arm_of(urdf_of(question.robot, question.folder), question.size == "quick", question.gain_scale)
+    train = rows_of(question.robot, question.trained.split("+"), folder, question.size)
+    arm = arm_of(urdf_of(question.robot, folder), question.size == "quick", question.gain_scale)
     with harness.one_thread():
         arm.fit(train.data, train.target, groups=train.groups)
         if question.loaded:
-            loaded = rows_of(question.robot, [question.loaded], question.folder, question.size)
+            loaded = rows_of(question.robot, [question.loaded], folder, question.size)
             load = arm.estimate_payload(loaded.data, loaded.target)
             names = ["mass", *(f"com {axis}" for axis in "xyz")]
             values, stds = np.r_[load.mass, load.com], np.r_[load.mass_std, load.com_std]
@@ -311,8 +296,8 @@ def questions_of(folder: Path, size: str) -> list[Question]:
         if {loaded, empty} <= set(moving("ur10e", folder)):
             more = splits.get("three", ()) if size == "full" else ()
             for trained in dict.fromkeys([(empty,), (empty, *more)]):
-                questions += [Question("ur10e", "+".join(trained), loaded, scale, size, folder) for scale in (0.0, 0.1)]
-    return questions + [Question("ur10e", "+".join(names), "", 0.0, size, folder) for names in splits.values()]
+                questions += [Question("ur10e", "+".join(trained), loaded, scale, size) for scale in (0.0, 0.1)]
+    return questions + [Question("ur10e", "+".join(names), "", 0.0, size) for names in splits.values()]
 
 
 def geometric(values: pd.Series) -> float:
@@ -434,7 +419,7 @@ def real(options: Any, output: Path) -> tuple[harness.Tables, int]:
         raise SystemExit("--data is needed: a folder with the folders ur10e and ur10, or one of them")
     folder = options.data.resolve()
     cells = [
-        Real(robot, split, model, options.size, folder)
+        Real(robot, split, model, options.size)
         for robot in SPLITS
         for split in splits_of(robot, folder, options.size)
         if tests_of(robot, split, folder)
@@ -442,9 +427,10 @@ def real(options: Any, output: Path) -> tuple[harness.Tables, int]:
     ]
     if not cells:
         raise SystemExit(f"{options.data} has no logs of {' or '.join(SPLITS)}")
-    n_failures = harness.run_missing(cells, run_real, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run_real, folder=folder), output, options.jobs)
     second = output.with_name(f"{output.stem}_parameters.csv")
-    n_failures += harness.run_missing(questions_of(folder, options.size), ask, second, options.jobs)
+    questions = questions_of(folder, options.size)
+    n_failures += harness.run_missing(questions, partial(ask, folder=folder), second, options.jobs)
     rows, found = (harness.frame(path, size=options.size) for path in (output, second))
     plot_real(rows, output.with_suffix(".png"))
     return real_tables(rows, found), n_failures
@@ -462,13 +448,8 @@ STICTION = RigidBodyRegressor().stiction_velocity
 TOLD = 0.25  # a share of the prior's variance
 
 
-@dataclass(frozen=True)
-class Simulated:
-    """One simulated arm, and the cutoff of the filter."""
-
-    cutoff: str
-    seed: int
-    size: str
+# One simulated arm, and the cutoff of the filter.
+Simulated = namedtuple("Simulated", "cutoff seed size")
 
 
 def trajectory(rng: np.random.Generator, n_joints: int, size: str) -> np.ndarray:

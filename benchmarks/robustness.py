@@ -13,7 +13,7 @@ from __future__ import annotations
 import time
 import traceback
 import warnings
-from dataclasses import dataclass
+from collections import namedtuple
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -29,15 +29,8 @@ from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForce, InertiaForceGravity
 from skevgp.solvers import LBFGS
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit. Of the part "nasty" the seed is also that of the data."""
-
-    part: str
-    case: str
-    variant: str
-    seed: int
+# One fit. Of the part "nasty" the seed is also that of the data.
+Cell = namedtuple("Cell", "part case variant seed")
 
 
 class Data(NamedTuple):

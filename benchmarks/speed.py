@@ -31,6 +31,7 @@ begin on samples of the rows.)
 from __future__ import annotations
 
 import ctypes
+import itertools
 import json
 import os
 import shutil
@@ -39,8 +40,8 @@ import sys
 import tempfile
 import time
 import warnings
+from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -67,22 +68,14 @@ ONE_THREAD |= {f"TF_NUM_{name}_THREADS": "1" for name in ("INTEROP", "INTRAOP")}
 OTHERS = {"scikit-learn": "scikit-learn GPR", "GPflow": "GPflow SGPR", "GPyTorch": "GPyTorch SGPR"}
 
 
-@dataclass(frozen=True)
-class Latency:
-    """A library in a round."""
-
-    library: str
-    round: int
-    size: str
-    python: str = field(compare=False)
+# A library in a round.
+Latency = namedtuple("Latency", "library round size")
 
 
 def latency_cells(options: Any) -> list[Latency]:
-    pythons = {"skevgp": sys.executable, "scikit-learn": sys.executable}
-    if options.peer_python:
-        pythons |= dict.fromkeys(("GPflow", "GPyTorch"), options.peer_python)
+    libraries = ["skevgp", "scikit-learn", *(["GPflow", "GPyTorch"] if options.peer_python else [])]
     rounds = range(1 if options.quick else 3)
-    return [Latency(library, turn, options.size, python) for turn in rounds for library, python in pythons.items()]
+    return [Latency(library, turn, options.size) for turn in rounds for library in libraries]
 
 
 def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
@@ -119,7 +112,7 @@ def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
     return calls
 
 
-def run_latency(cell: Latency) -> list[dict[str, Any]]:
+def run_latency(cell: Latency, options: Any) -> list[dict[str, Any]]:
     """Return a row per call."""
     rng, quick = np.random.RandomState(0), cell.size == "quick"
     X = rng.uniform(-2.0, 2.0, (2000, 6))
@@ -130,7 +123,8 @@ def run_latency(cell: Latency) -> list[dict[str, Any]]:
         with harness.one_thread():
             found = {name: microseconds(call, given["seconds"]) for name, call in calls_of_skevgp(given).items()}
     else:
-        said = work(cell.python, OTHERS[cell.library], given, **ONE_THREAD)
+        python = sys.executable if cell.library == "scikit-learn" else options.peer_python
+        said = work(python, OTHERS[cell.library], given, **ONE_THREAD)
         found = dict(zip(said.calls, said.microseconds, strict=True))
     return [{"call": name, "microseconds": value} for name, value in found.items()]
 
@@ -144,12 +138,8 @@ def latency_tables(rows: pd.DataFrame) -> harness.Tables:
 # --- casadi --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Casadi:
-    """A model of the cartpole."""
-
-    features: str
-    m: int
+# A model of the cartpole.
+Casadi = namedtuple("Casadi", "features m")
 
 
 def casadi_cells(options: Any) -> list[Casadi]:
@@ -210,7 +200,7 @@ def times_of_c(model: Any, row: np.ndarray) -> dict[str, Any]:
     return dict(zip(names, [1e3 * (written - start), compiling, *times], strict=True))
 
 
-def run_casadi(cell: Casadi) -> dict[str, Any]:
+def run_casadi(cell: Casadi, options: Any) -> dict[str, Any]:
     """Return times, and the largest difference from `predict`."""
     import casadi as ca
 
@@ -279,17 +269,8 @@ SIZES = {  # sweep -> (name, rows, inducing points, columns, outputs)
 }
 
 
-@dataclass(frozen=True)
-class Evaluation:
-    """A size on some cores."""
-
-    sweep: str
-    name: str
-    n: int
-    m: int
-    d: int
-    outputs: int
-    cores: int
+# A size on some cores.
+Evaluation = namedtuple("Evaluation", "sweep name n m d outputs cores")
 
 
 def evaluation_cells(options: Any) -> list[Evaluation]:
@@ -298,7 +279,7 @@ def evaluation_cells(options: Any) -> list[Evaluation]:
     return [Evaluation(sweep, *size, own) for sweep, own_sizes in sizes.items() for size in own_sizes for own in cores]
 
 
-def run_evaluation(cell: Evaluation) -> dict[str, Any]:
+def run_evaluation(cell: Evaluation, options: Any) -> dict[str, Any]:
     """Return medians and fastest of evaluation and products, which alternate in four rounds."""
     rng = np.random.RandomState(0)
     X = rng.randn(cell.n, cell.d)
@@ -353,13 +334,8 @@ class Timed(LBFGS):
         return super().minimise(timed, *others, **options)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """A fit of a few iterations."""
-
-    n_rows: int
-    engine: str
-    max_iter: int = 8
+# A fit of a few iterations.
+Rows = namedtuple("Rows", "n_rows engine max_iter", defaults=[8])
 
 
 def rows_cells(options: Any) -> list[Rows]:
@@ -397,7 +373,7 @@ def lazy(path: Path, shape: tuple[int, ...]) -> Any:
     return da.concatenate([da.from_delayed(piece(first), size, dtype=np.float64) for first, size in pieces])
 
 
-def run_rows(cell: Rows) -> dict[str, Any]:
+def run_rows(cell: Rows, options: Any) -> dict[str, Any]:
     """Fit in this process."""
     with tempfile.TemporaryDirectory() as folder:
         paths = make_files(Path(folder), cell.n_rows)
@@ -448,12 +424,8 @@ EPOCHS = {"adam 10": 10, "adam 40": 40, "adam 120": 120}
 FITS = ("default", *EPOCHS, "reference")
 
 
-@dataclass(frozen=True)
-class Million:
-    """A fit to its end."""
-
-    n_rows: int
-    fit: str
+# A fit to its end.
+Million = namedtuple("Million", "n_rows fit")
 
 
 def million_cells(options: Any) -> list[Million]:
@@ -461,7 +433,7 @@ def million_cells(options: Any) -> list[Million]:
     return [Million(5_000 if options.quick else 1_000_000, fit) for fit in fits]
 
 
-def run_million(cell: Million) -> dict[str, Any]:
+def run_million(cell: Million, options: Any) -> dict[str, Any]:
     """Fit in this process, with two threads and the noise where the bound is highest."""
     with tempfile.TemporaryDirectory() as folder:
         rows = [np.load(path, mmap_mode="r") for path in make_files(Path(folder), cell.n_rows + 10_000)]
@@ -525,36 +497,30 @@ print(json.dumps(dict(seconds=seconds, cpu_seconds=cpu_seconds, n_iter=int(model
 """
 
 
-@dataclass(frozen=True)
-class Checkout:
-    """A fit by this checkout or the other one."""
+# A fit by this checkout or the other one.
+Checkout = namedtuple("Checkout", "job checkout commit seed repeat")
 
-    job: str
-    checkout: str
-    commit: str
-    seed: int
-    repeat: int
-    folder: Path = field(compare=False)
-    quick: bool = field(compare=False)
+
+def folders(options: Any) -> dict[str, Path]:
+    here = Path(__file__).resolve().parents[1]
+    return {"this": here, "other": (options.other or here).resolve()}
 
 
 def checkout_cells(options: Any) -> list[Checkout]:
-    here = Path(__file__).resolve().parents[1]
-    jobs, seeds, cells = (["pendulum"], 1, []) if options.quick else (list(INDUCING), 4, [])
-    for name, folder in {"this": here, "other": (options.other or here).resolve()}.items():
+    jobs, seeds, commits = ["pendulum"] if options.quick else list(INDUCING), range(1 if options.quick else 4), {}
+    for name, folder in folders(options).items():
         command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
-        commit = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
-        for job in jobs:
-            cells += [Checkout(job, name, commit, seed, 0, folder, options.quick) for seed in range(seeds)]
-    return sorted(cells, key=lambda cell: (jobs.index(cell.job), cell.seed))  # in pairs
+        commits[name] = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    runs = itertools.product(jobs, seeds, commits)  # in pairs
+    return [Checkout(job, name, commits[name], seed, 0) for job, seed, name in runs]
 
 
-def run_checkout(cell: Checkout) -> dict[str, Any]:
+def run_checkout(cell: Checkout, options: Any) -> dict[str, Any]:
     """Fit in a process that imports skevgp from the folder."""
-    job = json.dumps([cell.job, INDUCING[cell.job], 3 if cell.quick else None, cell.seed])
-    environment = os.environ | {"PYTHONPATH": str(cell.folder)}
-    options = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
-    return json.loads(subprocess.run([sys.executable, "-c", FIT, job], **options).stdout.splitlines()[-1])
+    job = json.dumps([cell.job, INDUCING[cell.job], 3 if options.quick else None, cell.seed])
+    environment = os.environ | {"PYTHONPATH": str(folders(options)[cell.checkout])}
+    told = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
+    return json.loads(subprocess.run([sys.executable, "-c", FIT, job], **told).stdout.splitlines()[-1])
 
 
 def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
@@ -599,7 +565,7 @@ def main() -> None:
     options = harness.parse(parser)
     name, cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, name)
-    n_failures = harness.run_missing(cells(options), run, output, fresh=True)
+    n_failures = harness.run_missing(cells(options), partial(run, options=options), output, fresh=True)
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 
 

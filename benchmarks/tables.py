@@ -23,8 +23,8 @@ from __future__ import annotations
 
 import re
 import time
+from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -212,12 +212,7 @@ MODEL_SETS: dict[str, Callable[[int], Data]] = {
 # --- other models --------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Drawing:
-    """All models of a drawing of a set."""
-
-    name: str
-    seed: int
+Drawing = namedtuple("Drawing", "name seed")
 
 
 class Predicted(NamedTuple):
@@ -369,13 +364,8 @@ def guide(page: str, rows: pd.DataFrame) -> str:
 FITS = ("exact", "100", "auto", "grid")
 
 
-@dataclass(frozen=True)
-class Fit:
-    """A model on a drawing of a set."""
-
-    name: str
-    seed: int
-    model: str
+# A model on a drawing of a set.
+Fit = namedtuple("Fit", "name seed model")
 
 
 def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:

@@ -13,7 +13,8 @@ picture is of seed 0.
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -49,21 +50,14 @@ FAR = 9.0  # three beyond the last observation
 SIZES = {"full": (5, 10), "quick": (0, 3)}  # restarts and folds
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One model on one data set."""
-
-    data: str
-    model: str
-    seed: int
-    size: str
-    data_home: Path | None = field(compare=False)
+# One model on one data set.
+Cell = namedtuple("Cell", "data model seed size")
 
 
-def load(cell: Cell) -> Bunch:
+def load(cell: Cell, data_home: Path | None) -> Bunch:
     if cell.data == "toy":
         return make_toy(random_state=cell.seed)
-    return fetch_snelson(cell.data_home, download_if_missing=False)
+    return fetch_snelson(data_home, download_if_missing=False)
 
 
 def build(cell: Cell) -> RegressorMixin:
@@ -77,9 +71,9 @@ def build(cell: Cell) -> RegressorMixin:
     return EVGPRegressor(features, n_inducing=10, solver=LBFGS(n_restarts), noise_cv=None, random_state=seed)
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, data_home: Path | None) -> dict[str, Any]:
     """Fit a model to all rows, and to all rows without one fold."""
-    data, model = load(cell), build(cell)
+    data, model = load(cell, data_home), build(cell)
     seconds, caught = harness.timed(lambda: model.fit(data.data, data.target))
     held_out = np.empty((2, len(data.target)))
     with harness.one_thread():
@@ -162,16 +156,16 @@ def main() -> None:
         fetch_snelson(options.data_home, n_retries=1)
     output = harness.output_path(options, "toy")
     cells = [
-        Cell(source, name, seed, options.size, options.data_home)
+        Cell(source, name, seed, options.size)
         for source in options.systems
         for seed in options.seeds
         for name in TITLES
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run, data_home=options.data_home), output, options.jobs)
     tables = {}
     for source in options.systems:
         first = [cell for cell in cells if (cell.data, cell.seed) == (source, 0)]
-        rows = load(first[0])
+        rows = load(first[0], options.data_home)
         with harness.one_thread():
             models = {cell.model: build(cell).fit(rows.data, rows.target) for cell in first}
         stem = output.stem if source == options.systems[0] else f"{output.stem}_{source}"

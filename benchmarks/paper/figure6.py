@@ -16,8 +16,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections import namedtuple
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -43,17 +43,7 @@ NOMINAL = "EVGP-IFG, nominal"
 COLOURS = dict(zip([*MODELS, NOMINAL], np.array(harness.PALETTE)[[4, 5, 2, 1, 0, 3]], strict=True))
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    setting: str
-    n_trajectories: int
-    seed: int
-    size: str
-    max_iter: int | None = field(compare=False)
+Cell = namedtuple("Cell", "system model setting n_trajectories seed size")
 
 
 @lru_cache(maxsize=2)
@@ -62,12 +52,12 @@ def data(system: str, random_state: int, size: str) -> Bunch:
     return make_dynamics(system, QUICK_TRAJECTORIES if size == "quick" else None, random_state=random_state)
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, max_iter: int | None) -> dict[str, Any]:
     """Fit one model to the first trajectories of a run."""
     whole, test = (data(cell.system, state, cell.size) for state in (cell.seed, TEST_STATE))
     rows = whole.groups < cell.n_trajectories
     train = Bunch(data=whole.data[rows], target=whole.target[rows], groups=whole.groups[rows])
-    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
+    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter)
     return fitted_row(fit, train, test, n_rows=len(train.data))
 
 
@@ -145,7 +135,7 @@ def main() -> None:
     options = harness.parse(parser)
     output = harness.output_path(options, "learning_curves")
     cells = [
-        Cell(system, model, setting, n_trajectories, seed, options.size, options.max_iter)
+        Cell(system, model, setting, n_trajectories, seed, options.size)
         for system in options.systems
         for seed, n_trajectories, model, setting in itertools.product(
             options.seeds,
@@ -155,7 +145,7 @@ def main() -> None:
         )
         if has(system, model, setting) and (setting != "skevgp-nominal" or model == "EVGP-IFG")
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
     rows = named(harness.frame(output, size=options.size))
     for setting, own in rows.groupby("setting"):
         plot(own, output.with_name(f"{output.stem}{'' if setting == 'skevgp' else f'_{setting}'}.png"))

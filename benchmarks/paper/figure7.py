@@ -17,7 +17,8 @@ from __future__ import annotations
 import itertools
 import re
 import sys
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,23 +41,14 @@ SETTINGS = {
 MODELS = ("EVGP-IF", "EVGP-IFG")
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    setting: str
-    seed: int
-    size: str
-    max_iter: int | None = field(compare=False)
+Cell = namedtuple("Cell", "system model setting seed size")
 
 
-def run(cell: Cell) -> list[dict[str, Any]]:
+def run(cell: Cell, max_iter: int | None) -> list[dict[str, Any]]:
     """Fit, and return a row per weight."""
     n_trajectories = QUICK_TRAJECTORIES if cell.size == "quick" else None
     train = make_dynamics(cell.system, n_trajectories, random_state=cell.seed)
-    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter))
+    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter))
     seconds, _ = harness.timed(lambda: regressor.fit(train.data, train.target, groups=train.groups))
     mean = regressor.predict(train.data)
     H = regressor.feature_map_.transform(train.data)
@@ -169,12 +161,12 @@ def main() -> None:
     options = harness.parse(parser)
     output = harness.output_path(options, "beta")
     cells = [
-        Cell(system, model, setting, seed, options.size, options.max_iter)
+        Cell(system, model, setting, seed, options.size)
         for system, seed, setting, model in itertools.product(
             options.systems, options.seeds, options.settings, options.models
         )
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
     rows, tables = harness.frame(output, size=options.size), {}
     for system, own in rows.groupby("system"):
         tables[system] = table_of(own)

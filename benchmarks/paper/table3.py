@@ -15,8 +15,9 @@ from __future__ import annotations
 import pickle
 import sys
 import time
+from collections import namedtuple
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -58,17 +59,8 @@ LABELS = {
 }
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One measurement. Sizes that a model does not have are 0."""
-
-    what: str
-    setting: str
-    n_rows: int
-    n_inducing: int
-    n_outputs: int
-    n_layers: int
-    n_units: int
+# One measurement. Sizes that a model does not have are 0.
+Cell = namedtuple("Cell", "what setting n_rows n_inducing n_outputs n_layers n_units")
 
 
 @dataclass(frozen=True)
@@ -90,7 +82,7 @@ class Curve:
         n_rows = 2000 if network else FEW if self.few else 4800
         cell = Cell(self.what, self.setting, n_rows, *((0, 4, 2, 100) if network else (100, 4, 0, 0)))
         for size in self.sizes or SIZES[self.varied]:
-            yield replace(cell, **{self.varied: size})
+            yield cell._replace(**{self.varied: size})
 
     @property
     def name(self) -> str:
@@ -166,7 +158,7 @@ def run(cell: Cell) -> dict[str, Any]:
 
 def points_of(curve: Curve, data: pd.DataFrame) -> pd.Series:
     """Return the measurements of a curve by size."""
-    wanted = pd.DataFrame([asdict(cell) for cell in curve.cells()])
+    wanted = pd.DataFrame(list(curve.cells()))
     found = wanted.merge(data.assign(setting=data["setting"].astype(object).fillna("")), how="inner")
     return found.set_index(curve.varied)[curve.value].astype(float)
 

@@ -24,8 +24,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections import namedtuple
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -56,18 +56,8 @@ COLOURS = dict(zip(SETTINGS, np.array(harness.PALETTE)[[4, 1, 5, 0, 2, 3]], stri
 N_SEEDS = 4
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One fit. ``noise`` is the share of each training target's standard deviation."""
-
-    system: str
-    model: str
-    setting: str
-    seed: int
-    angles: str
-    noise: float
-    size: str
-    max_iter: int | None = field(compare=False)
+# One fit. ``noise`` is the share of each training target's standard deviation.
+Cell = namedtuple("Cell", "system model setting seed angles noise size")
 
 
 @lru_cache(maxsize=1)
@@ -82,10 +72,10 @@ def data(system: str, seed: int, noise: float, size: str, angles: str) -> tuple[
     return train, test
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, max_iter: int | None) -> dict[str, Any]:
     """Fit one model on one training set and evaluate it on one test set."""
     train, test = data(cell.system, cell.seed, cell.noise, cell.size, cell.angles)
-    return fitted_row(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter), train, test)
+    return fitted_row(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter), train, test)
 
 
 def sorted_rows(rows: pd.DataFrame) -> pd.DataFrame:
@@ -243,13 +233,13 @@ def main() -> None:
     noise = options.noise
     output = harness.output_path(options, f"results_table{f'_noise{noise:g}' if noise else ''}")
     cells = [
-        Cell(system, model, setting, seed, angles, noise, options.size, options.max_iter)
+        Cell(system, model, setting, seed, angles, noise, options.size)
         for system, seed, angles, model, setting in itertools.product(
             options.systems, options.seeds, options.angles, options.models, options.settings
         )
         if has(system, model, setting, angles)
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs)
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
     rows = harness.frame(output, size=options.size, noise=noise)
     (plot_reliability if noise else plot_errors)(rows, output.with_suffix(".png"))
     harness.write_page("The results: Table 4 of the paper, and ours", tables_of(rows), output, n_failures)

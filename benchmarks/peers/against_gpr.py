@@ -20,8 +20,8 @@ from __future__ import annotations
 import itertools
 import sys
 import time
+from collections import namedtuple
 from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -65,14 +65,7 @@ MEASURES = {
 }
 
 
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    n_rows: int
-    seed: int
+Cell = namedtuple("Cell", "system model n_rows seed")
 
 
 def regressor_of(cell: Cell, X: np.ndarray) -> RegressorMixin:
