@@ -41,7 +41,6 @@ TABLES = {
 # Largest number of training rows.
 MOST_ROWS, ITERATIONS = 12_000, 100
 
-
 # One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows.
 Cell = namedtuple("Cell", "data variant noise seed noise_cv size")
 
@@ -125,7 +124,6 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
     names = ["variant", "noise", "noise_cv"]
     blank = rows[names].astype(object).where(rows[names].notna(), "").replace("None", "")
     rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)

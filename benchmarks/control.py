@@ -49,7 +49,7 @@ import computed_torque as arms
 import harness
 import mpc
 from computed_torque import DT, ComputedTorque
-from harness import figure_of
+from harness import figure_of, text
 from paper.models import SIZES as PAPERS_SIZES
 from paper.models import SYSTEMS as PAPERS_SYSTEMS
 from paper.models import Fit, build, fitted_part, groups_of
@@ -88,7 +88,6 @@ METHODS: dict[str, dict[str, str]] = {
     "linearized": {"method": "linearized"},
     "mean": {"method": "mean"},
 }
-
 
 # One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories.
 Rollout = namedtuple("Rollout", "system model n_inducing noise share seed size")
@@ -203,7 +202,6 @@ def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bun
 
 
 def sizes(system: str, model: str) -> tuple[int, ...]:
-    """Return the numbers of inducing points."""
     if model == "RES-DBNN":
         return (0,)
     return ROLLOUT_SYSTEMS[system] if model.startswith("EVGP") else (PAPERS_SIZES[model][PAPERS_SYSTEMS.index(system)],)
@@ -267,7 +265,6 @@ LENGTHS = (10, 25)
 SYSTEMS = ("cartpole", "pendulum")
 TRUTHS = 3  # number of seeds, which differ in the first plans only
 SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
-
 
 # One run. The truth has no data, and no noise.
 SwingUp = namedtuple("SwingUp", "system model seconds noise length seed size")
@@ -379,7 +376,6 @@ CONTROLLERS = {
 }
 CASES = ("waves", "slow waves", "moves")
 
-
 # One arm, with its payload in kg.
 Tracking = namedtuple("Tracking", "payload seed size")
 
@@ -404,7 +400,6 @@ class WithoutPhysics:
 
 
 def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Bunch, seed: int) -> dict[str, Any]:
-    """Fit all models to the same log."""
     X, y, groups = log
     options = {"max_iter": size.max_iter, "random_state": seed}
     return {
@@ -548,7 +543,7 @@ def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
         "ratio": ahead.div(ahead[NOMINAL], axis=0).median().map("{:.2f}".format),
         "batch, per row": values["batch"].groupby("model").median(),
         "in the loop": loop.median(),
-        "ratio in the loop": ratios.map("{:.2f}".format).where(ratios.notna(), ""),
+        "ratio in the loop": text(ratios, 2),
     }
     costs = pd.DataFrame(columns).loc[list(CONTROLLERS)]
     found = {"errors": table, "errors by load": loads, "steps": costs}

@@ -83,7 +83,6 @@ def outcomes(model: str) -> dict[str, str]:
 
 
 def main() -> None:
-    """Run them, and say what came of it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--model", choices=IN_ITS_PLACE, default="skevgp")
     model = parser.parse_args().model

@@ -193,6 +193,11 @@ def figure_of(value: Any) -> str:
     return f"{value:#.3g}".rstrip(".") if np.isfinite(value) else ""
 
 
+def text(values: pd.Series, digits: int) -> pd.Series:
+    """Write numbers with so many decimals; nothing for NaN."""
+    return values.map(f"{{:.{digits}f}}".format).where(values.notna(), "")
+
+
 def best(values: pd.Series) -> pd.Series:
     """Write numbers, the least of them in bold."""
     return values.map(figure_of).where(values != values.min(), values.map(lambda value: f"**{figure_of(value)}**"))

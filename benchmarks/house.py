@@ -100,7 +100,6 @@ def lines_of_folders() -> pd.DataFrame:
 
 
 def main() -> None:
-    """Measure and write the CSV."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--list", action="store_true")
     options = parser.parse_args()

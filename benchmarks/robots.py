@@ -27,7 +27,7 @@ from __future__ import annotations
 import re
 import tempfile
 from collections import namedtuple
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
@@ -40,7 +40,7 @@ from sklearn.multioutput import MultiOutputRegressor
 from sklearn.utils import Bunch
 
 import harness
-from harness import best, ordered
+from harness import best, ordered, text
 from skevgp import EVGPRegressor, InverseDynamics
 from skevgp.datasets import load_log, load_robot, perturb_robot
 from skevgp.features import RigidBodyRegressor
@@ -101,17 +101,13 @@ MODELS = (
     "random forest",
 )
 
-
-# One fit to a real arm.
 Real = namedtuple("Real", "robot split model size")
-
 
 # The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+".
 Question = namedtuple("Question", "robot trained loaded gain_scale size")
 
 
 def paths_of(robot: str, folder: Path) -> dict[str, Path]:
-    """Return the files of the logs by name."""
     if robot == "ur10":
         files = [folder / robot / f"{name}_trajectory.db3" for name in ("ur10_exciting", "validation")]
         named = {name: files[name == "validation"] for name in UR10}
@@ -124,7 +120,6 @@ def paths_of(robot: str, folder: Path) -> dict[str, Path]:
 
 @lru_cache
 def log_of(robot: str, name: str, folder: Path) -> Bunch:
-    """Read a log."""
     path = paths_of(robot, folder)[name]
     if robot == "ur10":
         return load_log(path, keep=UR10[name], **SIGNALS)
@@ -160,7 +155,6 @@ def splits_of(robot: str, folder: Path, size: str) -> dict[str, tuple[str, ...]]
 
 
 def tests_of(robot: str, split: str, folder: Path) -> list[str]:
-    """Return the names of the test logs."""
     taken = {*TRAINING[robot], *SPLITS[robot][split]}
     return [name for name in moving(robot, folder) if name not in taken and not has_load(name)]
 
@@ -309,11 +303,6 @@ def pooled(rows: pd.DataFrame, name: str) -> float:
     return float(np.average(rows[name], weights=rows["n_test"]))
 
 
-def decimals(digits: int) -> Callable[[float], str]:
-    """Return a function that writes a number; nothing for NaN."""
-    return lambda value: "" if np.isnan(value) else f"{value:.{digits}f}"
-
-
 def split_tables(rows: pd.DataFrame, first: bool) -> harness.Tables:
     """Return errors over those of least squares, CR-2 of each joint, and nMSE of each test file, or lost ones."""
     rows = rows.assign(model=pd.Categorical(rows["model"], MODELS), joint="joint " + rows["joint"].astype(str))
@@ -323,11 +312,11 @@ def split_tables(rows: pd.DataFrame, first: bool) -> harness.Tables:
     means = models.apply(lambda own: pd.Series({name: pooled(own, name) for name in names}), include_groups=False)
     wins = least["model"].value_counts().reindex(means.index).map(f"{{}} of {len(least)}".format)
     summary = models["ratio"].agg(geometric).to_frame().join(by_joint["ratio"].mean().unstack())
-    summary = summary.assign(**{"best of all": wins, "NLPD": means["nlpd"].map(decimals(2))})
+    summary = summary.assign(**{"best of all": wins, "NLPD": text(means["nlpd"], 2)})
     for k in (1, 2, 3):
-        summary[f"CR-{k}"] = means[f"cr{k}"].map(decimals(3))
+        summary[f"CR-{k}"] = text(means[f"cr{k}"], 3)
     summary["seconds"] = models["fit_seconds"].first().map("{:.1f}".format)
-    bands = by_joint.apply(pooled, "cr2", include_groups=False).unstack().dropna().map(decimals(3))
+    bands = by_joint.apply(pooled, "cr2", include_groups=False).unstack().dropna().map("{:.3f}".format)
     tables = {"": summary.reset_index(names=""), "CR-2": bands.reset_index(names="")}
     if first:
         errors = rows.pivot(index=["test", "model"], columns="joint", values="nmse")
@@ -341,7 +330,6 @@ def split_tables(rows: pd.DataFrame, first: bool) -> harness.Tables:
 
 
 def real_tables(rows: pd.DataFrame, found: pd.DataFrame) -> harness.Tables:
-    """Return the tables of the page."""
     short, tables = [], {}
     for robot, splits in SPLITS.items():
         of_robot = rows[rows["robot"] == robot]
@@ -414,7 +402,6 @@ def plot_real(rows: pd.DataFrame, path: Path) -> None:
 
 
 def real(options: Any, output: Path) -> tuple[harness.Tables, int]:
-    """Measure, and return tables and the number of failures."""
     if options.data is None:
         raise SystemExit("--data is needed: a folder with the folders ur10e and ur10, or one of them")
     folder = options.data.resolve()
@@ -446,7 +433,6 @@ BASE, HARMONICS, SECONDS, STEP = 2.0 * np.pi * 0.03, 8, 30.0, 0.01
 FRICTION, LARGEST = (0.02, 0.1), 100.0
 STICTION = RigidBodyRegressor().stiction_velocity
 TOLD = 0.25  # a share of the prior's variance
-
 
 # One simulated arm, and the cutoff of the filter.
 Simulated = namedtuple("Simulated", "cutoff seed size")
@@ -554,7 +540,6 @@ def rms(values: np.ndarray) -> np.ndarray:
 
 
 def identification_tables(rows: pd.DataFrame) -> harness.Tables:
-    """Return the table of the page: a line per filter."""
     runs = rows.fillna({"cutoff": "none"}).groupby("cutoff", sort=False)
     means, sums = runs.mean(numeric_only=True), runs.sum(numeric_only=True)
     shares = runs.apply(lambda own: own["covered"] / own["n_told"], include_groups=False).groupby("cutoff", sort=False)
@@ -575,7 +560,6 @@ def identification_tables(rows: pd.DataFrame) -> harness.Tables:
 
 
 def identification(options: Any, output: Path) -> tuple[harness.Tables, int]:
-    """Measure, and return the table and the number of failures."""
     cells = [Simulated(cutoff, seed, options.size) for seed in options.seeds for cutoff in FILTERS]
     n_failures = harness.run_missing(cells, run_simulated, output, options.jobs)
     return identification_tables(harness.frame(output, size=options.size)), n_failures

@@ -171,7 +171,6 @@ COLUMNS = ("outcome", "bound_per_row", "gain_per_row", "error", "noise_share", "
 
 
 def run(cell: Cell) -> dict[str, Any]:
-    """Fit one model."""
     if cell.part == "nasty":
         found = fit(nasty(cell.seed), cell.seed, max_iter=100)
     elif cell.case.startswith("pendulum"):
@@ -183,7 +182,6 @@ def run(cell: Cell) -> dict[str, Any]:
 
 
 def cells_of(quick: bool) -> list[Cell]:
-    """Return the cells of both parts."""
     cells = [Cell("nasty", nasty(seed).case, "max_iter=100", seed) for seed in range(6 if quick else 500)]
     cases = [] if quick else [f"pendulum-{name}" for name in ("VGP", "RES-VGP", "IF", "IFG")]
     dimensions, noises = (range(1, 3), (1e-3,)) if quick else (range(1, 11), (0.0, 1e-3, 0.1))

@@ -67,8 +67,6 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 ONE_THREAD |= {f"TF_NUM_{name}_THREADS": "1" for name in ("INTEROP", "INTRAOP")}
 OTHERS = {"scikit-learn": "scikit-learn GPR", "GPflow": "GPflow SGPR", "GPyTorch": "GPyTorch SGPR"}
 
-
-# A library in a round.
 Latency = namedtuple("Latency", "library round size")
 
 
@@ -113,7 +111,6 @@ def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
 
 
 def run_latency(cell: Latency, options: Any) -> list[dict[str, Any]]:
-    """Return a row per call."""
     rng, quick = np.random.RandomState(0), cell.size == "quick"
     X = rng.uniform(-2.0, 2.0, (2000, 6))
     Y = np.sin(X @ rng.randn(6, 4)) + 0.05 * rng.randn(2000, 4)
@@ -137,8 +134,6 @@ def latency_tables(rows: pd.DataFrame) -> harness.Tables:
 
 # --- casadi --------------------------------------------------------------------------------------------------------
 
-
-# A model of the cartpole.
 Casadi = namedtuple("Casadi", "features m")
 
 
@@ -208,9 +203,9 @@ def run_casadi(cell: Casadi, options: Any) -> dict[str, Any]:
     data = make_dynamics(name, 60, 20, random_state=0)
     scale = data.target.std(axis=0)
     y = data.target + 0.01 * scale * np.random.RandomState(0).randn(*data.target.shape)
-    options = {"n_inducing": cell.m, "sharing": "all", "max_iter": 50, "random_state": 0}
+    settings = {"n_inducing": cell.m, "sharing": "all", "max_iter": 50, "random_state": 0}
     features_of = features[cell.features](name) if cell.features in features else None
-    model = EVGPRegressor(features_of, kernel_map=AngleEncoder(name), **options)
+    model = EVGPRegressor(features_of, kernel_map=AngleEncoder(name), **settings)
     harness.timed(lambda: model.fit(data.data, y))
     X = make_dynamics(name, 10, 20, random_state=1).data
     row, x = X[0].copy(), ca.MX.sym("x", X.shape[1])
@@ -268,8 +263,6 @@ SIZES = {  # sweep -> (name, rows, inducing points, columns, outputs)
     "points": [("", 9300, m, 5, 4) for m in (10, 25, 50, 100, 200, 400)],
 }
 
-
-# A size on some cores.
 Evaluation = namedtuple("Evaluation", "sweep name n m d outputs cores")
 
 
@@ -322,7 +315,6 @@ class Timed(LBFGS):
     """L-BFGS that keeps the seconds of each evaluation."""
 
     def minimise(self, objective: Any, *others: Any, **options: Any) -> Any:
-        """Minimise a timed objective."""
         self.seconds_: list[float] = getattr(self, "seconds_", [])
 
         def timed(x: np.ndarray) -> Any:
@@ -334,7 +326,6 @@ class Timed(LBFGS):
         return super().minimise(timed, *others, **options)
 
 
-# A fit of a few iterations.
 Rows = namedtuple("Rows", "n_rows engine max_iter", defaults=[8])
 
 
@@ -374,7 +365,6 @@ def lazy(path: Path, shape: tuple[int, ...]) -> Any:
 
 
 def run_rows(cell: Rows, options: Any) -> dict[str, Any]:
-    """Fit in this process."""
     with tempfile.TemporaryDirectory() as folder:
         paths = make_files(Path(folder), cell.n_rows)
         X, y = arrays = [np.load(path, mmap_mode="r") for path in paths]
@@ -386,8 +376,8 @@ def run_rows(cell: Rows, options: Any) -> dict[str, Any]:
             client = distributed.Client(cluster)
             X, y = (lazy(path, array.shape) for path, array in zip(paths, arrays, strict=True))
         solver = Timed()
-        options = {"max_iter": cell.max_iter, "noise_cv": None, "random_state": 0}
-        model = EVGPRegressor(n_inducing=100, solver=solver, n_jobs=2 if cell.engine.startswith("2") else 1, **options)
+        settings = {"max_iter": cell.max_iter, "noise_cv": None, "random_state": 0}
+        model = EVGPRegressor(n_inducing=100, solver=solver, n_jobs=2 if cell.engine.startswith("2") else 1, **settings)
         with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")
             start = time.perf_counter()
@@ -423,8 +413,6 @@ def rows_tables(rows: pd.DataFrame) -> harness.Tables:
 EPOCHS = {"adam 10": 10, "adam 40": 40, "adam 120": 120}
 FITS = ("default", *EPOCHS, "reference")
 
-
-# A fit to its end.
 Million = namedtuple("Million", "n_rows fit")
 
 
@@ -496,8 +484,6 @@ print(json.dumps(dict(seconds=seconds, cpu_seconds=cpu_seconds, n_iter=int(model
     nlpd=float(negative_log_predictive_density(test.target, mean, std)))))
 """
 
-
-# A fit by this checkout or the other one.
 Checkout = namedtuple("Checkout", "job checkout commit seed repeat")
 
 

@@ -211,7 +211,6 @@ MODEL_SETS: dict[str, Callable[[int], Data]] = {
 
 # --- other models --------------------------------------------------------------------------------------------------
 
-
 Drawing = namedtuple("Drawing", "name seed")
 
 
@@ -277,7 +276,6 @@ LARGE = tuple(name for name in MODELS if name not in ("GPR", "EVGP, auto"))
 
 
 def measured(model: str, data: Data, seed: int) -> dict[str, Any]:
-    """Fit a model and return its scores."""
     found: list[Any] = []
     wall = time.perf_counter()
     seconds, caught = harness.timed(lambda: found.extend(MODELS[model](data, seed)))
@@ -348,7 +346,6 @@ def against_exact(rows: pd.DataFrame) -> pd.DataFrame:
 
 
 def tables_of_models(rows: pd.DataFrame) -> harness.Tables:
-    """Return the tables of the page."""
     return {"models": scores(rows, ordered(MODEL_SETS, rows["name"])), "auto": against_exact(rows)}
 
 
@@ -363,8 +360,6 @@ def guide(page: str, rows: pd.DataFrame) -> str:
 
 FITS = ("exact", "100", "auto", "grid")
 
-
-# A model on a drawing of a set.
 Fit = namedtuple("Fit", "name seed model")
 
 

@@ -49,8 +49,6 @@ GRID = np.linspace(-4.0, 10.0, 421)[:, np.newaxis]
 FAR = 9.0  # three beyond the last observation
 SIZES = {"full": (5, 10), "quick": (0, 3)}  # restarts and folds
 
-
-# One model on one data set.
 Cell = namedtuple("Cell", "data model seed size")
 
 

@@ -42,7 +42,6 @@ TEST_STATE = 1000
 NOMINAL = "EVGP-IFG, nominal"
 COLOURS = dict(zip([*MODELS, NOMINAL], np.array(harness.PALETTE)[[4, 5, 2, 1, 0, 3]], strict=True))
 
-
 Cell = namedtuple("Cell", "system model setting n_trajectories seed size")
 
 
@@ -82,7 +81,6 @@ def table_of(rows: pd.DataFrame, measure: str, corner: str, spread: bool) -> pd.
 
 
 def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
     tables = {}
     for setting in sorted(rows["setting"].unique(), key=lambda name: name != "skevgp"):
         of_setting = rows[rows["setting"] == setting]

@@ -40,12 +40,10 @@ SETTINGS = {
 }
 MODELS = ("EVGP-IF", "EVGP-IFG")
 
-
 Cell = namedtuple("Cell", "system model setting seed size")
 
 
 def run(cell: Cell, max_iter: int | None) -> list[dict[str, Any]]:
-    """Fit, and return a row per weight."""
     n_trajectories = QUICK_TRAJECTORIES if cell.size == "quick" else None
     train = make_dynamics(cell.system, n_trajectories, random_state=cell.seed)
     regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter))

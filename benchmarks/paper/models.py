@@ -134,7 +134,6 @@ MODELS = tuple(SIZES)
 
 
 def build(fit: Fit) -> RegressorMixin:
-    """Return the unfitted regressor, of the paper's size."""
     size: Any = SIZES[fit.model][SYSTEMS.index(fit.system)]
     if fit.model == "RES-DBNN":
         return residual_network(fit, size)

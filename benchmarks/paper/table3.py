@@ -58,7 +58,6 @@ LABELS = {
     ("network", ""): "network",
 }
 
-
 # One measurement. Sizes that a model does not have are 0.
 Cell = namedtuple("Cell", "what setting n_rows n_inducing n_outputs n_layers n_units")
 
@@ -77,7 +76,6 @@ class Curve:
     sizes: tuple[int, ...] = ()
 
     def cells(self) -> Iterator[Cell]:
-        """Yield a cell for each size."""
         network = "network" in self.what
         n_rows = 2000 if network else FEW if self.few else 4800
         cell = Cell(self.what, self.setting, n_rows, *((0, 4, 2, 100) if network else (100, 4, 0, 0)))
@@ -86,7 +84,6 @@ class Curve:
 
     @property
     def name(self) -> str:
-        """Label of the line."""
         end = {"seconds": "", "n_bytes": ", pickled", "n_parameters": ", parameters"}[self.value]
         return LABELS[self.what, self.setting] + end + (f", {FEW} rows" if self.few else "")
 

@@ -36,7 +36,7 @@ import pandas as pd
 from sklearn.utils import Bunch
 
 import harness
-from harness import figure_of, ordered
+from harness import figure_of, ordered, text
 from paper.models import (
     MODELS,
     PROMISED,
@@ -54,7 +54,6 @@ from skevgp.datasets import make_dynamics
 MARKERS = dict(zip(SETTINGS, "svPo^D", strict=True))
 COLOURS = dict(zip(SETTINGS, np.array(harness.PALETTE)[[4, 1, 5, 0, 2, 3]], strict=True))
 N_SEEDS = 4
-
 
 # One fit. ``noise`` is the share of each training target's standard deviation.
 Cell = namedtuple("Cell", "system model setting seed angles noise size")
@@ -102,11 +101,11 @@ def marks(own: pd.DataFrame) -> str:
 def overview(rows: pd.DataFrame, noisy: bool) -> pd.DataFrame:
     """Return mean Errors, all rows / rows inside the training range; of noisy data CR-2. A column per setting."""
 
-    def text(own: pd.DataFrame) -> str:
-        means = [own["cr2"].mean()] if noisy else [own["error_mean"].mean(), own["error_inside"].mean(skipna=False)]
-        return " / ".join(figure_of(mean) for mean in means if np.isfinite(mean)) + marks(own)
+    def means(own: pd.DataFrame) -> str:
+        shown = [own["cr2"].mean()] if noisy else [own["error_mean"].mean(), own["error_inside"].mean(skipna=False)]
+        return " / ".join(figure_of(mean) for mean in shown if np.isfinite(mean)) + marks(own)
 
-    found = rows.groupby(["case", "model", "setting"], observed=True).apply(text, include_groups=False)
+    found = rows.groupby(["case", "model", "setting"], observed=True).apply(means, include_groups=False)
     found = found.unstack(fill_value="")
     published = PUBLISHED["cr2" if noisy else "error"].map("{:.3f}".format)
     papers = [published[case.removesuffix(", wrapped"), model] for case, model in found.index]
@@ -125,7 +124,7 @@ def calibration(rows: pd.DataFrame) -> pd.DataFrame:
         for (setting, case, model), own in groups
     }
     table = pd.DataFrame(shares).T.rename(columns=names)
-    return table.map(lambda share: "" if np.isnan(share) else f"{share:.3f}").reset_index(names="promised")
+    return table.apply(text, digits=3).reset_index(names="promised")
 
 
 def details(rows: pd.DataFrame) -> pd.DataFrame:
@@ -210,7 +209,6 @@ def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
 
 
 def tables_of(rows: pd.DataFrame) -> harness.Tables:
-    """Return the tables of the page."""
     rows, noisy = sorted_rows(rows), bool((rows["noise"] > 0).any())
     settings = rows.groupby("setting", observed=True)
     return {

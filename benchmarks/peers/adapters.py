@@ -56,12 +56,10 @@ class Watch:
 
     @property
     def seconds(self) -> float:
-        """Wall time so far."""
         return time.perf_counter() - self._begin
 
     @property
     def cpu_seconds(self) -> float:
-        """Processor time so far."""
         return time.process_time() - self._begin_cpu
 
     def deadline(self, model: int) -> float:
@@ -85,8 +83,6 @@ class Watch:
 
 
 class Checkpoint(NamedTuple):
-    """A fit at a time."""
-
     seconds: float
     cpu_seconds: float
     bound: float

@@ -64,7 +64,6 @@ MEASURES = {
     "log_likelihood": "log likelihood / N",
 }
 
-
 Cell = namedtuple("Cell", "system model n_rows seed")
 
 

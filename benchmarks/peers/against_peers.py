@@ -50,6 +50,7 @@ from scipy.stats import multivariate_normal
 
 import harness
 import skevgp
+from harness import text
 from peers.adapters import PEERS, load
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
@@ -65,8 +66,6 @@ _LINE, _TREES = "scikit-learn BayesianRidge", "scikit-learn HistGradientBoosting
 
 
 class Sets(NamedTuple):
-    """Training and test rows."""
-
     X: np.ndarray
     Y: np.ndarray
     X_test: np.ndarray
@@ -84,7 +83,6 @@ def standardised(X: np.ndarray, y: np.ndarray, is_test: np.ndarray) -> Sets:
 
 
 def tabular(name: str, seed: int, folder: Path | None) -> Sets:
-    """Read a split of a table."""
     table, masks = (np.loadtxt(f"{folder}/{name}/{file}.csv.gz", delimiter=",") for file in ("data", "test_mask"))
     return standardised(table[:, :-1], table[:, -1], masks[:, seed] == 1.0)
 
@@ -278,11 +276,6 @@ def time_to_reach(curve: pd.DataFrame, name: str, target: float, clock: str) -> 
         return float(seconds[i])
     share = (sign * target - values[i - 1]) / (values[i] - values[i - 1])
     return float(np.exp(np.interp(share, (0.0, 1.0), np.log(np.maximum(seconds[i - 1 : i + 1], 1e-9)))))
-
-
-def text(values: pd.Series, digits: int) -> pd.Series:
-    """Write numbers with so many decimals; nothing for NaN."""
-    return values.map(f"{{:.{digits}f}}".format).where(values.notna(), "")
 
 
 def first_seed(rows: pd.DataFrame, curves: pd.DataFrame) -> pd.DataFrame:
