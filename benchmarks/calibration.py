@@ -123,7 +123,7 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(lines)
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     names = ["variant", "noise", "noise_cv"]
     blank = rows[names].astype(object).where(rows[names].notna(), "").replace("None", "")
     rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)

@@ -80,7 +80,7 @@ def table_of(rows: pd.DataFrame, measure: str, corner: str, spread: bool) -> pd.
     return found.rename(columns="{} rows".format).rename_axis(corner).reset_index()
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     tables = {}
     for setting in sorted(rows["setting"].unique(), key=lambda name: name != "skevgp"):
         of_setting = rows[rows["setting"] == setting]

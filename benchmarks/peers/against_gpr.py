@@ -180,7 +180,7 @@ def expected_seconds(path: Path, cell: Cell) -> float:
     return sum(smaller["fit_seconds"] * (cell.n_rows / smaller["n_rows"]) ** MODELS[cell.model][0])
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     """Return exponents over the four largest sizes, and a table of all measures per data set."""
     means = rows.groupby(["system", "model", "n_rows"]).mean(numeric_only=True)
     for name in ("log_likelihood", "counterpart_log_likelihood"):
