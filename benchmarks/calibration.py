@@ -12,19 +12,14 @@ with their rows shuffled or sorted by a column, and tested on held-out rows.
 from __future__ import annotations
 
 import itertools
-import sys
-import time
-import warnings
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
-
-sys.path.insert(0, str(Path(__file__).parent))  # for what the scripts share
 
 import numpy as np
 import pandas as pd
 from sklearn import datasets
-from threadpoolctl import threadpool_limits
 
 import harness
 from skevgp import EVGPRegressor
@@ -46,18 +41,8 @@ TABLES = {
 # Largest number of training rows.
 MOST_ROWS, ITERATIONS = 12_000, 100
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows."""
-
-    data: str
-    variant: str
-    noise: str
-    seed: int
-    noise_cv: str
-    size: str
-    folder: Path | None = field(compare=False)
+# One fit. The variant of a system is "" or "angles", for an AngleEncoder; of a table the order of the rows.
+Cell = namedtuple("Cell", "data variant noise seed noise_cv size")
 
 
 Part = tuple[np.ndarray, np.ndarray]
@@ -66,26 +51,20 @@ Part = tuple[np.ndarray, np.ndarray]
 def system(cell: Cell) -> tuple[Part, Part, np.ndarray]:
     """Return training and test trajectories with the same noise, and the groups of the former."""
     n = 6 if cell.size == "quick" else SYSTEMS[cell.data][1]
-    everything = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
-    train = everything.groups < n
-    return (
-        (everything.data[train], everything.target[train]),
-        (everything.data[~train], everything.target[~train]),
-        everything.groups[train],
-    )
+    whole = make_dynamics(cell.data, n + TEST_TRAJECTORIES, noise=float(cell.noise), random_state=cell.seed)
+    train, test = ((whole.data[rows], whole.target[rows]) for rows in (whole.groups < n, whole.groups >= n))
+    return train, test, whole.groups[whole.groups < n]
 
 
-def table(cell: Cell) -> tuple[Part, Part]:
+def table(cell: Cell, folder: Path | None) -> tuple[Part, Part]:
     """Return training rows in the order of the variant, and test rows; columns are standardised."""
     rng = np.random.RandomState(cell.seed)
     if cell.data in TABLES:
         rows = rng.permutation(np.column_stack(TABLES[cell.data](cell.seed)))
         test = np.arange(len(rows)) >= 2 * len(rows) // 3
     else:
-        assert cell.folder is not None
-        rows, masks = (
-            np.loadtxt(cell.folder / cell.data / name, delimiter=",") for name in ("data.csv.gz", "test_mask.csv.gz")
-        )
+        files = (f"{folder}/{cell.data}/{name}.csv.gz" for name in ("data", "test_mask"))
+        rows, masks = (np.loadtxt(file, delimiter=",") for file in files)
         test = masks[:, cell.seed].astype(bool)
     train, test = rng.permutation(rows[~test])[:MOST_ROWS], rows[test]
     size = train.std(axis=0)
@@ -95,14 +74,11 @@ def table(cell: Cell) -> tuple[Part, Part]:
     return (train[:, :-1], train[:, -1]), (test[:, :-1], test[:, -1])
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, folder: Path | None) -> dict[str, Any]:
     """Fit one model and evaluate it on the test rows. ``fit_seconds`` is processor time of one thread."""
+    noise_cv = None if cell.noise_cv == "None" else int(cell.noise_cv)
     max_iter = 10 if cell.size == "quick" else ITERATIONS
-    settings = {
-        "noise_cv": None if cell.noise_cv == "None" else int(cell.noise_cv),
-        "max_iter": max_iter,
-        "random_state": cell.seed,
-    }
+    settings: dict[str, Any] = {"noise_cv": noise_cv, "max_iter": max_iter, "random_state": cell.seed}
     groups = None
     if cell.data in SYSTEMS:
         train, (X, y), groups = system(cell)
@@ -110,16 +86,11 @@ def run(cell: Cell) -> dict[str, Any]:
         features, n_inducing = InertiaForceGravity(cell.data), SYSTEMS[cell.data][0]
         model = EVGPRegressor(features, kernel_map=kernel_map, n_inducing=n_inducing, **settings)
     else:
-        train, (X, y) = table(cell)
+        train, (X, y) = table(cell, folder)
         model = EVGPRegressor(n_inducing=256 if len(train[0]) > 10_000 else 100, **settings)
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        start = time.process_time()
-        model.fit(*train, groups=groups)
-        seconds = time.process_time() - start
+    seconds, caught = harness.timed(lambda: model.fit(*train, groups=groups))
     mean, std = model.predict(X, return_std=True)
     return {
-        **{name: getattr(cell, name) for name in ("data", "variant", "noise", "seed", "noise_cv", "size")},
         "cr2": containing_ratios(y, mean, std)[1],
         "nlpd": negative_log_predictive_density(y, mean, std) / np.size(y[0]),
         "error_mean": prediction_error(y, mean),
@@ -127,40 +98,34 @@ def run(cell: Cell) -> dict[str, Any]:
         "n_rows": len(train[0]),
         "n_iter": model.n_iter_,
         "dependent": any(own.category is DependentRowsWarning for own in caught),
-        **harness.provenance(),
     }
 
 
 def table_of(rows: pd.DataFrame) -> pd.DataFrame:
     """Return a line for each setting, of the seeds that were fitted both without noise_cv and with it."""
+    setting = ["data", "variant", "noise"]
+    plain, default = (
+        own.set_index([*setting, "seed"]) for own in (rows[rows["noise_cv"] == ""], rows[rows["noise_cv"] != ""])
+    )
+    both = default.join(plain.add_suffix(" plain"), how="inner")
     lines = []
-    for (data, variant, noise), own in rows.groupby(["data", "variant", "noise"], sort=False):
-        without = own["noise_cv"].isin(["None", ""])
-        plain, default = (part.set_index("seed") for part in (own[without], own[~without]))
-        seeds = plain.index.intersection(default.index)
-        if seeds.empty:
-            continue
-        plain, default = plain.loc[seeds], default.loc[seeds]
-        means = {name: (plain[name].mean(), default[name].mean()) for name in ("cr2", "nlpd")}
-        lines.append(
-            {
-                "": " ".join(part for part in (data, variant, f"noise {noise}" * (noise != "")) if part),
-                "seeds": len(seeds),
-                "CR-2": "{:.3f} → {:.3f}".format(*means["cr2"]),
-                "of seeds": f"{default['cr2'].min():.3f} to {default['cr2'].max():.3f}",
-                "NLPD per output": "{:.3f} → {:.3f}".format(*means["nlpd"]),
-                "at worst": f"{(default['nlpd'] - plain['nlpd']).max():+.3f}",
-                "Error, ratio": f"{(default['error_mean'] / plain['error_mean']).mean():.3f}",
-                "time, ratio": f"{default['fit_seconds'].sum() / plain['fit_seconds'].sum():.2f}",
-                "warned": int(default["dependent"].sum()),
-            }
-        )
+    for found, own in both.groupby(setting, sort=False):
+        means = own.mean(numeric_only=True)
+        data, variant, noise = found
+        line = {"": " ".join(part for part in (data, variant, f"noise {noise}" * (noise != "")) if part)}
+        line |= {"seeds": len(own), "CR-2": f"{means['cr2 plain']:.3f} → {means['cr2']:.3f}"}
+        line["of seeds"] = f"{own['cr2'].min():.3f} to {own['cr2'].max():.3f}"
+        line["NLPD per output"] = f"{means['nlpd plain']:.3f} → {means['nlpd']:.3f}"
+        line["at worst"] = f"{(own['nlpd'] - own['nlpd plain']).max():+.3f}"
+        line["Error, ratio"] = f"{(own['error_mean'] / own['error_mean plain']).mean():.3f}"
+        line["time, ratio"] = f"{means['fit_seconds'] / means['fit_seconds plain']:.2f}"
+        lines.append({**line, "warned": int(own["dependent"].sum())})
     return pd.DataFrame(lines)
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
-    blank = {name: rows[name].astype(object).where(rows[name].notna(), "") for name in ("variant", "noise", "noise_cv")}
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
+    names = ["variant", "noise", "noise_cv"]
+    blank = rows[names].astype(object).where(rows[names].notna(), "").replace("None", "")
     rows, systems = rows.assign(**blank), rows["data"].isin(SYSTEMS)
     return {"systems": table_of(rows[systems]), "tables": table_of(rows[~systems])}
 
@@ -170,41 +135,33 @@ def variants(data: str, folder: Path | None) -> list[str]:
     if data in TABLES:
         width = np.shape(TABLES[data](0)[0])[1]
     else:
-        assert folder is not None
-        width = np.loadtxt(folder / data / "data.csv.gz", delimiter=",", max_rows=1).size - 1
+        width = np.loadtxt(f"{folder}/{data}/data.csv.gz", delimiter=",", max_rows=1).size - 1
     return ["shuffled", "sorted by 0", f"sorted by {width}"]
 
 
 def main() -> None:
     parser = harness.argument_parser(
-        __doc__,
-        quick="one system and one table, few trajectories and iterations, one seed",
-        seeds="seeds 0, 1, ...; default: 4, of a quick run 1",
-        systems=SYSTEMS,
+        __doc__, quick="a system and a table, few trajectories and iterations, one seed", seeds=4, systems=SYSTEMS
     )
     parser.add_argument("--folder", type=Path, help="of further tables")
-    options = parser.parse_args()
-    output, size = harness.output_path(options, "calibration"), "quick" if options.quick else "full"
-    n_seeds = (1 if options.quick else 4) if options.seeds is None else options.seeds
+    options = harness.parse(parser)
+    output = harness.output_path(options, "calibration")
     further = sorted(path.parent.name for path in options.folder.glob("*/data.csv.gz")) if options.folder else []
-    tables = [*TABLES, *further]
     systems = options.systems
+    tables = [*TABLES, *further]
     if options.quick:
         systems, tables = systems[:1], tables[:1]
-    of_systems = itertools.product(systems, ("", "angles"), NOISES)
-    settings = [
-        *of_systems,
-        *((name, variant, "") for name in tables for variant in variants(name, options.folder)),
-    ]
+    settings = [*itertools.product(systems, ("", "angles"), NOISES)]
+    settings += [(name, variant, "") for name in tables for variant in variants(name, options.folder)]
     cells = [
-        Cell(data, variant, noise, seed, noise_cv, size, options.folder)
-        for seed in range(n_seeds)
+        Cell(data, variant, noise, seed, noise_cv, options.size)
+        for seed in options.seeds
         for data, variant, noise in settings
         for noise_cv in ("None", "5")
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    tables = tables_of(harness.frame(output, size=size))
-    harness.write_page("Standard deviations that hold", tables, output, n_failures)
+    n_failures = harness.run_missing(cells, partial(run, folder=options.folder), output, options.jobs)
+    rows = harness.frame(output, size=options.size)
+    harness.write_page("Standard deviations that hold", tables_of(rows), output, n_failures)
 
 
 if __name__ == "__main__":

@@ -3,8 +3,8 @@
     python benchmarks/control.py rollouts                    # three systems, five models, two seeds: hours of one core
     python benchmarks/control.py rollouts --models EVGP-IFG  # one model: twenty minutes
     python benchmarks/control.py rollouts --systems iiwa14 --models EVGP-IFG  # not among the three
-    python benchmarks/control.py swing_up                    # hours of one core
-    python benchmarks/control.py swing_up --systems pendulum --seconds 1.5 3 --noises 0
+    python benchmarks/control.py swing_up --seeds 10         # hours of one core
+    python benchmarks/control.py swing_up --systems pendulum --models evgp-ifg
     python benchmarks/control.py tracking                    # a quarter of an hour of one core
     python benchmarks/control.py swing_up --quick            # the pendulum, one seed: half a minute
 
@@ -32,9 +32,9 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-import warnings
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections import namedtuple
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,30 +42,24 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "examples"))  # for
 
 import numpy as np
 import pandas as pd
-from scipy.stats import norm
 from sklearn.base import BaseEstimator, RegressorMixin
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import computed_torque as arms
 import harness
 import mpc
 from computed_torque import DT, ComputedTorque
-from harness import figure_of
+from harness import figure_of, text
+from paper.models import SIZES as PAPERS_SIZES
+from paper.models import SYSTEMS as PAPERS_SYSTEMS
 from paper.models import Fit, build, fitted_part, groups_of
 from skevgp import CoefPrior, EVGPRegressor, rollout
 from skevgp.datasets import load_robot, make_dynamics
 from skevgp.datasets.plant import Plant
-from skevgp.exceptions import DependentRowsWarning
 from skevgp.features import InertiaForceGravity
+from skevgp.metrics import crps
 from skevgp.robots import RigidBody
 from skevgp.solvers import LBFGS
-
-
-def size_of(options: Any) -> str:
-    return "quick" if options.quick else "full"
-
 
 # --- rollouts ------------------------------------------------------------------------------------------------------
 
@@ -84,6 +78,8 @@ MAIN = "EVGP-IFG"
 ROLLOUT_NOISES, SHARES = ("0.0", "0.01"), ("1", "0.1")
 HORIZONS = (1, 10, 50, 100)
 TEST_TRAJECTORIES, PARTICLES, ITERATIONS = 40, 100, 300
+# Of the page's lines.
+ORDERS = {"system": ROLLOUT_SYSTEMS, "model": ROLLOUT_MODELS, "noise": ("none", "1 %"), "share": SHARES}
 # Name of each method, and arguments of `rollout`.
 METHODS: dict[str, dict[str, str]] = {
     "consistent": {},
@@ -93,19 +89,8 @@ METHODS: dict[str, dict[str, str]] = {
     "mean": {"method": "mean"},
 }
 
-
-@dataclass(frozen=True)
-class Rollout:
-    """One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories."""
-
-    system: str
-    model: str
-    n_inducing: int
-    noise: str
-    share: str
-    seed: int
-    size: str
-    max_iter: int = field(compare=False)
+# One fit. ``n_inducing`` is 0 for a network; ``share`` is that of the paper's trajectories.
+Rollout = namedtuple("Rollout", "system model n_inducing noise share seed size")
 
 
 class Independent(RegressorMixin, BaseEstimator):
@@ -144,11 +129,6 @@ def particles_of(model: str) -> str:
     return "independent" if model == "RES-DBNN" else "consistent"
 
 
-def methods_of(model: str) -> list[str]:
-    """Return all methods for the main model, and two for the others."""
-    return list(METHODS) if model == MAIN else [particles_of(model), "mean"]
-
-
 def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     """Return the CRPS of samples (n, ...), whose mean does not depend on n (Ferro 2014)."""
     n = len(samples)
@@ -157,26 +137,21 @@ def crps_of_samples(truth: np.ndarray, samples: np.ndarray) -> np.ndarray:
     return np.abs(samples - truth).mean(axis=0) - spread
 
 
-def crps_of_normal(truth: np.ndarray, mean: np.ndarray, std: np.ndarray) -> np.ndarray:
-    """Return the CRPS of a normal distribution (Gneiting & Raftery 2007)."""
-    z = (truth - mean) / std
-    return std * (z * (2.0 * norm.cdf(z) - 1.0) + 2.0 * norm.pdf(z) - 1.0 / np.sqrt(np.pi))
-
-
 def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) -> dict[str, float]:
     """Return scores after some steps, of states (n, steps, 2 n_joints) with this scatter, positions first."""
     true, mean, std = (values[:, step - 1] / scatter for values in (truth, ahead.mean, ahead.std))
     errors, n_joints = np.abs(true - mean), len(scatter) // 2
     positions = np.sqrt(np.mean(errors[:, :n_joints] ** 2, axis=1))
+    score = np.nan  # of an unstable system
     if "samples" in ahead:
-        crps = crps_of_samples(true, np.moveaxis(ahead.samples[:, :, step - 1], 1, 0) / scatter)
-    else:
-        crps = crps_of_normal(true, mean, std)
+        score = crps_of_samples(true, np.moveaxis(ahead.samples[:, :, step - 1], 1, 0) / scatter).mean()
+    elif np.isfinite(mean).all():
+        score = crps(true, mean, std) / len(scatter)
     return {
         "error_median": np.median(positions),
         "error_p90": np.quantile(positions, 0.9),
         **{f"cr{k}": np.mean(errors <= k * std) for k in (1, 2, 3)},
-        "crps": crps.mean(),
+        "crps": score,
         # 0.674 if standard deviations are calibrated.
         "errors_in_std": np.median(errors / std),
     }
@@ -185,123 +160,101 @@ def measures(truth: np.ndarray, ahead: Bunch, step: int, scatter: np.ndarray) ->
 def run_rollouts(cell: Rollout) -> list[dict[str, Any]]:
     """Fit one model and roll it out by all methods. ``fit_seconds`` is processor time of one thread."""
     train, test = data(cell)
-    model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, cell.max_iter))
+    max_iter = 20 if cell.size == "quick" else ITERATIONS
+    model = build(Fit(cell.system, cell.model, ROLLOUT_MODELS[cell.model], cell.seed, cell.size, max_iter))
     if cell.n_inducing:
         model.set_params(**{"regressor__n_inducing" if cell.model == "RES-VGP" else "n_inducing": cell.n_inducing})
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        start = time.process_time()
-        model.fit(train.data, train.target, **groups_of(model, train))
-        seconds = time.process_time() - start
-        found = {method: rolled_out(model, method, test, cell) for method in methods_of(cell.model)}
-    fitted = fitted_part(model)
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups_of(model, train)))
+    fitted, rows = fitted_part(model), []
     common = {
         "n_rows": len(train.data),
         "n_iter": fitted.n_iter_,
         "noise_std": np.median(np.sqrt(fitted.noise_variance_) / train.scatter),
         "fit_seconds": seconds,
+        "max_iter": max_iter,
     }
-    return [
-        {
-            **{name: getattr(cell, name) for name in Rollout.__dataclass_fields__ if name != "max_iter"},
-            **{"method": method, "steps": step},
-            **measures(test.trajectories[:, 1:], ahead, step, train.scatter),
-            **common,
-            "rollout_seconds": taken,
-            "max_iter": cell.max_iter,
-            **harness.provenance(),
-        }
-        for method, (ahead, taken) in found.items()
-        for step in HORIZONS
-    ]
+    for method in METHODS if cell.model == MAIN else (particles_of(cell.model), "mean"):
+        ahead, taken = rolled_out(model, method, test, cell)
+        for step in HORIZONS:
+            found = measures(test.trajectories[:, 1:], ahead, step, train.scatter)
+            rows.append({"method": method, "steps": step, **found, **common, "rollout_seconds": taken})
+    return rows
 
 
 def rolled_out(model: Any, method: str, test: Bunch, cell: Rollout) -> tuple[Bunch, float]:
-    """Return the rollout, NaN if the learned system is unstable, and processor seconds."""
+    """Return the rollout, NaN if the learned system is unstable, and processor seconds of one thread."""
     n, n_states = len(test.trajectories), test.target.shape[1]
     inputs = test.data[:, n_states:].reshape(n, -1, test.data.shape[1] - n_states)
     options = {"n_samples": 10 if cell.size == "quick" else PARTICLES, "random_state": cell.seed, **METHODS[method]}
-    start = time.process_time()
-    try:
-        ahead = rollout(
-            Independent(model) if method == "independent" else model, test.trajectories[:, 0], inputs, **options
-        )
-    except ValueError as problem:
-        if "unstable" not in str(problem):
-            raise
-        nothing = np.full(test.trajectories[:, 1:].shape, np.nan)
-        ahead = Bunch(mean=nothing, std=nothing)
-    return ahead, time.process_time() - start
+    nothing = np.full(test.trajectories[:, 1:].shape, np.nan)
+    ahead = Bunch(mean=nothing, std=nothing)
+    model = Independent(model) if method == "independent" else model
+
+    def roll() -> None:
+        try:
+            ahead.update(rollout(model, test.trajectories[:, 0], inputs, **options))
+        except ValueError as problem:
+            if "unstable" not in str(problem):
+                raise
+
+    seconds, _ = harness.timed(roll)
+    return ahead, seconds
 
 
 def sizes(system: str, model: str) -> tuple[int, ...]:
-    """Return the numbers of inducing points."""
-    if model.startswith("EVGP"):
-        return ROLLOUT_SYSTEMS[system]
     if model == "RES-DBNN":
         return (0,)
-    regressor = build(Fit(system, model, ROLLOUT_MODELS[model], 0, "full", 0))
-    return (getattr(regressor, "regressor", regressor).n_inducing,)
+    return ROLLOUT_SYSTEMS[system] if model.startswith("EVGP") else (PAPERS_SIZES[model][PAPERS_SYSTEMS.index(system)],)
 
 
 def rollout_cells(options: Any) -> list[Rollout]:
     """Return the cells. The largest models come last, and other seeds after all systems."""
-    seeds = range(options.seeds or (1 if options.quick else 2))
     systems = ("pendulum",) if options.quick else options.systems or DEFAULT_SYSTEMS
     return [
-        Rollout(system, model, m, noise, share, seed, size_of(options), 20 if options.quick else ITERATIONS)
-        for seed, model, number in itertools.product(seeds, options.models or ROLLOUT_MODELS, (0, 1))
+        Rollout(system, model, m, noise, share, seed, options.size)
+        for seed, model, number in itertools.product(options.seeds, options.models or ROLLOUT_MODELS, (0, 1))
         for system in systems
         for m in sizes(system, model)[number : number + 1]
         for noise, share in itertools.product(ROLLOUT_NOISES, SHARES)
     ]
 
 
-def rollout_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def rollout_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return position errors, calibration, and in how many fits of the main model intervals are calibrated."""
     rows = rows.assign(noise=rows["noise"].map(lambda noise: f"{100 * noise:g} %" if noise else "none"))
     rows["share"] = rows["share"].map("{:g}".format)
-    setting = ["system", "n_inducing", "model", "noise", "share"]
-    orders = [list(ROLLOUT_SYSTEMS), list(ROLLOUT_MODELS), ["none", "1 %"], list(SHARES)]
-
-    def place(found: tuple[Any, ...]) -> tuple[int, ...]:
-        system, m, model, noise, share = found
-        known = [order.index(name) for order, name in zip(orders, (system, model, noise, share), strict=True)]
-        return known[0], m or sys.maxsize, *known[1:]
-
+    rows = rows.assign(
+        size=rows["n_inducing"].replace(0, sys.maxsize),  # networks after all numbers of points
+        **{name: pd.Categorical(rows[name], order) for name, order in ORDERS.items()},
+    )
     errors, bands, promises = [], [], []
-    for found, own in sorted(rows.groupby(setting), key=lambda item: place(item[0])):
-        system, m, model, noise, share = found
+    for found, own in rows.groupby(["system", "size", "model", "noise", "share"], observed=True):
+        system, _, model, noise, share = found
+        m = own["n_inducing"].iloc[0]
         line = {"": f"{system} m={m}" if m else system, "model": model, "noise": noise, "share": share}
         means = own.groupby(["method", "steps"]).mean(numeric_only=True)
-        fed_back, particles = means.loc["mean"], means.loc[particles_of(model)]
-        columns = {
-            f"after {step}": f"{figure_of(row['error_median'])} ({figure_of(row['error_p90'])})"
-            for step, row in fed_back.iterrows()
-        }
-        last = {"particles' mean: 1": particles["error_median"].iloc[0], "100": particles["error_median"].iloc[-1]}
-        errors.append({**line, "seeds": own["seed"].nunique(), **columns, **last})
+        fed_back, particles = means.loc["mean"], means.loc[particles_of(model)]["error_median"]
+        texts = fed_back["error_median"].map(figure_of) + fed_back["error_p90"].map(lambda p90: f" ({figure_of(p90)})")
+        last = {"particles' mean: 1": particles.iloc[0], "100": particles.iloc[-1]}
+        errors.append({**line, "seeds": own["seed"].nunique(), **texts.rename("after {}".format), **last})
         for method in list(METHODS)[:-1] if model == MAIN else [particles_of(model)]:
-            cr2 = {f"CR-2: {step}": f"{value:.2f}" for step, value in means.loc[method]["cr2"].items()}
-            crps = {f"CRPS: {step}": value for step, value in means.loc[method]["crps"].items()}
-            bands.append({**line, "particles": method, **cr2, **crps})
-    main = rows[rows["model"] == MAIN]
-    for noise, share, method in itertools.product(("none", "1 %"), SHARES, ("consistent", "consistent, no noise")):
-        own = main[(main["noise"] == noise) & (main["share"] == share)].set_index([*setting, "seed", "steps"])
-        if own.empty:
-            continue
-        particles, others = (own[own["method"] == name] for name in (method, "independent"))
-        most = 1.0 if noise == "none" else 0.99
-        tests = {f"CR-2 from 0.9 to {most:g}": particles["cr2"].between(0.9, most)}
-        tests["CRPS no worse than independent"] = particles["crps"] <= others["crps"].loc[particles.index]
-        for name, held in tests.items():
-            counts = held.groupby("steps").agg(["sum", "size"])
-            columns = {f"after {step}": f"{row['sum']} of {row['size']}" for step, row in counts.iterrows()}
-            promises.append({"noise": noise, "share": share, "particles": method, "": name, **columns})
-    return {
-        name: pd.DataFrame(lines)
-        for name, lines in zip(("position errors", "intervals", "fits"), (errors, bands, promises), strict=True)
-    }
+            cr2, scores = (means.loc[method][name] for name in ("cr2", "crps"))
+            columns = {**cr2.map("{:.2f}".format).rename("CR-2: {}".format), **scores.rename("CRPS: {}".format)}
+            bands.append({**line, "particles": method, **columns})
+    cells = ["system", "n_inducing", "seed", "steps"]
+    for (noise, share), own in rows[rows["model"] == MAIN].groupby(["noise", "share"], observed=True):
+        by_method = own.set_index(["method", *cells])
+        for method in ("consistent", "consistent, no noise"):
+            particles, others = by_method.loc[method], by_method.loc["independent"]
+            most = 1.0 if noise == "none" else 0.99
+            tests = {f"CR-2 from 0.9 to {most:g}": particles["cr2"].between(0.9, most)}
+            tests["CRPS no worse than independent"] = particles["crps"] <= others["crps"].loc[particles.index]
+            for name, held in tests.items():
+                counts = held.groupby("steps").agg(["sum", "size"]).astype(str)
+                columns = (counts["sum"] + " of " + counts["size"]).rename("after {}".format)
+                promises.append({"noise": noise, "share": share, "particles": method, "": name, **columns})
+    tables = {"position errors": errors, "intervals": bands, "fits": promises}
+    return {name: pd.DataFrame(lines) for name, lines in tables.items()}
 
 
 # --- swing-ups -----------------------------------------------------------------------------------------------------
@@ -313,18 +266,8 @@ SYSTEMS = ("cartpole", "pendulum")
 TRUTHS = 3  # number of seeds, which differ in the first plans only
 SWING_UPS = {"evgp-ifg": "EVGP-IFG", "firm": "EVGP-IFG, firm", "gp": "without physics", "truth": "the truth"}
 
-
-@dataclass(frozen=True)
-class SwingUp:
-    """One run. The truth has no data, and no noise."""
-
-    system: str
-    model: str
-    seconds: float
-    noise: float
-    length: int
-    seed: int
-    size: str
+# One run. The truth has no data, and no noise.
+SwingUp = namedtuple("SwingUp", "system model seconds noise length seed size")
 
 
 class Truth:
@@ -368,9 +311,7 @@ def firm(system: str) -> dict[str, np.ndarray]:
 def run_swing_up(cell: SwingUp) -> dict[str, Any]:
     """Learn, and swing up. Seconds are processor time of one thread."""
     task = mpc.TASKS[cell.system]
-    with threadpool_limits(1), warnings.catch_warnings():
-        for expected in (ConvergenceWarning, DependentRowsWarning):
-            warnings.simplefilter("ignore", expected)
+    with harness.one_thread():
         start = time.process_time()
         if cell.model == "truth":
             model, noise = Truth(cell.system), 0.0
@@ -384,13 +325,11 @@ def run_swing_up(cell: SwingUp) -> dict[str, Any]:
         end = time.process_time()
     away = np.flatnonzero(found.distance >= mpc.NEAR)
     return {
-        **{name: getattr(cell, name) for name in SwingUp.__dataclass_fields__},
         "success": found.success,
         "last_distance": found.distance[-mpc.LAST :].max(),
         "upright_from": mpc.DT * (away[-1] + 1),
         "fit_seconds": middle - start,
         "control_seconds": end - middle,
-        **harness.provenance(),
     }
 
 
@@ -398,21 +337,17 @@ def swing_up_cells(options: Any) -> list[SwingUp]:
     """Return the cells, seed by seed, so that the page is complete after each seed."""
     if options.quick:
         return [SwingUp("pendulum", model, 3.0, 0.0, mpc.LENGTH, 0, "quick") for model in ("evgp-ifg", "gp")]
-    models, systems, found = options.models or SWING_UPS, options.systems or SYSTEMS, []
-    for seed in range(options.seeds or 10):
-        for system in systems:
-            if seed < TRUTHS and "truth" in models:
-                found.append(SwingUp(system, "truth", 0.0, 0.0, 0, seed, "full"))
-            some = itertools.product(options.lengths, options.noises, options.seconds, models)
-            found += [
-                SwingUp(system, model, seconds, noise, length, seed, "full")
-                for length, noise, seconds, model in some
-                if model != "truth"
-            ]
-    return found
+    cells = []
+    for seed, system in itertools.product(options.seeds, options.systems or SYSTEMS):
+        for model in options.models or SWING_UPS:
+            sizes = itertools.product(SECONDS, NOISES, LENGTHS)
+            if model == "truth":
+                sizes = [(0.0, 0.0, 0)] if seed < TRUTHS else []
+            cells += [SwingUp(system, model, *size, seed, "full") for size in sizes]
+    return cells
 
 
-def swing_up_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def swing_up_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return successes of so many seeds, for each number of seconds of data."""
     seconds, lines = sorted(rows.loc[rows["model"] != "truth", "seconds"].unique()), []
     for (system, model, noise, length), own in rows.groupby(["system", "model", "noise", "length"]):
@@ -440,62 +375,37 @@ CONTROLLERS = {
     GP: "+ GP of the residual, without physics",
 }
 CASES = ("waves", "slow waves", "moves")
-# Number of timed steps.
-CALLS = 1000
+
+# One arm, with its payload in kg.
+Tracking = namedtuple("Tracking", "payload seed size")
 
 
-@dataclass(frozen=True)
-class Tracking:
-    """One arm, with its payload in kg."""
-
-    payload: float
-    seed: int
-    size: str
-
-
-@dataclass(frozen=True)
-class Size:
-    """Size of the log and of models, and numbers of references and moves."""
-
-    n_runs: int = 6
-    seconds: float = 10.0
-    n_inducing: int = 40
-    n_inducing_gp: int = 100
-    max_iter: int | None = None
-    n_references: int = 4
-    n_moves: int = 100
-    calls: int = CALLS
-
-
-SIZES = {"full": Size(), "quick": Size(3, 4.0, 10, 20, 30, 1, 20, 50)}
+# Size of the log and of models, and numbers of references, moves and timed steps.
+SIZES = {
+    "full": Bunch(runs=6, seconds=10.0, m=40, m_gp=100, max_iter=None, references=4, moves=100, calls=1000),
+    "quick": Bunch(runs=3, seconds=4.0, m=10, m_gp=20, max_iter=30, references=1, moves=20, calls=50),
+}
 
 
 class WithoutPhysics:
     """The nominal model, and a Gaussian process of all columns for the residual torque of each joint."""
 
-    def __init__(self, body: RigidBody, n_inducing: int, seed: int, max_iter: int | None):
-        self._body = body
-        self.model = EVGPRegressor(n_inducing=n_inducing, max_iter=max_iter, solver=LBFGS(tol=10.0), random_state=seed)
-
-    def fit(self, X: np.ndarray, y: np.ndarray, groups: np.ndarray) -> WithoutPhysics:
-        self.model.fit(X, y - self._forces(X), groups=groups)
-        return self
+    def __init__(self, body: RigidBody, log: tuple[np.ndarray, ...], **options: Any):
+        self.forces = lambda X: body.forces(*np.split(X, 3, axis=1))
+        X, y, groups = log
+        self.model = EVGPRegressor(solver=LBFGS(tol=10.0), **options).fit(X, y - self.forces(X), groups=groups)
 
     def predict(self, X: np.ndarray) -> np.ndarray:
-        return self._forces(X) + self.model.predict(X)
-
-    def _forces(self, X: np.ndarray) -> np.ndarray:
-        return self._body.forces(*np.split(X, 3, axis=1))
+        return self.forces(X) + self.model.predict(X)
 
 
-def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Size, seed: int) -> dict[str, Any]:
-    """Fit all models to the same log."""
+def learn(log: tuple[np.ndarray, ...], body: RigidBody, size: Bunch, seed: int) -> dict[str, Any]:
     X, y, groups = log
-    options = {"max_rows": 1500, "max_iter": size.max_iter, "random_state": seed}
+    options = {"max_iter": size.max_iter, "random_state": seed}
     return {
         WEIGHTS: arms.learner(n_inducing=0).fit(X, y, groups=groups),
-        BOTH: arms.learner(n_inducing=size.n_inducing, **options).fit(X, y, groups=groups),
-        GP: WithoutPhysics(body, size.n_inducing_gp, seed, size.max_iter).fit(X, y, groups),
+        BOTH: arms.learner(n_inducing=size.m, max_rows=1500, **options).fit(X, y, groups=groups),
+        GP: WithoutPhysics(body, log, n_inducing=size.m_gp, **options),
     }
 
 
@@ -510,33 +420,33 @@ def references(n: int, seed: int) -> dict[str, np.ndarray]:
     }
 
 
-def tracking_errors(
-    arm: arms.Arm, body: RigidBody, models: dict[str, Any], cases: dict[str, np.ndarray]
-) -> Iterator[tuple[str, str, str, float]]:
+Numbers = Iterator[tuple[str, str, str, float]]  # measure, model, case, value
+
+
+def controllers_of(body: RigidBody, models: dict[str, Any], reference: np.ndarray) -> dict[str, ComputedTorque]:
+    """Return a controller per model, which knows its torques along the reference in advance."""
+    integral = ComputedTorque(body, reference, ki=400.0)
+    ahead = {name: arms.missed_by(body, model, reference) for name, model in models.items()}
+    learned = {name: ComputedTorque(body, reference, missed) for name, missed in ahead.items()}
+    return {NOMINAL: ComputedTorque(body, reference), "integral": integral, **learned}
+
+
+def tracking_errors(arm: arms.Arm, body: RigidBody, models: dict[str, Any], cases: dict[str, np.ndarray]) -> Numbers:
     """Yield root mean square errors over joints and steps, mrad."""
     for case, reference in cases.items():
-        controllers = {NOMINAL: ComputedTorque(body, reference), "integral": ComputedTorque(body, reference, ki=400.0)}
-        for name, model in models.items():
-            controllers[name] = ComputedTorque(body, reference, arms.missed_by(body, model, reference))
-        for name, controller in controllers.items():
+        for name, controller in controllers_of(body, models, reference).items():
             error = arms.track(arm, controller, seed=1).error
             yield "error", name, case, 1e3 * float(np.sqrt(np.mean(error**2)))
 
 
-def step_costs(
-    body: RigidBody, models: dict[str, Any], reference: np.ndarray, calls: int
-) -> Iterator[tuple[str, str, str, float]]:
+def step_costs(body: RigidBody, models: dict[str, Any], reference: np.ndarray, calls: int) -> Numbers:
     """Yield microseconds of a step of one arm. Controllers alternate, so that all run under the same load."""
     reference = reference[:, :1]
-    ahead = {name: arms.missed_by(body, model, reference) for name, model in models.items()}
-    known = {
-        NOMINAL: ComputedTorque(body, reference),
-        "integral": ComputedTorque(body, reference, ki=400.0),
-        **{name: ComputedTorque(body, reference, missed) for name, missed in ahead.items()},
+    asked = {
+        name: ComputedTorque(body, reference, partial(arms.missed_by, body, models[name])) for name in (WEIGHTS, BOTH)
     }
-    asked = {name: ComputedTorque(body, reference, _one_row(body, models[name])) for name in (WEIGHTS, BOTH)}
     asked[GP] = ComputedTorque(body, reference, models[GP].model.compile().predict)
-    for when, controllers in (("ahead", known), ("in the loop", asked)):
+    for when, controllers in (("ahead", controllers_of(body, models, reference)), ("in the loop", asked)):
         names, taken = list(controllers), {name: [] for name in controllers}
         for call in range(calls):
             step = call % len(reference)
@@ -557,13 +467,9 @@ def step_costs(
         yield "batch", name, "per row", 1e6 * float(np.median(seconds)) / len(reference)
 
 
-def _one_row(body: RigidBody, model: Any) -> Callable[[np.ndarray], np.ndarray]:
-    return lambda wanted: arms.missed_by(body, model, wanted)
-
-
 def broken_limits(
     arm: arms.Arm, body: RigidBody, model: Any, X: np.ndarray, n_moves: int, share: float, seed: int
-) -> Iterator[tuple[str, str, str, float]]:
+) -> Numbers:
     """Yield how many moves break a limit: at any joint and step, and where the plan comes closest to it.
 
     The latter also of those only in which the joint accelerates there no more than it did in the log, of rows X.
@@ -601,79 +507,66 @@ def broken_limits(
 def run_tracking(cell: Tracking) -> list[dict[str, Any]]:
     """Log, learn, track, and move fast. Return a row for each number."""
     size, seed, body = SIZES[cell.size], 1000 * cell.seed + round(10 * cell.payload), RigidBody(load_robot("iiwa14"))
-    with threadpool_limits(1), warnings.catch_warnings():
-        for expected in (ConvergenceWarning, DependentRowsWarning):
-            warnings.simplefilter("ignore", expected)
+    with harness.one_thread():
         arm = arms.make_arm(cell.payload, seed)
-        log = arms.track(arm, ComputedTorque(body, arms.waves(size.n_runs, size.seconds, seed + 100)), seed=0)
+        log = arms.track(arm, ComputedTorque(body, arms.waves(size.runs, size.seconds, seed + 100)), seed=0)
         rows = arms.log_of(log)
-        models, cases = learn(rows, body, size, seed), references(size.n_references, seed + 200)
+        models, cases = learn(rows, body, size, seed), references(size.references, seed + 200)
         share = 0.35 if cell.payload <= 3.0 else 0.45  # with less the arm can hardly hold them
         found = [
             *tracking_errors(arm, body, models, cases),
             *step_costs(body, models, cases["waves"], size.calls),
-            *broken_limits(arm, body, models[BOTH], rows[0], size.n_moves, share, seed + 300),
+            *broken_limits(arm, body, models[BOTH], rows[0], size.moves, share, seed + 300),
         ]
-    own = {name: getattr(cell, name) for name in Tracking.__dataclass_fields__}
-    return [
-        {**own, "measure": measure, "model": model, "case": case, "value": value, **harness.provenance()}
-        for measure, model, case, value in found
-    ]
+    return [dict(zip(("measure", "model", "case", "value"), one, strict=True)) for one in found]
 
 
 def tracking_cells(options: Any) -> list[Tracking]:
     if options.quick:
         return [Tracking(2.0, 0, "quick")]
-    return [Tracking(payload, seed, "full") for seed in range(options.seeds or 2) for payload in PAYLOADS]
+    return [Tracking(payload, seed, "full") for seed in options.seeds for payload in PAYLOADS]
 
 
-def tracking_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tracking_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return errors (mrad), errors by load, microseconds of a step, and broken limits."""
-    by_arm = rows.set_index(["measure", "model", "case", "payload", "seed"])["value"].sort_index()
-    errors, loads, costs, limits = [], [], [], []
-    for model, name in CONTROLLERS.items():
-        own, line = by_arm["error", model], {"": name}
-        line |= {case: own[case].median() for case in CASES}
-        ratios = own / by_arm["error", NOMINAL]
-        line["ratio"] = f"{ratios.median():.3f} ({ratios.min():.3f} to {ratios.max():.3f})"
-        errors.append(line)
-        by_load = own.groupby("payload").median()
-        loads.append({"": name, **{f"{load} kg": value for load, value in by_load.items()}})
+    values = rows.set_index(["measure", "case", "payload", "seed", "model"])["value"]
+    errors, steps = (values[measure].unstack()[list(CONTROLLERS)] for measure in ("error", "step"))
+    ratios = errors.div(errors[NOMINAL], axis=0)
+    table = errors.groupby("case").median().T[list(CASES)]
+    table["ratio"] = ratios.median().map("{:.3f} (".format)
+    table["ratio"] += ratios.min().map("{:.3f} to ".format) + ratios.max().map("{:.3f})".format)
+    loads = errors.groupby("payload").median().T.rename(columns="{} kg".format)
+    ahead, loop = steps.loc["ahead"], steps.loc["in the loop"]
+    ratios = loop.div(ahead[NOMINAL], axis=0).median()
+    columns = {
+        "step": ahead.median(),
+        "ratio": ahead.div(ahead[NOMINAL], axis=0).median().map("{:.2f}".format),
+        "batch, per row": values["batch"].groupby("model").median(),
+        "in the loop": loop.median(),
+        "ratio in the loop": text(ratios, 2),
+    }
+    costs = pd.DataFrame(columns).loc[list(CONTROLLERS)]
+    found = {"errors": table, "errors by load": loads, "steps": costs}
+    tables = {name: own.rename(CONTROLLERS).reset_index(names="") for name, own in found.items()}
 
-        def cost(measure: str, case: str, model: str = model) -> pd.Series:
-            found = (measure, model, case)
-            return by_arm[found] if found in by_arm.index.droplevel([3, 4]) else pd.Series(dtype=float)
-
-        base, ahead, loop = by_arm["step", NOMINAL, "ahead"], cost("step", "ahead"), cost("step", "in the loop")
-        ratio = f"{(loop / base).median():.2f}" if len(loop) else ""
-        line = {"": name, "step": ahead.median(), "ratio": f"{(ahead / base).median():.2f}"}
-        line |= {"batch, per row": cost("batch", "per row").median(), "in the loop": loop.median()}
-        costs.append({**line, "ratio in the loop": ratio})
     promised = {"mean": "50 % where tightest", "mean + 2 std": "2.3 % where tightest"}
     promised["Boole"] = f"{1 - CHANCE:.0%} of moves"
-    for case, said in promised.items():
-        own = rows[(rows["case"] == case) & (rows["model"] == BOTH)].pivot_table(
-            index=["payload", "seed"], columns="measure", values="value"
-        )
-        n, logged = own["moves"].sum(), own["moves as logged"].sum()
-        weights = own["moves"].where(own["moves"] > 0.0)
-        means = ((own[name] * weights).sum() / weights.sum() for name in ("duration", "within 2 std"))
-        limits.append(
-            {
-                "planned with": case,
-                "moves": f"{n:.0f}",
-                "break a limit": f"{own['broken'].sum() / n:.1%}",
-                "where tightest": f"{own['broken where tightest'].sum() / n:.1%}",
-                "there as logged": f"{own['broken as logged'].sum() / logged:.1%} of {logged:.0f}",
-                "promised": said,
-                **{
-                    name: f"{mean:.{digits}f}"
-                    for name, mean, digits in zip(("duration", "within 2 std"), means, (2, 3), strict=True)
-                },
-            }
-        )
-    found = {"errors": errors, "errors by load": loads, "steps": costs, "limits": limits}
-    return {name: pd.DataFrame(lines) for name, lines in found.items()}
+    limits = rows[(rows["model"] == BOTH) & rows["case"].isin(promised)]
+    limits = limits.pivot(index=["case", "payload", "seed"], columns="measure", values="value")
+    sums = limits.groupby("case").sum().loc[list(promised)]
+    means = limits.mul(limits["moves"], axis=0).groupby("case").sum().div(sums["moves"], axis=0)
+    n, logged = sums["moves"], sums["moves as logged"]
+    columns = {
+        "moves": n.map("{:.0f}".format),
+        "break a limit": (sums["broken"] / n).map("{:.1%}".format),
+        "where tightest": (sums["broken where tightest"] / n).map("{:.1%}".format),
+        "there as logged": (sums["broken as logged"] / logged).map("{:.1%} of ".format) + logged.map("{:.0f}".format),
+        "promised": pd.Series(promised),
+        "duration": means["duration"].map("{:.2f}".format),
+        "within 2 std": means["within 2 std"].map("{:.3f}".format),
+    }
+    tables["limits"] = pd.DataFrame(columns).loc[list(promised)].reset_index(names="planned with")
+    return tables
 
 
 PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title
@@ -684,23 +577,17 @@ PARTS: dict[str, tuple[Any, ...]] = {  # cells, run, tables, title
 
 
 def main() -> None:
-    parser = harness.argument_parser(
-        __doc__, quick="one system, little data, one seed", seeds="number of seeds; default: 2, of swing-ups 10"
-    )
+    parser = harness.argument_parser(__doc__, quick="one system, little data, one seed", seeds=2)
     parser.add_argument("part", choices=PARTS)
     parser.add_argument("--systems", nargs="+", choices=ROLLOUT_SYSTEMS, help="default: all, of rollouts the first 3")
     models = [*ROLLOUT_MODELS, *SWING_UPS]
     parser.add_argument("--models", nargs="+", choices=models, help="default: all")
-    parser.add_argument("--seconds", nargs="+", type=float, default=SECONDS, help="of data; default: %(default)s")
-    parser.add_argument("--noises", nargs="+", type=float, default=NOISES, help="on states; default: %(default)s")
-    parser.add_argument("--lengths", nargs="+", type=int, default=LENGTHS, help="of trajectories; default: %(default)s")
-    options = parser.parse_args()
+    options = harness.parse(parser)
     cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, options.part)
     jobs = 1 if options.part == "tracking" else options.jobs  # it measures wall time
-    n_failures = harness.run_missing(cells(options), run, output, jobs, since=options.since)
-    rows = harness.frame(output)
-    harness.write_page(title, tables_of(rows[rows["size"] == size_of(options)]), output, n_failures)
+    n_failures = harness.run_missing(cells(options), run, output, jobs)
+    harness.write_page(title, tables_of(harness.frame(output, size=options.size)), output, n_failures)
 
 
 if __name__ == "__main__":

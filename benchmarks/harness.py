@@ -1,27 +1,24 @@
 """What the benchmarks share: options, cells that run in processes, a CSV that keeps what is finished, and a page.
 
-A benchmark measures cells. Each finished cell is appended to the CSV, so a long run can be interrupted and continued.
-Tables and pictures are made from the CSV. The page beside the CSV is text edited by hand; `write_page` replaces only
-the tables below its ``<!-- table: NAME -->`` lines.
+A benchmark measures cells. Each finished cell is added to the CSV, so a long run can be interrupted and continued; a
+row that is deleted is measured again. Tables and pictures are made from the CSV. The page beside it is text edited by
+hand; `write_page` replaces only the tables below its ``<!-- table: NAME -->`` lines.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
-import dataclasses
-import io
 import platform
 import re
 import signal
 import threading
 import time
 import warnings
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
-from datetime import UTC, date, datetime
-from multiprocessing import active_children, get_context
+from datetime import UTC, datetime
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +27,7 @@ import numpy as np
 import pandas as pd
 import scipy
 import sklearn
+from threadpoolctl import threadpool_limits
 
 import skevgp
 from skevgp import EVGPRegressor
@@ -41,70 +39,51 @@ WIDTH = 8.0  # inches of a picture
 # Okabe & Ito's colours, which colour-blind readers can tell apart, without black and yellow.
 PALETTE = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9")
 
-Row = dict[str, str]  # of a CSV
+Tables = dict[str, pd.DataFrame]  # of a page, by name
 
 
 # --- options -------------------------------------------------------------------------------------------------------
-
-
-def positive(text: str) -> int:
-    """Parse a positive integer."""
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a positive integer")
-    return int(text)
-
-
-def day(text: str) -> str:
-    """Parse a day in the format of `provenance`."""
-    try:
-        return date.fromisoformat(text).isoformat()
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} must be a day like 2026-11-23") from None
-
-
-def csv_path(text: str) -> Path:
-    """Parse the name of a CSV. With another suffix the page or the picture would overwrite it."""
-    if Path(text).suffix != ".csv":
-        raise argparse.ArgumentTypeError(f"{text!r} must be a file that ends in .csv")
-    return Path(text)
 
 
 def argument_parser(
     description: str | None,
     *,
     quick: str,
-    seeds: str | None = None,
+    seeds: int = 0,
     systems: Collection[str] = (),
     default_systems: Collection[str] = (),
     in_processes: bool = True,
 ) -> argparse.ArgumentParser:
-    """Return a parser with the options that all benchmarks have.
+    """Return a parser with the options that benchmarks have, for `parse`.
 
-    Parameters
-    ----------
-    description : str
-        Docstring of the script.
-    quick, seeds : str
-        Help of --quick and --seeds. If ``seeds`` is None, there is no such option.
-    systems, default_systems : collection of str
-        Choices and default of --systems. If ``systems`` is empty, there is no such option.
-    in_processes : bool, default=True
-        Whether there is --jobs. A benchmark that measures wall time runs one cell at a time.
+    ``seeds`` is the default of --seeds, of which a quick run has one. Without ``seeds`` or ``systems`` there is no such
+    option. A benchmark of wall time is not ``in_processes``: it runs one cell at a time.
     """
     parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help=quick)
     if seeds:
-        parser.add_argument("--seeds", type=positive, help=seeds)
+        parser.add_argument("--seeds", type=int, help=f"number of seeds; default: {seeds}, quick 1")
+        parser.set_defaults(n_seeds=seeds)
     if systems:
         default = list(default_systems or systems)
         said = f"default: {' '.join(default)}"
         parser.add_argument("--systems", nargs="+", choices=list(systems), default=default, help=said)
     if in_processes:
         said = "number of processes, each on one core; default: %(default)s"
-        parser.add_argument("--jobs", type=positive, default=joblib.cpu_count(), help=said)
-    parser.add_argument("--since", type=day, help="measure again what was measured before this day, 2026-11-23")
-    parser.add_argument("--output", type=csv_path, help="the CSV; default: in benchmarks/results")
+        parser.add_argument("--jobs", type=int, default=joblib.cpu_count(), help=said)
+    parser.add_argument("--output", type=Path, help="the CSV; default: in benchmarks/results")
     return parser
+
+
+def parse(parser: argparse.ArgumentParser) -> argparse.Namespace:
+    """Return the options, with ``size`` ("quick" or "full") and a range of ``seeds``."""
+    options = parser.parse_args()
+    options.size = "quick" if options.quick else "full"
+    if "seeds" in options:
+        options.seeds = range(options.seeds or (1 if options.quick else options.n_seeds))
+    if options.output and options.output.suffix != ".csv":  # or the page would overwrite it
+        parser.error("--output must end in .csv")
+    return options
 
 
 def output_path(options: argparse.Namespace, name: str) -> Path:
@@ -130,106 +109,48 @@ def provenance() -> dict[str, str]:
     }
 
 
-def whole_lines(path: Path) -> str:
-    """Return the text of a CSV without an incomplete last line of an interrupted write."""
-    text = path.read_bytes().decode() if path.exists() else ""
-    return text[: text.rfind("\n") + 1]
-
-
-def read(path: Path) -> list[Row]:
-    """Return the rows as text."""
-    return list(csv.DictReader(io.StringIO(whole_lines(path), newline="")))
-
-
 def frame(path: Path, **where: Any) -> pd.DataFrame:
-    """Return the rows with some values as a data frame; empty if there is no file."""
-    text = whole_lines(path)
-    rows = pd.read_csv(io.StringIO(text)) if text else pd.DataFrame(columns=list(where))
-    return rows[np.logical_and.reduce([rows[name] == value for name, value in where.items()])] if where else rows
+    """Return the rows with some values; empty if there is no file."""
+    rows = pd.read_csv(path) if path.exists() else pd.DataFrame(columns=list(where))
+    for name, value in where.items():
+        rows = rows[rows[name] == value]
+    return rows
+
+
+def finished(path: Path, names: Sequence[str]) -> set[tuple[str, ...]]:
+    """Return what the rows have in some columns, as text."""
+    if not path.exists():
+        return set()
+    rows = pd.read_csv(path, dtype=str, keep_default_na=False)
+    if not set(names) <= set(rows):
+        raise SystemExit(f"{path} has no columns {sorted(set(names) - set(rows))}: give another --output.")
+    return set(rows[list(names)].itertuples(index=False, name=None))
 
 
 def append(rows: Sequence[Mapping[str, Any]], path: Path) -> None:
     """Add rows. A new file gets their keys as header. An interrupted call adds all of them or none."""
-    old = whole_lines(path)
-    columns = next(csv.reader([old.partition("\n")[0]])) if old else list(rows[0])
-    if set(columns) != set(rows[0]):
+    old, new = path.read_text() if path.exists() else "", pd.DataFrame(rows)
+    columns = old.partition("\n")[0].split(",") if old else list(new)
+    if set(columns) | {"date"} != set(new) | {"date"}:  # which some files do not have
         raise SystemExit(f"{path} has other columns, of another version: give another --output, or move it away.")
-    new = io.StringIO(newline="")
-    writer = csv.DictWriter(new, columns)
-    if not old:
-        writer.writeheader()
-    writer.writerows(rows)
-    with path.open("ab", buffering=0) as file:
-        if file.tell() > len(old.encode()):
-            file.truncate(len(old.encode()))
-        file.write(new.getvalue().encode())
-
-
-def write(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], path: Path) -> None:
-    """Write a whole CSV. An interrupted call leaves the old file."""
-    new = path.with_suffix(".new")
-    with new.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns)
-        writer.writeheader()
-        writer.writerows(rows)
-    new.replace(path)
-
-
-def make_way(cell: tuple[str, ...], names: Sequence[str], columns: Sequence[str], path: Path) -> None:
-    """Remove the rows of a cell, and give the others the columns of new ones, with "nan" for unknown values."""
-    rows = read(path)
-    others = [row for row in rows if tuple(row[name] for name in names) != cell]
-    if len(others) < len(rows) or (rows and set(columns) != rows[0].keys()):
-        write(({name: row.get(name, "nan") for name in columns} for row in others), columns, path)
-
-
-def key(cell: Any) -> tuple[str, ...]:
-    """Return the fields by which cells are compared, as the CSV has them."""
-    return tuple(str(getattr(cell, field.name)) for field in dataclasses.fields(cell) if field.compare)
+    whole = path.with_suffix(".new")
+    whole.write_text(old + new[columns].to_csv(index=False, header=not old, na_rep="nan"))
+    whole.replace(path)
 
 
 def run_missing(
-    cells: Sequence[Any],
-    run: Callable[[Any], Any],
-    output: Path,
-    jobs: int = 1,
-    fresh: bool = False,
-    since: str | None = None,
-    again: Callable[[Row], bool] | None = None,
+    cells: Sequence[Any], run: Callable[[Any], Any], output: Path, jobs: int = 1, fresh: bool = False
 ) -> int:
-    """Run the cells that have no row in the CSV, in processes, and write each result as it arrives.
+    """Run the cells that have no row in the CSV, and write each result as it arrives; return the number of failures.
 
-    Parameters
-    ----------
-    cells : sequence of dataclass
-        Fields that are compared are columns of the CSV.
-    run : callable
-        Function cell -> row, or a list of rows; at the top level of a module.
-    output : Path
-        The CSV.
-    jobs : int, default=1
-        Number of processes.
-    fresh : bool, default=False
-        Whether each cell has a process of its own, for measurements of memory.
-    since : str, default=None
-        Rows that were measured before this day are replaced.
-    again : callable, default=None
-        Function row -> whether the row is replaced.
-
-    Returns
-    -------
-    n_failures : int
-        Number of cells that raised an error.
+    ``cells`` are named tuples, whose fields are columns of the CSV. ``run``, a function at the top level of a module,
+    returns the other columns of a cell's row, or a list of them for several rows. Cells run in so many processes; a
+    ``fresh`` one for each cell is for measurements of memory.
     """
     pyplot()  # fail before the fits if matplotlib is missing
     cells = list(dict.fromkeys(cells))
-    names = [field.name for field in dataclasses.fields(cells[0]) if field.compare] if cells else []
-    rows = read(output)
-    if rows and not set(names) <= rows[0].keys():
-        raise SystemExit(f"{output} has no columns {sorted(set(names) - rows[0].keys())}: give another --output.")
-    stay = (row for row in rows if not (since and row["date"] < since) and not (again and again(row)))
-    done = {tuple(row[name] for name in names) for row in stay}
-    missing = [cell for cell in cells if key(cell) not in done]
+    done = finished(output, cells[0]._fields) if cells else set()
+    missing = [cell for cell in cells if tuple(map(str, cell)) not in done]
     print(f"{len(cells) - len(missing)} of {len(cells)} cells are in {output}", flush=True)
     if not missing:
         return 0
@@ -243,22 +164,19 @@ def run_missing(
         pending = {pool.submit(run, cell): cell for cell in missing}
         try:
             for count, future in enumerate(as_completed(pending), start=1):
-                said = f"[{count}/{len(missing)}] {' '.join(key(pending[future]))}"
+                cell = pending[future]
+                said = f"[{count}/{len(missing)}] {' '.join(map(str, cell))}"
                 try:
                     result = future.result()
                 except Exception as problem:  # the other cells go on
                     n_failures += 1
                     said += f": failed: {type(problem).__name__}: {problem}"
                 else:
-                    new = result if isinstance(result, list) else [result]
-                    if since or again:
-                        make_way(key(pending[future]), names, list(new[0]), output)
-                    append(new, output)
+                    found = result if isinstance(result, list) else [result]
+                    append([{**cell._asdict(), **row, **provenance()} for row in found], output)
                 print(f"{said}; {time.perf_counter() - start:.0f} s so far", flush=True)
         except KeyboardInterrupt:
             pool.shutdown(wait=False, cancel_futures=True)
-            for process in active_children():
-                process.terminate()
             raise SystemExit(f"Interrupted. What is finished is in {output}; run again to go on.") from None
     return n_failures
 
@@ -275,15 +193,30 @@ def figure_of(value: Any) -> str:
     return f"{value:#.3g}".rstrip(".") if np.isfinite(value) else ""
 
 
+def text(values: pd.Series, digits: int) -> pd.Series:
+    """Write numbers with so many decimals; nothing for NaN."""
+    return values.map(f"{{:.{digits}f}}".format).where(values.notna(), "")
+
+
+def best(values: pd.Series) -> pd.Series:
+    """Write numbers, the least of them in bold."""
+    return values.map(figure_of).where(values != values.min(), values.map(lambda value: f"**{figure_of(value)}**"))
+
+
+def ordered(names: Collection[str], found: Collection[Any]) -> list[str]:
+    """Return the names that are found, in their own order."""
+    there = set(found)
+    return [name for name in names if name in there]
+
+
 def table(data: pd.DataFrame) -> str:
     """Write a data frame in Markdown, without its index."""
-    rows = [list(map(str, data.columns)), ["---"] * data.shape[1]]
-    columns = [data.iloc[:, i].tolist() for i in range(data.shape[1])]
-    rows += [[figure_of(cell) for cell in row] for row in zip(*columns, strict=True)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows) + "\n"
+    columns = [data.iloc[:, i].tolist() for i in range(data.shape[1])]  # each of its own type
+    rows = [data.columns, ["---"] * data.shape[1], *(map(figure_of, row) for row in zip(*columns, strict=True))]
+    return "".join(f"| {' | '.join(map(str, row))} |\n" for row in rows)
 
 
-def filled(page: str, tables: Mapping[str, pd.DataFrame]) -> str:
+def filled(page: str, tables: Tables) -> str:
     """Replace the tables below their lines ``<!-- table: NAME -->``."""
     for name, data in tables.items():
         pattern = rf"(<!-- table: {re.escape(name)} -->\n)(?:\n?(?:\|.*\n)+)?"
@@ -291,13 +224,12 @@ def filled(page: str, tables: Mapping[str, pd.DataFrame]) -> str:
     return page
 
 
-def write_page(title: str, tables: Mapping[str, pd.DataFrame], output: Path, n_failures: int = 0) -> None:
+def write_page(title: str, tables: Tables, output: Path, n_failures: int = 0) -> None:
     """Fill the tables of the page beside the CSV, or write a new page; exit with an error if cells failed."""
     page = output.with_suffix(".md")
     text = page.read_text() if page.exists() else f"# {title}\n"
     text += "".join(f"\n<!-- table: {name} -->\n" for name in tables if f"<!-- table: {name} -->" not in text)
-    text = filled(text, tables)
-    page.write_text(text)
+    page.write_text(filled(text, tables))
     for name, data in tables.items():
         print(f"\n{name}\n{table(data)}", end="")
     print(f"\n{page}")
@@ -329,11 +261,11 @@ def logarithmic(axes: Any, which: str = "y") -> None:
     axis.set_minor_formatter(ticker.NullFormatter())
 
 
-def legend(figure: Any, where: str = "upper", **options: Any) -> Any:
-    """Add one legend for all panels above ("upper") or below ("lower") them."""
+def legend(figure: Any, **options: Any) -> None:
+    """Add one legend for all panels above them."""
     pairs = (pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True))
     handles = {label: handle for handle, label in pairs}
-    return figure.legend(handles.values(), handles, loc=f"outside {where} center", **options)
+    figure.legend(handles.values(), handles, loc="outside upper center", **options)
 
 
 def save_picture(figure: Any, path: Path) -> None:
@@ -348,6 +280,23 @@ def save_picture(figure: Any, path: Path) -> None:
 
 
 # --- measuring -----------------------------------------------------------------------------------------------------
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Give linear algebra one thread, and ignore warnings."""
+    with threadpool_limits(1), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def timed(call: Callable[[], object]) -> tuple[float, list[warnings.WarningMessage]]:
+    """Return processor seconds of a call on one thread, and its warnings."""
+    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        start = time.process_time()
+        call()
+        return time.process_time() - start, caught
 
 
 class Stopwatch(LBFGS):

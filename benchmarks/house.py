@@ -13,18 +13,17 @@ from __future__ import annotations
 
 import argparse
 import ast
-import csv
 import inspect
 import sys
 import threading
 import tokenize
 import warnings
-from collections import Counter
 from pathlib import Path
 from types import CodeType, FrameType
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 import skevgp
 from skevgp import EVGPRegressor
@@ -70,32 +69,21 @@ def crossing_names() -> set[str]:
     """Private attributes of self that one class of `EVGPRegressor` uses and another one defines."""
     defined: dict[str, set[str]] = {}
     used: dict[str, set[str]] = {}
-    for kind in EVGPRegressor.__mro__:
-        if not kind.__module__.startswith("skevgp"):
-            continue
-        tree = ast.parse(inspect.getsource(kind)).body[0]
-        own = [node for node in ast.walk(tree) if isinstance(node, ast.Attribute) and _is_private_of_self(node)]
+    for kind in (kind for kind in EVGPRegressor.__mro__ if kind.__module__.startswith("skevgp")):
+        nodes = list(ast.walk(ast.parse(inspect.getsource(kind))))
+        own = [node for node in nodes if isinstance(node, ast.Attribute) and ast.unparse(node.value) == "self"]
+        own = [node for node in own if node.attr.startswith("_") and not node.attr.startswith("__")]
         used[kind.__name__] = {node.attr for node in own}
         defined[kind.__name__] = {node.attr for node in own if isinstance(node.ctx, ast.Store)}
-        defined[kind.__name__] |= {node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef)}
-    return {
-        name
-        for kind, names in used.items()
-        for name in names - defined[kind]
-        if any(name in others for other, others in defined.items() if other != kind)
-    }
+        defined[kind.__name__] |= {node.name for node in nodes if isinstance(node, ast.FunctionDef)}
+    everywhere = set().union(*defined.values())
+    return {name for kind, names in used.items() for name in (names - defined[kind]) & everywhere}
 
 
-def _is_private_of_self(node: ast.Attribute) -> bool:
-    is_self = isinstance(node.value, ast.Name) and node.value.id == "self"
-    return is_self and node.attr.startswith("_") and not node.attr.startswith("__")
-
-
-def lines_of_folders() -> dict[str, tuple[int, int, int]]:
+def lines_of_folders() -> pd.DataFrame:
     """Lines of code and of docstrings, and files, of each folder."""
-    counts: Counter[tuple[str, str]] = Counter()
+    counts = []
     for path in sorted(PACKAGE.rglob("*.py")):
-        folder = path.relative_to(PACKAGE).parts[0] if path.parent != PACKAGE else "(root)"
         of_docstrings: set[int] = set()
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef) and ast.get_docstring(node):
@@ -105,44 +93,36 @@ def lines_of_folders() -> dict[str, tuple[int, int, int]]:
             for token in tokenize.tokenize(file.readline):
                 if token.type not in (tokenize.COMMENT, tokenize.ENCODING) and token.string.strip():
                     of_code.update(range(token.start[0], token.end[0] + 1))
-        counts[folder, "code"] += len(of_code - of_docstrings)
-        counts[folder, "docstring"] += len(of_docstrings)
-        counts[folder, "files"] += 1
-    folders = sorted({folder for folder, _ in counts})
-    return {name: (counts[name, "code"], counts[name, "docstring"], counts[name, "files"]) for name in folders}
+        folder = path.relative_to(PACKAGE).parts[0] if path.parent != PACKAGE else "(root)"
+        counts.append((folder, len(of_code - of_docstrings), len(of_docstrings), 1))
+    kinds = ["lines of code", "lines of docstring", "files"]
+    return pd.DataFrame(counts, columns=["folder", *kinds]).groupby("folder").sum()
 
 
 def main() -> None:
-    """Measure and write the CSV."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--list", action="store_true")
-    arguments = parser.parse_args()
+    options = parser.parse_args()
     functions, calls = functions_of_a_fit()
-    seen: set[str] = set()
-    returns, last = 0, ""
-    for code in functions:
-        returns += code.co_filename != last and code.co_filename in seen
-        seen.add(code.co_filename)
-        last = code.co_filename
-        if arguments.list:
+    files = [code.co_filename for code in functions]
+    changes = [file for last, file in zip(["", *files], files, strict=False) if file != last]
+    if options.list:
+        for code in functions:
             print(Path(code.co_filename).relative_to(PACKAGE), code.co_qualname)
-    pairs = {frozenset(call) for call in calls if (call[1], call[0]) in calls}
-    rows = [
-        ("functions entered by a fit", len(functions)),
-        ("files entered by a fit", len(seen)),
-        ("pairs of files that call both ways", len(pairs)),
-        ("returns to a file that was left", returns),
-        ("private names crossing between classes of an estimator", len(crossing_names())),
-    ]
-    folders, kinds = lines_of_folders(), ("lines of code", "lines of docstring", "files")
-    totals = tuple(sum(each) for each in zip(*folders.values(), strict=True))
-    for name, numbers in {**folders, "all": totals}.items():
-        rows += [(f"{kind} of {name}", n) for kind, n in zip(kinds, numbers, strict=True)]
-    RESULTS.parent.mkdir(exist_ok=True)
-    with RESULTS.open("w", newline="") as file:
-        csv.writer(file).writerows([("meter", "value"), *rows])
-    for name, value in rows:
-        print(f"{value:7,d}  {name}")
+    meters = {
+        "functions entered by a fit": len(functions),
+        "files entered by a fit": len(set(files)),
+        "pairs of files that call both ways": len({frozenset(call) for call in calls if call[::-1] in calls}),
+        "returns to a file that was left": len(changes) - len(set(files)),
+        "private names crossing between classes of an estimator": len(crossing_names()),
+    }
+    lines = lines_of_folders()
+    lines.loc["all"] = lines.sum()
+    for folder, numbers in lines.iterrows():
+        meters |= {f"{kind} of {folder}": number for kind, number in numbers.items()}
+    table = pd.DataFrame(meters.items(), columns=["meter", "value"])
+    table.to_csv(RESULTS, index=False)
+    print(table.to_string(index=False))
 
 
 if __name__ == "__main__":

@@ -3,7 +3,7 @@
     python benchmarks/robots.py real --data ../data            # a quarter of an hour of one core
     python benchmarks/robots.py real --data ../data --quick    # a split per arm, few rows and iterations: a minute
     python benchmarks/robots.py identification                 # 50 runs, each without and with a filter: minutes
-    python benchmarks/robots.py identification --quick         # two runs of few rows: seconds
+    python benchmarks/robots.py identification --quick         # one run of few rows: seconds
 
 *real*: the folder has a folder of logs per arm. Arms without logs are left out. No row of the logs is written anywhere.
 
@@ -26,11 +26,9 @@ from __future__ import annotations
 
 import re
 import tempfile
-import time
-import warnings
+from collections import namedtuple
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -40,10 +38,9 @@ from sklearn.base import BaseEstimator, RegressorMixin
 from sklearn.ensemble import HistGradientBoostingRegressor, RandomForestRegressor
 from sklearn.multioutput import MultiOutputRegressor
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import harness
-from harness import figure_of
+from harness import best, ordered, text
 from skevgp import EVGPRegressor, InverseDynamics
 from skevgp.datasets import load_log, load_robot, perturb_robot
 from skevgp.features import RigidBodyRegressor
@@ -104,32 +101,13 @@ MODELS = (
     "random forest",
 )
 
+Real = namedtuple("Real", "robot split model size")
 
-@dataclass(frozen=True)
-class Real:
-    """One fit to a real arm."""
-
-    robot: str
-    split: str
-    model: str
-    size: str
-    folder: Path = field(compare=False)
-
-
-@dataclass(frozen=True)
-class Question:
-    """The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+"."""
-
-    robot: str
-    trained: str
-    loaded: str
-    gain_scale: float
-    size: str
-    folder: Path = field(compare=False)
+# The load of an identified arm, or its friction if ``loaded`` is empty. ``trained`` has logs joined by "+".
+Question = namedtuple("Question", "robot trained loaded gain_scale size")
 
 
 def paths_of(robot: str, folder: Path) -> dict[str, Path]:
-    """Return the files of the logs by name."""
     if robot == "ur10":
         files = [folder / robot / f"{name}_trajectory.db3" for name in ("ur10_exciting", "validation")]
         named = {name: files[name == "validation"] for name in UR10}
@@ -142,7 +120,6 @@ def paths_of(robot: str, folder: Path) -> dict[str, Path]:
 
 @lru_cache
 def log_of(robot: str, name: str, folder: Path) -> Bunch:
-    """Read a log."""
     path = paths_of(robot, folder)[name]
     if robot == "ur10":
         return load_log(path, keep=UR10[name], **SIGNALS)
@@ -153,16 +130,17 @@ def log_of(robot: str, name: str, folder: Path) -> Bunch:
 @lru_cache
 def moving(robot: str, folder: Path) -> tuple[str, ...]:
     """Return names of the logs in which the arm moves."""
-    names = []
-    for name in paths_of(robot, folder):
+
+    def moves(name: str) -> bool:
         try:
             log_of(robot, name, folder)
         except ValueError as problem:
             if "at rest" not in str(problem):
                 raise
-        else:
-            names.append(name)
-    return tuple(names)
+            return False
+        return True
+
+    return tuple(filter(moves, paths_of(robot, folder)))
 
 
 def has_load(name: str) -> bool:
@@ -177,7 +155,6 @@ def splits_of(robot: str, folder: Path, size: str) -> dict[str, tuple[str, ...]]
 
 
 def tests_of(robot: str, split: str, folder: Path) -> list[str]:
-    """Return the names of the test logs."""
     taken = {*TRAINING[robot], *SPLITS[robot][split]}
     return [name for name in moving(robot, folder) if name not in taken and not has_load(name)]
 
@@ -231,33 +208,26 @@ class LinearThenGP(RegressorMixin, BaseEstimator):
         return self
 
     def predict(self, X: np.ndarray, return_std: bool = False) -> Any:
-        mean = self.linear.predict(X)
-        if not return_std:
-            return mean + self.regressor.predict(X)
-        more, std = self.regressor.predict(X, return_std=True)
-        return mean + more, std
+        mean, std = self.regressor.predict(X, return_std=True)
+        mean = mean + self.linear.predict(X)
+        return (mean, std) if return_std else mean
 
 
 def model_of(name: str, robot: str, quick: bool) -> tuple[Any, bool, bool]:
     """Return a regressor with its defaults, whether it has a std, and whether its fit takes groups."""
-    short = {"max_iter": 5} if quick else {}
+    short, trees = ({"max_iter": 5}, {"n_estimators": 5}) if quick else ({}, {})
     gp = EVGPRegressor(n_inducing=10 if quick else 100, random_state=0, **short)
-    if name == "CAD":
-        return LinearTorques(robot, least_squares=False), False, False
-    if name == LEAST_SQUARES:
-        return LinearTorques(robot), True, False
-    if name == "least squares, prior":
-        return InverseDynamics(robot, n_inducing=0), True, True
-    if name == "GP":
-        return gp, True, True
-    if name == "least squares, then GP":
-        return LinearThenGP(LinearTorques(robot), gp), True, True
-    if name == EVGP:
-        return arm_of(robot, quick), True, True
-    if name == "gradient boosting":
-        return MultiOutputRegressor(HistGradientBoostingRegressor(random_state=0, **short)), False, False
-    trees = {"n_estimators": 5} if quick else {}
-    return MultiOutputRegressor(RandomForestRegressor(random_state=0, **trees)), False, False
+    boosting = HistGradientBoostingRegressor(random_state=0, **short)
+    return {
+        "CAD": (LinearTorques(robot, least_squares=False), False, False),
+        LEAST_SQUARES: (LinearTorques(robot), True, False),
+        "least squares, prior": (InverseDynamics(robot, n_inducing=0), True, True),
+        "GP": (gp, True, True),
+        "least squares, then GP": (LinearThenGP(LinearTorques(robot), gp), True, True),
+        EVGP: (arm_of(robot, quick), True, True),
+        "gradient boosting": (MultiOutputRegressor(boosting), False, False),
+        "random forest": (MultiOutputRegressor(RandomForestRegressor(random_state=0, **trees)), False, False),
+    }[name]
 
 
 def arm_of(robot: str, quick: bool, gain_scale: float = 0.0) -> InverseDynamics:
@@ -265,91 +235,63 @@ def arm_of(robot: str, quick: bool, gain_scale: float = 0.0) -> InverseDynamics:
     return InverseDynamics(robot, gain_scale=gain_scale, random_state=0, **short)
 
 
-def run_real(cell: Real) -> list[dict[str, Any]]:
+def run_real(cell: Real, folder: Path) -> list[dict[str, Any]]:
     """Fit a model and evaluate each joint on each test file. ``fit_seconds`` is processor time of one thread."""
-    robot = urdf_of(cell.robot, cell.folder)
-    train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], cell.folder, cell.size)
+    robot = urdf_of(cell.robot, folder)
+    train = rows_of(cell.robot, SPLITS[cell.robot][cell.split], folder, cell.size)
     model, has_band, by_groups = model_of(cell.model, robot, cell.size == "quick")
     reference = LinearTorques(robot).fit(train.data, train.target)
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        start = time.process_time()
-        model.fit(train.data, train.target, **({"groups": train.groups} if by_groups else {}))
-        seconds = time.process_time() - start
-        rows = []
-        for name in tests_of(cell.robot, cell.split, cell.folder):
-            test = rows_of(cell.robot, [name], cell.folder, cell.size)
-            base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
-            mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
-            for joint in range(test.target.shape[1]):
-                rows.append(
-                    {
-                        **{key: getattr(cell, key) for key in ("robot", "split", "model", "size")},
-                        "test": name,
-                        "joint": joint + 1,
-                        **measures(test.target[:, [joint]], mean[:, [joint]], None if std is None else std[:, [joint]]),
-                        "ratio": np.mean((mean - test.target)[:, joint] ** 2) / base[joint],
-                        "n_train": len(train.data),
-                        "n_test": len(test.data),
-                        "fit_seconds": seconds,
-                        **harness.provenance(),
-                    }
-                )
+    groups = {"groups": train.groups} if by_groups else {}
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, **groups))
+    rows = []
+    for name in tests_of(cell.robot, cell.split, folder):
+        test = rows_of(cell.robot, [name], folder, cell.size)
+        base = np.mean((reference.predict(test.data) - test.target) ** 2, axis=0)
+        mean, std = model.predict(test.data, return_std=True) if has_band else (model.predict(test.data), None)
+        for joint, least in enumerate(base):
+            own = [None if values is None else values[:, [joint]] for values in (test.target, mean, std)]
+            row = {"test": name, "joint": joint + 1, **measures(*own)}
+            row["ratio"] = np.mean((mean - test.target)[:, joint] ** 2) / least
+            rows.append({**row, "n_train": len(train.data), "n_test": len(test.data), "fit_seconds": seconds})
     return rows
 
 
 def measures(truth: np.ndarray, mean: np.ndarray, std: np.ndarray | None) -> dict[str, Any]:
     """Return scores of one joint (n, 1); empty without a std."""
-    error = {"nmse": np.mean((mean - truth) ** 2) / truth.var()}
-    if std is None:
-        return {**error, **dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")}
-    shares = containing_ratios(truth, mean, std)
-    bands = dict(zip(("cr1", "cr2", "cr3"), shares, strict=True))
-    return {**error, "nlpd": negative_log_predictive_density(truth, mean, std), **bands}
+    found = dict.fromkeys(("nlpd", "cr1", "cr2", "cr3"), "")
+    if std is not None:
+        found = {"nlpd": negative_log_predictive_density(truth, mean, std)}
+        found |= dict(zip(("cr1", "cr2", "cr3"), containing_ratios(truth, mean, std), strict=True))
+    return {"nmse": np.mean((mean - truth) ** 2) / truth.var(), **found}
 
 
-def ask(question: Question) -> list[dict[str, Any]]:
+def ask(question: Question, folder: Path) -> list[dict[str, Any]]:
     """Return what was identified, with standard deviations."""
-    train = rows_of(question.robot, question.trained.split("+"), question.folder, question.size)
-    arm = arm_of(urdf_of(question.robot, question.folder), question.size == "quick", question.gain_scale)
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    train = rows_of(question.robot, question.trained.split("+"), folder, question.size)
+    arm = arm_of(urdf_of(question.robot, folder), question.size == "quick", question.gain_scale)
+    with harness.one_thread():
         arm.fit(train.data, train.target, groups=train.groups)
         if question.loaded:
-            loaded = rows_of(question.robot, [question.loaded], question.folder, question.size)
+            loaded = rows_of(question.robot, [question.loaded], folder, question.size)
             load = arm.estimate_payload(loaded.data, loaded.target)
             names = ["mass", *(f"com {axis}" for axis in "xyz")]
             values, stds = np.r_[load.mass, load.com], np.r_[load.mass_std, load.com_std]
         else:
             keep = [name.startswith(("viscous", "coulomb")) for name in arm.coef_names_]
             names, values, stds = arm.coef_names_[keep], arm.coef_[keep], arm.coef_std_[keep]
-    return [
-        {
-            **{key: getattr(question, key) for key in ("robot", "trained", "loaded", "gain_scale", "size")},
-            "name": name,
-            "value": value,
-            "std": std,
-            **harness.provenance(),
-        }
-        for name, value, std in zip(names, values, stds, strict=True)
-    ]
+    found = zip(names, values, stds, strict=True)
+    return [{"name": name, "value": value, "std": std} for name, value, std in found]
 
 
 def questions_of(folder: Path, size: str) -> list[Question]:
     """Return questions of loads, from the log without the load alone and with training logs, and of friction."""
-    there = moving("ur10e", folder)
-    splits = splits_of("ur10e", folder, size)
-    questions = []
+    splits, questions = splits_of("ur10e", folder, size), []
     for loaded, empty, _ in LOADS:
-        if {loaded, empty} <= set(there):
+        if {loaded, empty} <= set(moving("ur10e", folder)):
             more = splits.get("three", ()) if size == "full" else ()
-            sets = [(empty,), (empty, *more)] if more else [(empty,)]
-            questions += [
-                Question("ur10e", "+".join(names), loaded, scale, size, folder)
-                for names in sets
-                for scale in (0.0, 0.1)
-            ]
-    return questions + [Question("ur10e", "+".join(names), "", 0.0, size, folder) for names in splits.values()]
+            for trained in dict.fromkeys([(empty,), (empty, *more)]):
+                questions += [Question("ur10e", "+".join(trained), loaded, scale, size) for scale in (0.0, 0.1)]
+    return questions + [Question("ur10e", "+".join(names), "", 0.0, size) for names in splits.values()]
 
 
 def geometric(values: pd.Series) -> float:
@@ -361,82 +303,78 @@ def pooled(rows: pd.DataFrame, name: str) -> float:
     return float(np.average(rows[name], weights=rows["n_test"]))
 
 
-def shown(value: float, digits: int) -> str:
-    return "" if np.isnan(value) else f"{value:.{digits}f}"
-
-
-def split_tables(rows: pd.DataFrame, first: bool) -> dict[str, pd.DataFrame]:
+def split_tables(rows: pd.DataFrame, first: bool) -> harness.Tables:
     """Return errors over those of least squares, CR-2 of each joint, and nMSE of each test file, or lost ones."""
+    rows = rows.assign(model=pd.Categorical(rows["model"], MODELS), joint="joint " + rows["joint"].astype(str))
     least = rows.loc[rows.groupby(["test", "joint"])["nmse"].idxmin()]
-    models = {model: own for model in MODELS if len(own := rows[rows["model"] == model])}
-    summary, bands, errors, lost = [], [], [], []
-    for model, own in models.items():
-        wins = f"{(least['model'] == model).sum()} of {len(least)}"
-        line = {"": model, "ratio": geometric(own["ratio"])}
-        line |= {f"joint {joint}": ratio for joint, ratio in own.groupby("joint")["ratio"].mean().items()}
-        line |= {"best of all": wins, "NLPD": shown(pooled(own, "nlpd"), 2)}
-        line |= {f"CR-{k}": shown(pooled(own, f"cr{k}"), 3) for k in (1, 2, 3)}
-        summary.append({**line, "seconds": f"{own['fit_seconds'].iloc[0]:.1f}"})
-        if own["cr2"].notna().all():
-            shares = {f"joint {joint}": shown(pooled(part, "cr2"), 3) for joint, part in own.groupby("joint")}
-            bands.append({"": model, **shares})
-    for test, here in rows.groupby("test", sort=False):
-        table = here.pivot(index="model", columns="joint", values="nmse")
-        for model in models:
-            best = table.loc[model] == table.min()
-            texts = {
-                f"joint {joint}": f"**{figure_of(value)}**" if best[joint] else figure_of(value)
-                for joint, value in table.loc[model].items()
-            }
-            errors.append({"test": test, "": model, **texts})
-    for row in rows[rows["model"] == EVGP].itertuples():
-        best = least[(least["test"] == row.test) & (least["joint"] == row.joint)].iloc[0]
-        if best["model"] != EVGP:
-            line = {"test": row.test, "joint": row.joint, "least": best["model"], "its nMSE": best["nmse"]}
-            lost.append({**line, "EVGP's": row.nmse, "ratio": f"{row.ratio:.2f}"})
-    last = {"errors": errors} if first else {"lost": lost}
-    return {name: pd.DataFrame(lines) for name, lines in ({"": summary, "CR-2": bands} | last).items()}
+    models, by_joint = (rows.groupby(keys, observed=True) for keys in ("model", ["model", "joint"]))
+    names = ["nlpd", "cr1", "cr2", "cr3"]
+    means = models.apply(lambda own: pd.Series({name: pooled(own, name) for name in names}), include_groups=False)
+    wins = least["model"].value_counts().reindex(means.index).map(f"{{}} of {len(least)}".format)
+    summary = models["ratio"].agg(geometric).to_frame().join(by_joint["ratio"].mean().unstack())
+    summary = summary.assign(**{"best of all": wins, "NLPD": text(means["nlpd"], 2)})
+    for k in (1, 2, 3):
+        summary[f"CR-{k}"] = text(means[f"cr{k}"], 3)
+    summary["seconds"] = models["fit_seconds"].first().map("{:.1f}".format)
+    bands = by_joint.apply(pooled, "cr2", include_groups=False).unstack().dropna().map("{:.3f}".format)
+    tables = {"": summary.reset_index(names=""), "CR-2": bands.reset_index(names="")}
+    if first:
+        errors = rows.pivot(index=["test", "model"], columns="joint", values="nmse")
+        errors = errors.groupby("test").transform(best).reindex(rows["test"].unique(), level=0)
+        return tables | {"errors": errors.reset_index(names=["test", ""])}
+    lost = rows[rows["model"] == EVGP].merge(least, on=["test", "joint"], suffixes=("", " least"))
+    lost = lost[lost["model least"] != EVGP]
+    lost = lost.assign(joint=lost["joint"].str.removeprefix("joint "), ratio=lost["ratio"].map("{:.2f}".format))
+    header = {"model least": "least", "nmse least": "its nMSE", "nmse": "EVGP's"}
+    return tables | {"lost": lost[["test", "joint", *header, "ratio"]].rename(columns=header)}
 
 
-def real_tables(rows: pd.DataFrame, found: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
+def real_tables(rows: pd.DataFrame, found: pd.DataFrame) -> harness.Tables:
     short, tables = [], {}
     for robot, splits in SPLITS.items():
-        there = [split for split in splits if ((rows["robot"] == robot) & (rows["split"] == split)).any()]
-        for number, split in enumerate(there):
-            own = rows[(rows["robot"] == robot) & (rows["split"] == split)]
+        of_robot = rows[rows["robot"] == robot]
+        for number, split in enumerate(ordered(splits, of_robot["split"])):
+            own = of_robot[of_robot["split"] == split]
             for name, table in split_tables(own, number == 0).items():
                 tables[", ".join(filter(None, (robot, split, name)))] = table
             own = own[own["model"] == EVGP]
-            shares = [pooled(part, "cr2") for _, part in own.groupby("joint")]
+            shares = own.groupby("joint").apply(pooled, "cr2", include_groups=False)
             line = {"arm": robot, "trained on": split, "ratio": f"{geometric(own['ratio']):.3f}"}
             line |= {"worst joint": f"{own.groupby('joint')['ratio'].mean().max():.2f}"}
-            line |= {"CR-2 of joints": f"{min(shares):.3f} to {max(shares):.3f}"}
+            line |= {"CR-2 of joints": f"{shares.min():.3f} to {shares.max():.3f}"}
             short.append({**line, "seconds": f"{own['fit_seconds'].iloc[0]:.0f}"})
     tables = {"in short": pd.DataFrame(short), **tables}
-    known, loads, frictions = {loaded: mass for loaded, _, mass in LOADS}, [], []
-    for row in found[found["name"] == "mass"].itertuples() if len(found) else ():
+    return tables | {"loads": loads_of(found), "friction": friction_of(found)} if len(found) else tables
+
+
+def loads_of(found: pd.DataFrame) -> pd.DataFrame:
+    """Return identified masses of loads with 95 % intervals."""
+    known, lines = {loaded: mass for loaded, _, mass in LOADS}, []
+    for row in found[found["name"] == "mass"].itertuples():
         low, high, mass = row.value - INTERVAL * row.std, row.value + INTERVAL * row.std, known[row.loaded]
         line = {"log": row.loaded, "arm known from": row.trained.replace("+", " + ")}
         line |= {"gain_scale": str(row.gain_scale), "mass, kg": f"{row.value:.3f}", "std": f"{row.std:.3f}"}
         line |= {"95 %": f"{low:.3f} to {high:.3f}", "width": f"{high - low:.3f}"}
         line |= {"true": "" if mass is None else f"{mass:.3f}"}
-        loads.append({**line, "inside": "" if mass is None else "yes" if low <= mass <= high else "no"})
-    if len(found):
-        for trained, own in found[found["loaded"].isna()].groupby("trained", sort=False):
-            for term in ("coulomb", "viscous"):
-                terms = own[own["name"].str.startswith(term)]
-                texts = [f"{v:.2f} ± {INTERVAL * s:.2f}" for v, s in zip(terms["value"], terms["std"], strict=True)]
-                line = {"": term, "known from": trained.replace("+", " + ")}
-                frictions.append(line | {f"joint {joint}": text for joint, text in enumerate(texts, start=1)})
-    return tables | {"loads": pd.DataFrame(loads), "friction": pd.DataFrame(frictions)}
+        lines.append({**line, "inside": "" if mass is None else "yes" if low <= mass <= high else "no"})
+    return pd.DataFrame(lines)
+
+
+def friction_of(found: pd.DataFrame) -> pd.DataFrame:
+    """Return identified friction of the joints with 95 % intervals."""
+    own = found[found["loaded"].isna()]
+    names = {"known from": own["trained"].str.replace("+", " + "), "": own["name"].str.partition("(")[0]}
+    own = own.assign(**names, text=own["value"].map("{:.2f} ± ".format) + (INTERVAL * own["std"]).map("{:.2f}".format))
+    own["joint"] = "joint " + (own.groupby(list(names)).cumcount() + 1).astype(str)
+    table = own.pivot(index=list(names), columns="joint", values="text")
+    table = table.reindex(names["known from"].unique(), level=0).reset_index()
+    return table[["", "known from", *table.columns[2:]]]
 
 
 def plot_real(rows: pd.DataFrame, path: Path) -> None:
     """Draw ratios of each joint and test file, and shares within two standard deviations, a panel per split."""
-    splits = [(robot, split) for robot in SPLITS for split in SPLITS[robot]]
-    present = set(zip(rows["robot"], rows["split"], strict=True))
-    splits = [one for one in splits if one in present]
+    present = zip(rows["robot"], rows["split"], strict=True)
+    splits = ordered([(robot, split) for robot in SPLITS for split in SPLITS[robot]], present)
     size = (harness.WIDTH, 0.9 + 1.7 * len(splits))
     figure, axes = harness.pyplot().subplots(len(splits), 2, figsize=size, sharex="col", squeeze=False)
     for (ratios, shares), (robot, split) in zip(axes, splits, strict=True):
@@ -463,24 +401,24 @@ def plot_real(rows: pd.DataFrame, path: Path) -> None:
     harness.save_picture(figure, path)
 
 
-def real(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
-    """Measure, and return tables and the number of failures."""
+def real(options: Any, output: Path) -> tuple[harness.Tables, int]:
     if options.data is None:
         raise SystemExit("--data is needed: a folder with the folders ur10e and ur10, or one of them")
     folder = options.data.resolve()
     cells = [
-        Real(robot, split, model, size, folder)
+        Real(robot, split, model, options.size)
         for robot in SPLITS
-        for split in splits_of(robot, folder, size)
+        for split in splits_of(robot, folder, options.size)
         if tests_of(robot, split, folder)
         for model in MODELS
     ]
     if not cells:
         raise SystemExit(f"{options.data} has no logs of {' or '.join(SPLITS)}")
-    n_failures = harness.run_missing(cells, run_real, output, options.jobs, since=options.since)
+    n_failures = harness.run_missing(cells, partial(run_real, folder=folder), output, options.jobs)
     second = output.with_name(f"{output.stem}_parameters.csv")
-    n_failures += harness.run_missing(questions_of(folder, size), ask, second, options.jobs, since=options.since)
-    rows, found = (harness.frame(path, size=size) for path in (output, second))
+    questions = questions_of(folder, options.size)
+    n_failures += harness.run_missing(questions, partial(ask, folder=folder), second, options.jobs)
+    rows, found = (harness.frame(path, size=options.size) for path in (output, second))
     plot_real(rows, output.with_suffix(".png"))
     return real_tables(rows, found), n_failures
 
@@ -496,14 +434,8 @@ FRICTION, LARGEST = (0.02, 0.1), 100.0
 STICTION = RigidBodyRegressor().stiction_velocity
 TOLD = 0.25  # a share of the prior's variance
 
-
-@dataclass(frozen=True)
-class Simulated:
-    """One simulated arm, and the cutoff of the filter."""
-
-    cutoff: str
-    seed: int
-    size: str
+# One simulated arm, and the cutoff of the filter.
+Simulated = namedtuple("Simulated", "cutoff seed size")
 
 
 def trajectory(rng: np.random.Generator, n_joints: int, size: str) -> np.ndarray:
@@ -578,11 +510,8 @@ def told(arm: Bunch, model: InverseDynamics) -> tuple[np.ndarray, np.ndarray]:
 def run_simulated(cell: Simulated) -> dict[str, Any]:
     """Identify one arm. ``fit_seconds`` is processor time of one thread."""
     one = arm(cell)
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        start = time.process_time()
-        model = InverseDynamics(one.nominal, n_inducing=0).fit(one.data, one.target, groups=one.groups)
-        seconds = time.process_time() - start
+    model = InverseDynamics(one.nominal, n_inducing=0)
+    seconds, _ = harness.timed(lambda: model.fit(one.data, one.target, groups=one.groups))
     z, width = told(one, model)
     X, truth = one.test
     H = model.feature_map_.transform(X)
@@ -592,7 +521,6 @@ def run_simulated(cell: Simulated) -> dict[str, Any]:
     links = 10 * truth.shape[1]
     of_links = H[:, :, :links] @ (model.coef_ - one.weights)[:links]
     return {
-        **asdict(cell),
         "n_rows": len(one.data),
         "n_told": len(z),
         "covered": np.sum(np.abs(z) <= INTERVAL),
@@ -604,7 +532,6 @@ def run_simulated(cell: Simulated) -> dict[str, Any]:
         "cad_error_worst": (rms(H @ model.coef_prior_mean_ - truth) / scatter).max(),
         "correlation_time": np.mean(model.correlation_time_),
         "fit_seconds": seconds,
-        **harness.provenance(),
     }
 
 
@@ -612,49 +539,46 @@ def rms(values: np.ndarray) -> np.ndarray:
     return np.sqrt(np.mean(values**2, axis=0))
 
 
-def identification_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the table of the page: a line per filter."""
-    lines = []
-    for cutoff, own in rows.fillna({"cutoff": "none"}).groupby("cutoff", sort=False):
-        shares = own["covered"] / own["n_told"]
-        torques = {"torques": "torque_error_worst", "links' torques": "links_error_worst"}
-        torques |= {"CAD's torques": "cad_error_worst"}
-        lines.append(
-            {
-                "filter": cutoff,
-                "runs": len(own),
-                "combinations": f"{own['n_told'].mean():.1f}",
-                "within 95 %": f"{own['covered'].sum() / own['n_told'].sum():.3f}",
-                "of runs": f"{shares.min():.2f} to {shares.max():.2f}",
-                "rms z": f"{np.sqrt(own['squares'].sum() / own['n_told'].sum()):.2f}",
-                "width": own["width"].mean(),
-                **{header: f"{own[name].median():.2%} ({own[name].max():.2%})" for header, name in torques.items()},
-                "correlation time": f"{own['correlation_time'].mean():.1f}",
-                "seconds": f"{own['fit_seconds'].mean():.1f}",
-            }
-        )
-    return {"identification": pd.DataFrame(lines)}
+def identification_tables(rows: pd.DataFrame) -> harness.Tables:
+    runs = rows.fillna({"cutoff": "none"}).groupby("cutoff", sort=False)
+    means, sums = runs.mean(numeric_only=True), runs.sum(numeric_only=True)
+    shares = runs.apply(lambda own: own["covered"] / own["n_told"], include_groups=False).groupby("cutoff", sort=False)
+    columns = {
+        "runs": runs.size(),
+        "combinations": means["n_told"].map("{:.1f}".format),
+        "within 95 %": (sums["covered"] / sums["n_told"]).map("{:.3f}".format),
+        "of runs": shares.min().map("{:.2f} to ".format) + shares.max().map("{:.2f}".format),
+        "rms z": np.sqrt(sums["squares"] / sums["n_told"]).map("{:.2f}".format),
+        "width": means["width"],
+    }
+    for header, name in {"torques": "torque", "links' torques": "links", "CAD's torques": "cad"}.items():
+        errors = runs[f"{name}_error_worst"]
+        columns[header] = errors.median().map("{:.2%}".format) + errors.max().map(" ({:.2%})".format)
+    columns |= {"correlation time": means["correlation_time"].map("{:.1f}".format)}
+    columns |= {"seconds": means["fit_seconds"].map("{:.1f}".format)}
+    return {"identification": pd.DataFrame(columns).reset_index(names="filter")}
 
 
-def identification(options: Any, output: Path, size: str) -> tuple[dict[str, pd.DataFrame], int]:
-    """Measure, and return the table and the number of failures."""
-    seeds = range(options.seeds or (2 if options.quick else 50))
-    cells = [Simulated(cutoff, seed, size) for seed in seeds for cutoff in FILTERS]
-    n_failures = harness.run_missing(cells, run_simulated, output, options.jobs, since=options.since)
-    return identification_tables(harness.frame(output, size=size)), n_failures
+def identification(options: Any, output: Path) -> tuple[harness.Tables, int]:
+    cells = [Simulated(cutoff, seed, options.size) for seed in options.seeds for cutoff in FILTERS]
+    n_failures = harness.run_missing(cells, run_simulated, output, options.jobs)
+    return identification_tables(harness.frame(output, size=options.size)), n_failures
+
+
+PARTS = {  # CSV, function, title
+    "real": ("real_arms", real, "Torques of real arms"),
+    "identification": ("identification", identification, "What is identified of a simulated arm"),
+}
 
 
 def main() -> None:
-    parser = harness.argument_parser(
-        __doc__, quick="few rows, iterations and trees", seeds="number of simulated arms; default: 50, quick 2"
-    )
-    parser.add_argument("part", choices=("real", "identification"))
+    parser = harness.argument_parser(__doc__, quick="few rows, iterations and trees", seeds=50)
+    parser.add_argument("part", choices=PARTS)
     parser.add_argument("--data", type=Path, help="of real arms: a folder with the folders ur10e and ur10")
-    options = parser.parse_args()
-    is_real, size = options.part == "real", "quick" if options.quick else "full"
-    output = harness.output_path(options, "real_arms" if is_real else "identification")
-    tables, n_failures = (real if is_real else identification)(options, output, size)
-    title = "Torques of real arms" if is_real else "What is identified of a simulated arm"
+    options = harness.parse(parser)
+    name, measure, title = PARTS[options.part]
+    output = harness.output_path(options, name)
+    tables, n_failures = measure(options, output)
     harness.write_page(title, tables, output, n_failures)
 
 

@@ -12,17 +12,16 @@
 With --quick each takes seconds.
 
 *latency*: 100 inducing points, 6 columns, 4 outputs that share them, one thread; medians over half a second. skevgp
-also has groups of one output, and the cartpole with its features. The peers are those of peers/adapters.py.
+also has groups of one output, and the cartpole with its features.
 
-*casadi*: the four states, one group of outputs, without features, with IFG and with nominal dynamics; the kernel sees
-sine and cosine of the angle. Processor time, the least of several rounds. CasADi is called through its buffers and C
-through ctypes.
+*casadi*: one group of outputs, without features, with IFG and with nominal dynamics. Processor time, the least of
+several rounds. CasADi is called through its buffers and C through ctypes.
 
 *evaluation*: the dense products are ``L_inv @ U``, ``V @ V.T``, ``G @ V`` and ``L_inv.T @ (G @ V)`` over all rows.
 Evaluation and products alternate; medians are compared, on one core and on all.
 
-*rows*: fits of 8 iterations to 8 columns with 100 inducing points, from a memory-mapped file on one and two threads,
-and by Dask on two workers. Memory is the peak above that before the fit.
+*rows*: 8 iterations to 8 columns with 100 inducing points, from a memory-mapped file on one and two threads, and by
+Dask on two workers. Memory is the peak above that before the fit.
 
 *million*: L-BFGS with its defaults, natural gradients on mini-batches for some epochs, and L-BFGS with a thousand
 iterations as the reference, of whose gain over noise alone the others have a share. (The reference in the CSV did not
@@ -32,6 +31,7 @@ begin on samples of the rows.)
 from __future__ import annotations
 
 import ctypes
+import itertools
 import json
 import os
 import shutil
@@ -40,19 +40,19 @@ import sys
 import tempfile
 import time
 import warnings
+from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pandas as pd
-from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF
 from threadpoolctl import threadpool_limits
 
 import harness
+from harness import figure_of
 from peers.adapters import microseconds
 from peers.against_peers import work
 from skevgp import EVGPRegressor
@@ -67,36 +67,13 @@ ONE_THREAD = {f"{name}_NUM_THREADS": "1" for name in ("OMP", "OPENBLAS", "MKL")}
 ONE_THREAD |= {f"TF_NUM_{name}_THREADS": "1" for name in ("INTEROP", "INTRAOP")}
 OTHERS = {"scikit-learn": "scikit-learn GPR", "GPflow": "GPflow SGPR", "GPyTorch": "GPyTorch SGPR"}
 
-
-@dataclass(frozen=True)
-class Latency:
-    """A library in a round."""
-
-    library: str
-    round: int
-    size: str
-    python: str = field(compare=False)
+Latency = namedtuple("Latency", "library round size")
 
 
 def latency_cells(options: Any) -> list[Latency]:
-    pythons = {"skevgp": sys.executable, "scikit-learn": sys.executable}
-    if options.peer_python:
-        pythons |= dict.fromkeys(("GPflow", "GPyTorch"), options.peer_python)
-    size, rounds = ("quick", 1) if options.quick else ("full", 3)
-    return [Latency(library, turn, size, python) for turn in range(rounds) for library, python in pythons.items()]
-
-
-def compiled_calls(model: Any, X: np.ndarray, name: str) -> dict[str, Callable[[], object]]:
-    """Return calls of a compiled model."""
-    fast, row = model.compile(), X[0]
-    return {
-        f"{name}: row, mean": lambda: fast.predict(row),
-        f"{name}: row, mean and std": lambda: fast.predict(row, return_std=True),
-        f"{name}: row, mean and Jacobian": lambda: fast.value_and_jacobian(row),
-        f"{name}: row, mean, std and both Jacobians": lambda: fast.value_and_jacobian(row, return_std=True),
-        f"{name}: horizon, mean and std": lambda: fast.predict(X, return_std=True),
-        f"{name}: horizon, mean and Jacobian": lambda: fast.value_and_jacobian(X),
-    }
+    libraries = ["skevgp", "scikit-learn", *(["GPflow", "GPyTorch"] if options.peer_python else [])]
+    rounds = range(1 if options.quick else 3)
+    return [Latency(library, turn, options.size) for turn in rounds for library in libraries]
 
 
 def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
@@ -111,49 +88,53 @@ def calls_of_skevgp(given: dict[str, Any]) -> dict[str, Callable[[], object]]:
     options = {"n_inducing": len(Z), "sharing": "all", "max_iter": 0, "random_state": 0}
     system = EVGPRegressor(InertiaForceGravity("cartpole"), kernel_map=AngleEncoder("cartpole"), **options)
     system.fit(train.data, train.target)
-    calls = {"predict: row, mean and std": lambda: one.predict(ahead[:1], return_std=True)}
-    calls |= compiled_calls(one, ahead, "compiled")
-    calls |= compiled_calls(four, ahead, "compiled, four groups")
-    calls |= compiled_calls(system, train.data[: len(ahead)], "compiled, cartpole with features")
-    fast = system.compile()
+    calls: dict[str, Callable[[], object]] = {
+        "predict: row, mean and std": lambda: one.predict(ahead[:1], return_std=True)
+    }
+    for name, model, rows in (
+        ("compiled", one, ahead),
+        ("compiled, four groups", four, ahead),
+        ("compiled, cartpole with features", system, train.data[: len(ahead)]),
+    ):
+        fast, row = model.compile(), rows[0]
+        calls |= {
+            f"{name}: row, mean": partial(fast.predict, row),
+            f"{name}: row, mean and std": partial(fast.predict, row, return_std=True),
+            f"{name}: row, mean and Jacobian": partial(fast.value_and_jacobian, row),
+            f"{name}: row, mean, std and both Jacobians": partial(fast.value_and_jacobian, row, return_std=True),
+            f"{name}: horizon, mean and std": partial(fast.predict, rows, return_std=True),
+            f"{name}: horizon, mean and Jacobian": partial(fast.value_and_jacobian, rows),
+        }
     calls["partial_fit of 10 rows"] = lambda: system.partial_fit(train.data[:10], train.target[:10])
     calls["new weights into the compiled predictor"] = lambda: fast.update(system)
     return calls
 
 
-def run_latency(cell: Latency) -> list[dict[str, Any]]:
-    """Return a row per call."""
+def run_latency(cell: Latency, options: Any) -> list[dict[str, Any]]:
     rng, quick = np.random.RandomState(0), cell.size == "quick"
     X = rng.uniform(-2.0, 2.0, (2000, 6))
     Y = np.sin(X @ rng.randn(6, 4)) + 0.05 * rng.randn(2000, 4)
     given = {"X": X, "Y": Y, "inducing_points": X[rng.permutation(2000)[: 10 if quick else 100]]}
     given |= {"ahead": rng.uniform(-2.0, 2.0, (50, 6)), "seconds": 0.0 if quick else 0.5}
     if cell.library == "skevgp":
-        with threadpool_limits(1), warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with harness.one_thread():
             found = {name: microseconds(call, given["seconds"]) for name, call in calls_of_skevgp(given).items()}
     else:
-        said = work(cell.python, OTHERS[cell.library], given, **ONE_THREAD)
+        python = sys.executable if cell.library == "scikit-learn" else options.peer_python
+        said = work(python, OTHERS[cell.library], given, **ONE_THREAD)
         found = dict(zip(said.calls, said.microseconds, strict=True))
-    same = {"library": cell.library, "round": cell.round, "size": cell.size}
-    return [{**same, "call": name, "microseconds": value, **harness.provenance()} for name, value in found.items()]
+    return [{"call": name, "microseconds": value} for name, value in found.items()]
 
 
-def latency_table(rows: pd.DataFrame) -> pd.DataFrame:
+def latency_tables(rows: pd.DataFrame) -> harness.Tables:
     found = rows.groupby(["library", "call"], sort=False)["microseconds"].agg(["median", "min", "size"])
-    columns = {"median": "median", "min": "least round", "size": "rounds"}
-    return found.round(0).astype(int).rename(columns=columns).reset_index()
+    found = found.round(0).astype(int).set_axis(["median", "least round", "rounds"], axis=1)
+    return {"latency": found.reset_index()}
 
 
 # --- casadi --------------------------------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True)
-class Casadi:
-    """A model of the cartpole."""
-
-    features: str
-    m: int
+Casadi = namedtuple("Casadi", "features m")
 
 
 def casadi_cells(options: Any) -> list[Casadi]:
@@ -180,13 +161,11 @@ def buffered(function: Any, *given: np.ndarray) -> Callable[[], None]:
         buffer.set_arg(i, memoryview(values))
     for i, values in enumerate(results):
         buffer.set_res(i, memoryview(values))
-    kept = buffer, given, results  # the call only points to them
 
-    def run() -> None:
-        assert kept
+    def run(*kept: Any) -> None:
         call()
 
-    return run
+    return partial(run, buffer, given, results)  # the call only points to them
 
 
 def times_of_c(model: Any, row: np.ndarray) -> dict[str, Any]:
@@ -216,7 +195,7 @@ def times_of_c(model: Any, row: np.ndarray) -> dict[str, Any]:
     return dict(zip(names, [1e3 * (written - start), compiling, *times], strict=True))
 
 
-def run_casadi(cell: Casadi) -> dict[str, Any]:
+def run_casadi(cell: Casadi, options: Any) -> dict[str, Any]:
     """Return times, and the largest difference from `predict`."""
     import casadi as ca
 
@@ -224,12 +203,10 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
     data = make_dynamics(name, 60, 20, random_state=0)
     scale = data.target.std(axis=0)
     y = data.target + 0.01 * scale * np.random.RandomState(0).randn(*data.target.shape)
-    options = {"n_inducing": cell.m, "sharing": "all", "max_iter": 50, "random_state": 0}
+    settings = {"n_inducing": cell.m, "sharing": "all", "max_iter": 50, "random_state": 0}
     features_of = features[cell.features](name) if cell.features in features else None
-    model = EVGPRegressor(features_of, kernel_map=AngleEncoder(name), **options)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        model.fit(data.data, y)
+    model = EVGPRegressor(features_of, kernel_map=AngleEncoder(name), **settings)
+    harness.timed(lambda: model.fit(data.data, y))
     X = make_dynamics(name, 10, 20, random_state=1).data
     row, x = X[0].copy(), ca.MX.sym("x", X.shape[1])
     start = time.perf_counter()
@@ -245,8 +222,6 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
     exact_mean, exact_std = model.predict(X, return_std=True)
     found_mean, found_variance = (found.full().T for found in function.map(len(X))(X.T))
     return {
-        "features": cell.features,
-        "m": len(model.inducing_points_),
         "build_ms": 1e3 * (built - start),
         "build_j_ms": 1e3 * (end - built),
         "f_us": least(buffered(function, row)),
@@ -259,12 +234,11 @@ def run_casadi(cell: Casadi) -> dict[str, Any]:
         "predict_us": least(lambda: model.predict(X[:1], return_std=True), 30),
         "mean_off": np.max(np.abs(found_mean - exact_mean) / scale),
         "std_off": np.max(np.abs(np.sqrt(found_variance) - exact_std) / scale),
-        **harness.provenance(),
         "casadi": ca.CasadiMeta.version(),
     }
 
 
-def casadi_tables(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def casadi_tables(rows: pd.DataFrame) -> harness.Tables:
     columns = {"f": "f_us", "J": "j_us", "f and J": "f_and_j_us", "all": "all_us", "f of parameters": "parametric_us"}
     columns |= {"C: f": "c_f_us", "C: mean and J": "c_j_us", "C: all": "c_all_us", "`predict`": "predict_us"}
     once = {"build, ms": "build_ms", "build J, ms": "build_j_ms", "parameters, µs": "parameters_us"}
@@ -289,18 +263,7 @@ SIZES = {  # sweep -> (name, rows, inducing points, columns, outputs)
     "points": [("", 9300, m, 5, 4) for m in (10, 25, 50, 100, 200, 400)],
 }
 
-
-@dataclass(frozen=True)
-class Evaluation:
-    """A size on some cores."""
-
-    sweep: str
-    name: str
-    n: int
-    m: int
-    d: int
-    outputs: int
-    cores: int
+Evaluation = namedtuple("Evaluation", "sweep name n m d outputs cores")
 
 
 def evaluation_cells(options: Any) -> list[Evaluation]:
@@ -309,7 +272,7 @@ def evaluation_cells(options: Any) -> list[Evaluation]:
     return [Evaluation(sweep, *size, own) for sweep, own_sizes in sizes.items() for size in own_sizes for own in cores]
 
 
-def run_evaluation(cell: Evaluation) -> dict[str, Any]:
+def run_evaluation(cell: Evaluation, options: Any) -> dict[str, Any]:
     """Return medians and fastest of evaluation and products, which alternate in four rounds."""
     rng = np.random.RandomState(0)
     X = rng.randn(cell.n, cell.d)
@@ -328,21 +291,19 @@ def run_evaluation(cell: Evaluation) -> dict[str, Any]:
                 V @ V.T, L_inv.T @ (G @ V)
                 products.append(time.perf_counter() - start)
     return {
-        **{name: getattr(cell, name) for name in ("sweep", "name", "n", "m", "d", "outputs", "cores")},
         "evaluation_ms": 1e3 * np.median(evaluations),
         "floor_ms": 1e3 * np.median(products),
         "ratio": np.median(evaluations) / np.median(products),
         "evaluation_fastest_ms": 1e3 * min(evaluations),
         "floor_fastest_ms": 1e3 * min(products),
         "repeats": len(evaluations),
-        **{name: harness.provenance()[name] for name in ("versions", "machine")},
     }
 
 
-def evaluation_table(rows: pd.DataFrame) -> pd.DataFrame:
+def evaluation_tables(rows: pd.DataFrame) -> harness.Tables:
     columns = {"name": "data", "n": "rows", "m": "points", "outputs": "outputs", "cores": "cores"}
     columns |= {"evaluation_ms": "evaluation, ms", "floor_ms": "products, ms", "ratio": "ratio"}
-    return rows[list(columns)].rename(columns=columns).fillna({"data": ""})
+    return {"evaluation": rows[list(columns)].rename(columns=columns).fillna({"data": ""})}
 
 
 # --- rows ----------------------------------------------------------------------------------------------------------
@@ -354,7 +315,6 @@ class Timed(LBFGS):
     """L-BFGS that keeps the seconds of each evaluation."""
 
     def minimise(self, objective: Any, *others: Any, **options: Any) -> Any:
-        """Minimise a timed objective."""
         self.seconds_: list[float] = getattr(self, "seconds_", [])
 
         def timed(x: np.ndarray) -> Any:
@@ -366,13 +326,7 @@ class Timed(LBFGS):
         return super().minimise(timed, *others, **options)
 
 
-@dataclass(frozen=True)
-class Rows:
-    """A fit of a few iterations."""
-
-    n_rows: int
-    engine: str
-    max_iter: int = 8
+Rows = namedtuple("Rows", "n_rows engine max_iter", defaults=[8])
 
 
 def rows_cells(options: Any) -> list[Rows]:
@@ -400,19 +354,17 @@ def lazy(path: Path, shape: tuple[int, ...]) -> Any:
 
     rows = max(min(CHUNK, shape[0] // 4), 1)
 
+    @dask.delayed
     def piece(first: int) -> np.ndarray:
         return np.array(np.load(path, mmap_mode="r")[first : first + rows])
 
-    return da.concatenate(
-        [
-            da.from_delayed(dask.delayed(piece)(first), (min(rows, shape[0] - first), *shape[1:]), dtype=np.float64)
-            for first in range(0, shape[0], rows)
-        ]
-    )
+    firsts = range(0, shape[0], rows)
+    sizes = [(min(rows, shape[0] - first), *shape[1:]) for first in firsts]
+    pieces = zip(firsts, sizes, strict=True)
+    return da.concatenate([da.from_delayed(piece(first), size, dtype=np.float64) for first, size in pieces])
 
 
-def run_rows(cell: Rows) -> dict[str, Any]:
-    """Fit in this process."""
+def run_rows(cell: Rows, options: Any) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         paths = make_files(Path(folder), cell.n_rows)
         X, y = arrays = [np.load(path, mmap_mode="r") for path in paths]
@@ -423,9 +375,9 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             cluster = distributed.LocalCluster(n_workers=2, threads_per_worker=1, dashboard_address=":0")
             client = distributed.Client(cluster)
             X, y = (lazy(path, array.shape) for path, array in zip(paths, arrays, strict=True))
-        solver, n_jobs = Timed(), 2 if cell.engine.startswith("2") else 1
-        options = {"max_iter": cell.max_iter, "noise_cv": None, "n_jobs": n_jobs, "random_state": 0}
-        model = EVGPRegressor(n_inducing=100, solver=solver, **options)
+        solver = Timed()
+        settings = {"max_iter": cell.max_iter, "noise_cv": None, "random_state": 0}
+        model = EVGPRegressor(n_inducing=100, solver=solver, n_jobs=2 if cell.engine.startswith("2") else 1, **settings)
         with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
             warnings.simplefilter("always")
             start = time.perf_counter()
@@ -436,8 +388,8 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             cluster.close()
         test = np.sort(np.random.RandomState(1).randint(cell.n_rows, size=min(cell.n_rows, 5000)))
         return {
-            **{"n_rows": cell.n_rows, "n_columns": 8, "n_inducing": 100, "engine": cell.engine},
-            "max_iter": cell.max_iter,
+            "n_columns": 8,
+            "n_inducing": 100,
             "evaluation_seconds": np.median(solver.seconds_),
             "n_evaluations": len(solver.seconds_),
             "fit_seconds": fit_seconds,
@@ -446,15 +398,14 @@ def run_rows(cell: Rows) -> dict[str, Any]:
             "r2": model.score(*(array[test] for array in arrays)),
             "noise_sd": np.sqrt(model.noise_variance_),
             "converged": not caught,
-            **{name: harness.provenance()[name] for name in ("versions", "machine")},
         }
 
 
-def rows_table(rows: pd.DataFrame) -> pd.DataFrame:
+def rows_tables(rows: pd.DataFrame) -> harness.Tables:
     seconds = rows.pivot(index="n_rows", columns="engine", values="evaluation_seconds")
     most = rows.groupby("n_rows")[["data_mb", "memory_mb"]].max()  # of all engines
     table = most.set_axis(["data, MB", "peak memory of the fit above the data, MB"], axis=1)
-    return table.join(seconds.add_prefix("seconds per evaluation: ")).rename_axis("rows").reset_index()
+    return {"rows": table.join(seconds.add_prefix("seconds per evaluation: ")).rename_axis("rows").reset_index()}
 
 
 # --- million -------------------------------------------------------------------------------------------------------
@@ -462,13 +413,7 @@ def rows_table(rows: pd.DataFrame) -> pd.DataFrame:
 EPOCHS = {"adam 10": 10, "adam 40": 40, "adam 120": 120}
 FITS = ("default", *EPOCHS, "reference")
 
-
-@dataclass(frozen=True)
-class Million:
-    """A fit to its end."""
-
-    n_rows: int
-    fit: str
+Million = namedtuple("Million", "n_rows fit")
 
 
 def million_cells(options: Any) -> list[Million]:
@@ -476,7 +421,7 @@ def million_cells(options: Any) -> list[Million]:
     return [Million(5_000 if options.quick else 1_000_000, fit) for fit in fits]
 
 
-def run_million(cell: Million) -> dict[str, Any]:
+def run_million(cell: Million, options: Any) -> dict[str, Any]:
     """Fit in this process, with two threads and the noise where the bound is highest."""
     with tempfile.TemporaryDirectory() as folder:
         rows = [np.load(path, mmap_mode="r") for path in make_files(Path(folder), cell.n_rows + 10_000)]
@@ -495,8 +440,6 @@ def run_million(cell: Million) -> dict[str, Any]:
         noise = float(np.mean(np.square(y)))
         mean, std = model.predict(X_test, return_std=True)
         return {
-            "n_rows": cell.n_rows,
-            "fit": cell.fit,
             "n_iter": model.n_iter_,
             "seconds": seconds,
             "cpu_seconds": cpu_seconds,
@@ -505,26 +448,17 @@ def run_million(cell: Million) -> dict[str, Any]:
             "noise_alone_per_row": -0.5 * (np.log(2.0 * np.pi * noise) + 1.0),
             "nlpd": negative_log_predictive_density(y_test, mean, std),
             "warned": bool(caught),
-            **harness.provenance(),
         }
 
 
-def million_table(rows: pd.DataFrame) -> pd.DataFrame:
+def million_tables(rows: pd.DataFrame) -> harness.Tables:
     gained = rows["bound_per_row"] - rows["noise_alone_per_row"]
-    reference = gained[rows["fit"] == "reference"]
-    share = 100.0 * gained / (reference.iloc[0] if len(reference) else np.nan)
-    return pd.DataFrame(
-        {
-            "fit": rows["fit"],
-            "iterations": rows["n_iter"],
-            "s": rows["seconds"].map("{:.0f}".format),
-            "CPU s": rows["cpu_seconds"].map("{:.0f}".format),
-            "MB above the data": rows["memory_mb"].map("{:.0f}".format),
-            "bound per row": rows["bound_per_row"].map("{:.4f}".format),
-            "gained": share.map("{:.2f} %".format),
-            "NLPD": rows["nlpd"].map("{:.4f}".format),
-        }
-    )
+    share = 100.0 * gained / gained.where(rows["fit"] == "reference").max()
+    columns = {"fit": rows["fit"], "iterations": rows["n_iter"]}
+    for header, name in {"s": "seconds", "CPU s": "cpu_seconds", "MB above the data": "memory_mb"}.items():
+        columns[header] = rows[name].map("{:.0f}".format)
+    columns |= {"bound per row": rows["bound_per_row"].map("{:.4f}".format), "gained": share.map("{:.2f} %".format)}
+    return {"million": pd.DataFrame({**columns, "NLPD": rows["nlpd"].map("{:.4f}".format)})}
 
 
 # --- checkout ------------------------------------------------------------------------------------------------------
@@ -550,49 +484,32 @@ print(json.dumps(dict(seconds=seconds, cpu_seconds=cpu_seconds, n_iter=int(model
     nlpd=float(negative_log_predictive_density(test.target, mean, std)))))
 """
 
-
-@dataclass(frozen=True)
-class Checkout:
-    """A fit by this checkout or the other one."""
-
-    job: str
-    checkout: str
-    commit: str
-    seed: int
-    repeat: int
-    folder: Path = field(compare=False)
-    quick: bool = field(compare=False)
+Checkout = namedtuple("Checkout", "job checkout commit seed repeat")
 
 
-def commit_of(folder: Path) -> str:
-    """Return the commit of a checkout, with "-dirty" if files differ from it."""
-    command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
-    return subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+def folders(options: Any) -> dict[str, Path]:
+    here = Path(__file__).resolve().parents[1]
+    return {"this": here, "other": (options.other or here).resolve()}
 
 
 def checkout_cells(options: Any) -> list[Checkout]:
-    here = Path(__file__).resolve().parents[1]
-    folders = {"this": here, "other": (options.other or here).resolve()}
-    jobs, seeds = (["pendulum"], 1) if options.quick else (list(INDUCING), 4)
-    return [
-        Checkout(job, name, commit_of(folder), seed, 0, folder, options.quick)
-        for job in jobs
-        for seed in range(seeds)
-        for name, folder in folders.items()
-    ]
+    jobs, seeds, commits = ["pendulum"] if options.quick else list(INDUCING), range(1 if options.quick else 4), {}
+    for name, folder in folders(options).items():
+        command = ["git", "-C", str(folder), "describe", "--always", "--dirty"]
+        commits[name] = subprocess.run(command, capture_output=True, text=True, check=False).stdout.strip()
+    runs = itertools.product(jobs, seeds, commits)  # in pairs
+    return [Checkout(job, name, commits[name], seed, 0) for job, seed, name in runs]
 
 
-def run_checkout(cell: Checkout) -> dict[str, Any]:
+def run_checkout(cell: Checkout, options: Any) -> dict[str, Any]:
     """Fit in a process that imports skevgp from the folder."""
-    job = json.dumps([cell.job, INDUCING[cell.job], 3 if cell.quick else None, cell.seed])
-    environment = os.environ | {"PYTHONPATH": str(cell.folder)}
-    options = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
-    said = json.loads(subprocess.run([sys.executable, "-c", FIT, job], **options).stdout.splitlines()[-1])
-    known = {name: getattr(cell, name) for name in ("job", "checkout", "commit", "seed", "repeat")}
-    return {**known, **said, **harness.provenance()}
+    job = json.dumps([cell.job, INDUCING[cell.job], 3 if options.quick else None, cell.seed])
+    environment = os.environ | {"PYTHONPATH": str(folders(options)[cell.checkout])}
+    told = {"env": environment, "cwd": tempfile.gettempdir(), "capture_output": True, "text": True, "check": True}
+    return json.loads(subprocess.run([sys.executable, "-c", FIT, job], **told).stdout.splitlines()[-1])
 
 
-def checkout_table(rows: pd.DataFrame) -> pd.DataFrame:
+def checkout_tables(rows: pd.DataFrame) -> harness.Tables:
     """Return medians of times, the median of their ratios, and means of the rest: this / other."""
     names = ["seconds", "cpu_seconds", "n_iter", "bound", "error", "nlpd"]
     rows = rows.drop_duplicates(["job", "checkout", "seed", "repeat"], keep="last")  # of the last run
@@ -602,48 +519,26 @@ def checkout_table(rows: pd.DataFrame) -> pd.DataFrame:
         line = {"this / other": job, "pairs": len(own)}
         for name in names:
             this, other = (own[name][which].median() for which in ("this", "other"))
-            line[name] = f"{harness.figure_of(float(this))} / {harness.figure_of(float(other))}"
+            line[name] = f"{figure_of(float(this))} / {figure_of(float(other))}"
             if "seconds" in name:
                 line[f"ratio of {name}"] = f"{(own[name]['this'] / own[name]['other']).median():.3f}"
         lines.append(line)
-    return pd.DataFrame(lines)
-
-
-def one_table(make: Callable[[pd.DataFrame], pd.DataFrame], name: str, rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    return {name: make(rows)}
+    return {"checkout": pd.DataFrame(lines)}
 
 
 PARTS: dict[str, tuple[str, Any, Any, Any, str]] = {  # CSV, cells, run, tables, title
-    "latency": (
-        "latency",
-        latency_cells,
-        run_latency,
-        partial(one_table, latency_table, "latency"),
-        "What a control loop waits for",
-    ),
+    "latency": ("latency", latency_cells, run_latency, latency_tables, "What a control loop waits for"),
     "casadi": ("casadi_latency", casadi_cells, run_casadi, casadi_tables, "A prediction by CasADi and in C"),
     "evaluation": (
         "evaluation_cost",
         evaluation_cells,
         run_evaluation,
-        partial(one_table, evaluation_table, "evaluation"),
+        evaluation_tables,
         "One evaluation of the bound and its gradient",
     ),
-    "rows": ("scaling", rows_cells, run_rows, partial(one_table, rows_table, "rows"), "Time and memory over rows"),
-    "million": (
-        "many_rows",
-        million_cells,
-        run_million,
-        partial(one_table, million_table, "million"),
-        "1,000,000 rows",
-    ),
-    "checkout": (
-        "checkout",
-        checkout_cells,
-        run_checkout,
-        partial(one_table, checkout_table, "checkout"),
-        "This checkout against another",
-    ),
+    "rows": ("scaling", rows_cells, run_rows, rows_tables, "Time and memory over rows"),
+    "million": ("many_rows", million_cells, run_million, million_tables, "1,000,000 rows"),
+    "checkout": ("checkout", checkout_cells, run_checkout, checkout_tables, "This checkout against another"),
 }
 
 
@@ -653,10 +548,10 @@ def main() -> None:
     parser.add_argument("--peer-python", help="of latency: a Python that has GPflow and GPyTorch")
     parser.add_argument("--fits", nargs="+", choices=FITS, help="of million; default: all but the reference")
     parser.add_argument("--other", type=Path, help="of checkout: folder of the other checkout; default: this one")
-    options = parser.parse_args()
+    options = harness.parse(parser)
     name, cells, run, tables_of, title = PARTS[options.part]
     output = harness.output_path(options, name)
-    n_failures = harness.run_missing(cells(options), run, output, fresh=True, since=options.since)
+    n_failures = harness.run_missing(cells(options), partial(run, options=options), output, fresh=True)
     harness.write_page(title, tables_of(harness.frame(output)), output, n_failures)
 
 

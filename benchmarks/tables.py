@@ -21,10 +21,10 @@ of 100 points is there too. Is the upper bound above the exact log marginal like
 
 from __future__ import annotations
 
+import re
 import time
-import warnings
+from collections import namedtuple
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -40,9 +40,9 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.linear_model import BayesianRidge
 from sklearn.model_selection import cross_val_predict
 from sklearn.preprocessing import StandardScaler
-from threadpoolctl import threadpool_limits
 
 import harness
+from harness import ordered
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics, make_toy
 from skevgp.features import InertiaForceGravity
@@ -72,7 +72,7 @@ class Data(NamedTuple):
     feature_map: TransformerMixin | None = None
 
 
-Draw = Callable[[int, np.random.RandomState], tuple[np.ndarray, np.ndarray]]
+Draw = Callable[[int, np.random.RandomState], Any]  # to X and y
 
 
 def drawn(draw: Draw, n_rows: int, seed: int) -> Data:
@@ -92,11 +92,6 @@ def sines(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
     """Return a sum of eight sines, one of each column, with noise."""
     X = rng.uniform(-2.0, 2.0, (n, 8))
     return X, np.sin(2.0 * X).sum(axis=1) + 0.3 * rng.randn(n)
-
-
-def waves(n_columns: int, n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
-    X, y, _ = next(harness.noisy_waves(n, n_columns, rng))
-    return X, y
 
 
 def linear(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
@@ -161,25 +156,33 @@ def boxes(n: int, rng: np.random.RandomState) -> tuple[np.ndarray, np.ndarray]:
     return X, y
 
 
-def friedman(make: Callable[..., Any], noise: float, n: int, rng: np.random.RandomState) -> tuple[Any, Any]:
-    return make(n, noise=noise, random_state=rng)
+def friedman(make: Callable[..., Any], noise: float) -> Draw:
+    return lambda n, rng: make(n, noise=noise, random_state=rng)
+
+
+def waves(n_columns: int) -> Draw:
+    return lambda n, rng: next(harness.noisy_waves(n, n_columns, rng))[:2]
+
+
+def sampled(n_rows: int, draw: Draw) -> Callable[[int], Data]:
+    return partial(drawn, draw, n_rows)
 
 
 INDUCING_SETS: dict[str, Callable[[int], Data]] = {
-    "toy-200": partial(drawn, toy, 200),
-    "toy-1000": partial(drawn, toy, 1000),
-    "friedman1": partial(drawn, lambda n, rng: make_friedman1(n, noise=1.0, random_state=rng), 800),
-    "friedman1-quiet": partial(drawn, lambda n, rng: make_friedman1(n, noise=0.1, random_state=rng), 800),
-    "friedman2": partial(drawn, lambda n, rng: make_friedman2(n, random_state=rng), 800),
-    "friedman3": partial(drawn, lambda n, rng: make_friedman3(n, noise=0.1, random_state=rng), 800),
-    "sines-8": partial(drawn, sines, 800),
+    "toy-200": sampled(200, toy),
+    "toy-1000": sampled(1000, toy),
+    "friedman1": sampled(800, friedman(make_friedman1, 1.0)),
+    "friedman1-quiet": sampled(800, friedman(make_friedman1, 0.1)),
+    "friedman2": sampled(800, friedman(make_friedman2, 0.0)),
+    "friedman3": sampled(800, friedman(make_friedman3, 0.1)),
+    "sines-8": sampled(800, sines),
     "diabetes": diabetes,
-    "waves-2": partial(drawn, partial(waves, 2), 1000),
-    "waves-6": partial(drawn, partial(waves, 6), 1000),
-    "linear-5": partial(drawn, linear, 600),
-    "nothing-3": partial(drawn, nothing, 500),
-    "steps-1": partial(drawn, steps, 400),
-    "chirp-1": partial(drawn, chirp, 600),
+    "waves-2": sampled(1000, waves(2)),
+    "waves-6": sampled(1000, waves(6)),
+    "linear-5": sampled(600, linear),
+    "nothing-3": sampled(500, nothing),
+    "steps-1": sampled(400, steps),
+    "chirp-1": sampled(600, chirp),
     "pendulum": partial(dynamics, "pendulum", 600, 0.0, False),
     "pendulum-ifg": partial(dynamics, "pendulum", 600, 0.01, True),
     "cartpole": partial(dynamics, "cartpole", 800, 0.01, False),
@@ -189,30 +192,26 @@ INDUCING_SETS: dict[str, Callable[[int], Data]] = {
 }
 # Friedman's own standard deviations of the noise (1991); the quiet one has none.
 FRIEDMAN = {
-    "friedman1": partial(friedman, make_friedman1, 1.0),
-    "friedman2": partial(friedman, make_friedman2, 125.0),
-    "friedman3": partial(friedman, make_friedman3, 0.1),
+    "friedman1": friedman(make_friedman1, 1.0),
+    "friedman2": friedman(make_friedman2, 125.0),
+    "friedman3": friedman(make_friedman3, 0.1),
 }
 MODEL_SETS: dict[str, Callable[[int], Data]] = {
     "diabetes": diabetes,
-    "toy-200": partial(drawn, toy, 200),
-    **{f"{name}-{n}": partial(drawn, draw, n) for n in (800, 2000) for name, draw in FRIEDMAN.items()},
-    "friedman2-quiet-800": partial(drawn, partial(friedman, make_friedman2, 0.0), 800),
-    "sines-800": partial(drawn, sines, 800),
-    "sines-2000": partial(drawn, sines, 2000),
-    "houses-2000": partial(drawn, houses, 2000),
-    "houses-20000": partial(drawn, houses, 20_000),
-    "boxes-2000": partial(drawn, boxes, 2000),
+    "toy-200": sampled(200, toy),
+    **{f"{name}-{n}": sampled(n, draw) for n in (800, 2000) for name, draw in FRIEDMAN.items()},
+    "friedman2-quiet-800": sampled(800, friedman(make_friedman2, 0.0)),
+    "sines-800": sampled(800, sines),
+    "sines-2000": sampled(2000, sines),
+    "houses-2000": sampled(2000, houses),
+    "houses-20000": sampled(20_000, houses),
+    "boxes-2000": sampled(2000, boxes),
 }
+
+
 # --- other models --------------------------------------------------------------------------------------------------
 
-
-@dataclass(frozen=True)
-class Drawing:
-    """All models of a drawing of a set."""
-
-    name: str
-    seed: int
+Drawing = namedtuple("Drawing", "name seed")
 
 
 class Predicted(NamedTuple):
@@ -224,35 +223,35 @@ class Predicted(NamedTuple):
     high: np.ndarray
 
 
+def around(mean: np.ndarray, std: np.ndarray) -> Predicted:
+    """Return normal distributions with their intervals."""
+    return Predicted(mean, std, mean - HALF_WIDTH * std, mean + HALF_WIDTH * std)
+
+
 def gaussian(regressor: Any, data: Data) -> tuple[Any, Callable[[], Predicted]]:
     """Fit a regressor with ``return_std``."""
     regressor.fit(data.X, data.y)
+    return regressor, lambda: around(*regressor.predict(data.X_test, return_std=True))
+
+
+def boosted_by_folds(data: Data, seed: int) -> tuple[Any, Callable[[], Predicted]]:
+    """Fit boosting; std comes from the errors of five folds."""
+    model = HistGradientBoostingRegressor(random_state=seed).fit(data.X, data.y)
+    folds = cross_val_predict(HistGradientBoostingRegressor(random_state=seed), data.X, data.y, cv=5)
+    std = np.sqrt(np.mean((data.y - folds) ** 2))
+    return model, lambda: around(mean := model.predict(data.X_test), np.full(len(mean), std))
+
+
+def boosted_quantiles(data: Data, seed: int) -> tuple[Any, Callable[[], Predicted]]:
+    """Fit boosting for the mean and two quantiles, from which std comes."""
+    levels = ({}, *({"loss": "quantile", "quantile": 0.5 + sign * COVERAGE / 2} for sign in (-1.0, 1.0)))
+    models = [HistGradientBoostingRegressor(random_state=seed, **level).fit(data.X, data.y) for level in levels]
 
     def predict() -> Predicted:
-        mean, std = regressor.predict(data.X_test, return_std=True)
-        return Predicted(mean, std, mean - HALF_WIDTH * std, mean + HALF_WIDTH * std)
-
-    return regressor, predict
-
-
-def boosted(data: Data, seed: int, folds: bool) -> tuple[None, Callable[[], Predicted]]:
-    """Fit boosting for the mean; std comes from two quantiles, or from the errors of five folds."""
-    make = partial(HistGradientBoostingRegressor, random_state=seed)
-    mean_model = make().fit(data.X, data.y)
-    if folds:
-        std = np.sqrt(np.mean((data.y - cross_val_predict(make(), data.X, data.y, cv=5)) ** 2))
-    else:
-        levels = (0.5 - COVERAGE / 2, 0.5 + COVERAGE / 2)
-        ends = [make(loss="quantile", quantile=level).fit(data.X, data.y) for level in levels]
-
-    def predict() -> Predicted:
-        mean = mean_model.predict(data.X_test)
-        if folds:
-            return Predicted(mean, np.full(len(mean), std), mean - HALF_WIDTH * std, mean + HALF_WIDTH * std)
-        low, high = (end.predict(data.X_test) for end in ends)
+        mean, low, high = (model.predict(data.X_test) for model in models)
         return Predicted(mean, np.maximum((high - low) / (2 * HALF_WIDTH), SMALLEST_STD), low, high)
 
-    return None, predict
+    return models[0], predict
 
 
 def exact(n_columns: int) -> RegressorMixin:
@@ -268,30 +267,21 @@ MODELS: dict[str, Fitting] = {
     ),
     "EVGP, 100": lambda data, seed: gaussian(EVGPRegressor(normalize_y=True, random_state=seed), data),
     "GPR": lambda data, seed: gaussian(exact(data.X.shape[1]), data),
-    "boosting, quantiles": lambda data, seed: boosted(data, seed, folds=False),
-    "boosting, folds": lambda data, seed: boosted(data, seed, folds=True),
+    "boosting, quantiles": boosted_quantiles,
+    "boosting, folds": boosted_by_folds,
     "BayesianRidge": lambda data, seed: gaussian(BayesianRidge(), data),
 }
 # With more rows than EXACT_ROWS the others would take hours.
 LARGE = tuple(name for name in MODELS if name not in ("GPR", "EVGP, auto"))
 
 
-def standardised(data: Data) -> Data:
-    """Scale columns to mean 0 and variance 1 on the training rows."""
-    scaler = StandardScaler().fit(data.X)
-    return data._replace(X=scaler.transform(data.X), X_test=scaler.transform(data.X_test))
-
-
 def measured(model: str, data: Data, seed: int) -> dict[str, Any]:
-    """Fit a model and return its scores."""
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always")
-        wall, start = time.perf_counter(), time.process_time()
-        regressor, predict = MODELS[model](data, seed)
-        seconds, wall_seconds = time.process_time() - start, time.perf_counter() - wall
-        start = time.process_time()
-        mean, std, low, high = predict()
-        predict_seconds = time.process_time() - start
+    found: list[Any] = []
+    wall = time.perf_counter()
+    seconds, caught = harness.timed(lambda: found.extend(MODELS[model](data, seed)))
+    wall_seconds, (regressor, predict) = time.perf_counter() - wall, found
+    predict_seconds, _ = harness.timed(lambda: found.extend(predict()))
+    mean, std, low, high = found[2:]
     return {
         "model": model,
         "m": len(regressor.inducing_points_) if isinstance(regressor, EVGPRegressor) else "",
@@ -309,65 +299,59 @@ def measured(model: str, data: Data, seed: int) -> dict[str, Any]:
 
 
 def run_models(cell: Drawing) -> list[dict[str, Any]]:
-    data = standardised(MODEL_SETS[cell.name](cell.seed))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    """Fit all models to columns of mean 0 and variance 1."""
+    data = MODEL_SETS[cell.name](cell.seed)
+    scaler = StandardScaler().fit(data.X)
+    data = data._replace(X=scaler.transform(data.X), X_test=scaler.transform(data.X_test))
+    with harness.one_thread():
         for model in MODELS:  # imports and first allocations are not timed
             MODELS[model](data._replace(X=data.X[:30], y=data.y[:30]), 0)[1]()
-    own = {"name": cell.name, "seed": cell.seed, "n_rows": len(data.X)}
     models = MODELS if len(data.X) <= EXACT_ROWS else LARGE
-    return [{**own, **measured(model, data, cell.seed), **harness.provenance()} for model in models]
+    return [{"n_rows": len(data.X), **measured(model, data, cell.seed)} for model in models]
 
 
 def scores(rows: pd.DataFrame, names: list[str]) -> pd.DataFrame:
     """Return means over seeds of all models of some sets; the best ones in bold."""
-    means = rows.groupby(["name", "model"]).mean(numeric_only=True)
-    lines = []
-    for name in names:
-        own = means.loc[name]
-        for model in [model for model in MODELS if model in own.index]:
-            line = {"set": name, "model": model}
-            for header, value in (("RMSE", "rmse"), ("NLPD", "nlpd"), ("CRPS", "crps")):
-                text, best = f"{own.loc[model, value]:.3f}", own[value].min() + 5e-4
-                line[header] = f"**{text}**" if own.loc[model, value] <= best else text
-            line |= {"coverage": f"{own.loc[model, 'coverage']:.3f}", "width": f"{own.loc[model, 'width']:.2f}"}
-            lines.append({**line, "seconds": own.loc[model, "seconds"]})
-    return pd.DataFrame(lines)
+    rows = rows[rows["name"].isin(names)]
+    rows = rows.assign(set=pd.Categorical(rows["name"], names), model=pd.Categorical(rows["model"], MODELS))
+    means = rows.groupby(["set", "model"], observed=True).mean(numeric_only=True)
+    texts = means.map("{:.3f}".format)
+    for name in (names := ["rmse", "nlpd", "crps"]):
+        won = means[name] <= means.groupby("set", observed=True)[name].transform("min") + 5e-4
+        texts[name] = texts[name].mask(won, "**" + texts[name] + "**")
+    texts["width"], texts["seconds"] = means["width"].map("{:.2f}".format), means["seconds"]
+    found = texts[[*names, "coverage", "width", "seconds"]]
+    return found.rename(columns={name: name.upper() for name in names}).reset_index()
 
 
 def against_exact(rows: pd.DataFrame) -> pd.DataFrame:
     """Return what "auto" loses against GPR, and the share of its time."""
     means = rows.groupby(["model", "name"]).mean(numeric_only=True)
-    lines = []
-    for name in MODEL_SETS:
-        if name.startswith(("houses", "boxes")) or ("GPR", name) not in means.index:
-            continue
-        exact, auto = means.loc["GPR", name], means.loc["EVGP, auto", name]
-        lost = auto["nlpd"] - exact["nlpd"]
-        lines.append(
-            {
-                "set": name,
-                "NLPD of GPR": f"{exact['nlpd']:.3f}",
-                "auto's, more": f"{lost:+.3f}",
-                f"within {ENOUGH}": "yes" if lost <= ENOUGH else "no",
-                "points": f"{auto['m']:.0f}",
-                "s, GPR": exact["seconds"],
-                "s, auto": auto["seconds"],
-                "ratio": f"{auto['seconds'] / exact['seconds']:.2f}",
-                "ratio on the wall": f"{auto['wall_seconds'] / exact['wall_seconds']:.2f}",
-            }
-        )
-    return pd.DataFrame(lines)
+    of_model = means.index.get_level_values("model")
+    exact, auto = (means[of_model == model].droplevel("model") for model in ("GPR", "EVGP, auto"))
+    names = [name for name in ordered(MODEL_SETS, exact.index) if not name.startswith(("houses", "boxes"))]
+    exact, auto = exact.loc[names], auto.loc[names]
+    lost, ratio = auto["nlpd"] - exact["nlpd"], auto / exact
+    columns = {
+        "NLPD of GPR": exact["nlpd"].map("{:.3f}".format),
+        "auto's, more": lost.map("{:+.3f}".format),
+        f"within {ENOUGH}": np.where(lost <= ENOUGH, "yes", "no"),
+        "points": auto["m"].map("{:.0f}".format),
+        "s, GPR": exact["seconds"],
+        "s, auto": auto["seconds"],
+        "ratio": ratio["seconds"].map("{:.2f}".format),
+        "ratio on the wall": ratio["wall_seconds"].map("{:.2f}".format),
+    }
+    return pd.DataFrame(columns).reset_index(names="set")
 
 
-def tables_of_models(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
-    return {"models": scores(rows, [n for n in MODEL_SETS if n in set(rows["name"])]), "auto": against_exact(rows)}
+def tables_of_models(rows: pd.DataFrame) -> harness.Tables:
+    return {"models": scores(rows, ordered(MODEL_SETS, rows["name"])), "auto": against_exact(rows)}
 
 
 def guide(page: str, rows: pd.DataFrame) -> str:
     """Fill the tables of the guide's page: "auto", or the names of sets."""
-    marked = [line.split("table: ")[1].removesuffix(" -->") for line in page.splitlines() if "<!-- table: " in line]
+    marked = re.findall("<!-- table: (.*) -->", page)
     tables = {name: against_exact(rows) if name == "auto" else scores(rows, name.split()) for name in marked}
     return harness.filled(page, tables)
 
@@ -376,35 +360,20 @@ def guide(page: str, rows: pd.DataFrame) -> str:
 
 FITS = ("exact", "100", "auto", "grid")
 
-
-@dataclass(frozen=True)
-class Fit:
-    """A model on a drawing of a set."""
-
-    name: str
-    seed: int
-    model: str
+Fit = namedtuple("Fit", "name seed model")
 
 
 def fitted(data: Data, model: str, seed: int) -> tuple[Any, dict[str, Any]]:
     """Fit a model; return it with its scores."""
     common = {"feature_map": data.feature_map, "normalize_y": data.feature_map is None, "random_state": seed}
-    regressor: Any
-    if model == "exact":
-        regressor = EGPRegressor(**common)
-    else:
-        n_inducing: Any = "auto" if model == "auto" else int(model)
-        # The exact model does not calibrate.
-        regressor = EVGPRegressor(**common, n_inducing=n_inducing, noise_cv=None)
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        start = time.process_time()
-        regressor.fit(data.X, data.y)
-        seconds = time.process_time() - start
-        mean, std = regressor.predict(data.X_test, return_std=True)
     sparse = model != "exact"
+    regressor: Any = EGPRegressor(**common)
+    if sparse:  # without calibration, as the exact model
+        n_inducing: Any = "auto" if model == "auto" else int(model)
+        regressor = EVGPRegressor(**common, n_inducing=n_inducing, noise_cv=None)
+    seconds, _ = harness.timed(lambda: regressor.fit(data.X, data.y))
+    mean, std = regressor.predict(data.X_test, return_std=True)
     return regressor, {
-        "model": model,
         "m": len(regressor.inducing_points_) if sparse else len(data.X),
         "n_iter": regressor.n_iter_,
         "seconds": round(seconds, 3),
@@ -440,60 +409,65 @@ def run_inducing(cell: Fit) -> dict[str, Any]:
         row |= {"seconds": seconds}
     else:
         regressor, row = fitted(data, cell.model, cell.seed)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with harness.one_thread():
         likelihood = row["lower"] if cell.model == "exact" else likelihood_of(regressor, data)
-    own = {"name": cell.name, "seed": cell.seed, "n_rows": len(data.X)}
-    return {**own, **row, "model": cell.model, "likelihood": likelihood, **harness.provenance()}
+    return {"n_rows": len(data.X), **row, "likelihood": likelihood}
 
 
-def tables_of_inducing(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of_inducing(rows: pd.DataFrame) -> harness.Tables:
     """Return NLPD lost against the exact model, numbers of points and times, and counts of sets."""
     means = rows.groupby(["model", "name"]).mean(numeric_only=True)
-    lines, near, lean = [], 0, 0
-    for name in [name for name in INDUCING_SETS if ("auto", name) in means.index]:
-        exact, hundred, auto, grid = (means.loc[model, name] for model in FITS)
-        ratio, lost = auto["m"] / grid["m"], auto["nlpd"] - exact["nlpd"]
-        near, lean = near + int(lost <= ENOUGH), lean + int(ratio <= 2.0)
-        line = {"set": name, "rows": f"{exact['m']:.0f}", "NLPD, exact": f"{exact['nlpd']:.3f}"}
-        line |= {"lost, m = 100": f"{hundred['nlpd'] - exact['nlpd']:.3f}", "lost, auto": f"{lost:.3f}"}
-        line |= {"smallest m": f"{grid['m']:.0f}", "auto's m": f"{auto['m']:.0f}", "ratio": f"{ratio:.2f}"}
-        seconds = {"s, exact": exact, "s, m = 100": hundred, "s, auto": auto}
-        lines.append({**line, **{header: f"{own['seconds']:.1f}" for header, own in seconds.items()}})
+    names = ordered(INDUCING_SETS, means.loc["auto"].index)
+    exact, hundred, auto, grid = (means.loc[model].loc[names] for model in FITS)
+    ratio, lost = auto["m"] / grid["m"], auto["nlpd"] - exact["nlpd"]
+    columns = {
+        "rows": exact["m"].map("{:.0f}".format),
+        "NLPD, exact": exact["nlpd"].map("{:.3f}".format),
+        "lost, m = 100": (hundred["nlpd"] - exact["nlpd"]).map("{:.3f}".format),
+        "lost, auto": lost.map("{:.3f}".format),
+        "smallest m": grid["m"].map("{:.0f}".format),
+        "auto's m": auto["m"].map("{:.0f}".format),
+        "ratio": ratio.map("{:.2f}".format),
+    }
+    for header, own in {"s, exact": exact, "s, m = 100": hundred, "s, auto": auto}.items():
+        columns[header] = own["seconds"].map("{:.1f}".format)
     sparse = rows.dropna(subset="upper")
     covered = sparse["upper"] >= sparse["likelihood"] - 1e-6 * sparse["likelihood"].abs()
     counts = {
-        f"sets within {ENOUGH} nats per row of the exact model": f"{near} of {len(lines)}",
-        "sets with at most twice the smallest number of the grid that is": f"{lean} of {len(lines)}",
-        "fits whose upper bound covers the exact log marginal likelihood": f"{covered.sum()} of {len(sparse)}",
+        f"sets within {ENOUGH} nats per row of the exact model": lost <= ENOUGH,
+        "sets with at most twice the smallest number of the grid that is": ratio <= 2.0,
+        "fits whose upper bound covers the exact log marginal likelihood": covered,
     }
-    return {"inducing": pd.DataFrame(lines), "counts": pd.DataFrame(counts.items(), columns=["", "count"])}
+    lines = [(name, f"{held.sum()} of {len(held)}") for name, held in counts.items()]
+    return {
+        "inducing": pd.DataFrame(columns).reset_index(names="set"),
+        "counts": pd.DataFrame(lines, columns=["", "count"]),
+    }
 
 
 def main() -> None:
-    parser = harness.argument_parser(
-        __doc__, quick="two small sets, one seed", seeds="number of seeds; default: 3, quick 1"
-    )
+    parser = harness.argument_parser(__doc__, quick="two small sets, one seed", seeds=3)
     parser.add_argument("part", choices=("models", "inducing"))
     known = sorted({*MODEL_SETS, *INDUCING_SETS})
     parser.add_argument("--sets", nargs="+", choices=known, metavar="SET", help=f"of {', '.join(known)}; default: all")
-    options = parser.parse_args()
-    models = options.part == "models"
-    output = harness.output_path(options, "tabular" if models else "auto_inducing")
-    sets, quick = (MODEL_SETS, ("diabetes", "toy-200")) if models else (INDUCING_SETS, ("linear-5", "toy-200"))
+    options = harness.parse(parser)
+    if options.part == "models":
+        output, sets, quick = harness.output_path(options, "tabular"), MODEL_SETS, ("diabetes", "toy-200")
+    else:
+        output, sets, quick = harness.output_path(options, "auto_inducing"), INDUCING_SETS, ("linear-5", "toy-200")
     names = [name for name in options.sets or (quick if options.quick else sets) if name in sets]
-    seeds = range(options.seeds or (1 if options.quick else 3))
-    cells: list[Any] = [Drawing(name, seed) for seed in seeds for name in names]
-    if not models:
-        cells = [Fit(name, seed, model) for seed in seeds for model in FITS for name in names]
-    run = run_models if models else run_inducing
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    rows = harness.frame(output)
-    if models and options.output is None and not options.quick:
-        PAGE.write_text(guide(PAGE.read_text(), rows))
-    tables = tables_of_models(rows) if models else tables_of_inducing(rows)
-    title = "Tables of data" if models else "Inducing points that are chosen"
-    harness.write_page(title, tables, output, n_failures)
+    if options.part == "models":
+        cells = [Drawing(name, seed) for seed in options.seeds for name in names]
+        n_failures = harness.run_missing(cells, run_models, output, options.jobs)
+        rows = harness.frame(output)
+        if options.output is None and not options.quick:
+            PAGE.write_text(guide(PAGE.read_text(), rows))
+        harness.write_page("Tables of data", tables_of_models(rows), output, n_failures)
+    else:
+        fits = [Fit(name, seed, model) for seed in options.seeds for model in FITS for name in names]
+        n_failures = harness.run_missing(fits, run_inducing, output, options.jobs)
+        tables = tables_of_inducing(harness.frame(output))
+        harness.write_page("Inducing points that are chosen", tables, output, n_failures)
 
 
 if __name__ == "__main__":

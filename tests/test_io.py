@@ -93,6 +93,7 @@ _OF_SCIKIT_LEARN = {
     "target": TransformedTargetRegressor(evgp(), transformer=StandardScaler()),
     "outputs": MultiOutputRegressor(evgp()),
     "range": evgp(sharing=[range(2)]),
+    "pipeline of one": make_pipeline(evgp()),
 }
 
 

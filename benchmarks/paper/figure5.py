@@ -13,9 +13,8 @@ picture is of seed 0.
 from __future__ import annotations
 
 import sys
-import time
-import warnings
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -30,7 +29,6 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.model_selection import KFold
 from sklearn.preprocessing import PolynomialFeatures
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import harness
 from skevgp import EGPRegressor, EVGPRegressor
@@ -51,22 +49,13 @@ GRID = np.linspace(-4.0, 10.0, 421)[:, np.newaxis]
 FAR = 9.0  # three beyond the last observation
 SIZES = {"full": (5, 10), "quick": (0, 3)}  # restarts and folds
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One model on one data set."""
-
-    data: str
-    model: str
-    seed: int
-    size: str
-    data_home: Path | None = field(compare=False)
+Cell = namedtuple("Cell", "data model seed size")
 
 
-def load(cell: Cell) -> Bunch:
+def load(cell: Cell, data_home: Path | None) -> Bunch:
     if cell.data == "toy":
         return make_toy(random_state=cell.seed)
-    return fetch_snelson(cell.data_home, download_if_missing=False)
+    return fetch_snelson(data_home, download_if_missing=False)
 
 
 def build(cell: Cell) -> RegressorMixin:
@@ -80,16 +69,12 @@ def build(cell: Cell) -> RegressorMixin:
     return EVGPRegressor(features, n_inducing=10, solver=LBFGS(n_restarts), noise_cv=None, random_state=seed)
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, data_home: Path | None) -> dict[str, Any]:
     """Fit a model to all rows, and to all rows without one fold."""
-    data, model = load(cell), build(cell)
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ConvergenceWarning)
-        start = time.process_time()
-        model.fit(data.data, data.target)
-        seconds = time.process_time() - start
-        converged = not any(issubclass(warning.category, ConvergenceWarning) for warning in caught)
-        held_out = np.empty((2, len(data.target)))
+    data, model = load(cell, data_home), build(cell)
+    seconds, caught = harness.timed(lambda: model.fit(data.data, data.target))
+    held_out = np.empty((2, len(data.target)))
+    with harness.one_thread():
         for train, test in KFold(SIZES[cell.size][1], shuffle=True, random_state=cell.seed).split(data.data):
             fold = clone(model).fit(data.data[train], data.target[train])
             held_out[:, test] = fold.predict(data.data[test], return_std=True)
@@ -99,7 +84,6 @@ def run(cell: Cell) -> dict[str, Any]:
     if noise is None:  # scikit-learn has the noise in the kernel
         kernel, noise = kernel.k1, kernel.k2.noise_level
     return {
-        **{name: getattr(cell, name) for name in ("data", "model", "seed", "size")},
         "log_likelihood_or_bound": getattr(model, "lower_bound_", None) or model.log_marginal_likelihood_value_,
         "signal_std": np.sqrt(kernel.k1.constant_value),
         "length_scale": np.ravel(kernel.k2.length_scale)[0],
@@ -111,8 +95,7 @@ def run(cell: Cell) -> dict[str, Any]:
         "nlpd": negative_log_predictive_density(data.target, *held_out),
         "rmse_of_truth": np.sqrt(np.mean((data.get("mean", np.nan) - model.predict(data.data)) ** 2)),
         "fit_seconds": seconds,
-        "converged": converged,
-        **harness.provenance(),
+        "converged": not any(issubclass(warning.category, ConvergenceWarning) for warning in caught),
     }
 
 
@@ -129,8 +112,7 @@ def plot(models: dict[str, RegressorMixin], data: Bunch, path: Path) -> pd.DataF
         axes.label_outer()
     harness.legend(figure, ncols=5)
     harness.save_picture(figure, path)
-    x = data.data[:, 0]
-    inside = (GRID[:, 0] >= x.min()) & (GRID[:, 0] <= x.max())
+    inside = (GRID[:, 0] >= data.data.min()) & (GRID[:, 0] <= data.data.max())
     lines = []
     for name, exact in EXACT.items():
         line = {"": name}
@@ -148,57 +130,44 @@ def table_of(data: pd.DataFrame) -> pd.DataFrame:
     means = data.groupby("model").mean(numeric_only=True).loc[list(TITLES)]
 
     def text(*columns: str) -> list[str]:
-        lines = means[list(columns)].to_numpy()
-        # Plus zero: no minus in front of zeros.
-        return ["" if np.isnan(line).any() else " ± ".join(f"{round(v, 2) + 0.0:.2f}" for v in line) for line in lines]
+        texts = (means[list(columns)].round(2) + 0.0).map("{:.2f}".format)  # plus zero: no minus in front of zeros
+        return texts.agg(" ± ".join, axis=1).where(means[columns[0]].notna(), "").tolist()
 
-    return pd.DataFrame(
-        {
-            "model": means.index,
-            "log likelihood or bound": text("log_likelihood_or_bound"),
-            "signal std": text("signal_std"),
-            "length scale": text("length_scale"),
-            "noise std": text("noise_std"),
-            "slope": text("slope", "slope_std"),
-            f"y at x = {FAR:g}": text("far_mean", "far_std"),
-            "RMSE": text("rmse"),
-            "NLPD": text("nlpd"),
-            "seconds": text("fit_seconds"),
-        }
-    )
+    columns = {"log likelihood or bound": ["log_likelihood_or_bound"], "signal std": ["signal_std"]}
+    columns |= {"length scale": ["length_scale"], "noise std": ["noise_std"], "slope": ["slope", "slope_std"]}
+    columns |= {f"y at x = {FAR:g}": ["far_mean", "far_std"], "RMSE": ["rmse"], "NLPD": ["nlpd"]}
+    texts = {header: text(*names) for header, names in columns.items()}
+    return pd.DataFrame({"model": means.index, **texts, "seconds": text("fit_seconds")})
 
 
 def main() -> None:
     parser = harness.argument_parser(
         __doc__,
         quick="no restarts, three folds, one seed",
-        seeds="number of seeds; default: 4, quick 1",
+        seeds=4,
         systems=SOURCES,
         default_systems=["snelson"],
     )
     parser.add_argument("--data-home", type=Path, help="a folder with Snelson's files; default: scikit-learn's")
-    options = parser.parse_args()
+    options = harness.parse(parser)
     if "snelson" in options.systems:
         fetch_snelson(options.data_home, n_retries=1)
-    size = "quick" if options.quick else "full"
     output = harness.output_path(options, "toy")
-    n_seeds = options.seeds or (1 if options.quick else 4)
     cells = [
-        Cell(source, name, seed, size, options.data_home)
+        Cell(source, name, seed, options.size)
         for source in options.systems
-        for seed in range(n_seeds)
+        for seed in options.seeds
         for name in TITLES
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    data, tables = harness.frame(output), {}
+    n_failures = harness.run_missing(cells, partial(run, data_home=options.data_home), output, options.jobs)
+    tables = {}
     for source in options.systems:
         first = [cell for cell in cells if (cell.data, cell.seed) == (source, 0)]
-        rows = load(first[0])
-        with threadpool_limits(1), warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # in the CSV
+        rows = load(first[0], options.data_home)
+        with harness.one_thread():
             models = {cell.model: build(cell).fit(rows.data, rows.target) for cell in first}
         stem = output.stem if source == options.systems[0] else f"{output.stem}_{source}"
-        tables[f"{source}, models"] = table_of(data[(data["data"] == source) & (data["size"] == size)])
+        tables[f"{source}, models"] = table_of(harness.frame(output, data=source, size=options.size))
         tables[f"{source}, sparse from exact"] = plot(models, rows, output.with_name(f"{stem}.png"))
     harness.write_page("The toy data: Figure 5 of the paper, and ours", tables, output, n_failures)
 

@@ -7,7 +7,6 @@ random state 1000.
     python benchmarks/paper/figure6.py --quick               # two sizes, few iterations, one run: a few minutes
     python benchmarks/paper/figure6.py --systems pendulum --settings paper skevgp-angles
     python benchmarks/paper/figure6.py --systems iiwa14 --max-iter 60  # of each GP
-    python benchmarks/paper/figure6.py --limited --max-iter 5000       # what a limit ended, to its end
 
 The settings are those of table4.py. Of "skevgp-nominal" there is EVGP-IFG on iiwa14. In skevgp's settings a run takes
 20 seconds of one core for the pendulum, 3 minutes for the cartpole, 12 for the acrobot and 3 hours for iiwa14.
@@ -17,8 +16,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections import namedtuple
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -29,8 +28,8 @@ import pandas as pd
 from sklearn.utils import Bunch
 
 import harness
-from harness import figure_of
-from paper.models import MODELS, PUBLISHED, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, fitted_row, has, limited
+from harness import figure_of, ordered
+from paper.models import MODELS, PUBLISHED, QUICK_TRAJECTORIES, SETTINGS, SYSTEMS, Fit, fitted_row, has
 from skevgp.datasets import make_dynamics
 
 N_TRAJECTORIES = {
@@ -43,18 +42,7 @@ TEST_STATE = 1000
 NOMINAL = "EVGP-IFG, nominal"
 COLOURS = dict(zip([*MODELS, NOMINAL], np.array(harness.PALETTE)[[4, 5, 2, 1, 0, 3]], strict=True))
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    setting: str
-    n_trajectories: int
-    seed: int
-    size: str
-    max_iter: int | None = field(compare=False)
+Cell = namedtuple("Cell", "system model setting n_trajectories seed size")
 
 
 @lru_cache(maxsize=2)
@@ -63,18 +51,13 @@ def data(system: str, random_state: int, size: str) -> Bunch:
     return make_dynamics(system, QUICK_TRAJECTORIES if size == "quick" else None, random_state=random_state)
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, max_iter: int | None) -> dict[str, Any]:
     """Fit one model to the first trajectories of a run."""
     whole, test = (data(cell.system, state, cell.size) for state in (cell.seed, TEST_STATE))
     rows = whole.groups < cell.n_trajectories
     train = Bunch(data=whole.data[rows], target=whole.target[rows], groups=whole.groups[rows])
-    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
-    return fitted_row(fit, train, test, n_trajectories=cell.n_trajectories, n_rows=len(train.data))
-
-
-def wanted(system: str, model: str, setting: str) -> bool:
-    """Return whether there is such a cell."""
-    return has(system, model, setting) and (setting != "skevgp-nominal" or model == "EVGP-IFG")
+    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter)
+    return fitted_row(fit, train, test, n_rows=len(train.data))
 
 
 def named(rows: pd.DataFrame) -> pd.DataFrame:
@@ -93,39 +76,37 @@ def table_of(rows: pd.DataFrame, measure: str, corner: str, spread: bool) -> pd.
         return f"{mean} ({figure_of(values.min())} to {figure_of(values.max())}, {len(values)})"
 
     found = rows.groupby(["model", "n_rows"])[measure].apply(text).unstack(fill_value="")
-    found = found.loc[[name for name in COLOURS if name in found.index]]
+    found = found.loc[ordered(COLOURS, found.index)]
     return found.rename(columns="{} rows".format).rename_axis(corner).reset_index()
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     tables = {}
     for setting in sorted(rows["setting"].unique(), key=lambda name: name != "skevgp"):
-        for system in [name for name in SYSTEMS if name in set(rows["system"])]:
-            own = rows[(rows["setting"] == setting) & (rows["system"] == system)]
-            if len(own):
-                tables[f"{setting}, {system}, Error"] = table_of(own, "error_mean", "Error of", True)
-                tables[f"{setting}, {system}, median row"] = table_of(own, "error_median", "median row of", False)
+        of_setting = rows[rows["setting"] == setting]
+        for system in ordered(SYSTEMS, of_setting["system"]):
+            own = of_setting[of_setting["system"] == system]
+            tables[f"{setting}, {system}, Error"] = table_of(own, "error_mean", "Error of", True)
+            tables[f"{setting}, {system}, median row"] = table_of(own, "error_median", "median row of", False)
     return tables
 
 
 def plot(rows: pd.DataFrame, path: Path) -> None:
     """Draw a panel per system: medians and quartiles over runs, and the paper's last points."""
-    systems = [name for name in SYSTEMS if name in set(rows["system"])]
+    systems = ordered(SYSTEMS, rows["system"])
     n_lines = -(-len(systems) // 2)
     figure, grid = harness.pyplot().subplots(n_lines, 2, figsize=(harness.WIDTH, 0.8 + 2.7 * n_lines), squeeze=False)
     for axes, system in zip(grid.flat, systems, strict=False):
         own = rows[rows["system"] == system]
         for number, (name, colour) in enumerate(COLOURS.items()):
-            errors = own[own["model"] == name].groupby("n_rows")["error_mean"]
-            quartiles = errors.quantile([0.25, 0.5, 0.75]).unstack()
+            runs = own[own["model"] == name].groupby("n_rows")
+            quartiles = runs["error_mean"].quantile([0.25, 0.5, 0.75]).unstack()
             if quartiles.empty:
                 continue
             middle, x = quartiles[0.5], quartiles.index * 1.02 ** (number - 2.5)  # bars stand apart
             bars = (middle - quartiles[0.25], quartiles[0.75] - middle)
             axes.errorbar(x, middle, bars, fmt="-", color=colour)
-            ended = own[own["model"] == name].groupby("n_rows")["converged"].all()
-            faces = [colour if ended[size] else "white" for size in quartiles.index]
+            faces = [colour if ended else "white" for ended in runs["converged"].all()]
             axes.scatter(x, middle, c=faces, edgecolors=colour, s=20, zorder=3)
             axes.plot([], [], "o-", color=colour, label=name)
             if name in MODELS:
@@ -143,36 +124,29 @@ def plot(rows: pd.DataFrame, path: Path) -> None:
 
 def main() -> None:
     parser = harness.argument_parser(
-        __doc__,
-        quick="4 and 12 trajectories, few iterations and one run",
-        seeds="number of runs; default: 4, quick 1",
-        systems=list(N_TRAJECTORIES),
+        __doc__, quick="4 and 12 trajectories, few iterations and one run", seeds=4, systems=N_TRAJECTORIES
     )
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: all")
     default = ["skevgp", "skevgp-nominal"]
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=default, help=f"default: {default}")
     parser.add_argument("--max-iter", type=int, help="of an EVGP; default: the regressor's")
-    parser.add_argument("--limited", action="store_true", help="fit again what a limit of iterations ended")
-    options = parser.parse_args()
-    size = "quick" if options.quick else "full"
+    options = harness.parse(parser)
     output = harness.output_path(options, "learning_curves")
     cells = [
-        Cell(system, model, setting, n_trajectories, seed, size, options.max_iter)
+        Cell(system, model, setting, n_trajectories, seed, options.size)
         for system in options.systems
         for seed, n_trajectories, model, setting in itertools.product(
-            range(options.seeds or (1 if options.quick else 4)),
+            options.seeds,
             (4, QUICK_TRAJECTORIES) if options.quick else N_TRAJECTORIES[system],
             options.models,
             options.settings,
         )
-        if wanted(system, model, setting)
+        if has(system, model, setting) and (setting != "skevgp-nominal" or model == "EVGP-IFG")
     ]
-    again = limited if options.limited else None
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since, again=again)
-    rows = named(harness.frame(output, size=size))
-    for setting in rows["setting"].unique():
-        stem = output.stem + ("" if setting == "skevgp" else f"_{setting}")
-        plot(rows[rows["setting"] == setting], output.with_name(f"{stem}.png"))
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
+    rows = named(harness.frame(output, size=options.size))
+    for setting, own in rows.groupby("setting"):
+        plot(own, output.with_name(f"{output.stem}{'' if setting == 'skevgp' else f'_{setting}'}.png"))
     harness.write_page("Learning curves: Figure 6 of the paper, and ours", tables_of(rows), output, n_failures)
 
 

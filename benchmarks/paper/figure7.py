@@ -17,9 +17,8 @@ from __future__ import annotations
 import itertools
 import re
 import sys
-import time
-import warnings
-from dataclasses import dataclass, field
+from collections import namedtuple
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,11 +26,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
 import pandas as pd
-from sklearn.exceptions import ConvergenceWarning
-from threadpoolctl import threadpool_limits
 
 import harness
-from harness import figure_of
+from harness import figure_of, ordered
 from paper.models import QUICK_TRAJECTORIES, SYSTEMS, Fit, build
 from skevgp.datasets import make_dynamics
 
@@ -43,30 +40,15 @@ SETTINGS = {
 }
 MODELS = ("EVGP-IF", "EVGP-IFG")
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    setting: str
-    seed: int
-    size: str
-    max_iter: int | None = field(compare=False)
+Cell = namedtuple("Cell", "system model setting seed size")
 
 
-def run(cell: Cell) -> list[dict[str, Any]]:
-    """Fit, and return a row per weight."""
+def run(cell: Cell, max_iter: int | None) -> list[dict[str, Any]]:
     n_trajectories = QUICK_TRAJECTORIES if cell.size == "quick" else None
     train = make_dynamics(cell.system, n_trajectories, random_state=cell.seed)
-    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter))
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        start = time.process_time()
-        regressor.fit(train.data, train.target, groups=train.groups)
-        seconds = time.process_time() - start
-        mean = regressor.predict(train.data)
+    regressor = build(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter))
+    seconds, _ = harness.timed(lambda: regressor.fit(train.data, train.target, groups=train.groups))
+    mean = regressor.predict(train.data)
     H = regressor.feature_map_.transform(train.data)
     tables = {
         "prior_mean": regressor.coef_prior_mean_,
@@ -78,14 +60,12 @@ def run(cell: Cell) -> list[dict[str, Any]]:
     }
     return [
         {
-            **{name: getattr(cell, name) for name in ("system", "model", "setting", "seed", "size")},
             "output": output,
             "feature": feature,
             **{name: values[o, j] for name, values in tables.items()},
             "max_iter": "" if regressor.max_iter is None else regressor.max_iter,
             "n_iter": regressor.n_iter_,
             "fit_seconds": seconds,
-            **harness.provenance(),
         }
         for o, output in enumerate(train.target_names)
         for j, feature in enumerate(regressor.feature_map_.get_feature_names_out())
@@ -101,25 +81,17 @@ def table_of(rows: pd.DataFrame) -> pd.DataFrame:
 
     outputs = list(rows["output"].unique())
     half = len(outputs) // 2
+    position = rows["output"].map(dict(zip(outputs[half:], outputs[:half], strict=True)))
+    rows = rows[position.notna() & ((rows["feature"] == position) | rows["feature"].str.startswith("sin("))]
+    orders = {"setting": list(SETTINGS), "model": MODELS, "output": outputs}
+    rows = rows.assign(**{name: pd.Categorical(rows[name], order) for name, order in orders.items()})
     lines = []
-    for setting, model, (velocity, position) in itertools.product(
-        SETTINGS, MODELS, zip(outputs[half:], outputs[:half], strict=True)
-    ):
-        own = rows[(rows["setting"] == setting) & (rows["model"] == model) & (rows["output"] == velocity)]
-        for feature in own["feature"].unique():
-            if feature == position or feature.startswith("sin("):
-                weight = own[own["feature"] == feature]
-                lines.append(
-                    {
-                        "setting": SETTINGS[setting],
-                        "model": model,
-                        "entry": f"({velocity}, {feature})",
-                        "b": text(weight["mean"]),
-                        "std": weight["std"].mean(),
-                        "least squares": text(weight["least_squares"]),
-                        "GP": text(weight["least_squares_of_gp"]),
-                    }
-                )
+    for (setting, model, output), own in rows.groupby(list(orders), observed=True):
+        for feature, weight in own.groupby("feature", sort=False):
+            line = {"setting": SETTINGS[setting], "model": model, "entry": f"({output}, {feature})"}
+            line |= {"b": text(weight["mean"]), "std": weight["std"].mean()}
+            line |= {"least squares": text(weight["least_squares"]), "GP": text(weight["least_squares_of_gp"])}
+            lines.append(line)
     return pd.DataFrame(lines)
 
 
@@ -144,12 +116,11 @@ def plot(rows: pd.DataFrame, path: Path) -> None:
     """Draw heat maps of prior, least squares and posterior, a column of panels per model; means over seeds."""
     from matplotlib.colors import LogNorm, SymLogNorm
 
-    settings = [setting for setting in SETTINGS if (rows["setting"] == setting).any()]
+    settings, models = ordered(SETTINGS, rows["setting"]), ordered(MODELS, rows["model"])
     lines = [("prior mean", settings[0], "prior_mean"), ("least squares", settings[0], "least_squares")]
     lines += [(f"{what}, {SETTINGS[s]}", s, value) for what, value in (("b", "mean"), ("std", "std")) for s in settings]
     outputs = list(rows["output"].unique())
     size = (harness.WIDTH, 0.4 + len(lines) * (0.45 + 0.3 * len(outputs)))
-    models = [model for model in MODELS if (rows["model"] == model).any()]
     figure, grid = harness.pyplot().subplots(len(lines), len(models), figsize=size, squeeze=False)
     stds = rows.loc[rows["std"] > 0, "std"]
     styles = {
@@ -178,23 +149,23 @@ def main() -> None:
     parser = harness.argument_parser(
         __doc__,
         quick="12 trajectories, few iterations and one seed",
-        seeds="number of seeds; default: 4, quick 1",
+        seeds=4,
         systems=SYSTEMS,
         default_systems=["acrobot"],
     )
     parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: both")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=list(SETTINGS), help="default: all")
     parser.add_argument("--max-iter", type=int, help="default: the regressor's")
-    options = parser.parse_args()
-    size = "quick" if options.quick else "full"
+    options = harness.parse(parser)
     output = harness.output_path(options, "beta")
-    seeds = range(options.seeds or (1 if options.quick else 4))
     cells = [
-        Cell(system, model, setting, seed, size, options.max_iter)
-        for system, seed, setting, model in itertools.product(options.systems, seeds, options.settings, options.models)
+        Cell(system, model, setting, seed, options.size)
+        for system, seed, setting, model in itertools.product(
+            options.systems, options.seeds, options.settings, options.models
+        )
     ]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
-    rows, tables = harness.frame(output, size=size), {}
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
+    rows, tables = harness.frame(output, size=options.size), {}
     for system, own in rows.groupby("system"):
         tables[system] = table_of(own)
         authors = own["setting"].str.startswith("author")

@@ -3,11 +3,7 @@
 from __future__ import annotations
 
 import re
-import time
-import warnings
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +15,6 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel
 from sklearn.pipeline import make_pipeline, make_union
 from sklearn.utils import Bunch
-from threadpoolctl import threadpool_limits
 
 import harness
 from skevgp import BayesianMLPRegressor, CoefPrior, EVGPRegressor, ResidualRegressor
@@ -63,21 +58,12 @@ class Fit:
     max_iter: int | None
 
 
-@dataclass(frozen=True)
-class Quick:
-    """Iterations of L-BFGS, steps of Adam and epochs of the network in a quick run."""
-
-    lbfgs: int
-    adam: int
-    epochs: int
-
-
-QUICK = {
-    "pendulum": Quick(300, 2000, 400),
-    "cartpole": Quick(200, 1000, 200),
-    "cartpole_damped": Quick(200, 1000, 200),
-    "acrobot": Quick(50, 100, 100),
-    "iiwa14": Quick(10, 2, 3),
+QUICK = {  # iterations of L-BFGS, steps of Adam and epochs of the network in a quick run
+    "pendulum": (300, 2000, 400),
+    "cartpole": (200, 1000, 200),
+    "cartpole_damped": (200, 1000, 200),
+    "acrobot": (50, 100, 100),
+    "iiwa14": (10, 2, 3),
 }
 SYSTEMS = tuple(QUICK)
 # The network learns until rows held back gain nothing.
@@ -106,25 +92,20 @@ def authors_start(fit: Fit, n_inducing: int, with_features: bool) -> dict[str, A
 def evgp(physics: type[TransformerMixin] | None, fit: Fit, n_inducing: int) -> EVGPRegressor:
     """Return an EVGP with features of inertia and force, with gravity too, or without features."""
     features = None if physics is None else physics(fit.system)
+    arguments: dict[str, Any] = {}
     if fit.setting == "skevgp-nominal":
         wrong = perturb_robot(fit.system, NOMINAL_ERROR, random_state=fit.seed)
         features = make_union(features, NominalDynamics(wrong))
-    arguments: dict[str, Any] = {}
-    if fit.setting == "paper":
-        arguments = dict(PAPER)
-    if fit.setting in AUTHORS_SCALE:
+    elif fit.setting == "paper":
+        arguments = PAPER
+    elif fit.setting in AUTHORS_SCALE:
         arguments = authors_start(fit, n_inducing, features is not None)
-    if fit.setting == "skevgp-angles":
+    elif fit.setting == "skevgp-angles":
         arguments = {"kernel_map": AngleEncoder(fit.system)}
     iterations = fit.max_iter
     if iterations is None and fit.size == "quick":
-        iterations = QUICK[fit.system].adam if fit.setting in ADAM else QUICK[fit.system].lbfgs
+        iterations = QUICK[fit.system][fit.setting in ADAM]
     return EVGPRegressor(features, n_inducing=n_inducing, max_iter=iterations, random_state=fit.seed, **arguments)
-
-
-def residual_vgp(fit: Fit, n_inducing: int) -> ResidualRegressor:
-    """Return a VGP that learns the change of state."""
-    return ResidualRegressor(evgp(None, fit, n_inducing))
 
 
 def residual_network(fit: Fit, hidden_layer_sizes: tuple[int, int]) -> ResidualRegressor:
@@ -133,43 +114,43 @@ def residual_network(fit: Fit, hidden_layer_sizes: tuple[int, int]) -> ResidualR
         hidden_layer_sizes,
         prior_scale=1.0 if fit.setting == "paper" else None,
         random_state=fit.seed,
-        **({"max_iter": QUICK[fit.system].epochs} if fit.size == "quick" else UNTIL_FLAT),
+        **({"max_iter": QUICK[fit.system][2]} if fit.size == "quick" else UNTIL_FLAT),
     )
     if fit.setting == "skevgp-angles":
         network = make_pipeline(AngleEncoder(fit.system), network)
     return ResidualRegressor(network)
 
 
-@dataclass(frozen=True)
-class Model:
-    """A model: how it is built, its sizes on each of `SYSTEMS` (the paper's Table 2), and its settings."""
-
-    build: Callable[[Fit, Any], RegressorMixin]
-    sizes: tuple[Any, ...]
-    settings: tuple[str, ...] = ("paper", "author", "skevgp", "skevgp-angles")
-
-
-NETWORK_SETTINGS = ("paper", "skevgp", "skevgp-angles")
-MODELS = {
-    "VGP": Model(partial(evgp, None), (40, 100, 100, 250, 500)),
-    "RES-VGP": Model(residual_vgp, (40, 100, 100, 250, 500)),
-    # For iiwa14 the paper says [512, 512], and a number of parameters that is that of two layers of 250.
-    "RES-DBNN": Model(residual_network, ((15, 15), (50, 50), (50, 50), (60, 60), (250, 250)), NETWORK_SETTINGS),
-    "EVGP-IF": Model(partial(evgp, InertiaForce), (10, 60, 60, 150, 350), settings=SETTINGS),
-    "EVGP-IFG": Model(partial(evgp, InertiaForceGravity), (10, 60, 60, 150, 350), settings=SETTINGS),
+# The sizes of the models on `SYSTEMS` (the paper's Table 2). For the network on iiwa14 the paper says [512, 512], and a
+# number of parameters that is that of two layers of 250.
+SIZES = {
+    "VGP": (40, 100, 100, 250, 500),
+    "RES-VGP": (40, 100, 100, 250, 500),
+    "RES-DBNN": ((15, 15), (50, 50), (50, 50), (60, 60), (250, 250)),
+    "EVGP-IF": (10, 60, 60, 150, 350),
+    "EVGP-IFG": (10, 60, 60, 150, 350),
 }
+MODELS = tuple(SIZES)
 
 
 def build(fit: Fit) -> RegressorMixin:
-    """Return the unfitted regressor, of the paper's size."""
-    model = MODELS[fit.model]
-    return model.build(fit, model.sizes[SYSTEMS.index(fit.system)])
+    size: Any = SIZES[fit.model][SYSTEMS.index(fit.system)]
+    if fit.model == "RES-DBNN":
+        return residual_network(fit, size)
+    physics = {"EVGP-IF": InertiaForce, "EVGP-IFG": InertiaForceGravity}.get(fit.model)
+    model = evgp(physics, fit, size)
+    return ResidualRegressor(model) if fit.model == "RES-VGP" else model
 
 
 def has(system: str, model: str, setting: str, angles: str = "raw") -> bool:
     """Return whether there is such a cell. Sines and cosines need no wrapped angles."""
-    of_system = setting != "skevgp-nominal" or system == "iiwa14"
-    return setting in MODELS[model].settings and of_system and (angles == "raw" or setting != "skevgp-angles")
+    if setting == "skevgp-nominal":
+        return system == "iiwa14" and model.startswith("EVGP")
+    if setting == "author-100":
+        return model.startswith("EVGP")
+    if setting == "author":
+        return model != "RES-DBNN"
+    return setting != "skevgp-angles" or angles == "raw"
 
 
 def fitted_part(regressor: Any) -> Any:
@@ -179,38 +160,24 @@ def fitted_part(regressor: Any) -> Any:
 
 
 def measures(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
-    """Return the paper's metrics, quantiles of the error over rows, and the NLPD."""
+    """Return the paper's metrics, quantiles of the error over rows, the NLPD, and shares that intervals hold."""
     errors = np.linalg.norm(target - mean, axis=1)
-    cr1, cr2, cr3 = containing_ratios(target, mean, std)
+    shares = containing_ratios(target, mean, std, norm.ppf(0.5 + 0.5 * np.array(PROMISED)))
     return {
         "error_mean": prediction_error(target, mean),
         "error_median": np.median(errors),
         "error_p99": np.quantile(errors, 0.99),
         "std_norm": std_norm(std),
-        "cr1": cr1,
-        "cr2": cr2,
-        "cr3": cr3,
+        **dict(zip(("cr1", "cr2", "cr3"), containing_ratios(target, mean, std), strict=True)),
         "nlpd": negative_log_predictive_density(target, mean, std),
+        **{f"within_{share}": ratio for share, ratio in zip(PROMISED, shares, strict=True)},
     }
-
-
-def reliability(target: np.ndarray, mean: np.ndarray, std: np.ndarray) -> dict[str, float]:
-    """Return the shares of the targets within intervals of normal distributions."""
-    half_widths = norm.ppf(0.5 + 0.5 * np.array(PROMISED))
-    ratios = containing_ratios(target, mean, std, half_widths)
-    return {f"within_{share}": ratio for share, ratio in zip(PROMISED, ratios, strict=True)}
-
-
-def beyond_range(train: np.ndarray, test: np.ndarray) -> np.ndarray:
-    """Return which entries of test rows lie beyond their column's range over training rows."""
-    return (test < train.min(axis=0)) | (test > train.max(axis=0))
 
 
 def in_range(train: Bunch, test: Bunch, errors: np.ndarray) -> dict[str, Any]:
     """Return errors inside and outside the training rows' ranges, and what is outside (column:rows:end:farthest)."""
     low, high = train.data.min(axis=0), train.data.max(axis=0)
-    beyond = beyond_range(train.data, test.data)
-    inside = ~beyond.any(axis=1)
+    inside = ~((test.data < low) | (test.data > high)).any(axis=1)
     return {
         "error_inside": errors[inside].mean() if inside.any() else np.nan,
         "error_outside": errors[~inside].mean() if not inside.all() else np.nan,
@@ -233,17 +200,6 @@ def groups_of(regressor: Any, train: Bunch) -> dict[str, np.ndarray]:
     return {"groups": train.groups} if isinstance(inner, EVGPRegressor) and "groups" in train else {}
 
 
-def timed(regressor: Any, train: Bunch, test: Bunch) -> tuple[np.ndarray, np.ndarray, float, list[Any]]:
-    """Fit; return mean and std on the test rows, processor seconds of one thread, and convergence warnings."""
-    with threadpool_limits(1), warnings.catch_warnings(record=True) as caught:
-        warnings.simplefilter("always", ConvergenceWarning)
-        start = time.process_time()
-        regressor.fit(train.data, train.target, **groups_of(regressor, train))
-        seconds = time.process_time() - start
-        mean, std = regressor.predict(test.data, return_std=True)
-    return mean, std, seconds, [warning for warning in caught if issubclass(warning.category, ConvergenceWarning)]
-
-
 def how_it_ended(messages: list[str], n_outputs: int) -> dict[str, Any]:
     """Return whether a search ended by itself, and of at least how many outputs the GP learned nothing."""
     said = " ".join(messages)
@@ -257,22 +213,20 @@ def limited(row: Any) -> bool:
 
 
 def fitted_row(fit: Fit, train: Bunch, test: Bunch, **columns: Any) -> dict[str, Any]:
-    """Fit a model and evaluate it on test rows; return a row of a CSV."""
+    """Fit a model and evaluate it on test rows; return the columns of a CSV that are not the cell's."""
     regressor = build(fit)
-    mean, std, seconds, caught = timed(regressor, train, test)
+    seconds, caught = harness.timed(lambda: regressor.fit(train.data, train.target, **groups_of(regressor, train)))
+    messages = [str(warning.message) for warning in caught if issubclass(warning.category, ConvergenceWarning)]
+    mean, std = regressor.predict(test.data, return_std=True)
     fitted = fitted_part(regressor)
     return {
-        **{name: getattr(fit, name) for name in ("system", "model", "setting", "seed")},
         **measures(test.target, mean, std),
-        **reliability(test.target, mean, std),
         **in_range(train, test, np.linalg.norm(test.target - mean, axis=1)),
         "n_parameters": fitted.n_parameters_,
         "fit_seconds": seconds,
         **columns,
-        "size": fit.size,
         "max_iter": "" if fit.max_iter is None or fit.model == "RES-DBNN" else fit.max_iter,
         "n_iter": fitted.n_iter_,
         "bound_per_row": getattr(fitted, "lower_bound_", np.nan) / len(train.data),
-        **how_it_ended([str(warning.message) for warning in caught], train.target.shape[1]),
-        **harness.provenance(),
+        **how_it_ended(messages, train.target.shape[1]),
     }

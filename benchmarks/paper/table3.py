@@ -15,9 +15,9 @@ from __future__ import annotations
 import pickle
 import sys
 import time
-import warnings
+from collections import namedtuple
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,9 +25,9 @@ sys.path.insert(0, str(Path(__file__).parents[1]))  # for what the scripts share
 
 import numpy as np
 import pandas as pd
-from threadpoolctl import threadpool_limits
 
 import harness
+from harness import figure_of
 from paper.models import PAPER
 from skevgp import BayesianMLPRegressor, EVGPRegressor
 from skevgp.solvers import Adam
@@ -58,18 +58,8 @@ LABELS = {
     ("network", ""): "network",
 }
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One measurement. Sizes that a model does not have are 0."""
-
-    what: str
-    setting: str
-    n_rows: int
-    n_inducing: int
-    n_outputs: int
-    n_layers: int
-    n_units: int
+# One measurement. Sizes that a model does not have are 0.
+Cell = namedtuple("Cell", "what setting n_rows n_inducing n_outputs n_layers n_units")
 
 
 @dataclass(frozen=True)
@@ -86,16 +76,14 @@ class Curve:
     sizes: tuple[int, ...] = ()
 
     def cells(self) -> Iterator[Cell]:
-        """Yield a cell for each size."""
         network = "network" in self.what
         n_rows = 2000 if network else FEW if self.few else 4800
         cell = Cell(self.what, self.setting, n_rows, *((0, 4, 2, 100) if network else (100, 4, 0, 0)))
         for size in self.sizes or SIZES[self.varied]:
-            yield replace(cell, **{self.varied: size})
+            yield cell._replace(**{self.varied: size})
 
     @property
     def name(self) -> str:
-        """Label of the line."""
         end = {"seconds": "", "n_bytes": ", pickled", "n_parameters": ", parameters"}[self.value]
         return LABELS[self.what, self.setting] + end + (f", {FEW} rows" if self.few else "")
 
@@ -137,13 +125,10 @@ def seconds_of(cell: Cell, X: np.ndarray, Y: np.ndarray, points: np.ndarray) -> 
         solver = Adam(BATCH, callback=lambda *_: times.append(time.process_time()), posterior="diagonal")
         EVGPRegressor(inducing_init=points, max_iter=30, random_state=0, **PAPER | {"solver": solver}).fit(X, Y)
         return list(np.diff(times))
-    layers, seconds = (cell.n_units,) * cell.n_layers, []
+    layers = (cell.n_units,) * cell.n_layers
     network = BayesianMLPRegressor(layers, batch_size=NETWORK_BATCH, max_iter=1, n_samples=1, random_state=0)
-    for _ in range(4):
-        start = time.process_time()
-        network.fit(X, Y)
-        seconds.append((time.process_time() - start) / -(-cell.n_rows // NETWORK_BATCH))
-    return seconds[1:]
+    n_steps = -(-cell.n_rows // NETWORK_BATCH)
+    return [harness.timed(lambda: network.fit(X, Y))[0] / n_steps for _ in range(4)][1:]
 
 
 def run(cell: Cell) -> dict[str, Any]:
@@ -152,9 +137,8 @@ def run(cell: Cell) -> dict[str, Any]:
     X = rng.randn(cell.n_rows, N_COLUMNS)
     Y = np.sin(X @ rng.randn(N_COLUMNS, cell.n_outputs)) + 0.01 * rng.randn(cell.n_rows, cell.n_outputs)
     points = np.random.RandomState(1).randn(cell.n_inducing, N_COLUMNS)
-    row = {**asdict(cell), **dict.fromkeys(("seconds", "seconds_median", "repeats", "n_parameters", "n_bytes"), "")}
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    row: dict[str, Any] = dict.fromkeys(("seconds", "seconds_median", "repeats", "n_parameters", "n_bytes"), "")
+    with harness.one_thread():
         if cell.what not in ("model", "network"):
             seconds = seconds_of(cell, X, Y, points)
             row |= {"seconds": min(seconds), "seconds_median": np.median(seconds), "repeats": len(seconds)}
@@ -166,42 +150,35 @@ def run(cell: Cell) -> dict[str, Any]:
                 model = EVGPRegressor(inducing_init=points, max_iter=0, random_state=0, **setting)
             n_bytes = len(pickle.dumps(model.fit(X, Y))) - (cell.what == "model") * len(pickle.dumps(points))
             row |= {"n_parameters": model.n_parameters_, "n_bytes": n_bytes}
-    return row | harness.provenance()
+    return row
 
 
-def points_of(curve: Curve, data: pd.DataFrame) -> tuple[np.ndarray, np.ndarray]:
-    """Return sizes and measurements of a curve."""
-    wanted = pd.DataFrame([asdict(cell) for cell in curve.cells()])
+def points_of(curve: Curve, data: pd.DataFrame) -> pd.Series:
+    """Return the measurements of a curve by size."""
+    wanted = pd.DataFrame(list(curve.cells()))
     found = wanted.merge(data.assign(setting=data["setting"].astype(object).fillna("")), how="inner")
-    return found[curve.varied].to_numpy(float), found[curve.value].to_numpy(float)
+    return found.set_index(curve.varied)[curve.value].astype(float)
 
 
-def exponents(curve: Curve, data: pd.DataFrame) -> tuple[float, float, float]:
+def exponents(curve: Curve, points: pd.Series) -> tuple[float, float, float]:
     """Return the exponent of the power law, and the lowest and highest one between neighbouring sizes."""
-    sizes, values = points_of(curve, data)
-    x, y = np.log(sizes[sizes >= curve.above]), np.log(values[sizes >= curve.above])
-    steps = np.diff(y) / np.diff(x)
-    return np.polyfit(x, y, 1)[0], steps.min(), steps.max()
+    points = np.log(points[points.index >= curve.above])
+    x, steps = np.log(points.index), np.diff(points) / np.diff(np.log(points.index))
+    return np.polyfit(x, points, 1)[0], steps.min(), steps.max()
 
 
 def table_of(curves: list[Curve], data: pd.DataFrame) -> pd.DataFrame:
     """Return exponents beside the paper's."""
     lines = []
     for curve in curves:
-        sizes, values = points_of(curve, data)
-        fitted, low, high = (f"{round(value, 2) + 0.0:.2f}" for value in exponents(curve, data))
+        points = points_of(curve, data)
+        fitted, low, high = (f"{round(value, 2) + 0.0:.2f}" for value in exponents(curve, points))
         unit, scale = {"seconds": (" s", 1.0), "n_bytes": (" MB", 1e-6), "n_parameters": ("", 1.0)}[curve.value]
-        lines.append(
-            {
-                "what": curve.name,
-                "against": LABELS[curve.varied],
-                "paper's exponent": curve.paper,
-                "ours (between neighbours)": f"{fitted} ({low} to {high})",
-                "fitted to": f"{max(sizes[0], curve.above):g} to {sizes[-1]:g}",
-                "smallest to largest": " to ".join(harness.figure_of(scale * value) for value in values[[0, -1]])
-                + unit,
-            }
-        )
+        line = {"what": curve.name, "against": LABELS[curve.varied], "paper's exponent": curve.paper}
+        line["ours (between neighbours)"] = f"{fitted} ({low} to {high})"
+        line["fitted to"] = f"{max(points.index[0], curve.above):g} to {points.index[-1]:g}"
+        line["smallest to largest"] = " to ".join(map(figure_of, scale * points.iloc[[0, -1]])) + unit
+        lines.append(line)
     return pd.DataFrame(lines)
 
 
@@ -219,10 +196,10 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
         shown = [curve for curve in curves if curve.varied in varied and curve.value == value]
         axes.set_visible(bool(shown))
         for number, curve in enumerate(shown):
-            sizes, values = points_of(curve, data)
-            label = f"{curve.name}: {exponents(curve, data)[0]:.2f}"
+            points = points_of(curve, data)
+            label = f"{curve.name}: {exponents(curve, points)[0]:.2f}"
             marker = "o" if number < len(harness.PALETTE) else "s"  # colours begin again
-            axes.plot(sizes, scale * values, f"{marker}{':' if curve.few else '-'}", markersize=4, label=label)
+            axes.plot(scale * points, f"{marker}{':' if curve.few else '-'}", markersize=4, label=label)
         if not shown:
             continue
         for which in "xy":
@@ -238,7 +215,7 @@ def plot(curves: list[Curve], data: pd.DataFrame, path: Path) -> None:
 def main() -> None:
     parser = harness.argument_parser(__doc__, quick="few sizes", systems=("gp", "network"))
     parser.set_defaults(jobs=1)
-    options = parser.parse_args()
+    options = harness.parse(parser)
     output = harness.output_path(options, "complexity")
     curves = [
         curve
@@ -246,11 +223,12 @@ def main() -> None:
         if ("network" if "network" in curve.what else "gp") in options.systems
     ]
     cells = [cell for curve in curves for cell in curve.cells()]
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since)
+    n_failures = harness.run_missing(cells, run, output, options.jobs)
     data = harness.frame(output)
+    tables = {}
     if not n_failures:
         plot(curves, data, output.with_suffix(".png"))
-    tables = {} if n_failures else {"complexity": table_of(curves, data)}
+        tables = {"complexity": table_of(curves, data)}
     harness.write_page("Complexity: the paper's Table 3, and measured", tables, output, n_failures)
 
 

@@ -24,9 +24,8 @@ from __future__ import annotations
 
 import itertools
 import sys
-from collections.abc import Iterator
-from dataclasses import dataclass, field
-from functools import lru_cache
+from collections import namedtuple
+from functools import lru_cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ import pandas as pd
 from sklearn.utils import Bunch
 
 import harness
-from harness import figure_of
+from harness import figure_of, ordered, text
 from paper.models import (
     MODELS,
     PROMISED,
@@ -56,19 +55,8 @@ MARKERS = dict(zip(SETTINGS, "svPo^D", strict=True))
 COLOURS = dict(zip(SETTINGS, np.array(harness.PALETTE)[[4, 1, 5, 0, 2, 3]], strict=True))
 N_SEEDS = 4
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit. ``noise`` is the share of each training target's standard deviation."""
-
-    system: str
-    model: str
-    setting: str
-    seed: int
-    angles: str
-    noise: float
-    size: str
-    max_iter: int | None = field(compare=False)
+# One fit. ``noise`` is the share of each training target's standard deviation.
+Cell = namedtuple("Cell", "system model setting seed angles noise size")
 
 
 @lru_cache(maxsize=1)
@@ -83,66 +71,67 @@ def data(system: str, seed: int, noise: float, size: str, angles: str) -> tuple[
     return train, test
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, max_iter: int | None) -> dict[str, Any]:
     """Fit one model on one training set and evaluate it on one test set."""
     train, test = data(cell.system, cell.seed, cell.noise, cell.size, cell.angles)
-    fit = Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, cell.max_iter)
-    return fitted_row(fit, train, test, angles=cell.angles, noise=cell.noise)
+    return fitted_row(Fit(cell.system, cell.model, cell.setting, cell.seed, cell.size, max_iter), train, test)
 
 
-def groups_of(rows: pd.DataFrame) -> Iterator[tuple[str, str, str, str, pd.DataFrame]]:
-    """Yield (case, system, model, setting, rows) in the paper's order; a case is a system and its angles."""
-    found = dict(list(rows.groupby(["system", "angles", "model", "setting"])))
-    for setting, system, angles, model in itertools.product(SETTINGS, SYSTEMS, ("raw", "wrapped"), MODELS):
-        if (system, angles, model, setting) in found:
-            own = found[system, angles, model, setting].sort_values("seed")
-            yield system + ", wrapped" * (angles == "wrapped"), system, model, setting, own
+def sorted_rows(rows: pd.DataFrame) -> pd.DataFrame:
+    """Put the rows into the paper's order, and add their case: a system and its angles."""
+    cases = [system + end for system in SYSTEMS for end in ("", ", wrapped")]
+    case = rows["system"] + np.where(rows["angles"] == "wrapped", ", wrapped", "")
+    orders = {"setting": SETTINGS, "case": cases, "model": MODELS}
+    rows = rows.assign(case=case)
+    rows = rows.assign(**{name: pd.Categorical(rows[name], order) for name, order in orders.items()})
+    return rows.sort_values([*orders, "seed"])
+
+
+def unsure(own: pd.DataFrame) -> tuple[bool, bool]:
+    """Return whether a limit ended a fit, and whether an output was not learned."""
+    return bool(own.apply(limited, axis=1).any()), bool((own["unlearned"] > 0).any())
 
 
 def marks(own: pd.DataFrame) -> str:
     """Return an asterisk if a limit ended a fit, a dagger if an output was not learned, and the number of seeds."""
-    said = "\\*" * bool(own.apply(limited, axis=1).any()) + "†" * bool((own["unlearned"] > 0).any())
-    return said + (f" ({len(own)})" if len(own) != N_SEEDS else "")
+    ended, unlearned = unsure(own)
+    return "\\*" * ended + "†" * unlearned + (f" ({len(own)})" if len(own) != N_SEEDS else "")
 
 
 def overview(rows: pd.DataFrame, noisy: bool) -> pd.DataFrame:
     """Return mean Errors, all rows / rows inside the training range; of noisy data CR-2. A column per setting."""
-    lines: dict[tuple[str, str], dict[str, str]] = {}
-    for case, system, model, setting, own in groups_of(rows):
-        published = PUBLISHED.loc[system, model]
-        said = f"{published.cr2 if noisy else published.error:.3f}"
-        if noisy:
-            text = figure_of(own["cr2"].mean())
-        else:
-            means = own["error_mean"].mean(), own["error_inside"].mean(skipna=False)
-            text = " / ".join(figure_of(mean) for mean in means if np.isfinite(mean))
-        line = lines.setdefault((case, model), {"system": case, "model": model, "in the paper": said})
-        line[f"ours: {setting}"] = text + marks(own)
-    cases = [system + end for system in SYSTEMS for end in ("", ", wrapped")]
-    order = sorted(lines, key=lambda line: (cases.index(line[0]), list(MODELS).index(line[1])))
-    columns = [f"ours: {setting}" for setting in SETTINGS if (rows["setting"] == setting).any()]
-    return pd.DataFrame([lines[line] for line in order])[["system", "model", "in the paper", *columns]].fillna("")
+
+    def means(own: pd.DataFrame) -> str:
+        shown = [own["cr2"].mean()] if noisy else [own["error_mean"].mean(), own["error_inside"].mean(skipna=False)]
+        return " / ".join(figure_of(mean) for mean in shown if np.isfinite(mean)) + marks(own)
+
+    found = rows.groupby(["case", "model", "setting"], observed=True).apply(means, include_groups=False)
+    found = found.unstack(fill_value="")
+    published = PUBLISHED["cr2" if noisy else "error"].map("{:.3f}".format)
+    papers = [published[case.removesuffix(", wrapped"), model] for case, model in found.index]
+    found.columns = [f"ours: {setting}" for setting in found.columns]
+    found.insert(0, "in the paper", papers)
+    return found.reset_index(names=["system", "model"])
 
 
 def calibration(rows: pd.DataFrame) -> pd.DataFrame:
     """Return shares of the targets within intervals that promise them."""
-    names = {"0.5": "within_0.5", "0.8": "within_0.8", "0.95": "within_0.95"}
-    names |= {"CR-1: 0.683": "cr1", "CR-2: 0.954": "cr2", "CR-3: 0.997": "cr3"}
-    lines = []
-    for case, _, model, setting, own in groups_of(rows):
-        means = own[list(names.values())].mean(skipna=False)
-        texts = [f"{mean:.3f}" if np.isfinite(mean) else "" for mean in means]
-        lines.append({"promised": f"{case} {model} {setting}{marks(own)}", **dict(zip(names, texts, strict=True))})
-    return pd.DataFrame(lines)
+    names = {"within_0.5": "0.5", "within_0.8": "0.8", "within_0.95": "0.95"}
+    names |= {"cr1": "CR-1: 0.683", "cr2": "CR-2: 0.954", "cr3": "CR-3: 0.997"}
+    groups = rows.groupby(["setting", "case", "model"], observed=True)
+    shares = {
+        f"{case} {model} {setting}{marks(own)}": own[list(names)].mean(skipna=False)
+        for (setting, case, model), own in groups
+    }
+    table = pd.DataFrame(shares).T.rename(columns=names)
+    return table.apply(text, digits=3).reset_index(names="promised")
 
 
-def details(rows: pd.DataFrame, wanted: str) -> pd.DataFrame:
+def details(rows: pd.DataFrame) -> pd.DataFrame:
     """Return all columns of the paper's table, ours / the paper's, for one setting."""
     lines = []
-    for case, system, model, setting, own in groups_of(rows):
-        if setting != wanted:
-            continue
-        paper, mean, errors = PUBLISHED.loc[system, model], own.mean(numeric_only=True), own["error_mean"]
+    for (case, model), own in rows.groupby(["case", "model"], observed=True):
+        paper, mean = PUBLISHED.loc[own["system"].iloc[0], model], own.mean(numeric_only=True)
         inside = own["error_inside"].mean(skipna=False)
         counts = ", ".join(map(str, sorted(own["n_parameters"].unique())))
         lines.append(
@@ -150,9 +139,9 @@ def details(rows: pd.DataFrame, wanted: str) -> pd.DataFrame:
                 "system": case,
                 "model": model,
                 "seeds": len(own),
-                "Error": f"{figure_of(errors.mean())} / {paper.error:.3f}",
-                "median seed": errors.median(),
-                "largest": errors.max(),
+                "Error": f"{figure_of(mean['error_mean'])} / {paper.error:.3f}",
+                "median seed": own["error_mean"].median(),
+                "largest": own["error_mean"].max(),
                 "inside": f"{figure_of(inside)} ({mean['inside']:.1%})" if np.isfinite(inside) else "",
                 "outside": mean["error_outside"],
                 "median row": mean["error_median"],
@@ -170,22 +159,22 @@ def details(rows: pd.DataFrame, wanted: str) -> pd.DataFrame:
 
 def plot_errors(rows: pd.DataFrame, path: Path) -> None:
     """Draw a panel per system: bars of the paper, a marker for each setting."""
-    systems = [system for system in SYSTEMS if (rows["system"] == system).any()]
+    systems, rows = ordered(SYSTEMS, rows["system"]), sorted_rows(rows[rows["angles"] == "raw"])
     n_lines = -(-len(systems) // 2)
     figure, grid = harness.pyplot().subplots(n_lines, 2, figsize=(harness.WIDTH, 2.4 + 2.9 * n_lines), squeeze=False)
     places = np.arange(len(MODELS))
     for axes, system in zip(grid.flat, systems, strict=False):
-        papers = PUBLISHED.loc[system]["error"].reindex(list(MODELS))
+        papers = PUBLISHED.loc[system]["error"].reindex(MODELS)
         axes.hlines(papers, places - 0.42, places + 0.42, color="black", label="in the paper")
-        for _, _, model, setting, own in groups_of(rows[(rows["system"] == system) & (rows["angles"] == "raw")]):
-            offset = 0.16 * (list(SETTINGS).index(setting) - 2.5)
-            place, colour, values = list(MODELS).index(model) + offset, COLOURS[setting], own["error_mean"]
-            unsure = own.apply(limited, axis=1).any() or (own["unlearned"] > 0).any()
-            style = {"color": colour, "markerfacecolor": "white" if unsure else colour, "linestyle": ""}
+        groups = rows[rows["system"] == system].groupby(["setting", "model"], observed=True)
+        for (setting, model), own in groups:
+            place = MODELS.index(model) + 0.16 * (SETTINGS.index(setting) - 2.5)
+            colour, values = COLOURS[setting], own["error_mean"]
+            style = {"color": colour, "markerfacecolor": "white" if any(unsure(own)) else colour, "linestyle": ""}
             axes.plot([place] * len(values), values, ".", color=colour, markersize=4, alpha=0.5)
             axes.plot(place, values.mean(), MARKERS[setting], label=f"ours: {setting}", **style)
             axes.plot(place, own["error_inside"].mean(), "_", color=colour, markersize=12)
-        axes.set_xticks(places, list(MODELS), fontsize=8)
+        axes.set_xticks(places, MODELS, fontsize=8)
         axes.set(title=system, ylabel="test Error (SI units)", yscale="log")
     for axes in grid.flat[len(systems) :]:
         axes.set_axis_off()
@@ -198,13 +187,13 @@ def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
     """Draw a panel per system and setting: the share that intervals hold less the share that they promise."""
     # Old rows have no such shares.
     rows = rows[(rows["angles"] == "raw") & rows[f"within_{PROMISED[0]}"].notna()]
-    panels = rows.groupby("system", sort=False)["setting"].unique()
-    systems = [system for system in SYSTEMS if system in panels]
+    panels = rows.groupby("system")["setting"].unique()
+    systems = ordered(SYSTEMS, panels.index)
     n_columns = max(map(len, panels))
     size = {"figsize": (harness.WIDTH, 1.1 + 1.7 * len(systems)), "squeeze": False}
     figure, grid = harness.pyplot().subplots(len(systems), n_columns, sharex=True, sharey=True, **size)
     for line, system in zip(grid, systems, strict=True):
-        settings = [setting for setting in SETTINGS if setting in panels[system]]
+        settings = ordered(SETTINGS, panels[system])
         for axes in line[len(settings) :]:
             axes.set_axis_off()
         for axes, setting in zip(line, settings, strict=False):
@@ -219,44 +208,37 @@ def plot_reliability(rows: pd.DataFrame, path: Path) -> None:
     harness.save_picture(figure, path)
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return the tables of the page."""
-    noisy = bool((rows["noise"] > 0).any())
-    settings = [setting for setting in SETTINGS if (rows["setting"] == setting).any()]
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
+    rows, noisy = sorted_rows(rows), bool((rows["noise"] > 0).any())
+    settings = rows.groupby("setting", observed=True)
     return {
         "CR-2" if noisy else "Error": overview(rows, noisy),
         "calibration": calibration(rows),
-        **{f"setting {setting}": details(rows, setting) for setting in settings},
+        **{f"setting {setting}": details(own) for setting, own in settings},
     }
 
 
 def main() -> None:
     parser = harness.argument_parser(
-        __doc__,
-        quick="12 trajectories, few iterations and one seed",
-        seeds="number of seeds; default: 4, quick 1",
-        systems=SYSTEMS,
+        __doc__, quick="12 trajectories, few iterations and one seed", seeds=N_SEEDS, systems=SYSTEMS
     )
-    parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
+    parser.add_argument("--models", nargs="+", choices=MODELS, default=MODELS, help="default: all")
     parser.add_argument("--settings", nargs="+", choices=SETTINGS, default=SETTINGS, help="default: all")
     parser.add_argument("--angles", nargs="+", choices=("raw", "wrapped"), default=["raw"], help="default: raw")
     parser.add_argument("--noise", type=float, default=0.0, help="as a share of each training target's std; default: 0")
     parser.add_argument("--max-iter", type=int, help="of an EVGP; default: the regressor's")
-    parser.add_argument("--limited", action="store_true", help="fit again what a limit of iterations ended")
-    options = parser.parse_args()
-    size, noise = "quick" if options.quick else "full", options.noise
+    options = harness.parse(parser)
+    noise = options.noise
     output = harness.output_path(options, f"results_table{f'_noise{noise:g}' if noise else ''}")
-    n_seeds = options.seeds or (1 if options.quick else N_SEEDS)
     cells = [
-        Cell(system, model, setting, seed, angles, noise, size, options.max_iter)
+        Cell(system, model, setting, seed, angles, noise, options.size)
         for system, seed, angles, model, setting in itertools.product(
-            options.systems, range(n_seeds), options.angles, options.models, options.settings
+            options.systems, options.seeds, options.angles, options.models, options.settings
         )
         if has(system, model, setting, angles)
     ]
-    again = limited if options.limited else None
-    n_failures = harness.run_missing(cells, run, output, options.jobs, since=options.since, again=again)
-    rows = harness.frame(output, size=size, noise=noise)
+    n_failures = harness.run_missing(cells, partial(run, max_iter=options.max_iter), output, options.jobs)
+    rows = harness.frame(output, size=options.size, noise=noise)
     (plot_reliability if noise else plot_errors)(rows, output.with_suffix(".png"))
     harness.write_page("The results: Table 4 of the paper, and ours", tables_of(rows), output, n_failures)
 

@@ -1,7 +1,7 @@
 """Each library as a peer: how it fits a job, and what it says of a model at fixed hyperparameters.
 
-`peers.py` runs a peer in a process of its own, because the libraries need different versions of NumPy. So nothing but
-NumPy is imported here until a peer asks for it. Jobs and results are .npz files.
+`against_peers.py` runs a peer in a process of its own, because the libraries need different versions of NumPy. So
+nothing but NumPy is imported here until a peer asks for it. Jobs and results are .npz files.
 
     python benchmarks/peers/adapters.py "GPflow SGPR" job.npz result.npz
 
@@ -17,6 +17,7 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from pathlib import Path
 from types import SimpleNamespace
@@ -55,12 +56,10 @@ class Watch:
 
     @property
     def seconds(self) -> float:
-        """Wall time so far."""
         return time.perf_counter() - self._begin
 
     @property
     def cpu_seconds(self) -> float:
-        """Processor time so far."""
         return time.process_time() - self._begin_cpu
 
     def deadline(self, model: int) -> float:
@@ -84,8 +83,6 @@ class Watch:
 
 
 class Checkpoint(NamedTuple):
-    """A fit at a time."""
-
     seconds: float
     cpu_seconds: float
     bound: float
@@ -158,13 +155,8 @@ class Peer:
         """Name of the package that an interpreter must have."""
         return self.modules[0].partition(".")[0]
 
-    def fit(self, job: Job, watch: Watch) -> Fitted:
-        """Fit a job."""
-        raise NotImplementedError
-
-    def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
-        """Return what is timed for control loops, of a model of ``X``, ``Y``, ``inducing_points``, rows ``ahead``."""
-        raise NotImplementedError
+    # Each peer has fit(job, watch) -> Fitted. Some have calls(given) -> name: what is timed for control loops, of a
+    # model of given.X, given.Y and given.inducing_points at rows given.ahead.
 
 
 class Skevgp(Peer):
@@ -193,15 +185,15 @@ class Skevgp(Peer):
     def fit(self, job: Job, watch: Watch) -> Fitted:
         model, stop, iterations = self.fit_until(job, watch, watch.time_limit)
 
+        def predictor(model: Any) -> Predict:
+            return lambda X: tuple(part.reshape(len(X), -1) for part in model.predict(X, return_std=True))
+
         def at(seconds: float) -> Checkpoint:
             own = Watch(watch.time_limit, 1)
             early = self.fit_until(job, own, seconds)[0]
-            return Checkpoint(own.seconds, own.cpu_seconds, early.lower_bound_, self.predictor(early))
+            return Checkpoint(own.seconds, own.cpu_seconds, early.lower_bound_, predictor(early))
 
-        return Fitted(self.predictor(model), [model.lower_bound_], stop, iterations, at=at)
-
-    def predictor(self, model: Any) -> Predict:
-        return lambda X: tuple(part.reshape(len(X), -1) for part in model.predict(X, return_std=True))
+        return Fitted(predictor(model), [model.lower_bound_], stop, iterations, at=at)
 
     def fit_until(self, job: Job, watch: Watch, seconds: float) -> tuple[Any, str, int]:
         from skevgp import EVGPRegressor
@@ -649,11 +641,11 @@ class ExactGP(Peer):
 
         scaled = Scaled(job)
         kernel = ConstantKernel() * RBF(scaled.lengthscales) + WhiteKernel(job.noise, (1e-10, 10.0))
-        models = []
-        for columns in scaled.models:
-            gp = GaussianProcessRegressor(kernel, random_state=job.seed).fit(scaled.X, scaled.Y[:, columns])
-            models.append(lambda X, gp=gp: gp.predict(X, return_std=True))
-        return Fitted(scaled.predictor(models), [], "converged")
+        gps = [
+            GaussianProcessRegressor(kernel, random_state=job.seed).fit(scaled.X, scaled.Y[:, columns])
+            for columns in scaled.models
+        ]
+        return Fitted(scaled.predictor([partial(gp.predict, return_std=True) for gp in gps]), [], "converged")
 
     def calls(self, given: SimpleNamespace) -> dict[str, Callable[[], object]]:
         """An exact model of as many rows as inducing points."""
@@ -679,8 +671,7 @@ class Line(Peer):
 
         scaled = Scaled(job)
         lines = [BayesianRidge().fit(scaled.X, scaled.Y[:, columns[0]]) for columns in scaled.models]
-        models = [lambda X, line=line: line.predict(X, return_std=True) for line in lines]
-        return Fitted(scaled.predictor(models), [], "converged")
+        return Fitted(scaled.predictor([partial(line.predict, return_std=True) for line in lines]), [], "converged")
 
 
 class Trees(Peer):

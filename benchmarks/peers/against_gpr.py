@@ -20,9 +20,8 @@ from __future__ import annotations
 import itertools
 import sys
 import time
-import warnings
+from collections import namedtuple
 from contextlib import suppress
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,9 +33,9 @@ from sklearn.base import RegressorMixin
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
-from threadpoolctl import threadpool_limits
 
 import harness
+from harness import ordered
 from paper.models import Fit, build
 from skevgp import EGPRegressor, EVGPRegressor
 from skevgp.datasets import make_dynamics
@@ -65,15 +64,7 @@ MEASURES = {
     "log_likelihood": "log likelihood / N",
 }
 
-
-@dataclass(frozen=True)
-class Cell:
-    """One fit."""
-
-    system: str
-    model: str
-    n_rows: int
-    seed: int
+Cell = namedtuple("Cell", "system model n_rows seed")
 
 
 def regressor_of(cell: Cell, X: np.ndarray) -> RegressorMixin:
@@ -151,15 +142,11 @@ def run(cell: Cell) -> dict[str, Any]:
     """Fit and predict, and measure both."""
     train, test = data(cell)
     regressor = regressor_of(cell, train.X)
-    with threadpool_limits(1), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with harness.one_thread():
         # Imports and first allocations are not measured.
         regressor_of(cell, train.X).fit(train.X[:10], train.y[:10]).predict(test.X[:10], return_std=True)
-        with warnings.catch_warnings(record=True) as caught, harness.peak_memory() as memory:
-            warnings.simplefilter("always")
-            start = time.process_time()
-            regressor.fit(train.X, train.y)
-            fit_seconds = time.process_time() - start
+        with harness.peak_memory() as memory:
+            fit_seconds, caught = harness.timed(lambda: regressor.fit(train.X, train.y))
         start = time.process_time()
         mean, std = regressor.predict(test.X, return_std=True)
         predict_seconds = time.process_time() - start
@@ -170,7 +157,6 @@ def run(cell: Cell) -> dict[str, Any]:
                 exact = counterpart(regressor, train, test)
     convergence = [str(warning.message) for warning in caught if issubclass(warning.category, ConvergenceWarning)]
     return {
-        **asdict(cell),
         "m": regressor.inducing_points_.shape[-2] if isinstance(regressor, EVGPRegressor) else "",
         "fit_seconds": fit_seconds,
         "predict_seconds": 1000.0 * predict_seconds / len(test.X),
@@ -182,56 +168,49 @@ def run(cell: Cell) -> dict[str, Any]:
         **exact,
         "converged": not convergence,
         "warning": convergence[0].splitlines()[0][:120] if convergence else "",
-        **harness.provenance(),
     }
 
 
-def expected_seconds(rows: list[harness.Row], cell: Cell) -> float:
-    """Return what a fit takes at most, judged by the largest smaller one."""
-    smaller = [
-        (int(row["n_rows"]), float(row["fit_seconds"]))
-        for row in rows
-        if (row["system"], row["model"], row["seed"]) == (cell.system, cell.model, str(cell.seed))
-        and int(row["n_rows"]) < cell.n_rows
-    ]
-    n, seconds = max(smaller, default=(1, 0.0))
-    return seconds * (cell.n_rows / n) ** MODELS[cell.model][0]
+def expected_seconds(path: Path, cell: Cell) -> float:
+    """Return what a fit takes at most, judged by the largest smaller one in the CSV."""
+    if not path.exists():
+        return 0.0
+    rows = harness.frame(path, system=cell.system, model=cell.model, seed=cell.seed)
+    smaller = rows[rows["n_rows"] < cell.n_rows].sort_values("n_rows").tail(1)
+    return sum(smaller["fit_seconds"] * (cell.n_rows / smaller["n_rows"]) ** MODELS[cell.model][0])
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame) -> harness.Tables:
     """Return exponents over the four largest sizes, and a table of all measures per data set."""
     means = rows.groupby(["system", "model", "n_rows"]).mean(numeric_only=True)
     for name in ("log_likelihood", "counterpart_log_likelihood"):
         means[name] = means[name] / means.index.get_level_values("n_rows")
     exponents, tables = [], {}
-    for system in [name for name in SYSTEMS if name in set(rows["system"])]:
-        parts = []
+    for system in ordered(SYSTEMS, rows["system"]):
+        own, parts = means.loc[system], []
+        models = ordered(MODELS, own.index.get_level_values("model"))
         for name, measure in MEASURES.items():
-            for model in [name for name in MODELS if name in means.loc[system].index]:
-                parts.append((measure, model, means.loc[system, model][name]))
-            if f"counterpart_{name}" in means and "EVGP" in means.loc[system].index:
-                exact = means.loc[system, "EVGP"][f"counterpart_{name}"].dropna()
-                parts.append((measure, "EVGP, made exact", exact))
-        table = pd.DataFrame([values for *_, values in parts])
-        table = table.set_axis([str(n) for n in table.columns], axis=1)
-        table.insert(0, "model", [model for _, model, _ in parts])
-        table.insert(0, "", [measure for measure, *_ in parts])
+            parts += [own.loc[model, name].rename((measure, model)) for model in models]
+            if f"counterpart_{name}" in own and "EVGP" in models:
+                exact = own.loc["EVGP", f"counterpart_{name}"].dropna()
+                parts.append(exact.rename((measure, "EVGP, made exact")))
+        table = pd.DataFrame(parts).rename(columns=str)
+        table.insert(0, "", [measure for measure, _ in table.index])
+        table.insert(1, "model", [model for _, model in table.index])
         tables[system] = table
-        for model in [name for name in MODELS if name in means.loc[system].index]:
-            own = means.loc[system, model].tail(4)
-            x = np.log(own.index)
-            powers = [
-                f"{np.polyfit(x, np.log(np.maximum(own[name], 1e-9)), 1)[0]:.2f}" if len(own) > 1 else ""
-                for name in ("fit_seconds", "memory_mb")
-            ]
-            exponents.append([system, model, str(own.index[-1]), *powers])
-    header = ["data", "model", "largest N", "time", "memory"]
-    return {"exponents": pd.DataFrame(exponents, columns=header), **tables}
+        for model in models:
+            last = own.loc[model].tail(4)
+            line = {"data": system, "model": model, "largest N": str(last.index[-1]), "time": "", "memory": ""}
+            if len(last) > 1:
+                y = np.log(last[["fit_seconds", "memory_mb"]].clip(lower=1e-9))
+                line["time"], line["memory"] = map("{:.2f}".format, np.polyfit(np.log(last.index), y, 1)[0])
+            exponents.append(line)
+    return {"exponents": pd.DataFrame(exponents), **tables}
 
 
 def plot(rows: pd.DataFrame, path: Path) -> None:
     """Draw time, memory, error and NLPD over N; a column of panels per data set."""
-    systems = [name for name in SYSTEMS if name in set(rows["system"])]
+    systems = ordered(SYSTEMS, rows["system"])
     names = ("fit_seconds", "memory_mb", "error", "nlpd")
     options = {"figsize": (harness.WIDTH, 8.4), "squeeze": False, "sharex": "col"}
     figure, grid = harness.pyplot().subplots(len(names), len(systems), **options)
@@ -253,27 +232,24 @@ def plot(rows: pd.DataFrame, path: Path) -> None:
 
 
 def main() -> None:
-    parser = harness.argument_parser(
-        __doc__, quick="50 and 150 rows", seeds="number of seeds; default: 1", systems=SYSTEMS
-    )
+    parser = harness.argument_parser(__doc__, quick="50 and 150 rows", seeds=1, systems=SYSTEMS)
     parser.add_argument("--models", nargs="+", choices=MODELS, default=list(MODELS), help="default: all")
     parser.add_argument("--sizes", nargs="+", type=int, help="rows; default: 125 to 4000, smooth to 100,000")
     said = "seconds a fit may be expected to take; default: %(default)g"
     parser.add_argument("--time-limit", type=float, default=300.0, help=said)
-    options = parser.parse_args()
+    options = harness.parse(parser)
     output, n_failures = harness.output_path(options, "against_gpr"), 0
     # One size after the other, since the time of a size tells that of the next.
     for n_rows in sorted(options.sizes or (QUICK_SIZES if options.quick else SIZES)):
-        done = harness.read(output)
         cells = [
             cell
-            for seed in range(options.seeds or 1)
+            for seed in options.seeds
             for system in options.systems
             for model in options.models
             if system in MODELS[model][1] and (system == "smooth" or n_rows <= N_ROWS)
-            if expected_seconds(done, cell := Cell(system, model, n_rows, seed)) <= options.time_limit
+            if expected_seconds(output, cell := Cell(system, model, n_rows, seed)) <= options.time_limit
         ]
-        n_failures += harness.run_missing(cells, run, output, options.jobs, fresh=True, since=options.since)
+        n_failures += harness.run_missing(cells, run, output, options.jobs, fresh=True)
     rows = harness.frame(output)
     plot(rows, output.with_suffix(".png"))
     harness.write_page("EVGPRegressor and GaussianProcessRegressor as N grows", tables_of(rows), output, n_failures)

@@ -1,12 +1,13 @@
 """skevgp against other libraries: same data, same number of inducing points, same kernel, same start.
 
 First every library has to agree with dense matrices at fixed hyperparameters. Then each fit is a row of a CSV, and its
-bound, RMSE and NLPD over time are in a second CSV. Peers that are not installed are left out. GPflow needs another
-NumPy than skevgp and GPJax: give the interpreter that has the peers (see requirements.txt and requirements_jax.txt).
+bound, RMSE and NLPD over time are in a second CSV; what is deleted from both is measured again. Peers that are not
+installed are left out. GPflow needs another NumPy than skevgp and GPJax: give the interpreter that has the peers (see
+requirements.txt and requirements_jax.txt).
 
     python benchmarks/peers/against_peers.py --peer-python .peers/bin/python --data-folder ../uci
     python benchmarks/peers/against_peers.py --peers "GPJax SGPR" --peer-python .peers_jax/bin/python
-    python benchmarks/peers/against_peers.py --datasets cartpole --peers skevgp "GPflow SGPR" --redo
+    python benchmarks/peers/against_peers.py --datasets cartpole --peers skevgp "GPflow SGPR"
     python benchmarks/peers/against_peers.py --quick  # small data, skevgp and scikit-learn: half a minute
 
 All ten splits of the tables, with GPflow's SGPR, gradient boosting, a straight line and skevgp, without curves:
@@ -26,7 +27,7 @@ and JAX's compilation are part of a fit.
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import os
 import platform
 import subprocess
@@ -49,6 +50,7 @@ from scipy.stats import multivariate_normal
 
 import harness
 import skevgp
+from harness import text
 from peers.adapters import PEERS, load
 from skevgp import EVGPRegressor
 from skevgp.datasets import make_dynamics
@@ -64,8 +66,6 @@ _LINE, _TREES = "scikit-learn BayesianRidge", "scikit-learn HistGradientBoosting
 
 
 class Sets(NamedTuple):
-    """Training and test rows."""
-
     X: np.ndarray
     Y: np.ndarray
     X_test: np.ndarray
@@ -83,10 +83,7 @@ def standardised(X: np.ndarray, y: np.ndarray, is_test: np.ndarray) -> Sets:
 
 
 def tabular(name: str, seed: int, folder: Path | None) -> Sets:
-    """Read a split of a table."""
-    if folder is None:
-        raise SystemExit(f"{name} is read from a folder: give --data-folder, or other --datasets.")
-    table, masks = (np.loadtxt(folder / name / f"{file}.csv.gz", delimiter=",") for file in ("data", "test_mask"))
+    table, masks = (np.loadtxt(f"{folder}/{name}/{file}.csv.gz", delimiter=",") for file in ("data", "test_mask"))
     return standardised(table[:, :-1], table[:, -1], masks[:, seed] == 1.0)
 
 
@@ -99,12 +96,9 @@ def smooth(n_rows: int, seed: int, folder: Path | None) -> Sets:
 
 def dynamics(system: str, seed: int, folder: Path | None, **sizes: int) -> Sets:
     """Simulate changes of the state, in the units of the system."""
-    X, Y, X_test, Y_test = (
-        array
-        for random_state in (seed, 1000 + seed)
-        for array in make_dynamics(system, random_state=random_state, return_X_y=True, **sizes)
-    )
-    return Sets(X, Y - X[:, : Y.shape[1]], X_test, Y_test - X_test[:, : Y.shape[1]])
+    train, test = (make_dynamics(system, random_state=state, **sizes) for state in (seed, 1000 + seed))
+    changes = (part.target - part.data[:, : part.target.shape[1]] for part in (train, test))
+    return Sets(train.data, next(changes), test.data, next(changes))
 
 
 @dataclass(frozen=True)
@@ -198,24 +192,20 @@ def run(python: str, peer: str, sets: Sets, job: dict[str, Any], cell: dict[str,
         return row | {"stop": "failed: predictions that are not finite"}, []
     errors = np.linalg.norm(Y - mean, axis=1)
     row |= {name: getattr(result, name) for name in ("predict_seconds", "iterations", "evaluations", "stop")}
-    row |= {"seconds": result.seconds[0], "cpu_seconds": result.cpu_seconds[0], "bound": result.bound[0]}
+    row |= {name: getattr(result, name)[0] for name in ("seconds", "cpu_seconds", "bound")}
     row |= {"output_bounds": " ".join(f"{bound:.2f}" for bound in result.bounds), **scores(Y, mean, std)}
     row |= {"error_mean": errors.mean(), "error_median": np.median(errors), "error_p99": np.quantile(errors, 0.99)}
     row |= {"std_norm": std_norm(std), "versions": result.versions}
     # The first gains are large and the many later ones small. The last point is kept.
     n, most = result.curve.shape[1], 150
     some = np.union1d(np.linspace(0, n - 1, min(n, most)).round().astype(int), np.arange(min(most, n)))
-    curve = [(*result.curve[:, i], "", "") for i in some]
-    for i, (seconds, cpu_seconds, bound) in enumerate(
-        zip(result.seconds, result.cpu_seconds, result.bound, strict=True)
-    ):
-        looked_at = (f"{value:.6f}" for value in scores(Y, result.mean[i], result.std[i]).values())
-        curve.append((seconds, cpu_seconds, bound, *looked_at))
-    so_far = ("seconds", "cpu_seconds", "bound", "rmse", "nlpd")
-    return row, [
-        {**cell, "n_train": len(job["X"]), **{f"{name}_so_far": v for name, v in zip(so_far, point, strict=True)}}
-        for point in sorted(curve, key=lambda point: point[:2])
-    ]
+    so_far = ["seconds", "cpu_seconds", "bound"]
+    curve = pd.DataFrame(result.curve[:, some].T, columns=so_far).assign(rmse="", nlpd="")
+    looked_at = pd.DataFrame({name: getattr(result, name) for name in so_far})
+    found = [scores(Y, *each) for each in zip(result.mean, result.std, strict=True)]
+    looked_at = looked_at.join(pd.DataFrame(found).map("{:.6f}".format))
+    curve = pd.concat([curve, looked_at]).sort_values(["seconds", "cpu_seconds"]).add_suffix("_so_far")
+    return row, curve.assign(**cell, n_train=len(job["X"])).to_dict("records")
 
 
 # --- agreement -----------------------------------------------------------------------------------------------------
@@ -224,14 +214,13 @@ def run(python: str, peer: str, sets: Sets, job: dict[str, Any], cell: dict[str,
 def cases() -> list[dict[str, Any]]:
     """Return each kernel with 500 rows and 20 inducing points, and with 60 rows that are all inducing points."""
     made = []
-    for kernel in ("rbf", "matern52"):
-        for n, m in ((500, 20), (60, 60)):
-            rng = np.random.RandomState(m)
-            X, X_test = rng.uniform(-2.0, 2.0, (n, 3)), rng.uniform(-2.0, 2.0, (50, 3))
-            y = np.sin(X).sum(axis=1) + 0.2 * rng.randn(n)
-            points = X if m == n else rng.uniform(-2.0, 2.0, (m, 3))
-            case = {"kernel": kernel, "X": X, "y": y, "X_test": X_test, "inducing_points": points}
-            made.append({**case, "lengthscales": np.array([0.6, 0.9, 1.2]), "signal": 1.7, "noise": 0.05})
+    for kernel, (n, m) in itertools.product(("rbf", "matern52"), ((500, 20), (60, 60))):
+        rng = np.random.RandomState(m)
+        X, X_test = rng.uniform(-2.0, 2.0, (n, 3)), rng.uniform(-2.0, 2.0, (50, 3))
+        y = np.sin(X).sum(axis=1) + 0.2 * rng.randn(n)
+        points = X if m == n else rng.uniform(-2.0, 2.0, (m, 3))
+        case = {"kernel": kernel, "X": X, "y": y, "X_test": X_test, "inducing_points": points}
+        made.append({**case, "lengthscales": np.array([0.6, 0.9, 1.2]), "signal": 1.7, "noise": 0.05})
     return made
 
 
@@ -294,13 +283,7 @@ def first_seed(rows: pd.DataFrame, curves: pd.DataFrame) -> pd.DataFrame:
     reference = rows[(rows["peer"] == "GPflow SGPR") & (rows["sharing"] == "none")].dropna(subset="seconds")
     lines = []
     for row in rows.itertuples():
-        line = {"peer": row.peer, "sharing": row.sharing, "rows": row.n_train}
-        line["m"] = "" if pd.isna(row.m) else f"{row.m:.0f}"
-        line |= {"seconds": row.seconds, "cpu s": row.cpu_seconds}
-        line["iterations"] = "" if pd.isna(row.iterations) else f"{row.iterations:.0f}"
-        line["bound / row"] = "" if pd.isna(row.bound) else f"{row.bound / row.n_train:.4f}"
-        line |= {"RMSE": row.rmse, "NLPD": "" if pd.isna(row.nlpd) else f"{row.nlpd:.4f}"}
-        line |= dict.fromkeys(("to bound, s", "×", "× net", "× by cpu", "to NLPD, s"), np.nan)
+        line = {"to bound, s": np.nan, "×": np.nan, "× net": np.nan, "× by cpu": np.nan, "to NLPD, s": np.nan}
         same = reference[reference["n_train"] == row.n_train]
         if len(same) and len(curves):
             best = same.iloc[0]
@@ -312,23 +295,37 @@ def first_seed(rows: pd.DataFrame, curves: pd.DataFrame) -> pd.DataFrame:
             line["× net"] = (best["seconds"] - first.head(1).sum()) / to_bound
             line["× by cpu"] = best["cpu_seconds"] / cpu
             line["to NLPD, s"] = time_to_reach(own, "nlpd", best["nlpd"] + 1e-6, "seconds")
-        lines.append({**line, "load": str(row.load), "stop": " ".join(dict.fromkeys(row.stop.split()))})
-    return pd.DataFrame(lines)
+        lines.append(line)
+    stops = rows["stop"].map(lambda stop: " ".join(dict.fromkeys(stop.split())))
+    columns = {
+        "peer": rows["peer"],
+        "sharing": rows["sharing"],
+        "rows": rows["n_train"],
+        "m": text(rows["m"], 0),
+        "seconds": rows["seconds"],
+        "cpu s": rows["cpu_seconds"],
+        "iterations": text(rows["iterations"], 0),
+        "bound / row": text(rows["bound"] / rows["n_train"], 4),
+        "RMSE": rows["rmse"],
+        "NLPD": text(rows["nlpd"], 4),
+        **pd.DataFrame(lines, index=rows.index),
+        "load": rows["load"].astype(str),
+        "stop": stops,
+    }
+    return pd.DataFrame(columns)
 
 
 def all_seeds(rows: pd.DataFrame, what: str) -> pd.DataFrame:
     """Return means ± standard errors over seeds, and the median of the seconds."""
-
-    def text(values: pd.Series) -> str:
-        error = f" ± {values.std() / np.sqrt(len(values)):.4f}" if len(values) > 1 else ""
-        return f"{values.mean():.4f}{error}"
-
     found = rows.dropna(subset="seconds").groupby(["peer", "sharing"], sort=False)
-    lines = {what: found.size(), "RMSE": found["rmse"].apply(text), "NLPD": found["nlpd"].apply(text)}
-    return pd.DataFrame({**lines, "seconds": found["seconds"].median()}).reset_index()
+    table = pd.DataFrame({what: found.size()})
+    for name in ("rmse", "nlpd"):
+        means, errors = (values.map("{:.4f}".format) for values in (found[name].mean(), found[name].sem()))
+        table[name.upper()] = (means + " ± " + errors).where(table[what] > 1, means)
+    return table.assign(seconds=found["seconds"].median()).reset_index()
 
 
-def tables_of(rows: pd.DataFrame, curves: pd.DataFrame) -> dict[str, pd.DataFrame]:
+def tables_of(rows: pd.DataFrame, curves: pd.DataFrame) -> harness.Tables:
     """Return two tables per data set: its first seed, and means over seeds if there are several."""
     tables = {}
     for name, own in rows.groupby("dataset", sort=False):
@@ -380,45 +377,32 @@ def plot(rows: pd.DataFrame, curves: pd.DataFrame, path: Path) -> None:
 # --- command -------------------------------------------------------------------------------------------------------
 
 
-def arguments() -> argparse.Namespace:
-    parser = harness.argument_parser(
-        __doc__, quick="small data in half a minute", seeds="number of seeds or splits; default: 1", in_processes=False
-    )
+def main() -> None:
+    parser = harness.argument_parser(__doc__, quick="small data in half a minute", in_processes=False)
+    parser.add_argument("--seeds", type=int, help="number of seeds or splits; default: 1")
     parser.add_argument("--datasets", nargs="+", choices=DATASETS, metavar="NAME", help=f"of {', '.join(DATASETS)}")
     parser.add_argument("--data-folder", type=Path, help="with the tables; default: they are left out")
     parser.add_argument("--peers", nargs="+", choices=PEERS, metavar="PEER", help=f"of {', '.join(PEERS)}")
-    parser.add_argument("--sharing", nargs="+", choices=("none", "all", "default"), help="default: all")
     parser.add_argument("--all-splits", action="store_true", help="other defaults: the tables, 10 splits, no curves")
-    said = "times before the end at which a fit of the first seed is looked at; default: 12"
-    parser.add_argument("--checkpoints", type=int, help=said)
     parser.add_argument("--time-limit", type=float, default=900.0, help="seconds per fit; default: %(default)s")
     parser.add_argument("--peer-python", default=sys.executable, help="interpreter with GPflow and GPyTorch, or GPJax")
-    parser.add_argument("--redo", action="store_true", help="run fits again that are in the CSV")
     options = parser.parse_args()
-    options.name = "splits" if options.all_splits else "against_peers"
-    defaults = DEFAULTS["quick" if options.quick else options.name]
-    for option, value in zip(("datasets", "seeds", "checkpoints", "peers"), defaults, strict=True):
-        if getattr(options, option) is None:
-            missing = TABLES if option == "datasets" and options.data_folder is None else ()
-            setattr(options, option, [one for one in value if one not in missing] if missing else value)
-    return options
-
-
-def main() -> None:
-    options = arguments()
     harness.pyplot()  # fail before the fits if matplotlib is missing
-    output = harness.output_path(options, options.name)
+    name = "splits" if options.all_splits else "against_peers"
+    datasets, n_seeds, n_checkpoints, peers = DEFAULTS["quick" if options.quick else name]
+    output = harness.output_path(options, name)
     curves_output = output.with_name(f"{output.stem}_curves.csv")
-    pythons, checked = interpreters(options.peers, options.peer_python), False
+    pythons, checked = interpreters(options.peers or peers, options.peer_python), False
     known = QUICK if options.quick else DATASETS
-    for name, seed in ((name, seed) for name in options.datasets if name in known for seed in range(options.seeds)):
-        dataset, sets = known[name], None
+    if options.data_folder is None:
+        known = {name: dataset for name, dataset in known.items() if name not in TABLES}
+    wanted = [name for name in options.datasets or datasets if name in known]
+    for name, seed in itertools.product(wanted, range(options.seeds or n_seeds)):
+        dataset, sets, done = known[name], None, harness.finished(output, KEY)
         for peer in pythons:
             for sharing in PEERS[peer].sharing if dataset.several else ("none",):
                 cell = dict(zip(KEY, (peer, name, sharing, seed), strict=True))
-                values = tuple(map(str, cell.values()))
-                done = any(tuple(row[part] for part in KEY) == values for row in harness.read(output))
-                if (done and not options.redo) or (options.sharing and sharing not in options.sharing):
+                if tuple(map(str, cell.values())) in done:
                     continue
                 if not checked:
                     check(pythons)
@@ -441,13 +425,12 @@ def main() -> None:
                     "max_iter": 0 if PEERS[peer].own_rule and not options.quick else dataset.max_iter,
                     "time_limit": options.time_limit,
                     "seed": seed,
-                    "n_checkpoints": options.checkpoints if seed == 0 else 0,
+                    "n_checkpoints": n_checkpoints if seed == 0 else 0,
                 }
                 row, curve = run(pythons[peer], peer, sets, job, cell)
-                for path, new in ((output, [row]), (curves_output, curve)):
-                    if new:
-                        harness.make_way(values, KEY, list(new[0]), path)
-                        harness.append(new, path)
+                harness.append([row], output)
+                if curve:
+                    harness.append(curve, curves_output)
                 print(f"{name}, seed {seed}: {peer}, {sharing}: {row['seconds']} s, {row['stop']}", flush=True)
     rows, curves = harness.frame(output), harness.frame(curves_output)
     if len(curves):

@@ -61,25 +61,22 @@ def megabytes(folder: Path) -> float:
     return sum(file.stat().st_size for file in files if "__pycache__" not in file.parts) / 1e6
 
 
+def said(command: list[str]) -> str:
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
+
+
 def measured(name: str) -> dict[str, str]:
     """Install a package in an empty environment, and measure it."""
     distribution, module = PACKAGES[name]
     with tempfile.TemporaryDirectory() as folder:
-        subprocess.run([sys.executable, "-m", "venv", "--without-pip", folder], check=True)
-        python = Path(folder, "Scripts" if os.name == "nt" else "bin", "python")
-        pip = [sys.executable, "-m", "pip", "--python", str(python)]
-        subprocess.run([*pip, "install", "--quiet", "--no-compile", distribution], check=True)
-        listed = json.loads(subprocess.run([*pip, "list", "--format=json"], check=True, capture_output=True).stdout)
+        said([sys.executable, "-m", "venv", "--without-pip", folder])
+        python = str(Path(folder, "Scripts" if os.name == "nt" else "bin", "python"))
+        pip = [sys.executable, "-m", "pip", "--python", python]
+        said([*pip, "install", "--quiet", "--no-compile", distribution])
+        listed = json.loads(said([*pip, "list", "--format=json"]))
         versions = {each["name"].lower(): each["version"] for each in listed}
-        found = subprocess.run(
-            [python, "-c", "import sysconfig; print(sysconfig.get_path('platlib'))"],
-            check=True,
-            capture_output=True,
-            text=True,
-        )
-        installed = Path(found.stdout.strip())
+        installed = Path(said([python, "-c", "import sysconfig; print(sysconfig.get_path('platlib'))"]).strip())
         return {
-            "package": name,
             "version": versions["skevgp" if name == "skevgp" else distribution],
             "distributions": str(len(versions)),
             "megabytes": f"{megabytes(installed):.1f}",
@@ -94,15 +91,12 @@ def main() -> None:
     """Measure the packages, or some of them; rows of others stay."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--packages", nargs="+", choices=PACKAGES, default=list(PACKAGES))
-    parser.add_argument("--output", type=Path, default=Path(__file__).with_suffix(".csv"))
-    options = parser.parse_args()
-    rows = pd.read_csv(options.output, dtype=str) if options.output.exists() else pd.DataFrame()
-    for name in options.packages:
-        row = pd.DataFrame([measured(name)])
-        print(row.to_string(), flush=True)
-        others = rows[rows["package"] != name] if len(rows) else rows
-        rows = pd.concat([others, row]).sort_values("package", key=lambda names: names.map(list(PACKAGES).index))
-        rows.to_csv(options.output, index=False)
+    output = Path(__file__).with_suffix(".csv")
+    rows = pd.read_csv(output, dtype=str, index_col="package")
+    for name in parser.parse_args().packages:
+        rows.loc[name] = pd.Series(measured(name))
+        rows.to_csv(output)
+    print(rows.to_string())
 
 
 if __name__ == "__main__":

@@ -1,9 +1,12 @@
 """Pages of results have the numbers of their CSVs, and REPRODUCTION.md has the numbers of the pages."""
 
 import importlib
+import re
 import sys
 from pathlib import Path
 
+import numpy as np
+import pandas as pd
 import pytest
 
 ROOT = Path(__file__).parents[2]
@@ -81,3 +84,79 @@ def test_tables_of_reproduction_are_those_of_the_pages():
     lines = [line.strip() for line in (ROOT / "REPRODUCTION.md").read_text().splitlines() if line.startswith(starts)]
     assert len(lines) > 100
     assert not [line for line in lines if line not in known]
+
+
+def rows(name, **where):
+    """The rows of a CSV, of full runs, in which columns have these values."""
+    found = pd.read_csv(RESULTS / f"{name}.csv")
+    where = {"size": "full", **where} if "size" in found else where
+    return found.loc[np.all([found[key] == value for key, value in where.items()], axis=0)] if where else found
+
+
+def errors(system):
+    found = rows("results_table", system=system, model="EVGP-IFG", angles="raw").groupby("setting")["error_mean"]
+    spread = found.max()["skevgp"] / found.min()["skevgp"]
+    return {"ours": [found.mean().get(setting) for setting in ("skevgp", "skevgp-angles")], "spread": spread}
+
+
+def peer(dataset, name, sharing="none"):
+    own = rows("against_peers", dataset=dataset, peer=name, sharing=sharing)
+    return [own["seconds"].mean(), (own["bound"] / own["n_train"]).mean(), own["rmse"].mean(), own["nlpd"].mean()]
+
+
+def arm(model, robot="ur10e", split="three"):
+    own = rows("real_arms", robot=robot, split=split, model=model)
+    within = np.average(own["cr2"].fillna(0.0), weights=own["n_test"])
+    return [
+        np.exp(np.log(own["ratio"]).mean()),
+        *own.groupby("joint")["ratio"].mean(),
+        within,
+        own["fit_seconds"].mean(),
+    ]
+
+
+def inducing():
+    found = rows("auto_inducing").pivot_table(index="name", columns="model", values=["nlpd", "seconds"])
+    good = [(found["nlpd", model] - found["nlpd", "exact"] < 0.02).sum() for model in ("auto", "100")]
+    return [*good, (found["seconds", "auto"] / found["seconds", "100"]).max()]
+
+
+def jitters():
+    found = rows("robustness", part="jitter").pivot(index="case", columns="variant", values="error").clip(lower=1e-9)
+    ratio = found["default"] / found.drop(columns="default").min(axis=1)
+    return [(ratio <= 1.1).sum(), ratio.max()]
+
+
+def total(name, column, **where):
+    return rows(name, **where)[column].sum()
+
+
+# Words with {} for numbers, and where these are from.
+SAID = [
+    ("README", "| cartpole | 60 | 0.011 | {} | {} |", lambda: errors("cartpole")["ours"]),
+    ("README", "| cartpole_damped | 60 | 0.011 | {} | {} |", lambda: errors("cartpole_damped")["ours"]),
+    ("README", "| acrobot | 150 | 0.131 | {} | {} |", lambda: errors("acrobot")["ours"]),
+    ("README", "physics alone |" + 9 * " {} |", lambda: arm("least squares, prior")),
+    ("README", "| `InverseDynamics` | **{}** |" + 8 * " {} |", lambda: arm("EVGP")),
+    ("README", "all columns |" + 9 * " {} |", lambda: arm("least squares, then GP")),
+    ("README", "trajectory ({};", lambda: arm("EVGP", "ur10", "whole")[:1]),
+    ("README", "m=256: GPflow | {} | {} | {} | {} | 49.7 | | skevgp", lambda: peer("elevators", "GPflow SGPR")),
+    ("README", "| 49.7 | | skevgp | {} | {} | {} | {} |", lambda: peer("elevators", "skevgp")),
+    ("README", "| 180 | | skevgp | {} | {} | {} | {} |", lambda: peer("acrobot", "skevgp", "default")),
+    ("README", "in {}, and at most {} times that", jitters),
+    ("README", "on {} of [20 sets] 100 points on {}; it took up to {} times", inducing),
+    ("README", "physics: {} of 70", lambda: [total("swing_up", "success", model="evgp-ifg", noise=0.01, length=10)]),
+    ("README", "Boole's 4.1 in {} of", lambda: [total("tracking", "value", measure="broken", case="Boole")]),
+    ("REPRODUCTION", "{} times the smallest for EVGP-IFG", lambda: [errors("pendulum")["spread"]]),
+    ("REPRODUCTION", "{} times on the damped one", lambda: [errors("cartpole_damped")["spread"]]),
+    ("REPRODUCTION", "took {} h for Table 4,", lambda: [total("results_table", "fit_seconds") / 3600]),
+]
+
+
+@pytest.mark.parametrize(("page", "words", "measured"), SAID)
+def test_sentences_have_the_numbers_of_the_csvs(page, words, measured):
+    """Up to the digits that they show."""
+    pattern = re.escape(words).replace(r"\{\}", r"(-?[\d.,]*\d)").replace(r"sets\]", r"sets\].*?")
+    (found,) = re.finditer(pattern, " ".join((ROOT / f"{page}.md").read_text().split()))
+    for text, value in zip(found.groups(), measured(), strict=True):
+        assert abs(float(text.replace(",", "")) - value) <= 0.501 * 10.0 ** -len(text.partition(".")[2]), text

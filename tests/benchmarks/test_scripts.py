@@ -21,7 +21,7 @@ BENCHMARKS = ROOT / "benchmarks"
 SCRIPTS = [
     path
     for path in sorted(BENCHMARKS.rglob("*.py"))
-    if "parse_args()" in path.read_text() or "parse_args(arguments)" in path.read_text()
+    if "__main__" in path.read_text() and ("parse(parser)" in path.read_text() or "parse_args()" in path.read_text())
 ]
 PAGES = [
     ROOT / "README.md",

@@ -8,8 +8,9 @@ import pytest
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from skevgp import EVGPRegressor
-from skevgp.data.threads import BlockMap, single_threaded_libraries, thread_pool
+from skevgp.data.threads import BlockMap, side_by_side, single_threaded_libraries, thread_pool
 from skevgp.solvers import LBFGS
+from skevgp.utils.monitor import Monitor
 
 
 @pytest.fixture
@@ -63,6 +64,16 @@ def test_error_in_a_thread_reaches_the_caller_and_ends_the_rest(threads):
     with pytest.raises(ValueError, match="part 3"):
         list(threads(fails, range(1000)))
     assert len(seen) < 20
+
+
+def test_jobs_that_ctrl_c_kept_from_a_start_return_their_best():
+    class Jobs(list):
+        def __iter__(self):
+            yield self[0]
+            raise KeyboardInterrupt
+
+    monitor = Monitor()
+    assert side_by_side(lambda job: (job, monitor.stopped), Jobs("abc"), 2, monitor)[1:] == [("b", True), ("c", True)]
 
 
 def test_libraries_are_limited_in_any_thread_and_set_free_afterwards():

@@ -69,6 +69,7 @@ ZERO, ONE = np.zeros(7), np.ones(7)
         ({"kp": -1.0}, "kp must be a number or 7 numbers, not negative; got -1.0"),
         ({"ki": np.ones(6)}, "ki must be a number or 7 numbers"),
         ({"kd": 67.0}, r"kd must be below 2 / dt = 66.6667.*got 67.0"),
+        ({"kd": 64.0, "dt": 0.03125}, r"kd must be below 2 / dt = 64,.*got 64.0"),
     ],
 )
 def test_invalid_arguments_of_a_controller_raise(arguments, message):

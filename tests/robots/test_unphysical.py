@@ -71,6 +71,10 @@ def test_unphysical_inertia_warns(tmp_path, moments, mass, told):
         model = load_robot(path)
     with pytest.warns(RobotModelWarning, match="triangle inequality"):
         load_robot(model)
+    weld = '<joint name="w" type="fixed"><parent link="b"/><child link="c"/></joint><link name="c"/></robot>'
+    path.write_text(path.read_text().replace("</robot>", weld))
+    with pytest.warns(RobotModelWarning, match=rf"'b' of the joint 'j2', with what is fixed to it \('c'\), has {told}"):
+        load_robot(path)
 
 
 @pytest.mark.parametrize(

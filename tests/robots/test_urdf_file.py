@@ -204,6 +204,8 @@ def test_negative_mass_is_warned_of_as_a_part_and_refused_as_a_body(load):
     model, messages = warned(load, text.format(joint("b", "c", "fixed")))
     assert "The link 'c' has <mass value=\"-0.5\">" in messages[0]
     assert model.inertias[1].mass == 1.5
+    light = f"{BODY.format('d', 0)}{BODY.format('e', 0.5)}{joint('b', 'd')}{joint('d', 'e', 'fixed')}"
+    assert warned(load, text.format(joint("b", "c", "fixed") + light))[0].inertias[2].mass == 0.5
     with pytest.raises(ValueError, match="mass=-0.5 at the link that the joint 'to_c' moves; it must be 0 or above"):
         load(text.format(joint("b", "c")))
 

@@ -45,6 +45,14 @@ def test_first_steps_are_adams():
         np.testing.assert_allclose(points[t], x, rtol=1e-6)
 
 
+@pytest.mark.parametrize("constant", [True, False])
+def test_steps_fall_along_a_cosine_unless_they_are_constant(constant):
+    shares = []
+    adam(noisy_bowl(), np.zeros(2), FREE, 100, 0.1, pace=shares.append, constant=constant)
+    expected = np.ones(100) if constant else 0.5 * (1.0 + np.cos(np.pi * np.arange(100) / 100))
+    np.testing.assert_allclose(shares, expected)
+
+
 def test_plateau_starts_the_last_fall():
     """A bowl this simple needs no 20,000 steps; how many it takes does not depend on how many it may take."""
     a = adam(noisy_bowl(), np.zeros(2), FREE, 20_000, 0.1)

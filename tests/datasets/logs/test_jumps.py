@@ -66,6 +66,19 @@ def test_jump_that_is_no_turn_cuts_the_record(load):
     assert np.abs(transitions.target[:, 0] - transitions.data[:, 0]).max() < 0.02
 
 
+LINK = """<link name="{}"><inertial><mass value="1"/>
+<inertia ixx="0.1" iyy="0.1" izz="0.1" ixy="0" ixz="0" iyz="0"/></inertial></link>"""
+
+
+@pytest.mark.parametrize(("joint", "turns"), [("continuous", True), ("revolute", False)])
+def test_joint_of_a_urdf_is_unwrapped_if_it_has_no_limits(load, tmp_path, joint, turns):
+    limits = '<limit lower="-3.2" upper="3.2" effort="1" velocity="9"/>'
+    links = f'<joint name="q1" type="{joint}"><parent link="a"/><child link="b"/><axis xyz="0 0 1"/>{limits}</joint>'
+    (tmp_path / "arm.urdf").write_text(f'<robot name="r">{LINK.format("a")}{LINK.format("b")}{links}</robot>')
+    log = load((Q + np.pi) % (2.0 * np.pi) - np.pi, DQ, robot=tmp_path / "arm.urdf")
+    assert (log.recordings[0].wrapped["q1"] > 0) == turns
+
+
 def test_joint_with_limits_is_not_unwrapped(load):
     shown = (Q + np.pi) % (2.0 * np.pi) - np.pi
     log = load(shown, DQ, robot="cartpole", joints=["theta"])
