@@ -14,9 +14,7 @@ there are two splits, and of dynamics four seeds.
 
 from __future__ import annotations
 
-import time
-import warnings
-from dataclasses import dataclass
+from collections import namedtuple
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 from sklearn.preprocessing import StandardScaler
-from threadpoolctl import threadpool_limits
 
 import harness
 from skevgp import EGPRegressor, EVGPRegressor
@@ -35,18 +32,17 @@ from skevgp.solvers import LBFGS
 
 TABLES = ("airfoil", "elevators", "kin40k")
 SYSTEMS = ("pendulum", "cartpole", "acrobot")
+BOUNDS = ("titsias", "tight", "titsias, 120 %")
 ROWS, TRAJECTORIES = 5000, 20
 SEEDS, LARGE_SPLITS = 4, 2  # of dynamics, and of tables with 256 points
 TOY_POINTS = (2, 3, 4, 5, 6, 8, 10, 13, 16, 20, 25, 32)
+# Rows, inducing points and outputs of the evaluations that are timed.
+SIZES = ((4000, 100, 1), (4000, 256, 1), (8000, 100, 4), (20_000, 100, 1))
 
-
-@dataclass(frozen=True)
-class Cell:
-    """Fits of one set or system, with and without noise_cv."""
-
-    name: str
-    seed: int
-    m: int
+# Fits of one set or system by each bound, with and without noise_cv.
+Cell = namedtuple("Cell", "name seed m")
+# Evaluations of each bound.
+Cost = namedtuple("Cost", "rows m outputs")
 
 
 def table(folder: Path, cell: Cell, n_rows: int) -> tuple[EVGPRegressor, tuple[np.ndarray, ...]]:
@@ -76,16 +72,14 @@ def dynamics(cell: Cell, n_trajectories: int) -> tuple[EVGPRegressor, tuple[np.n
 def measured(bound: str, folds: int | None, regressor: EVGPRegressor, rows: Any, groups: Any) -> dict[str, Any]:
     """Fit by one bound, and return scores on the test, relative to the size of the targets."""
     X, Y, X_test, Y_test, *unit = rows
-    name, points = bound, regressor.n_inducing
-    if bound == "titsias, 120 %":
-        name, points = "titsias", int(1.2 * points)
-    regressor.set_params(solver=LBFGS(bound=name), noise_cv=folds, n_inducing=points)
-    start = time.process_time()
-    regressor.fit(X, Y, groups=groups)
-    seconds = time.process_time() - start
-    mean, std = (part.reshape(Y_test.shape) / (unit[0] if unit else 1.0) for part in regressor.predict(X_test, True))
-    Y_test = Y_test / (unit[0] if unit else 1.0)
-    start = time.process_time()
+    share = 1.2 if bound.endswith("120 %") else 1.0
+    regressor.set_params(
+        solver=LBFGS(bound=bound.partition(",")[0]), noise_cv=folds, n_inducing=int(share * regressor.n_inducing)
+    )
+    seconds, _ = harness.timed(lambda: regressor.fit(X, Y, groups=groups))
+    size = unit[0] if unit else 1.0
+    mean, std = (part.reshape(Y_test.shape) / size for part in regressor.predict(X_test, True))
+    Y_test = Y_test / size
     return {
         "bound": bound,
         "noise_cv": "yes" if folds else "no",
@@ -100,24 +94,31 @@ def measured(bound: str, folds: int | None, regressor: EVGPRegressor, rows: Any,
     }
 
 
-def run(cell: Cell, folder: Path | None, n_rows: int, n_trajectories: int) -> list[dict[str, Any]]:
-    with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore")
-        found = []
-        for folds in (None, 5):
-            for bound in ("titsias", "tight", "titsias, 120 %"):
-                groups = None
-                if cell.name in TABLES:
-                    regressor, rows = table(folder or Path(), cell, n_rows)
-                else:
-                    regressor, rows, groups = dynamics(cell, n_trajectories)
-                scores = measured(bound, folds, regressor, rows, groups)
-                found.append({"name": cell.name, "seed": cell.seed, "m": cell.m, **scores, **harness.provenance()})
+def run(cell: Cell, folder: Path, n_rows: int, n_trajectories: int) -> list[dict[str, Any]]:
+    found = []
+    for folds in (None, 5):
+        for bound in BOUNDS:
+            groups = None
+            if cell.name in TABLES:
+                regressor, rows = table(folder, cell, n_rows)
+            else:
+                regressor, rows, groups = dynamics(cell, n_trajectories)
+            found.append(measured(bound, folds, regressor, rows, groups))
     return found
 
 
-def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
-    """Return means over seeds, and differences between bounds with their standard errors."""
+def run_cost(cell: Cost) -> dict[str, float]:
+    rng = np.random.RandomState(0)
+    X = rng.randn(cell.rows, 8)
+    Y = np.sin(X @ rng.randn(8, cell.outputs)) + 0.1 * rng.randn(cell.rows, cell.outputs)
+    with harness.one_thread():
+        return {
+            bound: min(harness.evaluation_seconds(X, Y, cell.m, bound=bound, sharing="all")) for bound in BOUNDS[:2]
+        }
+
+
+def tables_of(rows: pd.DataFrame, times: pd.DataFrame) -> harness.Tables:
+    """Return means over seeds, differences between bounds with their standard errors, and seconds of evaluations."""
     scores = ["rmse", "nlpd", "crps"]
     keys = ["name", "noise_cv", "m"]
     means = rows.groupby([*keys, "bound"], sort=False)[[*scores, "cr2", "lower_bound", "noise_std", "seconds"]].mean()
@@ -136,7 +137,8 @@ def tables_of(rows: pd.DataFrame) -> dict[str, pd.DataFrame]:
                 line[f"{said}{against}"] = f"{change.mean():+.4f}{error}"
             line[f"× seconds{against}"] = (own["seconds"]["tight"] / own["seconds"][other]).median()
         lines.append(line | {"seeds": len(own)})
-    return {"means": means.reset_index(), "tight less titsias": pd.DataFrame(lines)}
+    cost = times[["rows", "m", "outputs", *BOUNDS[:2]]].assign(ratio=times["tight"] / times["titsias"])
+    return {"means": means.reset_index(), "tight less titsias": pd.DataFrame(lines), "evaluation": cost}
 
 
 def draw(output: Path, n_rows: int, sizes: tuple[int, ...]) -> None:
@@ -146,8 +148,7 @@ def draw(output: Path, n_rows: int, sizes: tuple[int, ...]) -> None:
     figure, (left, right) = harness.pyplot().subplots(1, 2, figsize=(9.0, 3.4), layout="constrained")
     for bound, style in (("titsias", "o-"), ("tight", "s-")):
         solver = LBFGS(bound=bound, n_restarts=4)
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
+        with harness.one_thread():
             models = [
                 EVGPRegressor(n_inducing=m, noise_cv=None, solver=solver, random_state=0).fit(X, y) for m in sizes
             ]
@@ -163,32 +164,31 @@ def draw(output: Path, n_rows: int, sizes: tuple[int, ...]) -> None:
 
 
 def main() -> None:
-    """Read the command line, fit what is missing, and write the page and the picture."""
-    parser = harness.argument_parser(__doc__, quick="one small set", seeds="number of splits; default: 10")
+    parser = harness.argument_parser(__doc__, quick="one small set", seeds=10)
     parser.add_argument("--data-folder", type=Path, help="with the three tables; default: they are left out")
     parser.add_argument("--sets", nargs="+", help="some of the sets; default: all")
-    options = parser.parse_args()
-    seeds = options.seeds or (1 if options.quick else 10)
+    options = harness.parse(parser)
+    output = harness.output_path(options, "bounds")
     names = [] if options.data_folder is None else [*TABLES]
-    names += [f"{system}, noise {noise} %" for noise in ("1", "0") for system in SYSTEMS]
-    if options.quick:
-        names = ["pendulum, noise 1 %"]
+    names += [f"{system}, noise {noise} %" for noise in (1, 0) for system in SYSTEMS]
     sizes = (10,) if options.quick else (100, 256)
     cells = [
         Cell(name, seed, m)
-        for seed in range(seeds)
+        for seed in options.seeds
         for m in sizes
-        for name in names
-        if seed < (SEEDS if name not in TABLES else seeds if m == sizes[0] else LARGE_SPLITS)
+        for name in (options.sets or (names[:1] if options.quick else names))
+        if seed < (SEEDS if name not in TABLES else len(options.seeds) if m == sizes[0] else LARGE_SPLITS)
         if m == sizes[0] or name in TABLES
     ]
-    cells = [cell for cell in cells if not options.sets or cell.name in options.sets]
-    output = harness.output_path(options, "bounds")
-    rows, trajectories = (ROWS, TRAJECTORIES) if not options.quick else (100, 3)
+    rows, trajectories = (100, 3) if options.quick else (ROWS, TRAJECTORIES)
     job = partial(run, folder=options.data_folder, n_rows=rows, n_trajectories=trajectories)
-    failures = harness.run_missing(cells, job, output, options.jobs, since=options.since)
+    n_failures = harness.run_missing(cells, job, output, options.jobs)
+    costs = [Cost(200, 10, 1)] if options.quick else [Cost(*size) for size in SIZES]
+    times = output.with_name(f"{output.stem}_cost.csv")
+    n_failures += harness.run_missing(costs, run_cost, times)
     draw(output, *((40, (3, 6)) if options.quick else (200, TOY_POINTS)))
-    harness.write_page("The two lower bounds", tables_of(harness.frame(output)), output, failures)
+    tables = tables_of(harness.frame(output), harness.frame(times))
+    harness.write_page("The two lower bounds", tables, output, n_failures)
 
 
 if __name__ == "__main__":

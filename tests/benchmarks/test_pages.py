@@ -44,6 +44,7 @@ PAGES = {
     "swing_up": ("control", lambda own, rows: own.swing_up_tables(rows)),
     "tracking": ("control", lambda own, rows: own.tracking_tables(rows)),
     "identification": ("robots", lambda own, rows: own.identification_tables(rows)),
+    "bounds": ("bounds", lambda own, rows: own.tables_of(rows, own.harness.frame(RESULTS / "bounds_cost.csv"))),
     "calibration": ("calibration", lambda own, rows: own.tables_of(rows)),
     "robustness": ("robustness", lambda own, rows: own.tables_of(rows)),
 }

@@ -98,6 +98,7 @@ SMOKE = [
     smoke("control", "rollouts --models EVGP-IFG"),
     smoke("control", "swing_up", long=True),
     smoke("control", "tracking", long=True),
+    smoke("bounds"),
     smoke("calibration", "--systems pendulum"),
     smoke("tables", "models --sets toy-200", long=True),
     smoke("tables", "inducing --sets toy-200"),
