@@ -120,8 +120,9 @@ class Dense:
 
     def charge(self, values):
         """Twice the nats that the bound loses for what the inducing points do not explain."""
-        over_noise = [each / values["noise"][o] for o, each in enumerate(self.left(values))]
-        return sum(self.counts @ (anp.log(1.0 + each) if self.tight else each) for each in over_noise)
+        over_noise = [self.counts * each / values["noise"][o] for o, each in enumerate(self.left(values))]
+        n = np.maximum(self.counts, 1.0)
+        return sum(anp.sum(n * anp.log(1.0 + each / n) if self.tight else each) for each in over_noise)
 
     def bound(self, values):
         """The lower bound of the family; the likelihood if the model is exact."""

@@ -1,10 +1,12 @@
 """Learning while the system runs: thousands of small updates, and what they cost nothing of."""
 
 import numpy as np
+import pytest
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import CoefPrior, EVGPRegressor
+from skevgp.solvers import LBFGS
 
 KERNEL = ConstantKernel(1.5, "fixed") * RBF([1.0, 1.3], "fixed") + WhiteKernel(1e-4, "fixed")
 
@@ -33,3 +35,20 @@ def test_update_makes_no_factor_of_the_points_and_no_bound(monkeypatch):
     monkeypatch.undo()
     assert found.lower_bound_ != before
     assert found.upper_bound_ >= found.lower_bound_
+
+
+@pytest.mark.parametrize("fading", [1.0, 0.1])
+@pytest.mark.parametrize("n_points", [12, 40])
+def test_tight_bound_stays_one_when_rows_are_added_or_forgotten(n_points, fading):
+    """Also after an exact fit, whose noise may be lower than that of the sparse model."""
+    X, Y = rows(60)
+    kernel = ConstantKernel(1.5, "fixed") * RBF([1.0, 1.3], "fixed") + WhiteKernel(1e-13, "fixed")
+    found = {}
+    for bound in ("titsias", "tight"):
+        learner = model(X[:n_points]).set_params(solver=LBFGS(bound=bound))
+        if n_points == 40:
+            learner.set_params(kernel=kernel)
+        learner.fit(X[:40], Y[:40]).partial_fit(X[40:], Y[40:], forgetting_factor=fading)
+        found[bound] = learner.lower_bound_
+    assert found["titsias"] <= found["tight"] + 1e-6 * abs(found["tight"])
+    assert found["tight"] <= learner.upper_bound_ + 1e-6 * abs(found["tight"])

@@ -223,8 +223,12 @@ class FittedModel:
             whitenings = list(sparse.whitenings(values))
         else:
             whitenings = [group.whitening for group in self.predictor.groups]
+        before = self.statistics
+        if self.is_exact or weight < 1.0:
+            # The tight charge of earlier rows with another noise or weight is not known from their sums.
+            before = sparse.with_loose_charge(values, before)
         new = sparse.statistics(values, sparse.blocks(rows, values["inducing_points"].shape[1]), whitenings)
-        statistics = [old.scaled(weight) + more for old, more in zip(self.statistics, new, strict=True)]
+        statistics = [old.scaled(weight) + more for old, more in zip(before, new, strict=True)]
         predictor = sparse.at_optimum(values, statistics, whitenings)
         return replace(
             self,

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..data.rows import LocalSource, Rows
+from ..model.model import SparseModel
 from ..model.parameters import Values
 from ..model.predictor import Predictor
 from ..noise.base import RowScales
@@ -52,6 +53,10 @@ class RowDoubts:
             raise TypeError("Rows of Dask arrays cannot be doubted.")
         return replace(rows, source=source.reweighted(self.scales.mean, self.scales.log_variance))
 
+    def precision(self, sparse: SparseModel, noise: np.ndarray) -> np.ndarray | None:
+        """E[τ]/σ² (o, n) of each output and row, if the bound is the tight one."""
+        return self.scales.mean / noise[:, np.newaxis] if sparse.tight else None
+
     def told(self, fitted: FittedModel) -> FittedModel:
         """A fitted model with the noise variance of rows that are not outliers. No upper bound is known."""
         predictor = replace(fitted.predictor, noise=fitted.values["noise"] * self.noise_factor)
@@ -68,8 +73,7 @@ class RowDoubts:
         doubts = replace(self, scales=self.scales.at((look.errors**2 / predicted).sum(axis=1)))
         for _ in range(_TURNS):
             new = plain.updated(doubts.weigh(rows))
-            tau = doubts.scales.mean / noise[:, np.newaxis] if fitted.sparse.tight else None
-            before, look = doubts, look_at(rows, of_residuals(new.predictor), tau)
+            before, look = doubts, look_at(rows, of_residuals(new.predictor), doubts.precision(fitted.sparse, noise))
             doubts = replace(self, scales=self.scales.at(look.distances(noise)))
             if not doubts.differ_from(before):
                 break
@@ -124,8 +128,7 @@ def settle(model: Model, fit: Fit, rows: Rows, doubts: RowDoubts) -> tuple[Model
     """
     noise = fit.values["noise"]
     for _ in range(_TURNS):
-        tau = doubts.scales.mean / noise[:, np.newaxis] if model.sparse.tight else None
-        look = look_at(rows, predictor_at(model, fit.values), tau)
+        look = look_at(rows, predictor_at(model, fit.values), doubts.precision(model.sparse, noise))
         factor = np.where(model.table["noise"].free, look.clean_variance() / noise, 1.0)
         before, doubts = doubts, RowDoubts(doubts.scales.at(look.distances(noise)), factor)
         model = replace(model, rows=doubts.weigh(rows))
@@ -191,9 +194,9 @@ def look_at(rows: Rows, predictor: Predictor, tau: np.ndarray | None = None) -> 
 
     For the tight bound, ``tau`` (o, n) is E[τ]/σ² of each output and row.
     """
-    # The charge of the tight bound, -½ log(1 + τ d/(σ² v)), is convex in E[τ] (see `model.bounds.BoundAtOptimum`). Its
-    # tangent at the present E[τ] is below it. The tangent has the slope -½ d' / (σ² v) with d' = d / (1 + τ d/(σ² v)).
-    # So the best q(τ) for d' in place of d raises the bound.
+    # The charge of the tight bound, -½ n log(1 + x) with n = max(w, 1) and x = w τ d / (n σ² v), is convex in E[τ] (see
+    # `model.bounds.BoundAtOptimum`). Its tangent at the present E[τ] is below it. The tangent has the slope
+    # -½ w d' / (σ² v) with d' = d / (1 + x). So the best q(τ) for d' in place of d raises the bound.
 
     def of(first: int) -> tuple[np.ndarray, ...]:
         some = rows.some(np.arange(first, min(first + _ROWS_AT_ONCE, len(rows))))
@@ -203,7 +206,7 @@ def look_at(rows: Rows, predictor: Predictor, tau: np.ndarray | None = None) -> 
             counts, variance = some.counts, some.counts / some.precision
         if tau is not None and latent is not None:
             d = predictor.unexplained(some.inputs, some.features)
-            x = d * tau[:, first : first + len(d)].T / variance[:, np.newaxis]
+            x = d * tau[:, first : first + len(d)].T * (np.minimum(counts, 1.0) / variance)[:, np.newaxis]
             latent = np.maximum(latent - d * (x / (1.0 + x)), 0.0)
         return some.targets - mean, np.zeros_like(mean) if latent is None else latent, variance, counts
 

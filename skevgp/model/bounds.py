@@ -48,6 +48,11 @@ class Group:
     # Whether the bound is the tight one. ``statistics`` then have the charge at ``signal`` and ``noise``.
     tight: bool = False
 
+    def charges(self) -> np.ndarray:
+        """Twice the nats (o,) that the bound loses for what the points do not explain, and their slopes in log s²."""
+        loose = self.signal / self.noise * self.statistics.unexplained
+        return np.broadcast_to(self.statistics.charge if self.tight else loose, (2, len(self.noise)))
+
     @cached_property
     def scales(self) -> np.ndarray:
         """(o, m + p): the diagonal of T of each output (see `times_T`), if the weights are independent a priori."""
@@ -256,8 +261,9 @@ class BoundAtOptimum:
     #     -½ Tr(R diag(a) R) - KL[q(f|u) || p(f|u)] = ½ Σ (log a_i - a_i + 1 - a_i x_i).
     #
     # Their maximum is -½ Σ log(1 + x_i) ≥ -½ Σ x_i, at a_i = 1 / (1 + x_i). All other terms, and so q(v, w), are the
-    # same. A row of weight w counts w times. The derivative in d_i is -½ (w_i / (σ² v_i)) / (1 + x_i). In log s² it is
-    # -½ Σ w_i x_i / (1 + x_i), and minus that in log σ².
+    # same. A row of weight w ≥ 1 counts w times. If w < 1, its likelihood has the factor w, but the divergence has not.
+    # The maximum is then -½ log(1 + w x_i). Both are -½ n log(1 + w x_i / n), n = max(w, 1). The derivative in d_i is
+    # -½ (w / (σ² v_i)) / (1 + w x_i / n). In log s² it is -½ Σ w x_i / (1 + w x_i / n), and minus that in log σ².
     #
     # The tight bound is at most the log likelihood, but unlike the other one it may fall if a point is added.
     #
@@ -299,9 +305,7 @@ class BoundAtOptimum:
             factor_bar,
             group.signal / noise if group.tight else None,
         )
-        unexplained = unexplained_slope = unexplained_bar * statistics.unexplained
-        if group.tight:
-            unexplained, unexplained_slope = -0.5 * (statistics.charge * np.ones((2, len(noise))))
+        unexplained, unexplained_slope = -0.5 * group.charges()
         # |v|² + |w + w₀|² of each output. Shared weights count once.
         mean[:, m:] += group.prior.reference
         if group.prior.shared:

@@ -84,6 +84,17 @@ class SparseModel:
         sets = zip(self.groups, whitenings or self.whitenings(values), strict=True)
         return [collect(blocks, whitening, outputs, self._ratio(values, outputs)) for outputs, whitening in sets]
 
+    def with_loose_charge(
+        self, values: Values, statistics: Sequence[SufficientStatistics]
+    ) -> list[SufficientStatistics]:
+        """The same statistics, with the charge of Titsias (2009) in the tight bound, which is not below its own."""
+        pairs = zip(self.groups, statistics, strict=True)
+        ratios = ((self._ratio(values, outputs), own) for outputs, own in pairs)
+        return [
+            own if ratio is None else replace(own, charge=np.outer([1, 1], ratio * own.unexplained))
+            for ratio, own in ratios
+        ]
+
     def _ratio(self, values: Values, outputs: slice) -> np.ndarray | None:
         """s²/σ² (o,) of a group, for the tight bound."""
         return values["signal"][outputs] / values["noise"][outputs] if self.tight else None
@@ -112,7 +123,7 @@ class SparseModel:
         The noise variance in ``values`` is σ² times ``share``.
         """
         for outputs, whitening in zip(self.groups, self.whitenings(values), strict=True):
-            ratio = self._ratio(values, outputs)
+            ratio = None if self.complete else self._ratio(values, outputs)
             statistics = collect(blocks, whitening, outputs, None if ratio is None else share * ratio)
             yield self.group(values, outputs, whitening, statistics)
 

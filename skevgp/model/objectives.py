@@ -27,8 +27,7 @@ def evaluate(
 
     It takes two passes over the rows for each set of inducing points. ``terms_of`` returns the term of each group. If
     outputs share their weights it gets all groups at once, else one at a time. The noise variance in ``values`` is σ²
-    times ``share``. Raises `NotPositiveDefiniteError` if a
-    matrix is not finite.
+    times ``share``. Raises `NotPositiveDefiniteError` if a matrix is not finite.
     """
     total, gradient = 0.0, {name: np.zeros(value.shape) for name, value in values.items()}
     separate = values["hyperparameters"].ndim == 2
@@ -152,7 +151,7 @@ class ElboTerms:
     #     ½ [N log 2πσ² + (eᵀe + s² Σ (k̃ - |v(x)|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`.
     #
     # The first term, with σ² itself, is added in `ElboObjective.evaluate`. In the tight bound (see `BoundAtOptimum`),
-    # N/n Σ w log(1 + x) takes the place of s² Σ (k̃ - |v(x)|²) / σ². Its x has σ² itself.
+    # N/n Σ n log(1 + x) takes the place of s² Σ (k̃ - |v(x)|²) / σ². Its x has σ² itself.
 
     def __init__(self, elbo: ElboObjective, values: Values, group: Group, share: float):
         self._share = share
@@ -179,9 +178,8 @@ class ElboTerms:
         f, b = self.weights[:m], self.weights[m:]
         shift = self._mean.copy()
         shift[:, m:] += group.prior.reference
-        unexplained = slope = self._ratio * statistics.unexplained
-        if group.tight:
-            unexplained, slope = statistics.charge * np.ones((2, len(group.noise))) / self._share
+        # Rows count N/n times. The bound of Titsias (2009) has that factor in the noise already.
+        unexplained, slope = group.charges() / (self._share if group.tight else 1.0)
         data = residuals.squares / group.noise
         loss = 0.5 * float((data + unexplained).sum() + np.vdot(shift, shift) - shift.size) + spread.value
         from_mean = 0.5 * np.einsum("mo,mo->o", f, residuals.VE) / group.noise

@@ -131,8 +131,8 @@ class SufficientStatistics:
     # Σ w log v and Σ max(ω, 1) - Σ w, as in `LinearSums`.
     log_variance: float
     surplus: float
-    # (2, o): Σ w log(1 + x) and Σ w x / (1 + x), x = (s²/σ²) (k(x, x) - |v|²) / v, for the tight bound at one signal
-    # and noise variance (see `BoundAtOptimum`). 0 for the bound of Titsias (2009).
+    # (2, o): Σ n log(1 + x) and Σ n x / (1 + x), n = max(w, 1), x = (s²/σ²) (k(x, x) - |v|²) ω / n, for the tight bound
+    # at one signal and noise variance (see `BoundAtOptimum`). 0 for the bound of Titsias (2009).
     charge: Any = 0.0
 
     @cached_property
@@ -217,7 +217,8 @@ def _charge(ratio: np.ndarray, unexplained: np.ndarray, counts: np.ndarray | Non
 
     The slope of an output is 1 / (1 + x). In the mean it has the weight ``ratio`` (o,).
     """
-    # (o, n): x of each output and row. ``unexplained`` has the factor ω = w / v, and x has the factor 1 / v.
+    # (o, n): x of each output and row. ``unexplained`` has the factor ω.
+    counts = None if counts is None else np.maximum(counts, 1.0)
     x = np.multiply.outer(ratio, unexplained if counts is None else unexplained / counts)
     slopes = 1.0 / (1.0 + x)
     each = np.array([np.log1p(x), x * slopes])

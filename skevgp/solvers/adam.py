@@ -43,9 +43,9 @@ class Adam(MiniBatchSolver):
 
     posterior : {"full", "diagonal"}, default="full"
         Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
-    bound : {"tight", "titsias"}, default="titsias"
-        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025),
-        which is never lower. Predictions at the same parameters are the same.
+    bound : {"titsias", "tight"}, default="titsias"
+        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025).
+        At the same parameters the tight bound is never lower, and predictions are the same. See :doc:`/guide/bounds`.
     tol : float or "auto", default="auto"
         Tolerance in nats; ``"auto"`` is 0.01. Adam begins its last steps when the median loss over a third of the steps
         changes by less than this, or by no more than chance.
@@ -89,7 +89,7 @@ class Adam(MiniBatchSolver):
         schedule: Literal["cosine", "constant"] = "cosine",
         *,
         posterior: Literal["full", "diagonal"] = "full",
-        bound: Literal["tight", "titsias"] = "titsias",
+        bound: Literal["titsias", "tight"] = "titsias",
         tol: float | Literal["auto"] = "auto",
         max_time: float | None = None,
     ):

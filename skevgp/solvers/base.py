@@ -60,7 +60,7 @@ class Solver(StatefulEstimator):
     n_restarts: int
     callback: Callback | None
     posterior: Literal["full", "diagonal"]
-    bound: Literal["tight", "titsias"] = "titsias"
+    bound: Literal["titsias", "tight"] = "titsias"
     tol: float | Literal["auto"]
     max_time: float | None
     # Largest number of inducing points for n_inducing="auto". Only a solver that sees all rows uses it.
@@ -74,8 +74,8 @@ class Solver(StatefulEstimator):
             raise TypeError(f"callback of {name} must be None or a function; got {self.callback!r}.")
         if self.posterior not in ("full", "diagonal"):
             raise ValueError(f'posterior of {name} must be "full" or "diagonal"; got {self.posterior!r}.')
-        if self.bound not in ("tight", "titsias"):
-            raise ValueError(f'bound of {name} must be "tight" or "titsias"; got {self.bound!r}.')
+        if not isinstance(self.bound, str) or self.bound not in ("titsias", "tight"):
+            raise ValueError(f'bound of {name} must be "titsias" or "tight"; got {self.bound!r}.')
         if self.max_time is not None:
             check_real(self.max_time, f"max_time of {name}", minimum=0.0, strict=True)
         if not (isinstance(self.tol, str) and self.tol == "auto"):

@@ -46,9 +46,9 @@ class LBFGS(Solver):
 
     posterior : {"full", "diagonal"}, default="full"
         Form of q: one joint Gaussian of inducing values and weights, or diagonal in both, as in the paper.
-    bound : {"tight", "titsias"}, default="titsias"
-        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025),
-        which is never lower. Predictions at the same parameters are the same.
+    bound : {"titsias", "tight"}, default="titsias"
+        Lower bound that is maximised. ``"titsias"`` is that of Titsias (2009), and ``"tight"`` that of Titsias (2025).
+        At the same parameters the tight bound is never lower, and predictions are the same. See :doc:`/guide/bounds`.
     tol : float or "auto", default="auto"
         Tolerance in nats. L-BFGS starts again from its best point when each of three iterations in a row gains less,
         and stops when such a start gains no more. ``"auto"`` is 0.0015 % of the gain so far, and at least 0.01.
@@ -95,7 +95,7 @@ class LBFGS(Solver):
         callback: Callback | None = None,
         *,
         posterior: Literal["full", "diagonal"] = "full",
-        bound: Literal["tight", "titsias"] = "titsias",
+        bound: Literal["titsias", "tight"] = "titsias",
         tol: float | Literal["auto"] = "auto",
         max_time: float | None = None,
         max_inducing: int = 1000,

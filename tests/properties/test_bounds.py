@@ -46,6 +46,15 @@ def test_bounds_are_ordered(case):
     assert_in_order(loose, tight, likelihood)
 
 
+@fewer(2)
+@given(fixed_cases(exact=False), st.floats(0.01, 2.0))
+def test_bounds_of_weighted_rows_are_ordered(case, weight):
+    weights = weight * np.linspace(0.1, 1.0, len(case.X))
+    models = [*(case.with_model(solver=LBFGS(bound=own)).model for own in ("titsias", "tight")), exact_of(case.model)]
+    loose, tight, exact = (clone(model).fit(case.X, case.Y, weights) for model in models)
+    assert_in_order(loose.lower_bound_, tight.lower_bound_, exact.log_marginal_likelihood_value_, tight.upper_bound_)
+
+
 @given(fixed_cases(exact=False), st.data())
 def test_more_points_bring_the_bounds_together(case, draws):
     points = draws.draw(tables(7, case.X.shape[1]))
