@@ -56,6 +56,28 @@ class _NewtonFeatures(RobotMap):
         scale[driven, inputs] = self.unknown_scale
         return mean, scale
 
+    KNOWN, UNKNOWN, ZERO, ROW = 0.3, 3.0, 0.05, 1.0
+
+    def coef_groups(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
+        """PROTOTYPE: labels, and shares of d / rms(h)."""
+        layout = self._layout
+        probe = clone(self).set_params(known_scale=1.0, unknown_scale=2.0, free_scale=3.0)
+        if hasattr(self, "_gravity"):
+            probe._gravity = probe._gravity_map(read_once(self.robot), layout.n_columns)
+        kind = probe._prior(layout, 1.0)[1]
+        labels = np.where(kind == 1.0, "known", np.where(kind == 2.0, "unknown", "zero")).astype(object)
+        shares = np.where(kind == 1.0, np.nan, np.where(kind == 2.0, self.UNKNOWN, self.ZERO * self.UNKNOWN))
+        rows = self._predicted_states(layout)
+        return labels[rows], shares[rows]
+
+    def coef_rows(self, scale: np.ndarray) -> np.ndarray:
+        n = self._layout.n_joints
+        kind = np.isnan(self.coef_groups(len(scale))[1])
+        scale = np.where(kind, self.KNOWN * self.dt, scale)
+        if len(scale) == 2 * n and self.outputs is None:
+            scale[:n] = self.ROW * self.dt * scale[n:]
+        return scale
+
 
 def _per_term(value: ArrayLike, n_terms: int, name: str) -> np.ndarray:
     array = as_floats(value, name)

@@ -10,7 +10,7 @@ import numpy as np
 from ..data.rows import Rows, Source
 from ..data.threads import BlockMap, side_by_side
 from ..model.model import SparseModel
-from ..model.parameters import ParameterTable, Values
+from ..model.parameters import ParameterTable, Values, log_prior
 from ..model.predictor import Predictor
 from ..model.statistics import Kernel, SufficientStatistics
 from ..utils.monitor import Monitor
@@ -138,10 +138,10 @@ def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedM
     # If the bound is not known, errors are summed row by row, which keeps digits where the noise is low.
     known = found is None and not changed and np.isfinite(fit.bound) and fit.n_rows is None
     if exact is None:
-        bound = fit.bound if known else sparse.bound(values, statistics, model.blocks)
+        bound = fit.bound - log_prior(values) if known else sparse.bound(values, statistics, model.blocks)
         upper_bound = sparse.upper_bound(values, statistics, model.blocks)
     else:
-        bound = upper_bound = fit.bound if known else float(exact.log_likelihoods(values).sum())
+        bound = upper_bound = fit.bound - log_prior(values) if known else float(exact.log_likelihoods(values).sum())
     # In the sparse predictor, the jitter of k(X_m, X_m) would show in the std.
     distinct = values["inducing_points"].shape[1] == len(model.rows)
     is_exact = exact is not None and (distinct or bool((values["signal"] > _HIGH_RATIO * values["noise"]).any()))

@@ -23,7 +23,7 @@ from .calibration import CrossValidation
 from .inducing import Placement
 from .prior import CoefPrior, resolved, says_shared, wide_scale
 from .search import Rules, rules_of
-from .units import Units
+from .units import Units, _LeftOver
 
 # An infinite prior scale becomes this many times the scale with which a feature could explain y alone.
 _VAGUE = 1e3
@@ -178,7 +178,18 @@ def _prior(
     vague = np.isinf(scale)
     # An infinite scale becomes one so wide that its value does not matter.
     scale = np.where(vague, _VAGUE * wide_scale(size, targets.largest, targets.largest, shared), scale)
+    groups = None
+    if not shared and root is None and hasattr(feature_map, "coef_groups") and isinstance(asked.scale, str):
+        labels, shares = feature_map.coef_groups(o)
+        names = sorted(set(labels.ravel()) - {""})
+        groups = np.array([[names.index(one) if one else -1 for one in row] for row in labels])
+        left = _LeftOver(np.zeros(o), mean)
+        squares = data.source.sum(left)[1]
+        d = np.sqrt(squares / targets.n)
+        by = d[:, np.newaxis] / np.where(size > 0.0, size, 1.0)
+        scale = np.where(np.isnan(shares), scale, shares * by)
+        scale = feature_map.coef_rows(scale) if hasattr(feature_map, "coef_rows") else scale
     if shared:
         mean, scale, vague = (np.repeat(values, o, axis=0) for values in (mean, scale, vague))
         root = None if root is None else np.repeat(root, o, axis=0)
-    return CoefficientPrior(mean, scale, np.zeros(scale.shape), root, shared), vague
+    return CoefficientPrior(mean, scale, np.zeros(scale.shape), root, shared, groups), vague

@@ -135,8 +135,14 @@ def starting_table(
     signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, column_centre(inputs)
     lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
     still = bool(np.all(constant))
+    coef = []
+    if n_groups := getattr(getattr(units, "prior", None), "n_groups", 0):
+        scales = np.ones((1 if units.prior.shared else len(o), n_groups))
+        learned = problem.max_iter > 0 and not problem.solver.stochastic
+        coef = [Parameter("coef", scales, "log", 1e-4, 1e4, fixed=not learned)]
     return ParameterTable(
         [
+            *coef,
             parameter_of(
                 starts.hyperparameters, "hyperparameters", default, lower * typical, upper * root_d * typical, 1.0
             ),

@@ -279,12 +279,16 @@ class BoundAtOptimum:
         if group.prior.root is not None:
             self.weights[m:] = group.prior.times(mean[:, m:]).T
         joint_bar, factor_bar = np.zeros(joint.shape), np.zeros((m, m))
+        # (o, p): the variances of w.
+        spread = np.empty(group.prior.scale.shape)
         # (o,) each: log|B| plus twice the gap, and the derivatives of the bound in log s² and log 1/σ² through B.
         log_det, from_signal, from_noise = np.empty((3, len(noise)))
         for o, q in enumerate(posteriors):
             log_det[o] = q.log_det
             B_bar = -0.5 * symmetric_inverse(q.root_inv)
+            spread[o] = -2.0 * np.diagonal(B_bar)[m:]
             if family == "diagonal":
+                spread[o] = 1.0 / np.maximum(np.diagonal(q.B)[m:], 1.0)
                 gap, gap_B_bar, gap_factor_bar = diagonal_gap(q.B, log_det[o], B_bar, group.whitening)
                 log_det[o] += 2.0 * gap
                 B_bar -= gap_B_bar
@@ -308,6 +312,7 @@ class BoundAtOptimum:
         unexplained, unexplained_slope = -0.5 * group.charges()
         # |v|² + |w + w₀|² of each output. Shared weights count once.
         mean[:, m:] += group.prior.reference
+        self._coef = _scale_gradient(group, mean[:, m:], spread, posteriors) if group.prior.n_groups else None
         if group.prior.shared:
             for own, q in zip(mean, posteriors, strict=True):
                 own[q.n_own :] = 0.0
@@ -337,10 +342,29 @@ class BoundAtOptimum:
         return float((self._value - 0.5 * residuals.squares / self.group.noise).sum())
 
     def finish(self, residuals: Residuals) -> tuple[float, dict[str, np.ndarray]]:
-        """The bound, and its gradients (o,) in log s² and log σ²."""
+        """The bound, and its gradients in log s² (o,), log σ² (o,) and the logarithms of learned scales (o, g)."""
         signal = self._log_signal + 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
         noise = self._log_noise + 0.5 * residuals.squares / self.group.noise
-        return self.value(residuals), {"signal": signal, "noise": noise}
+        found = {"signal": signal, "noise": noise}
+        return self.value(residuals), found if self._coef is None else found | {"coef": self._coef}
+
+
+def _scale_gradient(
+    group: Group, z: np.ndarray, spread: np.ndarray, posteriors: Sequence[WhitenedPosterior]
+) -> np.ndarray:
+    """The derivatives (o, g) of the bound in the logarithms of the learned scales.
+
+    ``z`` (o, p) is the mean of (β - μ_β) / c, and ``spread`` (o, p) its variance.
+    """
+    # At the optimum of q(f_m, β) the bound depends on c through KL[q(β) || p(β)] only, so that its derivative in log c
+    # of a weight is E[z²] - 1. Weights that outputs share count once.
+    each, prior = z**2 + spread - 1.0, group.prior
+    assert prior.groups is not None
+    found = np.zeros((len(z), prior.n_groups + 1))
+    for own, values, which, q in zip(found, each, prior.groups, posteriors, strict=True):
+        if not prior.shared or q.n_own == len(q.B):
+            np.add.at(own, which, values)
+    return found[:, :-1]
 
 
 def equation_errors(group: Group, posteriors: Sequence[WhitenedPosterior], residuals: Residuals) -> list[np.ndarray]:

@@ -40,7 +40,7 @@ from ..utils.linalg import (
     triangular_inverse,
 )
 from .bounds import LOG_2PI
-from .parameters import ParameterTable, Values
+from .parameters import ParameterTable, Values, log_prior
 from .predictor import CoefficientPrior, Predictor, PredictorGroup
 from .statistics import Kernel, Whitening
 
@@ -156,7 +156,7 @@ class ExactModel:
         # With the QR factorisation H C = Rᵀ Qᵀ, Q (p, n) and R (n, n), the rows depend on Qᵀ w ~ N(-Qᵀ w₀, I) only. So
         # Rᵀ replaces H, and Qᵀ w₀ replaces w₀.
         (o, p), n = self.prior.scale.shape, len(self.rows.inputs)
-        if p <= n or self.prior.shared or self.vague.any():
+        if p <= n or self.prior.shared or self.vague.any() or self.prior.n_groups:
             return self
         features, reference = np.empty((n, o, n)), np.empty((o, n))
         for index, (scale, w0) in enumerate(zip(self.prior.scale, self.prior.reference, strict=True)):
@@ -173,6 +173,7 @@ class ExactModel:
     def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
         """The kernel at the rows, for all outputs or for each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
+        prior = self.prior.at(values["coef"]) if "coef" in values else self.prior
         each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
         relative = None if self.rows.precision is None else 1.0 / self.rows.precision
         covariances = [
@@ -187,7 +188,7 @@ class ExactModel:
                 own.targets[:, 0],
                 values["signal"][index],
                 values["noise"][index],
-                self.prior.outputs(slice(index, index + 1)),
+                prior.outputs(slice(index, index + 1)),
                 self.vague[index],
                 relative,
             )
@@ -217,6 +218,13 @@ class ExactModel:
             total += output.log_likelihood
             own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
             K_bars[index % len(K_bars)] += own
+            if "coef" in values and (output.is_first or not self.prior.shared):
+                # As in `bounds`: E[z²] - 1 of each weight.
+                of_groups = np.zeros(self.prior.n_groups + 1)
+                assert self.prior.groups is not None
+                each = output.from_prior**2 + (output.R_inv**2).sum(axis=1) - 1.0
+                np.add.at(of_groups, self.prior.groups[index], each)
+                gradient["coef"][0 if self.prior.shared else index] += of_groups[:-1]
         # The factor for copies of rows has the power -Σ (w - 1) / 2 of σ².
         gradient["noise"] -= 0.5 * (self.rows.total - len(self.rows.inputs))
         for at, K_bar in zip(covariances, K_bars, strict=True):
@@ -245,7 +253,7 @@ class ExactModel:
                     self.rows.of(own).inputs,
                     Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
                     values["signal"][own],
-                    self.prior.outputs(own),
+                    (self.prior.at(values["coef"]) if "coef" in values else self.prior).outputs(own),
                     [mean],
                     [root],
                 )
@@ -261,6 +269,8 @@ class LikelihoodObjective:
         self.model, self.table = model.with_fewer_features(), table
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        likelihood, gradient = self.model.log_likelihood(self.table.values(flat))
+        values = self.table.values(flat)
+        likelihood, gradient = self.model.log_likelihood(values)
+        likelihood += log_prior(values, gradient)
         n_rows = self.model.rows.total
         return -likelihood / n_rows, -self.table.gradient(gradient) / n_rows

@@ -11,7 +11,7 @@ from ..data.blocks import Blocks
 from .bounds import LOG_2PI, BoundAtOptimum, Group, bounds_at_optimum, optimal_posteriors
 from .families import DiagonalFamily, Family, FullFamily, NaturalFamily
 from .model import SparseModel
-from .parameters import ParameterTable, Values
+from .parameters import ParameterTable, Values, log_prior
 from .predictor import Predictor
 from .statistics import Residuals, StatisticsGradient, pull_back
 
@@ -44,7 +44,10 @@ def evaluate(
             gradient["hyperparameters"][index if separate else slice(None)] += hyper_bar
             gradient["inducing_points"][index] += Z_bar
             for name, bar in own.items():
-                gradient[name][group.outputs] = bar
+                if name == "coef" and model.prior.shared:
+                    gradient[name] += bar.sum(axis=0)
+                else:
+                    gradient[name][group.outputs] = bar
             index += 1
     return total, gradient
 
@@ -57,7 +60,9 @@ class BoundObjective:
         self._terms_of = partial(bounds_at_optimum, family=model.family)
 
     def __call__(self, flat: np.ndarray) -> tuple[float, np.ndarray]:
-        bound, gradient = evaluate(self.model, self.table.values(flat), self.blocks, self._terms_of)
+        values = self.table.values(flat)
+        bound, gradient = evaluate(self.model, values, self.blocks, self._terms_of)
+        bound += log_prior(values, gradient)
         n_rows = self.blocks.linear.n_rows
         return -bound / n_rows, -self.table.gradient(gradient) / n_rows
 

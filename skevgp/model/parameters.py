@@ -58,6 +58,19 @@ class Parameter:
         return limits
 
 
+def log_prior(values: Values, gradient: Values | None = None) -> float:
+    """The log density of the learned scales of the weights: log-normal around the map's own, of width e.
+
+    Its gradient in their logarithms is added to ``gradient``.
+    """
+    if "coef" not in values:
+        return 0.0
+    logs = np.log(values["coef"])
+    if gradient is not None:
+        gradient["coef"] -= logs
+    return -0.5 * float((logs**2).sum())
+
+
 class ParameterTable:
     """Parameters with distinct names, in a fixed order. Their free entries make up the flat vector (size,)."""
 

@@ -30,6 +30,24 @@ class CoefficientPrior:
     # Whether all outputs have the same w, and so the same β in the user's units. Rows of the arrays then differ by the
     # units of the outputs only.
     shared: bool = False
+    # (o, p): the group of each weight, whose scale is a parameter. -1: its scale stays. None: all stay.
+    groups: np.ndarray | None = None
+
+    @property
+    def n_groups(self) -> int:
+        """Number of groups of weights with a scale that is learned."""
+        return 0 if self.groups is None else int(self.groups.max(initial=-1)) + 1
+
+    def at(self, factors: np.ndarray) -> CoefficientPrior:
+        """The prior with the scales of groups multiplied by ``factors`` (o, g), and the same offset.
+
+        Shared weights have one row of factors.
+        """
+        if self.groups is None:
+            return self
+        factors = np.broadcast_to(factors, (len(self.scale), self.n_groups))
+        by = np.take_along_axis(np.hstack([factors, np.ones((len(factors), 1))]), self.groups, axis=1)
+        return replace(self, scale=self.scale * by, reference=self.reference / by)
 
     @property
     def offset(self) -> np.ndarray:
@@ -52,6 +70,7 @@ class CoefficientPrior:
             self.reference[columns],
             None if self.root is None else self.root[columns],
             self.shared,
+            None if self.groups is None else self.groups[columns],
         )
 
     def scaled(self, factor: np.ndarray) -> CoefficientPrior:
