@@ -68,7 +68,8 @@ def test_fit_to_chunks_is_fit_to_arrays(sharing, feature_map):
 
 def test_chunks_may_be_of_one_row_or_none():
     rows = (1, 299, 0, 1, 299)
-    assert_same_model(model(max_iter=5).fit(*chunked(X, Y, rows=rows)), model(max_iter=5).fit(X, Y))
+    parameters = {"max_iter": 5, "noise_cv": 5}
+    assert_same_model(model(**parameters).fit(*chunked(X, Y, rows=rows)), model(**parameters).fit(X, Y))
 
 
 def test_fit_to_chunks_on_two_workers_is_fit_to_arrays(cluster):
