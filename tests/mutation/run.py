@@ -1,6 +1,8 @@
 """Mutation testing: show each mutant of a list to the quick tests that execute it. Appends to a CSV; may be stopped.
 
-python tests/mutation/run.py --list tests/mutation/mutants.csv --out tests/mutation/results.csv
+python tests/mutation/run.py --list tests/mutation/mutants.csv --out FILE
+
+`results.csv` has the outcomes of `mutants.csv`, and `faults.csv` is a list of faults that were chosen by hand.
 """
 
 import argparse
@@ -75,10 +77,10 @@ def judge(row: dict[str, str], root: Path, covered: CoverageData, breadth: Count
 
 
 def main() -> None:
-    """Read the command line, run, and print the share of mutants killed and the survivors."""
+    """Read the command line, run, and print the numbers of outcomes and the survivors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--list", type=Path, default=ROOT / "tests/mutation/mutants.csv")
-    parser.add_argument("--out", type=Path, default=ROOT / "tests/mutation/results.csv")
+    parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
     root = DATA.with_name("copy")
     shutil.rmtree(root, ignore_errors=True)
