@@ -5,7 +5,7 @@ import warnings
 import numpy as np
 import pytest
 from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, ExpSineSquared, WhiteKernel
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import CoefPrior, EGPRegressor, EVGPRegressor
@@ -223,3 +223,13 @@ def test_many_more_features_than_rows_find_a_noise_that_rounding_does_not_outwei
     fitted.fit(few, y)
     # No more than that either: there is nothing else to learn.
     assert fitted.lower_bound_ == pytest.approx(alone(fitted, few, y), abs=0.2)
+
+
+def test_fit_with_one_parameter_is_restarted():
+    x, numbers = np.linspace(0.0, 3.0, 15)[:, np.newaxis], {0: [], 2: []}
+    y = np.sin(2.0 * x[:, 0]) + 0.1 * np.random.RandomState(0).randn(15)
+    kernel = ConstantKernel(1.0, "fixed") * RBF(1.0, "fixed") + WhiteKernel(0.3)
+    for n_restarts, seen in numbers.items():
+        solver = LBFGS(n_restarts=n_restarts, callback=lambda number, *_, seen=seen: seen.append(number))
+        EVGPRegressor(kernel=kernel, inducing_init=x, solver=solver, noise_cv=None, random_state=0).fit(x, y)
+    assert numbers[2].count(1) == 3 * numbers[0].count(1) > 0

@@ -189,12 +189,12 @@ class Look:
             variance = np.maximum(self.counts[kept] @ squares[kept] / self.counts[kept].sum(), np.finfo(float).tiny)
 
 
-def look_at(rows: Rows, predictor: Predictor, tau: np.ndarray | None = None) -> Look:
+def look_at(rows: Rows, predictor: Predictor, precision: np.ndarray | None = None) -> Look:
     """Predict each row by a predictor of residuals, in one pass.
 
-    For the tight bound, ``tau`` (o, n) is E[τ]/σ² of each output and row.
+    For the tight bound, ``precision`` (o, n) is E[τ]/σ² of each output and row.
     """
-    # The charge of the tight bound, -½ n log(1 + x) with n = max(w, 1) and x = w τ d / (n σ² v), is convex in E[τ] (see
+    # The charge of the tight bound, -½ ŵ log(1 + x) with ŵ = max(w, 1) and x = w τ d / (ŵ σ² v), is convex in E[τ] (see
     # `model.bounds.BoundAtOptimum`). Its tangent at the present E[τ] is below it. The tangent has the slope
     # -½ w d' / (σ² v) with d' = d / (1 + x). So the best q(τ) for d' in place of d raises the bound.
 
@@ -204,9 +204,9 @@ def look_at(rows: Rows, predictor: Predictor, tau: np.ndarray | None = None) -> 
         counts = variance = np.ones(len(mean))
         if some.counts is not None and some.precision is not None:
             counts, variance = some.counts, some.counts / some.precision
-        if tau is not None and latent is not None:
+        if precision is not None and latent is not None:
             d = predictor.unexplained(some.inputs, some.features)
-            x = d * tau[:, first : first + len(d)].T * (np.minimum(counts, 1.0) / variance)[:, np.newaxis]
+            x = d * precision[:, first : first + len(d)].T * (np.minimum(counts, 1.0) / variance)[:, np.newaxis]
             latent = np.maximum(latent - d * (x / (1.0 + x)), 0.0)
         return some.targets - mean, np.zeros_like(mean) if latent is None else latent, variance, counts
 

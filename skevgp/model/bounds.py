@@ -262,8 +262,8 @@ class BoundAtOptimum:
     #
     # Their maximum is -½ Σ log(1 + x_i) ≥ -½ Σ x_i, at a_i = 1 / (1 + x_i). All other terms, and so q(v, w), are the
     # same. A row of weight w ≥ 1 counts w times. If w < 1, its likelihood has the factor w, but the divergence has not.
-    # The maximum is then -½ log(1 + w x_i). Both are -½ n log(1 + w x_i / n), n = max(w, 1). The derivative in d_i is
-    # -½ (w / (σ² v_i)) / (1 + w x_i / n). In log s² it is -½ Σ w x_i / (1 + w x_i / n), and minus that in log σ².
+    # The maximum is then -½ log(1 + w x_i). Both are -½ ŵ log(1 + w x_i / ŵ), ŵ = max(w, 1). The derivative in d_i is
+    # -½ (w / (σ² v_i)) / (1 + w x_i / ŵ). In log s² it is -½ Σ w x_i / (1 + w x_i / ŵ), and minus that in log σ².
     #
     # The tight bound is at most the log likelihood, but unlike the other one it may fall if a point is added.
     #

@@ -156,9 +156,9 @@ class ElboTerms:
     #     ½ [N log 2πσ² + (eᵀe + s² Σ (k̃ - |v(x)|²)) / σ² + |v|² + |w + w₀|² - (m + p)] + the family's `SpreadTerms`.
     #
     # The first term, with σ² itself, is added in `ElboObjective.evaluate`. In the tight bound (see `BoundAtOptimum`),
-    # N/n Σ n log(1 + x) takes the place of s² Σ (k̃ - |v(x)|²) / σ². Its x has σ² itself.
+    # N/n Σ ŵ log(1 + x) takes the place of s² Σ (k̃ - |v(x)|²) / σ². Its x has σ² itself.
 
-    def __init__(self, elbo: ElboObjective, values: Values, group: Group, share: float):
+    def __init__(self, elbo: ElboObjective, values: Values, group: Group, share: float = 1.0):
         self._share = share
         self._group, self._n_rows, m = group, elbo.n_rows, len(group.whitening.L)
         self._mean = elbo.family.mean(values, group)

@@ -131,7 +131,7 @@ class SufficientStatistics:
     # Σ w log v and Σ max(ω, 1) - Σ w, as in `LinearSums`.
     log_variance: float
     surplus: float
-    # (2, o): Σ n log(1 + x) and Σ n x / (1 + x), n = max(w, 1), x = (s²/σ²) (k(x, x) - |v|²) ω / n, for the tight bound
+    # (2, o): Σ ŵ log(1 + x) and Σ ŵ x / (1 + x), ŵ = max(w, 1), x = (s²/σ²) (k(x, x) - |v|²) ω / ŵ, for the tight bound
     # at one signal and noise variance (see `BoundAtOptimum`). 0 for the bound of Titsias (2009).
     charge: Any = 0.0
 

@@ -2,10 +2,12 @@ import ctypes
 import shutil
 import subprocess
 
+import casadi as ca
 import numpy as np
 import pytest
 from sklearn.pipeline import make_union
 
+import skevgp
 from skevgp import CoefPrior
 from skevgp.features import AngleEncoder, InertiaForceGravity, NominalDynamics
 
@@ -50,6 +52,7 @@ def test_c_predicts(name, tmp_path):
     model = fitted(MODELS[name])
     source, header = model.to_c(tmp_path)
     assert (source, header) == (tmp_path / "evgp.c", tmp_path / "evgp.h")
+    assert f"skevgp {skevgp.__version__} with CasADi {ca.CasadiMeta.version()}" in header.read_text()
     library, function = compiled(source), model.to_casadi()
     for x in data(seed=1)[0][:3]:
         mean, variance = predicted(model, x.reshape(1, -1))

@@ -105,6 +105,26 @@ def test_linearised_covariance_goes_through_the_derivatives(sparse, inputs, proc
     np.testing.assert_allclose(found.std**2, np.einsum("tii->ti", found.covariance))
 
 
+class _Plain(BaseEstimator):
+    """A regressor of other packages, which does not say how many columns it takes."""
+
+    def fit(self, X, y):
+        return self
+
+    def __sklearn_is_fitted__(self):
+        return True
+
+    def predict(self, X, return_std=False):
+        mean = X[:, :1] + X[:, 1:].sum(axis=1, keepdims=True)
+        return (mean, np.zeros_like(mean)) if return_std else mean
+
+
+def test_inputs_say_how_many_there_are_if_the_regressor_does_not():
+    U = np.arange(24.0).reshape(2, 4, 3)
+    found = rollout(_Plain(), np.zeros((2, 1)), U, method="mean", process_noise="none")
+    np.testing.assert_allclose(found.mean[:, :, 0], U.sum(axis=2).cumsum(axis=1))
+
+
 class _Hidden(BaseEstimator):
     """A regressor that can do nothing but predict."""
 

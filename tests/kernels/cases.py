@@ -58,7 +58,7 @@ SIMPLE = {
 }
 COMPOSITE = {
     "sum": sk.RBF([0.8, 1.4]) + sk.Matern(0.9, nu=2.5) + 0.3,
-    "product": sk.Matern(1.9, nu=1.5) * sk.DotProduct(0.7) * sk.DotProduct(0.4),
+    "product": sk.Matern(1.9, nu=1.5) * sk.DotProduct(0.7) * sk.DotProduct(0.4) * sk.DotProduct(1.1),
     "nested": (sk.RBF([1.0, 2.0]) + 0.5 * sk.DotProduct()) * (sk.RationalQuadratic(0.9, 0.6) + sk.ConstantKernel(0.2)),
     "other order": sk.DotProduct(0.7) * sk.RBF(0.8) + sk.RBF(1.4) * (sk.DotProduct(0.6) + sk.ConstantKernel(0.4)),
     "periodic": sk.RBF(3.0) * sk.ExpSineSquared(1.2, 9.0) + 0.1 * sk.Matern(0.5, nu=0.5) + FunctionKernel(polynomial),

@@ -56,6 +56,11 @@ def taken(X, Z, values=1.0):
         (FunctionKernel(taken), r"taken needs other names for its hyperparameters \['values'\]"),
         (FunctionKernel(smooth, {"length": 1.0}), r"values names \['length'\]; the hyperparameters of smooth"),
         (FunctionKernel(smooth, values_bounds={"length": (1, 2)}), r"values_bounds names \['length'\]"),
+        (FunctionKernel(smooth, values_bounds=(1.0, 2.0, 3.0)), "values_bounds must be two numbers, the lower first"),
+        (
+            FunctionKernel(smooth, values_bounds={"lengthscale": (1, 2, 3)}),
+            "values_bounds of 'lengthscale' must be two",
+        ),
         (FunctionKernel(smooth, {"weight": 0.0}), "must be positive"),
         (FunctionKernel(lambda X, Z: np.exp(-cdist(X, Z))), "<lambda> cannot be traced by autograd: write it with"),
         (FunctionKernel(lambda X, Z: X @ Z.T * np.nan), r"kernel: k\(X, X\) is not finite"),

@@ -1,6 +1,8 @@
 """Mutation testing: show each mutant of a list to the quick tests that execute it. Appends to a CSV; may be stopped.
 
-python tests/mutation/run.py --list tests/mutation/mutants.csv --out tests/mutation/results.csv
+python tests/mutation/run.py --list tests/mutation/mutants.csv --out FILE
+
+`results.csv` has the outcomes of `mutants.csv`, and `faults.csv` is a list of faults that were chosen by hand.
 """
 
 import argparse
@@ -18,21 +20,26 @@ from pathlib import Path
 from coverage import CoverageData
 
 ROOT = Path(__file__).parents[2]
+DATA = ROOT / ".mutation_cache/coverage"
 COVERAGE = ["--cov=skevgp", "--cov-context=test", "--cov-report=", "--cov-fail-under=0", "-n", "2"]
 FIELDS = ["id", "outcome", "test", "file", "function", "original", "mutated", "occurrence"]
 
 
 def pytest(root: Path, *options: str, tests: list[str] | None = None) -> str:
-    """Run tests of a copy of the repository; the test that failed, or ''."""
-    (root / "chosen.txt").write_text("\n".join(tests or []))
-    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", *options, f"@{root / 'chosen'}"]
-    try:
-        done = subprocess.run(command, cwd=root, env=os.environ | {"PYTHONPATH": str(root)}, text=True,
-                              capture_output=True, timeout=1800)  # fmt: skip
-    except subprocess.TimeoutExpired:
-        return "timeout"
-    failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", done.stdout, re.MULTILINE)
-    return failed[0] if failed else "" if done.returncode in (0, 5) else done.stdout.strip()[-100:]
+    """Run tests of a copy of the repository, or all quick ones; the test that failed, or ''."""
+    chosen, paths = DATA.with_name("chosen.txt"), {"PYTHONPATH": str(root), "COVERAGE_FILE": str(DATA)}
+    chosen.write_text("\n".join(tests or []))
+    command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--hypothesis-seed=0", *options]
+    with DATA.with_name("printed.txt").open("w+") as printed:
+        try:
+            done = subprocess.run([*command, f"@{chosen}"], cwd=root, env=os.environ | paths, stdout=printed,
+                                  stderr=printed, timeout=1800)  # fmt: skip
+        except subprocess.TimeoutExpired:
+            return "timeout"
+        printed.seek(0)
+        text = printed.read()
+    failed = re.findall(r"^(?:FAILED|ERROR) (.+?)(?: - .*)?$", text, re.MULTILINE)
+    return "" if done.returncode == 0 else next(iter(failed), text.strip()[-100:])
 
 
 def places(tree: ast.AST, function: str, text: str, scope: str = "") -> list[tuple[int, int, int, int]]:
@@ -63,25 +70,24 @@ def judge(row: dict[str, str], root: Path, covered: CoverageData, breadth: Count
     chosen = sorted({test.partition("|")[0] for test in tests}, key=lambda test: breadth[test])
     try:
         path.write_bytes(head + row["mutated"].encode() + tail)
-        failed = pytest(root, "-x", "-n", "2", tests=chosen)
+        failed = pytest(root, "-x", "-n", "2", tests=chosen) if chosen else ""
     finally:
         path.write_bytes(source)
-    return ("killed" if failed else "survived"), failed
+    return ("killed" if failed else "survived" if chosen else "no test"), failed
 
 
 def main() -> None:
-    """Read the command line, run, and print the share of mutants killed and the survivors."""
+    """Read the command line, run, and print the numbers of outcomes and the survivors."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--list", type=Path, default=ROOT / "tests/mutation/mutants.csv")
-    parser.add_argument("--out", type=Path, default=ROOT / "tests/mutation/results.csv")
+    parser.add_argument("--out", type=Path, required=True)
     args = parser.parse_args()
-    root, data = ROOT / ".mutation/copy", ROOT / ".mutation/coverage"
+    root = DATA.with_name("copy")
     shutil.rmtree(root, ignore_errors=True)
-    shutil.copytree(ROOT, root, ignore=shutil.ignore_patterns(".git", ".venv", ".mutation", "*cache*"))
-    if not data.exists():  # remove it when the tests change
+    shutil.copytree(ROOT, root, ignore=shutil.ignore_patterns(".git", ".venv", "*cache*"))
+    if not DATA.exists():  # remove it when the tests change
         print("Which test executes which line? One run of the quick tests:", pytest(root, *COVERAGE) or "all passed")
-        shutil.move(root / ".coverage", data)
-    covered = CoverageData(str(data))
+    covered = CoverageData(str(DATA))
     covered.read()
     breadth = Counter(x for file in covered.measured_files() for x in chain(*covered.contexts_by_lineno(file).values()))
     done = {row["id"] for row in csv.DictReader(args.out.open())} if args.out.exists() else set[str]()

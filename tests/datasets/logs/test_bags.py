@@ -315,3 +315,11 @@ def test_velocity_that_one_joint_never_has_raises(tmp_path, first):
             message.velocity = np.array([message.velocity[0], np.nan])
     with pytest.raises(ValueError, match="the velocity of joint 'b' is not finite in any row kept: the driver may nev"):
         load_log(write(tmp_path / "bag", topics))
+
+
+def test_messages_of_other_joints_are_passed_over(tmp_path):
+    hand = [(START + t + 1, state(START + t + 1, ["finger"], [0.0])) for t in NS[::10].tolist()]
+    file = write(tmp_path / "bag", {"/joint_states": (STATES, [*states(), *hand])})
+    assert_recorded(load_log(file, joints=["a", "b"]))
+    with pytest.raises(ValueError, match=r"messages are of different joints, .*: \[\('a', 'b'\), \('finger',\)\]"):
+        load_log(file)

@@ -55,6 +55,13 @@ def test_wrapped_angle_gives_the_data_of_the_unwrapped_one(load, unit, low, high
         assert_allclose(found.target - found.data[:, :2], expected.target - expected.data[:, :2], atol=1e-9 * unit)
 
 
+def test_velocity_of_a_joint_that_mostly_rests_is_not_taken_for_differences(load):
+    velocity = np.where(T > 12.0, 3.0 * np.sin(np.pi * (T - 12.0) / 8.0), 0.01 * np.cos(T))
+    q = np.r_[0.0, np.cumsum(0.005 * (velocity[1:] + velocity[:-1]))]
+    log = load((q + np.pi) % (2.0 * np.pi) - np.pi, velocity)
+    assert log.recordings[0].wrapped["q1"] > 0
+
+
 def test_jump_that_is_no_turn_cuts_the_record(load):
     log = load(np.sin(T) + 1.3 * (T > 9.995), np.cos(T))
     (cut,) = [cut for cut in log.recordings[0].cuts if cut[2] == "jump"]

@@ -97,6 +97,13 @@ def test_nothing_leaks_across_a_gap(load):
     assert (log.time[log.pieces == 1] > gap[1]).all()
 
 
+@pytest.mark.parametrize(("missing", "n_gaps"), [(3, 0), (6, 1)])
+def test_gap_is_longer_than_five_steps(load, missing, n_gaps):
+    t = np.arange(0.0, 10.0, 0.01)
+    log = load(table_of(np.r_[t[:500], t[500 + missing :]]))
+    assert len(np.unique(log.pieces)) == 1 + n_gaps
+
+
 @pytest.mark.parametrize("n_rows", [1, 2, 20])
 def test_pieces_too_short_for_the_filter_are_left_out(load, n_rows):
     t = irregular_times()
