@@ -276,7 +276,7 @@ class GaussianProcess(MultiOutputMixin, RegressorMixin, StatefulEstimator):
         self.feature_map_, self.kernel_map_, self._fitted = maps.feature_map, maps.kernel_map, fitted
         self._posterior = Posterior(fitted.predictor(), maps)
         self._set_weights_and_noise()
-        predictor, prior = self._posterior.predictor, fitted.units.prior
+        predictor, prior = self._posterior.predictor, fitted.prior
         if self.feature_map_ is not None:
             first = 0 if self._n_outputs == 1 or predictor.shared else slice(None)
             self.coef_names_ = coef_names(self.feature_map_, maps.columns, self.coef_.shape[-1])

@@ -13,7 +13,7 @@ from ..robots import GravityTerm, Layout, get_system, layout_of
 from ..robots.loading import Robot, joint_axes, known_robot
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import RobotMap, indices_of
+from .robot_map import RobotMap, VelocityPrior, indices_of
 
 # An axis counts as vertical up to this angle in rad, because URDF files round π/2.
 _TILT = 1e-3
@@ -27,13 +27,13 @@ _COMPONENTS = {"u_x": (1, 1.0), "u_y": (0, -1.0), "": (2, 1.0)}
 class GravityMap(RobotMap):
     """Features of gravity alone, with a prior that knows which joints each feature accelerates."""
 
-    unknown_scale: float
-    free_scale: float
+    unknown_ratio: float
+    coupling_ratio: float
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
-        "unknown_scale": [Interval(Real, 0, None, closed="left")],
-        "free_scale": [Interval(Real, 0, None, closed="left")],
+        "unknown_ratio": [Interval(Real, 0, None, closed="left")],
+        "coupling_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
     def _terms(self) -> Sequence[GravityTerm | Lever]:
@@ -48,21 +48,24 @@ class GravityMap(RobotMap):
             acts_on[list(term.acts_on), column] = True
         return acts_on
 
-    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    def _mean(self, layout: Layout, dt: float) -> np.ndarray:
+        return np.zeros((2 * layout.n_joints, len(self._terms())))
+
+    def _velocity_prior(self, layout: Layout) -> VelocityPrior:
         acts_on = self._acts_on(layout)
-        of_velocities = np.where(acts_on, self.unknown_scale, self.free_scale)
-        scale = np.vstack([np.full(acts_on.shape, self.free_scale, dtype=float), of_velocities])
-        return np.zeros_like(scale), scale
+        prior = VelocityPrior.of(layout.n_joints, acts_on.shape[1], self.coupling_ratio, "coupling")
+        prior.set(acts_on, self.unknown_ratio, "gravity")
+        return prior
 
 
 class SineGravity(GravityMap):
     """The sine of each angle against the vertical of a planar system, or of every column without a robot."""
 
-    def __init__(self, robot: Robot | None, unknown_scale: float, free_scale: float):
+    def __init__(self, robot: Robot | None, unknown_ratio: float, coupling_ratio: float):
         self.robot = robot
         self.outputs = None
-        self.unknown_scale = unknown_scale
-        self.free_scale = free_scale
+        self.unknown_ratio = unknown_ratio
+        self.coupling_ratio = coupling_ratio
 
     def _terms(self) -> Sequence[GravityTerm]:
         assert self.robot is not None
@@ -129,13 +132,15 @@ class LinkGravity(GravityMap):
         The links, by the name of their joint or its index from 0 (the paper counts from 1). If None, all links.
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    unknown_scale : float, default=1.0
-        Prior standard deviation of the weights for the velocities of the joints between the base and the link.
-    free_scale : float, default=1.0
-        Prior standard deviation of the other weights. With 0 they stay 0.
+    unknown_ratio : float, default=3.0
+        Prior standard deviation of what the pull on a link contributes to the velocities of the joints between the base
+        and the link, as a multiple of the change that the prior mean of all features leaves.
+    coupling_ratio : float, default=0.3
+        The same for the velocities of other joints, which the pull moves through the mass matrix. With 0 these weights
+        stay 0.
     dt : "column" or None, default=None
         If ``"column"``, X has a last column, the time step Δt of each row in seconds, and features are multiplied by
-        it. Weights are then rates (1/m for a lever), with the standard deviations above divided by 0.03 s.
+        it. Weights are then rates (1/m for a lever).
 
     Attributes
     ----------
@@ -188,16 +193,16 @@ class LinkGravity(GravityMap):
         axes: str = "xy",
         links: Sequence[int | str] | None = None,
         outputs: Sequence[int | str] | None = None,
-        unknown_scale: float = 1.0,
-        free_scale: float = 1.0,
+        unknown_ratio: float = 3.0,
+        coupling_ratio: float = 0.3,
         dt: Literal["column"] | None = None,
     ):
         self.robot = robot
         self.axes = axes
         self.links = links
         self.outputs = outputs
-        self.unknown_scale = unknown_scale
-        self.free_scale = free_scale
+        self.unknown_ratio = unknown_ratio
+        self.coupling_ratio = coupling_ratio
         self.dt = dt
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {

@@ -16,7 +16,7 @@ from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
 from ..utils.validation import as_floats
 from .gravity import GravityMap, LinkGravity, SineGravity, links_under_gravity
-from .robot_map import STEP, RobotMap
+from .robot_map import STEP, RobotMap, VelocityPrior
 
 
 class _NewtonFeatures(RobotMap):
@@ -24,59 +24,40 @@ class _NewtonFeatures(RobotMap):
 
     dt: float | Literal["column"]
     inverse_inertia: ArrayLike
-    known_scale: float
-    unknown_scale: float
-    free_scale: float
+    known_rate: float
+    unknown_ratio: float
+    coupling_ratio: float
+    other_ratio: float
     _begins_with_state = True
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
         "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"})],
         "inverse_inertia": [Real, "array-like"],
-        "known_scale": [Interval(Real, 0, None, closed="left")],
-        "unknown_scale": [Interval(Real, 0, None, closed="left")],
-        "free_scale": [Interval(Real, 0, None, closed="left")],
+        "known_rate": [Interval(Real, 0, None, closed="left")],
+        "unknown_ratio": [Interval(Real, 0, None, closed="left")],
+        "coupling_ratio": [Interval(Real, 0, None, closed="left")],
+        "other_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
-    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        # Euler's rule (the paper's eq. inertia_prior). Known entries (1 and Δt) have known_scale. Unknown entries
-        # (Δt/J) have the user's guess as mean and unknown_scale. All other entries have mean 0 and free_scale.
+    def _mean(self, layout: Layout, dt: float) -> np.ndarray:
+        # Euler's rule (the paper's eq. inertia_prior), with the user's guess of Δt/J. All other entries are 0.
         n, n_inputs = layout.n_joints, layout.n_inputs
         joints = np.arange(n)
         mean = np.zeros((2 * n, layout.n_columns))
-        scale = np.full((2 * n, layout.n_columns), self.free_scale, dtype=float)
-        for row, column, value in (
-            (joints, joints, 1.0),  # q' = q + ...
-            (joints, n + joints, dt),  # ... + Δt q̇
-            (n + joints, n + joints, 1.0),  # q̇' = q̇ + ...
-        ):
-            mean[row, column], scale[row, column] = value, self.known_scale
-        driven, inputs = n + np.array(layout.driven), 2 * n + np.arange(n_inputs)
-        mean[driven, inputs] = dt * _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")  # γ u
-        scale[driven, inputs] = self.unknown_scale
-        return mean, scale
+        mean[joints, joints] = mean[n + joints, n + joints] = 1.0  # q' = q + ..., q̇' = q̇ + ...
+        mean[joints, n + joints] = dt  # ... + Δt q̇
+        guess = _per_term(self.inverse_inertia, n_inputs, "inverse_inertia")
+        mean[n + np.array(layout.driven), 2 * n + np.arange(n_inputs)] = dt * guess  # γ u
+        return mean
 
-    KNOWN, UNKNOWN, ZERO, ROW = 0.3, 3.0, 0.05, 1.0
-
-    def coef_groups(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """PROTOTYPE: labels, and shares of d / rms(h)."""
-        layout = self._layout
-        probe = clone(self).set_params(known_scale=1.0, unknown_scale=2.0, free_scale=3.0)
-        if hasattr(self, "_gravity"):
-            probe._gravity = probe._gravity_map(read_once(self.robot), layout.n_columns)
-        kind = probe._prior(layout, 1.0)[1]
-        labels = np.where(kind == 1.0, "known", np.where(kind == 2.0, "unknown", "zero")).astype(object)
-        shares = np.where(kind == 1.0, np.nan, np.where(kind == 2.0, self.UNKNOWN, self.ZERO * self.UNKNOWN))
-        rows = self._predicted_states(layout)
-        return labels[rows], shares[rows]
-
-    def coef_rows(self, scale: np.ndarray) -> np.ndarray:
-        n = self._layout.n_joints
-        kind = np.isnan(self.coef_groups(len(scale))[1])
-        scale = np.where(kind, self.KNOWN * self.dt, scale)
-        if len(scale) == 2 * n and self.outputs is None:
-            scale[:n] = self.ROW * self.dt * scale[n:]
-        return scale
+    def _velocity_prior(self, layout: Layout) -> VelocityPrior:
+        n, joints = layout.n_joints, np.arange(layout.n_joints)
+        prior = VelocityPrior.of(n, layout.n_columns, self.other_ratio, "other")
+        prior.set(np.s_[:, 2 * n :], self.coupling_ratio, "coupling")
+        prior.set((np.array(layout.driven), 2 * n + np.arange(layout.n_inputs)), self.unknown_ratio, "input")
+        prior.set_rate((joints, n + joints), self.known_rate, "known")
+        return prior
 
 
 def _per_term(value: ArrayLike, n_terms: int, name: str) -> np.ndarray:
@@ -167,17 +148,19 @@ class InertiaForce(_NewtonFeatures):
         dt: float | Literal["column"] = STEP,
         inverse_inertia: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
-        known_scale: float = 0.1,
-        unknown_scale: float = 1.0,
-        free_scale: float = 1.0,
+        known_rate: float = 0.3,
+        unknown_ratio: float = 3.0,
+        coupling_ratio: float = 0.3,
+        other_ratio: float = 0.003,
     ):
         self.robot = robot
         self.dt = dt
         self.inverse_inertia = inverse_inertia
         self.outputs = outputs
-        self.known_scale = known_scale
-        self.unknown_scale = unknown_scale
-        self.free_scale = free_scale
+        self.known_rate = known_rate
+        self.unknown_ratio = unknown_ratio
+        self.coupling_ratio = coupling_ratio
+        self.other_ratio = other_ratio
 
     def _features(self, X: np.ndarray) -> np.ndarray:
         return X.copy()
@@ -279,9 +262,10 @@ class InertiaForceGravity(_NewtonFeatures):
         gravity: LinkGravity | None = None,
         gravity_gain: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
-        known_scale: float = 0.1,
-        unknown_scale: float = 1.0,
-        free_scale: float = 1.0,
+        known_rate: float = 0.3,
+        unknown_ratio: float = 3.0,
+        coupling_ratio: float = 0.3,
+        other_ratio: float = 0.003,
     ):
         self.robot = robot
         self.dt = dt
@@ -289,9 +273,10 @@ class InertiaForceGravity(_NewtonFeatures):
         self.gravity = gravity
         self.gravity_gain = gravity_gain
         self.outputs = outputs
-        self.known_scale = known_scale
-        self.unknown_scale = unknown_scale
-        self.free_scale = free_scale
+        self.known_rate = known_rate
+        self.unknown_ratio = unknown_ratio
+        self.coupling_ratio = coupling_ratio
+        self.other_ratio = other_ratio
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **_NewtonFeatures._parameter_constraints,
@@ -312,13 +297,13 @@ class InertiaForceGravity(_NewtonFeatures):
             if features.robot is None:
                 features.robot = robot
         elif robot is None or ((system := named_system(robot)) is not None and system.gravity):
-            features = SineGravity(robot, self.unknown_scale, self.free_scale)
+            features = SineGravity(robot, self.unknown_ratio, self.coupling_ratio)
         else:
             features = LinkGravity(
                 robot,
                 links=links_under_gravity(robot),
-                unknown_scale=self.unknown_scale,
-                free_scale=self.free_scale,
+                unknown_ratio=self.unknown_ratio,
+                coupling_ratio=self.coupling_ratio,
             )
         return features.fit(np.zeros((1, n_columns)))
 
@@ -335,13 +320,19 @@ class InertiaForceGravity(_NewtonFeatures):
     def _names(self, columns: np.ndarray) -> list[str]:
         return [*columns, *self._gravity._names(columns)]
 
-    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        fitted = hasattr(self, "_gravity")
-        features = self._gravity if fitted else self._gravity_map(read_once(self.robot), layout.n_columns)
-        mean, scale = features._prior(layout, dt)
-        acts_on, gain = features._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
+    def _of_gravity(self, layout: Layout) -> GravityMap:
+        """Return the features of gravity, also before `fit`."""
+        return (
+            self._gravity if hasattr(self, "_gravity") else self._gravity_map(read_once(self.robot), layout.n_columns)
+        )
+
+    def _mean(self, layout: Layout, dt: float) -> np.ndarray:
+        acts_on, gain = self._of_gravity(layout)._acts_on(layout), as_floats(self.gravity_gain, "gravity_gain")
         if gain.shape != acts_on.shape or not np.isfinite(gain).all():
             gain = _per_term(gain, acts_on.shape[1], "gravity_gain")
-        mean[layout.n_joints :] = np.where(acts_on, 0.0 - dt * gain, 0.0)
-        of_inertia, scale_of_inertia = super()._prior(layout, dt)
-        return np.hstack([of_inertia, mean]), np.hstack([scale_of_inertia, scale])
+        of_gravity = np.zeros((2 * layout.n_joints, acts_on.shape[1]))
+        of_gravity[layout.n_joints :] = np.where(acts_on, 0.0 - dt * gain, 0.0)
+        return np.hstack([super()._mean(layout, dt), of_gravity])
+
+    def _velocity_prior(self, layout: Layout) -> VelocityPrior:
+        return super()._velocity_prior(layout).beside(self._of_gravity(layout)._velocity_prior(layout))

@@ -12,7 +12,7 @@ from ..robots import Layout, RigidBody
 from ..robots.loading import Robot, known_robot
 from ..utils.shapes import same_for_all
 from ..utils.sklearn import Interval, StrOptions
-from .robot_map import STEP, RobotMap
+from .robot_map import STEP, RobotMap, VelocityPrior
 
 _NAMES = {
     "acceleration": "acc({})",
@@ -50,14 +50,14 @@ class NominalDynamics(RobotMap):
         rates (see Notes).
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    known_scale : float, default=0.3
-        Relative error of the model's accelerations: prior standard deviation, as a multiple of Δt, of the weights of a
-        joint's acceleration for its velocity. Their mean is Δt.
-    unknown_scale : float, default=1.0
-        Prior standard deviation of the weights of ``"gravity"`` and ``"bias"`` for velocities. They are Δt times an
-        inverse inertia, and their mean is 0.
-    free_scale : float, default=1.0
-        Prior standard deviation of all other weights, as a multiple of Δt. Their mean is 0; with 0 they stay 0.
+    model_error : float, default=0.3
+        Relative error of the model's accelerations. The weight of a joint's acceleration for its velocity is Δt times 1
+        ± ``model_error``.
+    unknown_ratio : float, default=3.0
+        Prior standard deviation of what the torques ``"gravity"`` and ``"bias"`` contribute to velocities, as a
+        multiple of the change that the prior mean of all features leaves.
+    other_ratio : float, default=0.03
+        The same for all other weights, whose mean is 0. With 0 they stay 0.
 
     Attributes
     ----------
@@ -72,16 +72,14 @@ class NominalDynamics(RobotMap):
 
     Notes
     -----
-    Scales are multiples of Δt because the weights of accelerations are about Δt. Masses with an error of 20 % change
-    the known weights by about as much; the default is somewhat wider.
+    Masses with an error of 20 % change accelerations by about as much; the default of ``model_error`` is somewhat
+    wider. The prior standard deviations for a position are Δt times those for its velocity.
 
     If ``terms`` has ``"acceleration"``, the weights of ``"input"`` are corrections with mean 0. Otherwise their mean is
     Δt.
 
-    With ``dt="column"`` the features are multiplied by the Δt of their row, and replace Δt by 1 in the scales above:
-    the weight of a joint's acceleration has mean 1 and standard deviation ``known_scale``. Weights of ``"gravity"`` and
-    ``"bias"`` for velocities have the standard deviation ``unknown_scale`` divided by 0.03 s. The prior of h(x)β equals
-    that of ``dt=0.03`` if the column is 0.03.
+    With ``dt="column"`` the features are multiplied by the Δt of their row, and the weight of a joint's acceleration
+    has mean 1 and standard deviation ``model_error``.
 
     Effort limits are not applied, and dry friction is left out. Do not scale the columns of X before this map. Scale in
     the ``kernel_map`` of the regressor, which only the kernel uses.
@@ -118,25 +116,25 @@ class NominalDynamics(RobotMap):
         terms: Sequence[str] = ("acceleration",),
         dt: float | Literal["column"] = STEP,
         outputs: Sequence[int | str] | None = None,
-        known_scale: float = 0.3,
-        unknown_scale: float = 1.0,
-        free_scale: float = 1.0,
+        model_error: float = 0.3,
+        unknown_ratio: float = 3.0,
+        other_ratio: float = 0.03,
     ):
         self.robot = robot
         self.terms = terms
         self.dt = dt
         self.outputs = outputs
-        self.known_scale = known_scale
-        self.unknown_scale = unknown_scale
-        self.free_scale = free_scale
+        self.model_error = model_error
+        self.unknown_ratio = unknown_ratio
+        self.other_ratio = other_ratio
 
     _parameter_constraints: ClassVar[dict[str, Any]] = {
         **RobotMap._parameter_constraints,
         "terms": ["array-like"],
         "dt": [Interval(Real, 0, None, closed="neither"), StrOptions({"column"})],
-        "known_scale": [Interval(Real, 0, None, closed="left")],
-        "unknown_scale": [Interval(Real, 0, None, closed="left")],
-        "free_scale": [Interval(Real, 0, None, closed="left")],
+        "model_error": [Interval(Real, 0, None, closed="left")],
+        "unknown_ratio": [Interval(Real, 0, None, closed="left")],
+        "other_ratio": [Interval(Real, 0, None, closed="left")],
     }
 
     def _prepare(self, robot: Robot | None) -> None:
@@ -205,18 +203,30 @@ class NominalDynamics(RobotMap):
             return columns.tolist()
         return [_NAMES[term].format(name) for term in self._terms for name in columns[: self._layout.n_joints]]
 
-    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return blocks (2 * n_joints, n_joints) of the terms, next to each other."""
+    def _is_known(self, term: str) -> bool:
+        """Whether a joint's own column of a term predicts its acceleration."""
+        return term == "acceleration" or (term == "input" and "acceleration" not in self.terms)
+
+    def _mean(self, layout: Layout, dt: float) -> np.ndarray:
         self._check_terms()
         n = layout.n_joints
-        own = np.eye(n, dtype=bool)
-        means, scales = [], []
+        return np.vstack(
+            [
+                np.zeros((n, n * len(self.terms))),
+                np.hstack([dt * self._is_known(term) * np.eye(n) for term in self.terms]),
+            ]
+        )
+
+    def _velocity_prior(self, layout: Layout) -> VelocityPrior:
+        # Blocks (n_joints, n_joints) of the terms, next to each other.
+        self._check_terms()
+        n = layout.n_joints
+        prior = VelocityPrior.of(n, 0, 0.0, "")
         for term in self.terms:
-            mean, scale = np.zeros((2 * n, n)), np.full((2 * n, n), self.free_scale * dt)
+            block = VelocityPrior.of(n, n, self.other_ratio, "other accelerations")
             if term in ("gravity", "bias"):
-                scale[n:] = self.unknown_scale
-            elif term == "acceleration" or "acceleration" not in self.terms:
-                mean[n:][own], scale[n:][own] = dt, self.known_scale * dt
-            means.append(mean)
-            scales.append(scale)
-        return np.hstack(means), np.hstack(scales)
+                block = VelocityPrior.of(n, n, self.unknown_ratio, f"{term} torques")
+            elif self._is_known(term):
+                block.set_rate(np.eye(n, dtype=bool), self.model_error, "model")
+            prior = prior.beside(block)
+        return prior

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from numbers import Real
-from typing import Any, ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -20,7 +20,7 @@ from ..utils.sklearn import check_feature_names_in, fit_context
 from ..utils.state import StatefulEstimator
 from ..utils.validation import is_plain
 
-# Time step in s that the default prior scales belong to.
+# Default time step, s.
 STEP = 0.03
 
 
@@ -95,6 +95,8 @@ class RobotTransformer(TransformerMixin, StatefulEstimator):
             self._layout = layout_of(robot)
             self._check_columns()
             self._check_steps(rows)
+            if self._timed:
+                self._mean_step = float(rows[:, -1].mean())
         self._prepare(robot)
         return self
 
@@ -245,11 +247,41 @@ def has_robot(transformer: RobotMap) -> bool:
     return True
 
 
+class VelocityPrior(NamedTuple):
+    """Standard deviations of the weights for velocities, (n_joints, n_features) each."""
+
+    # Of the weight divided by Δt. NaN: in units of the data.
+    rate: np.ndarray
+    # In units of the data: multiples of rms(y - h(x)ᵀμ) / rms of the feature. NaN: ``rate`` holds.
+    ratio: np.ndarray
+    # The label of the group.
+    group: np.ndarray
+
+    @classmethod
+    def of(cls, n_joints: int, n_features: int, ratio: float, group: str) -> VelocityPrior:
+        """All weights alike, in units of the data."""
+        shape = n_joints, n_features
+        return cls(np.full(shape, np.nan), np.full(shape, ratio), np.full(shape, group, dtype=object))
+
+    def set(self, where: Any, ratio: float, group: str) -> None:
+        """Put some weights into another group, in units of the data."""
+        self.rate[where], self.ratio[where], self.group[where] = np.nan, ratio, group
+
+    def set_rate(self, where: Any, rate: float, group: str) -> None:
+        """Put some weights into another group, with a standard deviation of their own."""
+        self.rate[where], self.ratio[where], self.group[where] = rate, np.nan, group
+
+    def beside(self, other: VelocityPrior) -> VelocityPrior:
+        """The prior of these features and further ones."""
+        return VelocityPrior(*(np.hstack(pair) for pair in zip(self, other, strict=True)))
+
+
 class RobotMap(RobotTransformer):
     """Features for predicting states, with a prior of their weights.
 
-    A subclass defines h(x) of x = [q, q̇, u] and `_prior` for one time step. With ``dt="column"`` features are
-    multiplied by the row's Δt, and the prior is per second. Features that begin with the state z become [z, Δt h(x)].
+    A subclass defines h(x) of x = [q, q̇, u], and `_mean` and `_velocity_prior` of the weights for one time step. With
+    ``dt="column"`` features are multiplied by the row's Δt, and weights are per second. Features that begin with the
+    state z become [z, Δt h(x)].
     """
 
     outputs: Sequence[int | str] | None
@@ -262,7 +294,7 @@ class RobotMap(RobotTransformer):
 
     @available_if(has_robot)
     def coef_prior(self, n_outputs: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior of the weights β.
+        """Return the prior of the weights β, as far as it does not depend on the data.
 
         Parameters
         ----------
@@ -272,7 +304,7 @@ class RobotMap(RobotTransformer):
         Returns
         -------
         mean, scale : ndarray of shape (n_outputs, n_features_out)
-            Means and standard deviations.
+            Means and standard deviations. Standard deviations in units of the data are NaN (see `coef_scale`).
 
         Raises
         ------
@@ -280,8 +312,71 @@ class RobotMap(RobotTransformer):
             If ``n_outputs`` does not fit the robot, or a parameter is out of its range.
         """
         self._validate_params()
-        layout = self._layout if hasattr(self, "_layout") else layout_of(self.robot)
-        mean, scale = self._prior_of_steps(layout)
+        layout = self._known_layout()
+        rows, scale = self._checked_states(layout, n_outputs), self._velocity_prior(layout).rate
+        dt = self._typical_step() or STEP
+        mean = self._mean(layout, dt)
+        # A velocity that is wrong by some amount moves its position by Δt times that.
+        scale = np.vstack([dt * scale, scale])
+        if not self._takes_steps():
+            return mean[rows], dt * scale[rows]
+        before = np.eye(2 * layout.n_joints, self._n_kept(layout))
+        mean[:, : before.shape[1]] -= before
+        mean, scale = np.hstack([before, mean / dt]), np.hstack([np.zeros_like(before), scale])
+        return mean[rows], scale[rows]
+
+    @available_if(has_robot)
+    def coef_scale(self, left_over: ArrayLike, size: ArrayLike) -> np.ndarray:
+        """Return standard deviations of the prior in units of the data.
+
+        Parameters
+        ----------
+        left_over : array-like of shape (n_outputs,)
+            Root mean square of what the prior mean leaves of each column of y: rms(y - h(x)ᵀμ).
+        size : array-like of shape (n_features_out,)
+            Root mean square of each feature. Above 0.
+
+        Returns
+        -------
+        scale : ndarray of shape (n_outputs, n_features_out)
+            A ratio of the map times ``left_over / size``. For a position, ``left_over`` is Δt times that of its
+            velocity, if y has the velocity. NaN for weights with a standard deviation of their own (see `coef_prior`).
+        """
+        layout = self._known_layout()
+        left_over = np.asarray(left_over, dtype=float)
+        rows, n = self._checked_states(layout, len(left_over)), layout.n_joints
+        ratio = self._with_kept(self._velocity_prior(layout).ratio, layout, np.nan)
+        found = dict(zip(rows, left_over, strict=True))
+        step = self._typical_step()
+        change = [
+            step * found[row + n] if step is not None and row < n and row + n in found else found[row] for row in rows
+        ]
+        return ratio[[row % n for row in rows]] * np.array(change)[:, np.newaxis] / np.asarray(size, dtype=float)
+
+    @available_if(has_robot)
+    def coef_groups(self, n_outputs: int) -> np.ndarray:
+        """Name the groups of weights whose standard deviations are learned together.
+
+        Parameters
+        ----------
+        n_outputs : int
+            Number of predicted states.
+
+        Returns
+        -------
+        labels : ndarray of str of shape (n_outputs, n_features_out)
+            The group of each weight. The weights for a position have the groups of those for its velocity.
+        """
+        layout = self._known_layout()
+        rows = self._checked_states(layout, n_outputs)
+        labels = self._with_kept(self._velocity_prior(layout).group, layout, "")
+        return labels[[row % layout.n_joints for row in rows]]
+
+    def _known_layout(self) -> Layout:
+        return self._layout if hasattr(self, "_layout") else layout_of(self.robot)
+
+    def _checked_states(self, layout: Layout, n_outputs: int) -> list[int]:
+        """Return the predicted states, or raise ValueError if their number is not ``n_outputs``."""
         rows = self._predicted_states(layout)
         if n_outputs != len(rows):
             names = [layout.state_names[row] for row in rows]
@@ -290,7 +385,16 @@ class RobotMap(RobotTransformer):
                 f"{len(rows)} states: {names}. Say which ones y holds with outputs=[...]; the names are "
                 f"{layout.state_names}."
             )
-        return mean[rows], scale[rows]
+        return rows
+
+    def _typical_step(self) -> float | None:
+        """Return the time step, or the mean of those in `fit`. None if it is not known."""
+        return float(self.dt) if isinstance(self.dt, Real) else getattr(self, "_mean_step", None)
+
+    def _with_kept(self, values: np.ndarray, layout: Layout, kept: float | str) -> np.ndarray:
+        """Return values (n, p) with columns for the state in front, if features begin with it and steps are given."""
+        n_kept = self._n_kept(layout) if self._takes_steps() else 0
+        return np.hstack([np.full((len(values), n_kept), kept, dtype=values.dtype), values])
 
     def _predicted_states(self, layout: Layout) -> list[int]:
         names = layout.state_names
@@ -298,17 +402,12 @@ class RobotMap(RobotTransformer):
             return list(range(len(names)))
         return indices_of(self.outputs, names, "outputs", "states")
 
-    def _prior_of_steps(self, layout: Layout) -> tuple[np.ndarray, np.ndarray]:
-        """Return the prior; if rows have time steps, that of `STEP` without the state itself, divided by `STEP`."""
-        mean, scale = self._prior(layout, float(self.dt) if isinstance(self.dt, Real) else STEP)
-        if not self._takes_steps():
-            return mean, scale
-        before = np.eye(2 * layout.n_joints, self._n_kept(layout))
-        mean[:, : before.shape[1]] -= before
-        return np.hstack([before, mean / STEP]), np.hstack([np.zeros_like(before), scale / STEP])
+    def _mean(self, layout: Layout, dt: float) -> np.ndarray:
+        """Return the mean (2 * n_joints, n_features) of the weights for all states; works before `fit`."""
+        raise NotImplementedError
 
-    def _prior(self, layout: Layout, dt: float) -> tuple[np.ndarray, np.ndarray]:
-        """Return mean and scale (2 * n_joints, n_features) of the weights for all states; works before `fit`."""
+    def _velocity_prior(self, layout: Layout) -> VelocityPrior:
+        """Return the prior standard deviations of the weights for velocities; works before `fit`."""
         raise NotImplementedError
 
     def _n_kept(self, layout: Layout) -> int:

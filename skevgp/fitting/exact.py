@@ -11,8 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..model.exact import ExactModel, LikelihoodObjective
-from ..model.parameters import ParameterTable, Values
-from ..model.predictor import Predictor
+from ..model.parameters import ParameterTable, Values, log_prior
+from ..model.predictor import CoefficientPrior, Predictor
 from ..solvers import LBFGS
 from ..solvers.base import Minimum, Tolerance
 from ..utils.linalg import NotPositiveDefiniteError
@@ -214,9 +214,14 @@ class ExactFit:
         return self.units.predictor([self.model.predictor(self.fit.values)], [list(range(len(self.units.target_unit)))])
 
     @property
+    def prior(self) -> CoefficientPrior:
+        """The prior of the weights in the user's units, with the learned scales."""
+        return self.units.prior.at(self.fit.values)
+
+    @property
     def log_marginal_likelihood(self) -> float:
         """Log marginal likelihood, in nats, summed over outputs."""
-        return self.fit.bound - self._shift
+        return self.fit.bound - log_prior(self.fit.values) - self._shift
 
     def log_likelihood_at(self, output: int, numbers: np.ndarray) -> tuple[float, np.ndarray]:
         """Log likelihood of an output at other numbers, and its gradient in their logarithms.
@@ -226,7 +231,9 @@ class ExactFit:
         """
         own, model = slice(output, output + 1), self.model
         kernel = model.kernel if model.kernels is None else model.kernels[output]
-        model = ExactModel(kernel, model.prior.outputs(own), model.vague[own], model.rows.of(own))
+        factors = {name: value for name, value in self.fit.values.items() if name == "coef_factors"}
+        prior = model.prior.at(factors).outputs(own)
+        model = ExactModel(kernel, prior, model.vague[own], model.rows.of(own))
         *hyperparameters, signal, noise = numbers
         variance = self.units.target_unit[own] ** 2
         values = {
@@ -291,10 +298,11 @@ def fit_exact(
     best = search(task)
     values, changed = with_signal_of_constants(problem, rows, table, best.values)
     if changed:
-        best = replace(best, values=values, bound=float(model.log_likelihoods(values).sum()))
+        best = replace(best, values=values, bound=float(model.log_likelihoods(values).sum()) + log_prior(values))
 
     # Messages for the user.
-    proper = replace(model.prior, reference=np.where(vague, 0.0, model.prior.reference))
+    learned = model.prior.at(best.values)
+    proper = replace(learned, reference=np.where(vague, 0.0, learned.reference))
     messages = [best.message, far_from_prior(proper, rows)]
     if problem.max_iter > 0:
         each = [(rows, best.values["noise"])]

@@ -11,7 +11,7 @@ from ..data.rows import Rows, Source
 from ..data.threads import BlockMap, side_by_side
 from ..model.model import SparseModel
 from ..model.parameters import ParameterTable, Values, log_prior
-from ..model.predictor import Predictor
+from ..model.predictor import CoefficientPrior, Predictor
 from ..model.statistics import Kernel, SufficientStatistics
 from ..utils.monitor import Monitor
 from .calibration import calibrated
@@ -114,7 +114,7 @@ def grown(model: Model) -> tuple[Model, Fit]:
 def finished(model: Model, fit: Fit, doubts: RowDoubts | None = None) -> FittedModel:
     """Calibrate signal and noise, compute the bounds and make the predictor of a fit."""
     sparse, values, exact, by = model.sparse, fit.values, model.exact, model.problem.noise_cv
-    messages, found, dependent = [fit.message, far_from_prior(sparse.prior, model.rows)], None, False
+    messages, found, dependent = [fit.message, far_from_prior(sparse.prior.at(values), model.rows)], None, False
     values, changed = with_signal_of_constants(model.problem, model.rows, model.table, values)
     statistics = sparse.statistics(values, model.blocks)
     if not model.monitor.stopped and model.max_iter > 0:
@@ -267,6 +267,15 @@ class Fitted:
         return replace(self, models=tuple(models))
 
     @property
+    def prior(self) -> CoefficientPrior:
+        """The prior of the weights in the user's units, with the learned scales."""
+        prior, o = self.units.prior, len(self.units.target_unit)
+        factors = np.ones((o, prior.n_groups))
+        for outputs, one in zip(self.outputs, self.models, strict=True):
+            factors[outputs] = one.values.get("coef_factors", 1.0)
+        return prior.at({"coef_factors": factors})
+
+    @property
     def row_scales(self) -> np.ndarray | None:
         """E[τ] of each row and model, (n, n_models). None for Gaussian noise."""
         each = [one.doubts.scales.mean for one in self.models if one.doubts is not None]
@@ -363,6 +372,8 @@ class Fitted:
             return {}
         ratio = (self.units.target_unit[own] / units.target_unit[own]) ** 2
         found = {"noise": values["noise"] * ratio, "inducing_points": points}
+        if self.units.prior.labels == units.prior.labels and "coef_factors" in values:
+            found["coef_factors"] = values["coef_factors"]
         if one.sparse.kernel == kernel:
             found |= {"hyperparameters": values["hyperparameters"], "signal": values["signal"] * ratio}
         return found

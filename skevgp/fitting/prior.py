@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -41,6 +42,11 @@ class CoefPrior(StatefulEstimator):
         parameters. Then ``mean``, ``scale`` and ``coef_`` have no axis of outputs, all outputs are fitted together, and
         they depend on each other (``predict(X, return_cov="joint")``). ``"auto"`` asks the feature map's attribute
         ``share_coef``. Not for Adam or the diagonal posterior.
+    groups : array-like of str of shape (n_h,) or (n_outputs, n_h), "auto" or None, default="auto"
+        Labels of groups of weights, one group for each output and label. The fit learns a factor for the standard
+        deviations of each group, together with kernel and noise. It has a log-normal prior around 1, and its logarithm
+        has the standard deviation 1. An empty label keeps the standard deviation as it is. ``"auto"`` asks the feature
+        map, unless ``scale`` or ``cov`` are given. If None, all standard deviations stay.
 
     Examples
     --------
@@ -60,11 +66,13 @@ class CoefPrior(StatefulEstimator):
         scale: ArrayLike | Literal["auto"] = "auto",
         cov: ArrayLike | None = None,
         shared: bool | Literal["auto"] = "auto",
+        groups: ArrayLike | Literal["auto"] | None = "auto",
     ):
         self.mean = mean
         self.scale = scale
         self.cov = cov
         self.shared = shared
+        self.groups = groups
 
 
 def as_coef_prior(coef_prior: Any) -> CoefPrior:
@@ -86,26 +94,49 @@ def as_coef_prior(coef_prior: Any) -> CoefPrior:
 
 
 class Resolved(NamedTuple):
-    """Mean and standard deviations (k, p), and C (k, p, p) with Σ = C Cᵀ. k is 1 if outputs share their weights."""
+    """The prior of the weights in the user's units. k is 1 if outputs share their weights, else their number."""
 
+    # (k, p) each: mean and standard deviations.
     mean: np.ndarray
     scale: np.ndarray
+    # (k, p, p): C with Σ = C Cᵀ. None: weights are independent.
     root: np.ndarray | None
+    # (k, p): the label of each weight's group, whose scale is learned. Empty: the scale stays.
+    groups: np.ndarray
+
+
+@dataclass(frozen=True)
+class InData:
+    """What the data say of sizes. k is 1 if outputs share their weights, else their number."""
+
+    # (k, p): the scale of weights without prior knowledge, from `wide_scale`.
+    wide: np.ndarray
+    # (p,) or (o, p): the rms of each feature.
+    size: np.ndarray
+    # Maps a prior mean (k, p) to the rms (o,) of what it leaves of y.
+    left_over: Callable[[np.ndarray], np.ndarray]
 
 
 def resolved(
-    prior: CoefPrior, feature_map: Any, X: Any, wide: np.ndarray, n_outputs: int, allow_vague: bool = False
+    prior: CoefPrior, feature_map: Any, X: Any, data: InData, n_outputs: int, allow_vague: bool = False
 ) -> Resolved:
     """The prior of the weights of a fitted feature map, checked.
 
-    The map's method ``coef_prior(n_outputs)`` returns the mean, and the standard deviations or the covariance: (k, p,
-    p), or one (p, p) for all. A union joins the priors of its parts. A part without the method, and entries of a scale
-    that are NaN, get mean 0 and the scale ``wide`` (k, p). Only the first row of X is used, to find the widths of the
+    A map may have three methods, and a union joins what its parts say:
+
+    - ``coef_prior(n_outputs)`` returns the mean, and the standard deviations or the covariance: (k, p, p), or one
+      (p, p) for all. Standard deviations that are NaN come from the next method.
+    - ``coef_scale(left_over, size)`` returns standard deviations (k, p) in units of the data: ``left_over`` (o,) is the
+      rms of what the prior mean of all features leaves of y, and ``size`` (p,) that of each feature. Those that are
+      still NaN are wide.
+    - ``coef_groups(n_outputs)`` returns the labels (k, p) of groups of weights, whose scales are learned.
+
+    A part without the first has mean 0 and wide scales. Only the first row of X is used, to find the widths of the
     parts. ``allow_vague`` allows infinite scales. Raises a ValueError if a shape does not fit, a value is not finite, a
-    scale is negative, or a covariance is not positive semi-definite.
+    scale is negative, a covariance is not positive semi-definite, or weights of two groups are correlated.
     """
-    shape, shared = wide.shape, n_outputs > len(wide)
-    for name in ("mean", "scale", "cov"):
+    shape, shared = data.wide.shape, n_outputs > len(data.wide)
+    for name in ("mean", "scale", "cov", "groups"):
         value = getattr(prior, name)
         if feature_map is None and (isinstance(value, list | tuple) or np.ndim(value) > 0):
             raise ValueError(f"{name} of CoefPrior needs a feature_map: without one there are no weights.")
@@ -113,30 +144,98 @@ def resolved(
         raise ValueError(
             f"cov and scale={prior.scale!r} of CoefPrior both say how far weights may be; give one of them."
         )
-    auto_mean, auto_scale, correlation = np.zeros(shape), wide, _independent(shape)
-    if feature_map is not None and "auto" in (_word(prior.mean), _word(prior.scale)):
-        first = safe_indexing(X, slice(0, 1))
-        auto_mean, scale, correlation = _map_prior(feature_map, first, n_outputs, shape)
-        auto_scale = np.where(np.isnan(scale), auto_scale, scale)
-    mean = auto_mean if _word(prior.mean) == "auto" else _as_table(prior.mean, "mean of CoefPrior", shape, shared)
-    scale, scale_name = auto_scale, 'scale="auto" of CoefPrior, the feature map\'s or 10 std(y) / rms of a feature,'
-    if _word(prior.scale) != "auto":
-        scale_name = "scale of CoefPrior"
-        scale, correlation = _as_table(prior.scale, scale_name, shape, shared), _independent(shape)
+    by_hand = _word(prior.scale) != "auto" or prior.cov is not None
+    parts: list[_Part] = []
+    if feature_map is not None and not (by_hand and _word(prior.mean) != "auto" and _word(prior.groups) != "auto"):
+        parts = list(_parts(feature_map, safe_indexing(X, slice(0, 1)), np.arange(shape[1])))
+    mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
+    for part in parts:
+        own = shape[0], len(part.columns)
+        part_mean, part_scale, part_correlation = _own_prior(part.feature_map, n_outputs, own)
+        mean[:, part.columns] = part_mean / part.weight
+        scale[:, part.columns] = part_scale / abs(part.weight)
+        correlation[:, part.columns[:, np.newaxis], part.columns] = part_correlation
+    if _word(prior.mean) != "auto":
+        mean = _as_table(prior.mean, "mean of CoefPrior", shape, shared)
+    scale_name = 'scale="auto" of CoefPrior, the feature map\'s or 10 std(y) / rms of a feature,'
     if prior.cov is not None:
         scale, correlation = _of_covariance(prior.cov, "cov of CoefPrior", shape)
-    finite = np.where(scale == np.inf, wide, scale) if allow_vague else scale
-    for name, values in (("mean of CoefPrior", mean), (scale_name, finite)):
-        if not np.isfinite(values).all():
-            raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
-        check_magnitude(values, name)
+    elif by_hand:
+        scale_name = "scale of CoefPrior"
+        scale, correlation = _as_table(prior.scale, scale_name, shape, shared), _independent(shape)
+    else:
+        _check_finite(mean, "mean of CoefPrior")
+        scale = _in_units_of_data(scale, mean, parts, data)
+    _check_finite(mean, "mean of CoefPrior")
+    _check_finite(np.where(scale == np.inf, data.wide, scale) if allow_vague else scale, scale_name)
     if (scale < 0).any():
         raise ValueError(f"scale of CoefPrior must not be negative; its smallest value is {scale.min()}.")
+    groups = _groups(prior, parts, n_outputs, shape, by_hand)
+    groups[(scale == 0.0) | np.isinf(scale)] = ""
+    mean, scale = mean.astype(float), scale.astype(float)
     if (correlation == _independent(shape)).all():
-        return Resolved(mean.astype(float), scale.astype(float), None)
-    eigenvalues, vectors = (np.array(each) for each in zip(*map(eigh, correlation), strict=True))
-    root = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))[:, np.newaxis]
-    return Resolved(mean.astype(float), scale.astype(float), scale[:, :, np.newaxis] * root)
+        return Resolved(mean, scale, None, groups)
+    root = np.array([_root(own, labels) for own, labels in zip(correlation, groups, strict=True)])
+    return Resolved(mean, scale, scale[:, :, np.newaxis] * root, groups)
+
+
+def _check_finite(values: np.ndarray, name: str) -> None:
+    if not np.isfinite(values).all():
+        raise ValueError(f"{name} must be finite; it holds {values[~np.isfinite(values)][0]}.")
+    check_magnitude(values, name)
+
+
+def _in_units_of_data(scale: np.ndarray, mean: np.ndarray, parts: Sequence[_Part], data: InData) -> np.ndarray:
+    """Scales (k, p) in which those that are NaN are taken from the sizes of the data."""
+    scale = scale.copy()
+    asking = [part for part in parts if hasattr(part.feature_map, "coef_scale") and np.isnan(scale).any()]
+    left_over = data.left_over(mean) if asking else np.empty(0)
+    for part in asking:
+        # A feature that is 0 on all rows has no size. Its weight may have any scale.
+        size = data.size[..., part.columns] / abs(part.weight)
+        found = part.feature_map.coef_scale(left_over, np.where(size > 0.0, size, 1.0)) / abs(part.weight)
+        missing = np.isnan(scale[:, part.columns])
+        scale[:, part.columns] = np.where(missing, found, scale[:, part.columns])
+    return np.where(np.isnan(scale), data.wide, scale)
+
+
+def _groups(
+    prior: CoefPrior, parts: Sequence[_Part], n_outputs: int, shape: tuple[int, int], by_hand: bool
+) -> np.ndarray:
+    """The labels (k, p) of the groups of weights with learned scales. Empty: the scale stays."""
+    groups = np.full(shape, "", dtype=object)
+    if prior.groups is None:
+        return groups
+    if _word(prior.groups) != "auto":
+        labels = np.asarray(prior.groups, dtype=object)
+        if labels.shape not in _shapes(shape) and labels.shape != shape[1:]:
+            raise ValueError(
+                f"groups of CoefPrior must be 'auto', None or the labels of all weights, of the shape {shape[1:]} or "
+                f"{shape}; got the shape {labels.shape}."
+            )
+        groups[...] = np.vectorize(str, otypes=[object])(labels)
+        return groups
+    labelled = [part for part in parts if hasattr(part.feature_map, "coef_groups")]
+    for part in [] if by_hand else labelled:
+        labels = np.asarray(part.feature_map.coef_groups(n_outputs), dtype=object).reshape(shape[0], -1)
+        prefix = f"{part.name}: " if len(labelled) > 1 and part.name else ""
+        groups[:, part.columns] = [[f"{prefix}{label}" if label else "" for label in row] for row in labels]
+    return groups
+
+
+def _root(correlation: np.ndarray, groups: np.ndarray) -> np.ndarray:
+    """A C (p, p) with C Cᵀ = ``correlation``, in which weights of different groups have nothing in common."""
+    root = np.zeros(correlation.shape)
+    for group in dict.fromkeys(groups):
+        own = np.flatnonzero(groups == group)
+        if correlation[own][:, groups != group].any():
+            raise ValueError(
+                f"Weights of different groups must be independent; those of the group {group!r} are correlated with "
+                "others. CoefPrior(groups=None) leaves all scales as they are."
+            )
+        eigenvalues, vectors = eigh(correlation[np.ix_(own, own)])
+        root[np.ix_(own, own)] = vectors * np.sqrt(np.maximum(eigenvalues, 0.0))
+    return root
 
 
 def _independent(shape: tuple[int, int]) -> np.ndarray:
@@ -224,24 +323,29 @@ def wide_scale(
     return np.where(wide > 0.0, wide, size.max())
 
 
-def _map_prior(
-    feature_map: Any, first: Any, n_outputs: int, shape: tuple[int, int]
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Mean and scale (k, width) of a map's weights, and their correlation. NaN in the scale if the map has none."""
+class _Part(NamedTuple):
+    """A map inside pipelines and unions: its columns of h(x), and the number that they are multiplied by."""
+
+    feature_map: Any
+    columns: np.ndarray
+    weight: float
+    name: str
+
+
+def _parts(feature_map: Any, first: Any, columns: np.ndarray, name: str = "") -> Iterator[_Part]:
+    """The maps with a prior inside pipelines and unions, given the first row of their X."""
     if hasattr(feature_map, "coef_prior"):
-        return _own_prior(feature_map, n_outputs, shape)
-    mean, scale, correlation = np.zeros(shape), np.full(shape, np.nan), _independent(shape)
-    if isinstance(feature_map, Pipeline):
+        yield _Part(feature_map, columns, 1.0, name)
+    elif isinstance(feature_map, Pipeline):
         steps = [step for _, step in feature_map.steps if step not in ("passthrough", None)]
         for step in steps[:-1]:
             first = step.transform(first)
-        return _map_prior(steps[-1], first, n_outputs, shape) if steps else (mean, scale, correlation)
-    for part, part_first, columns, weight in _parts_of(feature_map, first):
-        part_mean, part_scale, part_correlation = _map_prior(part, part_first, n_outputs, (shape[0], len(columns)))
-        mean[:, columns] = part_mean / weight
-        scale[:, columns] = part_scale / abs(weight)
-        correlation[:, columns[:, np.newaxis], columns] = part_correlation
-    return mean, scale, correlation
+        if steps:
+            yield from _parts(steps[-1], first, columns, name)
+    else:
+        for own_name, part, part_first, own, weight in _parts_of(feature_map, first):
+            for inner in _parts(part, part_first, columns[own], own_name):
+                yield inner._replace(weight=weight * inner.weight)
 
 
 def says_shared(feature_map: Any) -> bool:
@@ -277,8 +381,8 @@ def _own_prior(feature_map: Any, n_outputs: int, shape: tuple[int, int]) -> tupl
     return mean, parts[1].reshape(shape), _independent(shape)
 
 
-def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarray, float]]:
-    """The parts of a union: map, its input for the first row, its columns in the result, and its weight.
+def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[str, Any, Any, np.ndarray, float]]:
+    """The parts of a union: name, map, its input for the first row, its columns in the result, and its weight.
 
     Parts of weight 0 are left out: their features are 0.
     """
@@ -290,14 +394,14 @@ def _parts_of(feature_map: Any, first: Any) -> Iterator[tuple[Any, Any, np.ndarr
             width = np.shape(first if part == "passthrough" else transformed(part, first))[-1]
             weight = _weight(feature_map, name)
             if weight != 0.0:
-                yield part, first, np.arange(start, start + width), weight
+                yield name, part, first, np.arange(start, start + width), weight
             start += width
     elif isinstance(feature_map, ColumnTransformer):
         for name, part, columns in feature_map.transformers_:
             own = np.arange(feature_map.output_indices_[name].start, feature_map.output_indices_[name].stop)
             weight = _weight(feature_map, name)
             if len(own) and weight != 0.0:
-                yield part, safe_indexing(first, columns, axis=1), own, weight
+                yield name, part, safe_indexing(first, columns, axis=1), own, weight
 
 
 def _weight(union: Any, name: str) -> float:

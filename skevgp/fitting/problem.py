@@ -21,9 +21,9 @@ from ..solvers.base import Solver
 from ..utils.validation import check_magnitude, check_not_vanishing
 from .calibration import CrossValidation
 from .inducing import Placement
-from .prior import CoefPrior, resolved, says_shared, wide_scale
+from .prior import CoefPrior, InData, resolved, says_shared, wide_scale
 from .search import Rules, rules_of
-from .units import Units, _LeftOver
+from .units import LeftOver, Units
 
 # An infinite prior scale becomes this many times the scale with which a feature could explain y alone.
 _VAGUE = 1e3
@@ -111,8 +111,8 @@ class Problem:
                     f"WhiteKernel of kernel={kernel!r}; give one of them."
                 )
             spec = spec.with_noise(noise.variance)
-        prior, vague = _prior(coef_prior, data, features, targets, allow_vague)
         target_mean = targets.mean if normalize_y else np.zeros(len(targets.mean))
+        prior, vague = _prior(coef_prior, data, features, targets, target_mean, allow_vague)
         units = Units.of(data.source, features, targets, target_mean, prior)
         with np.errstate(over="ignore"):
             spread = prior.scale * features.largest / units.target_unit[:, np.newaxis]
@@ -162,7 +162,7 @@ class Problem:
 
 
 def _prior(
-    asked: CoefPrior, data: Dataset, features: Moments, targets: Moments, allow_vague: bool
+    asked: CoefPrior, data: Dataset, features: Moments, targets: Moments, target_mean: np.ndarray, allow_vague: bool
 ) -> tuple[CoefficientPrior, np.ndarray]:
     """The prior of the weights in the user's units, and which of them (o, p) are vague."""
     o, shared, feature_map = len(targets.mean), asked.shared, data.maps.feature_map
@@ -173,23 +173,23 @@ def _prior(
     shared = bool(shared) and o > 1 and feature_map is not None
     # A bump far from all rows, for example, counts as 0.
     size = np.where(features.largest > _NEGLIGIBLE * features.largest.max(initial=0.0), features.rms, 0.0)
+
+    def left_over(mean: np.ndarray) -> np.ndarray:
+        _, squares = data.source.sum(LeftOver(target_mean, np.broadcast_to(mean, (o, mean.shape[1]))))
+        found = np.sqrt(squares / targets.n)
+        return np.where(found > 0.0, found, np.where(targets.largest > 0.0, targets.largest, 1.0))
+
     wide = wide_scale(size, np.sqrt(targets.variance), targets.largest, shared)
-    mean, scale, root = resolved(asked, feature_map, data.given, wide, o, allow_vague)
+    found = resolved(asked, feature_map, data.given, InData(wide, size, left_over), o, allow_vague)
+    mean, scale, root, groups = found.mean, found.scale, found.root, found.groups
+    if shared:
+        mean, scale, groups = (np.repeat(values, o, axis=0) for values in (mean, scale, groups))
+        root = None if root is None else np.repeat(root, o, axis=0)
     vague = np.isinf(scale)
     # An infinite scale becomes one so wide that its value does not matter.
     scale = np.where(vague, _VAGUE * wide_scale(size, targets.largest, targets.largest, shared), scale)
-    groups = None
-    if not shared and root is None and hasattr(feature_map, "coef_groups") and isinstance(asked.scale, str):
-        labels, shares = feature_map.coef_groups(o)
-        names = sorted(set(labels.ravel()) - {""})
-        groups = np.array([[names.index(one) if one else -1 for one in row] for row in labels])
-        left = _LeftOver(np.zeros(o), mean)
-        squares = data.source.sum(left)[1]
-        d = np.sqrt(squares / targets.n)
-        by = d[:, np.newaxis] / np.where(size > 0.0, size, 1.0)
-        scale = np.where(np.isnan(shares), scale, shares * by)
-        scale = feature_map.coef_rows(scale) if hasattr(feature_map, "coef_rows") else scale
-    if shared:
-        mean, scale, vague = (np.repeat(values, o, axis=0) for values in (mean, scale, vague))
-        root = None if root is None else np.repeat(root, o, axis=0)
-    return CoefficientPrior(mean, scale, np.zeros(scale.shape), root, shared, groups), vague
+    labels = tuple(dict.fromkeys(label for label in groups.ravel() if label))
+    numbers = None
+    if labels:
+        numbers = np.array([[labels.index(label) if label else -1 for label in row] for row in groups])
+    return CoefficientPrior(mean, scale, np.zeros(scale.shape), root, shared, labels, numbers), vague

@@ -33,6 +33,8 @@ _CONSTANT = 1e-12
 # Short fits: largest numbers of rows and points, iterations of the first fit and of the others, tolerance in nats.
 _SAMPLE, _POINTS = 1000, 100
 _FIRST_ITERATIONS, _FURTHER_ITERATIONS, _SHORT_TOL = 60, 25, 0.1
+# Values that each output has by itself.
+_PER_OUTPUT = ("signal", "noise", "coef_factors")
 
 
 def with_groups(
@@ -172,7 +174,7 @@ class _ShortFits:
         others = [[o] for o in range(len(starts)) if o not in outputs]
         (model,) = (own for own in self._planned([outputs, *others]) if own.rows.columns == outputs)
         own = [starts[o] for o in outputs]
-        values = {name: np.concatenate([one[name] for one in own]) for name in ("signal", "noise")}
+        values = {name: np.concatenate([one[name] for one in own]) for name in _PER_OUTPUT if name in own[0]}
         values["hyperparameters"] = np.exp(np.mean([np.log(one["hyperparameters"]) for one in own], axis=0))
         return _short_fit(model, model.table.started_at(values), _FURTHER_ITERATIONS, self.monitor)
 
@@ -208,4 +210,4 @@ def _short_fit(model: Model, table: ParameterTable, n_iter: int, monitor: Monito
     minimum = LBFGS().minimise(model.objective(table), table.start(), table.limits(), n_iter, tolerance, monitor)
     values = table.values(minimum.x)
     each = range(len(values["noise"]))
-    return [values | {name: values[name][[o]] for name in ("signal", "noise")} for o in each]
+    return [values | {name: values[name][[o]] for name in _PER_OUTPUT if name in values} for o in each]

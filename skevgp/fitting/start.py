@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from .problem import Problem
 
 # Lowest noise variance in squared target units: about the rounding error of the residuals.
+# Limits of the factors of the standard deviations of groups of weights.
+_FACTOR_LIMITS = 1e-4, 1e4
 LOWEST_NOISE = 1e-20
 _NEIGHBOUR_SAMPLE = 2000
 
@@ -135,14 +137,10 @@ def starting_table(
     signal, highest, centre = o / mean_variance, rules.highest_noise * precision * o, column_centre(inputs)
     lowest_noise = np.maximum(rules.lowest_noise * scatter, np.maximum(LOWEST_NOISE, rounding) * precision)
     still = bool(np.all(constant))
-    coef = []
-    if n_groups := getattr(getattr(units, "prior", None), "n_groups", 0):
-        scales = np.ones((1 if units.prior.shared else len(o), n_groups))
-        learned = problem.max_iter > 0 and not problem.solver.stochastic
-        coef = [Parameter("coef", scales, "log", 1e-4, 1e4, fixed=not learned)]
+    n_groups = (1 if units.prior.shared else len(o)), units.prior.n_groups
+    factors = [Parameter("coef_factors", np.ones(n_groups), "log", *_FACTOR_LIMITS)] if units.prior.labels else []
     return ParameterTable(
         [
-            *coef,
             parameter_of(
                 starts.hyperparameters, "hyperparameters", default, lower * typical, upper * root_d * typical, 1.0
             ),
@@ -167,6 +165,7 @@ def starting_table(
                 np.maximum(highest, units.target_scatter[own] * precision),
                 still and starts.noise.value is None,
             ),
+            *factors,
             Parameter(
                 "inducing_points",
                 inducing_points,

@@ -35,7 +35,7 @@ def _products(raw: RawRows, basis: np.ndarray | None = None) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _LeftOver:
+class LeftOver:
     """Maps rows to HᵀΩl (o, p) and lᵀΩl (o,), with l = y - target_mean - H coefᵀ. Optionally also HᵀΩH, Σω, Σw."""
 
     target_mean: np.ndarray
@@ -98,7 +98,7 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
     # refinement correct the rounding of sums over targets.
     (o, p), roots = prior.scale.shape, prior.roots()
     w = np.zeros((o, p))
-    HL, squares, HH, total_precision, n_rows = source.sum(_LeftOver(target_mean, prior.mean, with_products=True))
+    HL, squares, HH, total_precision, n_rows = source.sum(LeftOver(target_mean, prior.mean, with_products=True))
     everything = [list(range(o))] if prior.shared else [[output] for output in range(o)]
     together = [outputs for outputs in everything if squares[outputs].any() and prior.scale[outputs].any()]
     if not together:
@@ -111,7 +111,7 @@ def features_alone(source: Source, target_mean: np.ndarray, prior: CoefficientPr
         for _ in range(3):
             for step in steps:
                 step.take(w, np.einsum("oij,oi->oj", roots, HL))
-            HL, squares = source.sum(_LeftOver(target_mean, prior.mean + prior.times(w)))
+            HL, squares = source.sum(LeftOver(target_mean, prior.mean + prior.times(w)))
     return w, np.sqrt(squares / total_precision)
 
 

@@ -312,10 +312,13 @@ class BoundAtOptimum:
         unexplained, unexplained_slope = -0.5 * group.charges()
         # |v|² + |w + w₀|² of each output. Shared weights count once.
         mean[:, m:] += group.prior.reference
-        self._coef = _scale_gradient(group, mean[:, m:], spread, posteriors) if group.prior.n_groups else None
+        # At the optimum of q(f_m, β) the bound depends on the prior's standard deviation c of a weight only through
+        # KL[q(β) || p(β)]. With z = w + w₀ the derivative in log c is E[z²] - 1.
+        self._factors = mean[:, m:] ** 2 + spread - 1.0
         if group.prior.shared:
-            for own, q in zip(mean, posteriors, strict=True):
+            for own, factors, q in zip(mean, self._factors, posteriors, strict=True):
                 own[q.n_own :] = 0.0
+                factors[q.n_own - m :] = 0.0
         penalty = np.einsum("ok,ok->o", mean, mean)
         # (o,) each: the bound without eᵀe, and its derivatives in log s² and log σ².
         log_noise = statistics.n_rows * (LOG_2PI + np.log(noise)) + statistics.log_variance
@@ -342,29 +345,13 @@ class BoundAtOptimum:
         return float((self._value - 0.5 * residuals.squares / self.group.noise).sum())
 
     def finish(self, residuals: Residuals) -> tuple[float, dict[str, np.ndarray]]:
-        """The bound, and its gradients in log s² (o,), log σ² (o,) and the logarithms of learned scales (o, g)."""
+        """The bound, and its gradients in the logarithms of s² (o,), σ² (o,) and factors of scales (o, g)."""
         signal = self._log_signal + 0.5 * (self.gradient.VE * residuals.VE).sum(axis=0)
         noise = self._log_noise + 0.5 * residuals.squares / self.group.noise
         found = {"signal": signal, "noise": noise}
-        return self.value(residuals), found if self._coef is None else found | {"coef": self._coef}
-
-
-def _scale_gradient(
-    group: Group, z: np.ndarray, spread: np.ndarray, posteriors: Sequence[WhitenedPosterior]
-) -> np.ndarray:
-    """The derivatives (o, g) of the bound in the logarithms of the learned scales.
-
-    ``z`` (o, p) is the mean of (β - μ_β) / c, and ``spread`` (o, p) its variance.
-    """
-    # At the optimum of q(f_m, β) the bound depends on c through KL[q(β) || p(β)] only, so that its derivative in log c
-    # of a weight is E[z²] - 1. Weights that outputs share count once.
-    each, prior = z**2 + spread - 1.0, group.prior
-    assert prior.groups is not None
-    found = np.zeros((len(z), prior.n_groups + 1))
-    for own, values, which, q in zip(found, each, prior.groups, posteriors, strict=True):
-        if not prior.shared or q.n_own == len(q.B):
-            np.add.at(own, which, values)
-    return found[:, :-1]
+        if self.group.prior.n_groups:
+            found["coef_factors"] = self.group.prior.of_groups(self._factors)
+        return self.value(residuals), found
 
 
 def equation_errors(group: Group, posteriors: Sequence[WhitenedPosterior], residuals: Residuals) -> list[np.ndarray]:

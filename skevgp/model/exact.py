@@ -173,7 +173,7 @@ class ExactModel:
     def outputs(self, values: Values) -> tuple[list[Any], list[OutputGivenKernel]]:
         """The kernel at the rows, for all outputs or for each, and each output given it."""
         hyperparameters, o = np.log(values["hyperparameters"]), len(self.vague)
-        prior = self.prior.at(values["coef"]) if "coef" in values else self.prior
+        prior = self.prior.at(values)
         each = [self.rows.of(slice(output, output + 1)) for output in range(o)]
         relative = None if self.rows.precision is None else 1.0 / self.rows.precision
         covariances = [
@@ -218,13 +218,11 @@ class ExactModel:
             total += output.log_likelihood
             own, gradient["signal"][index], gradient["noise"][index] = output.gradient()
             K_bars[index % len(K_bars)] += own
-            if "coef" in values and (output.is_first or not self.prior.shared):
-                # As in `bounds`: E[z²] - 1 of each weight.
-                of_groups = np.zeros(self.prior.n_groups + 1)
-                assert self.prior.groups is not None
+            if "coef_factors" in values and (output.is_first or not self.prior.shared):
+                # E[z²] - 1 of each weight, as in `bounds.BoundAtOptimum`.
                 each = output.from_prior**2 + (output.R_inv**2).sum(axis=1) - 1.0
-                np.add.at(of_groups, self.prior.groups[index], each)
-                gradient["coef"][0 if self.prior.shared else index] += of_groups[:-1]
+                of_groups = self.prior.outputs(slice(index, index + 1)).of_groups(each[np.newaxis])
+                gradient["coef_factors"][0 if self.prior.shared else index] += of_groups[0]
         # The factor for copies of rows has the power -Σ (w - 1) / 2 of σ².
         gradient["noise"] -= 0.5 * (self.rows.total - len(self.rows.inputs))
         for at, K_bar in zip(covariances, K_bars, strict=True):
@@ -253,7 +251,7 @@ class ExactModel:
                     self.rows.of(own).inputs,
                     Whitening(covariances[index % len(covariances)], output.L, output.L_inv),
                     values["signal"][own],
-                    (self.prior.at(values["coef"]) if "coef" in values else self.prior).outputs(own),
+                    self.prior.at(values).outputs(own),
                     [mean],
                     [root],
                 )

@@ -32,11 +32,13 @@ class SpreadTerms:
     log_noise: np.ndarray
     # (o, k): gradients in the coordinates of the parameter ``spread``. k is 0 if there is none.
     spread: np.ndarray
+    # (o, p): gradients in the logarithms of the weights' scales.
+    log_scale: np.ndarray
 
     @classmethod
     def zeros(cls, m: int, p: int, o: int, k: int) -> SpreadTerms:
         VV, VH, factor = np.zeros((m, m)), np.zeros((m, p)), np.zeros((m, m))
-        return cls(0.0, VV, VH, factor, np.zeros(o), np.zeros(o), np.zeros((o, k)))
+        return cls(0.0, VV, VH, factor, np.zeros(o), np.zeros(o), np.zeros((o, k)), np.zeros((o, p)))
 
     def add_output(self, o: int, group: Group, S_v: np.ndarray, rows: np.ndarray, penalty: float) -> None:
         """Add the terms of output o: S_v (m, m + p) of S, the diagonal of σ⁻² PᵀP S (m + p,), and Tr(S) - log|S|."""
@@ -47,6 +49,7 @@ class SpreadTerms:
         self.VH += (s / group.noise[o]) * S_v[:, m:] * group.prior.scale[o]
         self.log_signal[o] = 0.5 * rows[:m].sum()
         self.log_noise[o] = -0.5 * rows.sum()
+        self.log_scale[o] = rows[m:]
 
 
 class _GradientFamily:
@@ -113,6 +116,7 @@ class DiagonalFamily(_GradientFamily):
             0.5 * from_data[:, :m].sum(axis=1),
             -0.5 * from_data.sum(axis=1),
             0.5 * (from_data + from_prior - 1.0),
+            from_data[:, m:],
         )
 
     def roots(self, values: Values, L_inv: Sequence[np.ndarray]) -> list[np.ndarray]:

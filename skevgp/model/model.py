@@ -53,10 +53,6 @@ class SparseModel:
     # Whether the bound is the tight one of Titsias (2025), not that of Titsias (2009).
     tight: bool = False
 
-    def prior_at(self, values: Values) -> CoefficientPrior:
-        """The prior of the weights, with the learned scales of groups."""
-        return self.prior.at(values["coef"]) if "coef" in values else self.prior
-
     def kernel_of(self, values: Values, group: int) -> tuple[Kernel, np.ndarray]:
         """k̃ of a group, and its hyperparameters (n_hyper,)."""
         hyperparameters = values["hyperparameters"]
@@ -108,7 +104,7 @@ class SparseModel:
         signal, noise = values["signal"][outputs], values["noise"][outputs]
         if self.complete:
             statistics = replace(statistics, unexplained=0.0, charge=0.0)
-        prior = self.prior_at(values).outputs(outputs)
+        prior = self.prior.at(values).outputs(outputs)
         return Group(outputs, whitening, statistics, signal, noise, prior, self.complete, self.tight)
 
     def groups_of(
@@ -176,7 +172,7 @@ class SparseModel:
                 points,
                 whitening,
                 values["signal"][outputs],
-                self.prior_at(values).outputs(outputs),
+                self.prior.at(values).outputs(outputs),
                 mean[outputs],
                 root[outputs],
             )

@@ -44,10 +44,9 @@ def evaluate(
             gradient["hyperparameters"][index if separate else slice(None)] += hyper_bar
             gradient["inducing_points"][index] += Z_bar
             for name, bar in own.items():
-                if name == "coef" and model.prior.shared:
-                    gradient[name] += bar.sum(axis=0)
-                else:
-                    gradient[name][group.outputs] = bar
+                # Shared weights have one row of factors.
+                shared = name == "coef_factors" and model.prior.shared
+                gradient[name][slice(None) if shared else group.outputs] += bar
             index += 1
     return total, gradient
 
@@ -125,6 +124,10 @@ class ElboObjective:
         )
         loss += 0.5 * self.n_rows * float(len(values["noise"]) * LOG_2PI + np.log(values["noise"]).sum())
         loss += 0.5 * len(values["noise"]) * self.blocks.linear.log_variance
+        scales: Values = {"coef_factors": np.zeros(np.shape(values.get("coef_factors", ())))}
+        loss -= log_prior(values, scales)
+        if "coef_factors" in values:
+            gradient["coef_factors"] -= scales["coef_factors"]
         return loss / self.n_rows, self.table.gradient(gradient) / self.n_rows
 
     def solution(self, x: np.ndarray) -> tuple[float, Predictor]:
@@ -178,7 +181,7 @@ class ElboTerms:
         )
 
     def finish(self, residuals: Residuals) -> tuple[float, Values]:
-        """The loss, and its gradients (o, ...) in log s², log σ² and the parameters of q."""
+        """The loss, and its gradients (o, ...) in log s², log σ², log factors and the parameters of q."""
         group, statistics, spread, m = self._group, self._group.statistics, self._spread, len(self._group.whitening.L)
         f, b = self.weights[:m], self.weights[m:]
         shift = self._mean.copy()
@@ -192,9 +195,14 @@ class ElboTerms:
             "signal": 0.5 * slope - from_mean + spread.log_signal,
             "noise": 0.5 * (self._n_rows - data - slope) + spread.log_noise,
         }
+        HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
+        from_weights = (HE / group.noise).T * group.prior.scale
+        if group.prior.n_groups:
+            # With q(w) as it is, the weights and their spread grow with the scales, and w₀ falls.
+            own = spread.log_scale - from_weights * self._mean[:, m:] - shift[:, m:] * group.prior.reference
+            gradient["coef_factors"] = group.prior.of_groups(own)
         if self._has_parameters:
-            HE = statistics.HR - statistics.VH.T @ f - statistics.HH @ b
             shift[:, :m] -= (residuals.VE * (np.sqrt(group.signal) / group.noise)).T
-            shift[:, m:] -= (HE / group.noise).T * group.prior.scale
+            shift[:, m:] -= from_weights
             gradient |= {"mean": shift, "spread": spread.spread}
         return loss, gradient

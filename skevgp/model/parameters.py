@@ -59,15 +59,15 @@ class Parameter:
 
 
 def log_prior(values: Values, gradient: Values | None = None) -> float:
-    """The log density of the learned scales of the weights: log-normal around the map's own, of width e.
+    """The log prior density of the logarithms of ``coef_factors``, without its constant.
 
-    Its gradient in their logarithms is added to ``gradient``.
+    They are standard normal: a factor is e or 1/e at one standard deviation. The gradient is added to ``gradient``.
     """
-    if "coef" not in values:
+    if "coef_factors" not in values:
         return 0.0
-    logs = np.log(values["coef"])
+    logs = np.log(values["coef_factors"])
     if gradient is not None:
-        gradient["coef"] -= logs
+        gradient["coef_factors"] -= logs
     return -0.5 * float((logs**2).sum())
 
 

@@ -10,6 +10,7 @@ import numpy as np
 
 from ..data.rows import Columns, of_outputs, times_weights
 from ..utils.linalg import covariance_root, diagonal_of, nearest_covariance
+from .parameters import Values
 from .statistics import Kernel, Whitening
 
 # Predictions of several rows at once take arrays of about this many numbers.
@@ -30,24 +31,35 @@ class CoefficientPrior:
     # Whether all outputs have the same w, and so the same β in the user's units. Rows of the arrays then differ by the
     # units of the outputs only.
     shared: bool = False
-    # (o, p): the group of each weight, whose scale is a parameter. -1: its scale stays. None: all stay.
+    # Names of the groups of weights whose scales are parameters, and (o, p) the group of each weight. -1: its scale
+    # stays. C has no entries between groups.
+    labels: tuple[str, ...] = ()
     groups: np.ndarray | None = None
 
     @property
     def n_groups(self) -> int:
         """Number of groups of weights with a scale that is learned."""
-        return 0 if self.groups is None else int(self.groups.max(initial=-1)) + 1
+        return len(self.labels)
 
-    def at(self, factors: np.ndarray) -> CoefficientPrior:
-        """The prior with the scales of groups multiplied by ``factors`` (o, g), and the same offset.
+    def at(self, values: Values) -> CoefficientPrior:
+        """The prior with the scales of groups times the factors (o, g) in ``values``, and the same offset.
 
         Shared weights have one row of factors.
         """
-        if self.groups is None:
+        if self.groups is None or "coef_factors" not in values:
             return self
-        factors = np.broadcast_to(factors, (len(self.scale), self.n_groups))
+        factors = np.broadcast_to(values["coef_factors"], (len(self.scale), self.n_groups))
         by = np.take_along_axis(np.hstack([factors, np.ones((len(factors), 1))]), self.groups, axis=1)
-        return replace(self, scale=self.scale * by, reference=self.reference / by)
+        root = None if self.root is None else self.root * by[:, :, np.newaxis]
+        return replace(self, scale=self.scale * by, reference=self.reference / by, root=root)
+
+    def of_groups(self, each: np.ndarray) -> np.ndarray:
+        """Sums (o, g) over the weights of each group of numbers (o, p). Shared weights have one row, the first."""
+        assert self.groups is not None
+        sums = np.zeros((len(each), self.n_groups + 1))
+        for own, numbers, group in zip(sums, each, self.groups, strict=True):
+            np.add.at(own, group, numbers)
+        return sums[:1, :-1] if self.shared else sums[:, :-1]
 
     @property
     def offset(self) -> np.ndarray:
@@ -70,6 +82,7 @@ class CoefficientPrior:
             self.reference[columns],
             None if self.root is None else self.root[columns],
             self.shared,
+            self.labels,
             None if self.groups is None else self.groups[columns],
         )
 
