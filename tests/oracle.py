@@ -1,5 +1,6 @@
 """The bounds written down from the data in plain autograd.numpy: no statistics, no blocks, no hand-written gradient."""
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -15,6 +16,7 @@ from skevgp.kernels.parse import Start, Starts
 from skevgp.kernels.stationary import SquaredExponential
 from skevgp.model.bounds import LOG_2PI
 from skevgp.model.model import SparseModel
+from skevgp.model.parameters import Parameter, ParameterTable
 from skevgp.model.predictor import CoefficientPrior
 
 
@@ -69,6 +71,17 @@ class Dense:
     def linear(self, H, weights):
         return np.stack([own(H, o) @ weights[o] for o in self.outputs], axis=1)
 
+    def by(self, values):
+        """The factors (o, p) of the weights' scales."""
+        if self.prior.groups is None:
+            return np.ones(self.prior.scale.shape)
+        factors = values["coef_factors"] * np.ones((len(self.outputs), 1))
+        factors = anp.concatenate([factors, np.ones((len(self.outputs), 1))], axis=1)
+        return factors[np.arange(len(factors))[:, None], self.prior.groups]
+
+    def C(self, values):
+        return self.prior.roots() * self.by(values)[:, :, None]
+
     def k(self, values, o, A, B):
         return values["signal"][o] * squared_exponential(A, B, values["hyperparameters"])
 
@@ -83,7 +96,7 @@ class Dense:
 
     def covariance(self, values, k, A, H_A, B, H_B):
         """Of all outputs of rows A and B: (o n_A, o n_B)."""
-        C = self.prior.roots()
+        C = self.C(values)
 
         def block(i, j):
             if i != j and not self.prior.shared:
@@ -138,7 +151,8 @@ class Dense:
             targets = self.residuals[:, [o]] + self.H @ (self.prior.mean - self.prior.offset)[[o]].T
             rows = SimpleNamespace(inputs=self.X, features=self.H, targets=targets, counts=None, precision=None)
             alone = Dense(rows, self.prior.outputs([o]))
-            its = values | {name: values[name][[o]] for name in ("signal", "noise")}
+            names = ("signal", "noise", *(["coef_factors"] if self.prior.groups is not None else []))
+            its = values | {name: values[name][[o]] for name in names}
             its["inducing_points"] = values["inducing_points"][[o % len(values["inducing_points"])]]
             total += alone.log_density(its, alone.total(its, alone.sparse_k), alone.traces(its)[0])
         return total
@@ -154,9 +168,12 @@ class Dense:
         """The posterior precision of (f_m, β)."""
         Z = values["inducing_points"][o % len(values["inducing_points"])]
         A, p = self.projected(values, o, self.X, self.H), self.H.shape[1]
-        K_inv, C_inv = anp.linalg.inv(self.k(values, o, Z, Z)), np.diag(self.prior.scale[o] ** -2.0)
+        K_inv, C_inv = (
+            anp.linalg.inv(self.k(values, o, Z, Z)),
+            anp.diag((self.prior.scale * self.by(values))[o] ** -2.0),
+        )
         top = anp.hstack([K_inv, np.zeros((len(Z), p))])
-        prior = anp.concatenate([top, np.hstack([np.zeros((p, len(Z))), C_inv])])
+        prior = anp.concatenate([top, anp.hstack([np.zeros((p, len(Z))), C_inv])])
         return prior + A.T @ (self.precision[:, None] / values["noise"][o] * A)
 
     def gap(self, values):
@@ -187,7 +204,7 @@ class Dense:
 
     def weights(self, values):
         """Means (o, p) and covariances (o, p, p)."""
-        C, S = self.prior.roots(), self.total(values, self.known_k)
+        C, S = self.C(values), self.total(values, self.known_k)
         means, covariances = [], []
         for o in self.outputs:
             each = [C[o] @ C[i].T @ own(self.H, i).T * float(i == o or self.prior.shared) for i in self.outputs]
@@ -225,7 +242,8 @@ def blocks_of(raw, kernel, size=17, **options):
 def values_of(table, flat):
     """The parameters at coordinates of a table without hand-written code, for autograd."""
     c, points = table.coordinates(flat), table["inducing_points"]
-    values = {name: anp.exp(c[name]) for name in ("hyperparameters", "signal", "noise")}
+    names = [own.name for own in table.parameters if own.transform == "log"]
+    values = {name: anp.exp(c[name]) for name in names}
     return values | {"inducing_points": c["inducing_points"] * points.unit + points.origin}
 
 
@@ -238,6 +256,7 @@ def table_of(inputs, points, starts, scatter, n_hyperparameters, rules=Rules(1e-
     """The parameters of a model of rows with such inputs, whose internal units are the user's."""
     none = np.zeros(len(scatter))
     units = SimpleNamespace(target_unit=none + 1.0, constant=none > 0.0, rounding=none, target_scatter=none + 1.0)
+    units.prior = SimpleNamespace(labels=(), n_groups=0, shared=False)
     spec = SimpleNamespace(starts=starts, covariance=SimpleNamespace(n_hyperparameters=n_hyperparameters))
     rows = SimpleNamespace(
         inputs=Moments.of(inputs), columns=slice(None), mean_precision=1.0, scatter=lambda: np.asarray(scatter)
@@ -257,6 +276,17 @@ def problem(family="full", shared=True, n=60, m=6, d=2, o=2, p=3, seed=0):
     Z = np.array([X[rng.choice(n, m, replace=False)] + 0.1 * rng.randn(m, d) for _ in groups])
     starts = Start(0.8 + rng.rand(d)), Start(0.5 + rng.rand(o)), Start(0.1 + 0.1 * rng.rand(o))
     return model, rows, table_of(X, Z, Starts(*starts), np.ones(o), d)
+
+
+def with_groups(model, table):
+    """The same with two groups of weights whose scales are learned, and weights whose scales stay."""
+    (o, p), rng = model.prior.scale.shape, np.random.RandomState(5)
+    groups = rng.randint(-1, 2, (o, p))
+    # Correlated weights are in one group.
+    groups = groups if model.prior.root is None else np.zeros((o, p), dtype=int)
+    model = replace(model, prior=replace(model.prior, labels=("a", "b"), groups=groups))
+    factors = Parameter("coef_factors", 0.5 + rng.rand(1 if model.prior.shared else o, 2), "log")
+    return model, ParameterTable([*table.parameters, factors])
 
 
 def negative_elbo(statistics, signal, noise, prior, mean, root, log_det):
@@ -300,6 +330,6 @@ def negative_elbo(statistics, signal, noise, prior, mean, root, log_det):
     spread = anp.concatenate([root, mean[:, :, None]], axis=2)
     squares = anp.sum(anp.matmul(PP, spread) * spread, axis=(1, 2)) - 2.0 * anp.sum(Pr * mean, axis=1) + statistics.RR
     data = statistics.n_rows * (LOG_2PI + anp.log(noise)) + (squares + signal * statistics.unexplained) / noise
-    shift = mean + np.hstack([np.zeros((o, m)), prior.reference])
+    shift = mean + anp.hstack([np.zeros((o, m)), prior.reference])
     divergence = anp.sum(root**2, axis=(1, 2)) + anp.sum(shift**2, axis=1) - (m + p) - log_det
     return 0.5 * anp.sum(data + divergence)

@@ -12,8 +12,9 @@ from numpy.testing import assert_allclose
 from skevgp.model.exact import ExactModel
 from skevgp.model.model import SparseModel
 from skevgp.model.objectives import BoundObjective, ElboObjective
+from skevgp.model.parameters import log_prior
 
-from ..oracle import Dense, blocks_of, problem, relative_error, values_of
+from ..oracle import Dense, blocks_of, problem, relative_error, values_of, with_groups
 
 M, N, O = 6, 40, 2  # noqa: E741
 RNG = np.random.RandomState(7)
@@ -40,6 +41,7 @@ def setting(family, n_groups, shared, weighted, p):
     if weighted:
         counts, variance = rng.uniform(0.2, 3.0, N), np.exp(rng.randn(N))
         raw = replace(raw, counts=counts, precision=counts / variance)
+    model, table = with_groups(model, table)
     return model, raw, table
 
 
@@ -69,7 +71,8 @@ def test_sparse_model_is_dense_one(family, tight, n_groups, shared, weighted, p)
     model, dense = replace(model, tight=tight), Dense(raw, model.prior, family, tight=tight)
     values, blocks = table.values_at_start(), blocks_of(raw, model.kernel)
     statistics = model.statistics(values, blocks)
-    lower, likelihood = dense.bound(values), dense.likelihood(values)
+    lower, likelihood, of_factors = dense.bound(values), dense.likelihood(values), log_prior(values)
+    assert of_factors < 0.0
     assert model.bound(values, statistics, blocks) == pytest.approx(lower, rel=1e-8)
     assert model.bound(values, statistics) == pytest.approx(lower, rel=1e-8)
     assert lower < likelihood < model.upper_bound(values, statistics, blocks)
@@ -81,8 +84,13 @@ def test_sparse_model_is_dense_one(family, tight, n_groups, shared, weighted, p)
             assert model.upper_bound(values, statistics, seen) == pytest.approx(dense.upper_bound(values), rel=1e-8)
 
     value, gradient = BoundObjective(model, table, blocks)(table.start())
-    assert value == pytest.approx(-lower / blocks.linear.n_rows, rel=1e-8)
-    expected = grad(lambda flat: -dense.bound(values_of(table, flat)) / blocks.linear.n_rows)(table.start())
+    assert value == pytest.approx(-(lower + of_factors) / blocks.linear.n_rows, rel=1e-8)
+
+    def loss(flat):
+        values = values_of(table, flat)
+        return (0.5 * anp.sum(anp.log(values["coef_factors"]) ** 2) - dense.bound(values)) / blocks.linear.n_rows
+
+    expected = grad(loss)(table.start())
     assert relative_error(gradient, expected) < 1e-7
     if not shared:
         elbo = ElboObjective(model, table, blocks)
@@ -95,16 +103,17 @@ def test_exact_model_is_dense_one(shared, weighted, p):
     sparse, raw, table = setting("full", 1, shared, weighted, p)
     model = ExactModel(sparse.kernel, sparse.prior, np.zeros((O, p), dtype=bool), raw)
     dense, values = Dense(raw, model.prior, exact=True), table.values_at_start()
-    names = ("hyperparameters", "signal", "noise")
+    names = ("hyperparameters", "signal", "noise", "coef_factors")
     value, gradient = model.log_likelihood(values)
     assert value == pytest.approx(dense.likelihood(values), rel=1e-10)
 
     def of_logs(logs):
-        parts = dict(zip(names, (logs[:2], logs[2 : 2 + O], logs[2 + O :]), strict=True))
+        parts = dict(zip(names, (logs[:2], logs[2 : 2 + O], logs[2 + O : 2 + 2 * O], logs[2 + 2 * O :]), strict=True))
+        parts["coef_factors"] = parts["coef_factors"].reshape(values["coef_factors"].shape)
         return dense.likelihood(values | {name: anp.exp(part) for name, part in parts.items()})
 
-    logs = np.log(np.concatenate([values[name] for name in names]))
-    assert relative_error(np.concatenate([gradient[name] for name in names]), grad(of_logs)(logs)) < 1e-8
+    logs = np.log(np.concatenate([values[name].ravel() for name in names]))
+    assert relative_error(np.concatenate([gradient[name].ravel() for name in names]), grad(of_logs)(logs)) < 1e-8
     assert_predictions(model.predictor(values), dense, values, p)
 
 

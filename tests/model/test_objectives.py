@@ -1,6 +1,7 @@
 """The loss of mini-batches and its hand-written gradient, for each family of q."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import autograd.numpy as anp
 import numpy as np
@@ -11,7 +12,7 @@ from skevgp.data.blocks import Batch
 from skevgp.model.objectives import ElboObjective
 from skevgp.model.statistics import SufficientStatistics
 
-from ..oracle import negative_elbo, problem, relative_error, whitened
+from ..oracle import negative_elbo, problem, relative_error, whitened, with_groups
 
 FAMILIES = ("full", "diagonal")
 SHARED = (True, False)
@@ -73,12 +74,18 @@ def traced_loss(elbo, family, block, linear):
             linear.n_rows, VV, VH, VR, linear.HH[0], linear.HR, linear.RR, unexplained, 0.0, 0.0
         ).scaled(n_rows / linear.n_rows)
         assert VV.shape == (o, m, m)
+        prior, of_factors = model.prior, 0.0
+        if prior.groups is not None:
+            logs = anp.concatenate([c["coef_factors"], np.zeros((o, 1))], axis=1)[np.arange(o)[:, None], prior.groups]
+            prior = SimpleNamespace(scale=prior.scale * anp.exp(logs), reference=prior.reference * anp.exp(-logs))
+            of_factors = 0.5 * anp.sum(c["coef_factors"] ** 2) / n_rows
         return (
-            negative_elbo(
+            of_factors
+            + negative_elbo(
                 statistics,
                 anp.exp(c["signal"]),
                 anp.exp(c["noise"]),
-                model.prior,
+                prior,
                 c["mean"] * table["mean"].unit,
                 anp.stack(roots),
                 anp.stack(log_dets),
@@ -95,7 +102,7 @@ def traced_loss(elbo, family, block, linear):
 @pytest.mark.parametrize("tight", [False, True])
 def test_loss_and_gradient_agree_with_autograd(tight, family, shared, size):
     model, rows, table = problem(family, shared, n=60, m=5, p=2)
-    model = replace(model, tight=tight)
+    model, table = with_groups(replace(model, tight=tight), table)
     elbo = ElboObjective(model, table, rows.blocks(model.kernel, 60))
     rows_of = batch(model, rows, size)
     x = away_from_the_start(elbo)
