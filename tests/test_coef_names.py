@@ -5,6 +5,7 @@ import pytest
 from sklearn.preprocessing import PolynomialFeatures
 
 from skevgp import EGPRegressor, EVGPRegressor
+from skevgp.datasets import make_dynamics
 from skevgp.features import InertiaForceGravity
 
 RNG = np.random.RandomState(0)
@@ -31,7 +32,7 @@ def test_without_features_there_are_none(estimator):
 
 
 def test_coef_names_of_robot():
-    state = RNG.uniform(-1.0, 1.0, (30, 3))
-    m = EVGPRegressor(InertiaForceGravity("pendulum"), max_iter=0, n_inducing=5).fit(state, state[:, :2])
+    state, after = make_dynamics("pendulum", 3, 10, random_state=0, return_X_y=True)
+    m = EVGPRegressor(InertiaForceGravity("pendulum"), max_iter=0, n_inducing=5).fit(state, after)
     assert m.coef_names_.tolist() == m.feature_map_.get_feature_names_out().tolist()
     assert len(set(m.coef_names_)) == m.coef_.shape[1]

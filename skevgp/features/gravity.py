@@ -132,7 +132,7 @@ class LinkGravity(GravityMap):
         The links, by the name of their joint or its index from 0 (the paper counts from 1). If None, all links.
     outputs : sequence of int or str, default=None
         States in the columns of y, by index or name. If None, all of them, [q, q̇].
-    unknown_ratio : float, default=3.0
+    unknown_ratio : float, default=1.0
         Prior standard deviation of what the pull on a link contributes to the velocities of the joints between the base
         and the link, as a multiple of the change that the prior mean of all features leaves.
     coupling_ratio : float, default=0.3
@@ -193,7 +193,7 @@ class LinkGravity(GravityMap):
         axes: str = "xy",
         links: Sequence[int | str] | None = None,
         outputs: Sequence[int | str] | None = None,
-        unknown_ratio: float = 3.0,
+        unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         dt: Literal["column"] | None = None,
     ):

@@ -149,7 +149,7 @@ class InertiaForce(_NewtonFeatures):
         inverse_inertia: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
         known_rate: float = 0.3,
-        unknown_ratio: float = 3.0,
+        unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         other_ratio: float = 0.003,
     ):
@@ -263,7 +263,7 @@ class InertiaForceGravity(_NewtonFeatures):
         gravity_gain: ArrayLike = 0.0,
         outputs: Sequence[int | str] | None = None,
         known_rate: float = 0.3,
-        unknown_ratio: float = 3.0,
+        unknown_ratio: float = 1.0,
         coupling_ratio: float = 0.3,
         other_ratio: float = 0.003,
     ):

@@ -53,7 +53,7 @@ class NominalDynamics(RobotMap):
     model_error : float, default=0.3
         Relative error of the model's accelerations. The weight of a joint's acceleration for its velocity is Δt times 1
         ± ``model_error``.
-    unknown_ratio : float, default=3.0
+    unknown_ratio : float, default=1.0
         Prior standard deviation of what the torques ``"gravity"`` and ``"bias"`` contribute to velocities, as a
         multiple of the change that the prior mean of all features leaves.
     other_ratio : float, default=0.03
@@ -117,7 +117,7 @@ class NominalDynamics(RobotMap):
         dt: float | Literal["column"] = STEP,
         outputs: Sequence[int | str] | None = None,
         model_error: float = 0.3,
-        unknown_ratio: float = 3.0,
+        unknown_ratio: float = 1.0,
         other_ratio: float = 0.03,
     ):
         self.robot = robot

@@ -273,6 +273,25 @@ class RigidBodyRegressor(RobotTransformer):
         return mean, covariance
 
 
+    @available_if(has_robot)
+    def coef_groups(self, n_outputs: int) -> np.ndarray:
+        """Name the groups of weights whose prior standard deviations are learned together.
+
+        Parameters
+        ----------
+        n_outputs : int
+            Number of predicted torques: one per joint.
+
+        Returns
+        -------
+        labels : ndarray of str of shape (n_features_out,)
+            "inertia" for the inertial parameters of all links, and the names in ``friction``.
+        """
+        terms = self._checked_friction()
+        labels = ["inertia"] * (len(_INERTIAL) * n_outputs) + [term for term in terms for _ in range(n_outputs)]
+        return np.array(labels, dtype=object)
+
+
 def _sizes(model: Any) -> np.ndarray:
     """Return the size of each link: distance to the farthest joint or centre of mass on it, or radius of gyration."""
     sizes = np.zeros(model.nv)

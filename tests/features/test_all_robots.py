@@ -40,13 +40,24 @@ def uses(robot):
     rng = np.random.default_rng(0)
     rows, torque_rows = rng.uniform(-1.0, 1.0, (1, layout.n_columns)), rng.uniform(-1.0, 1.0, (1, 3 * n))
 
+    def prior_of(feature_map, n_outputs):
+        """Mean and standard deviations. Those in units of the data are 0 where the map has its own."""
+        if not hasattr(feature_map, "coef_prior"):
+            return []
+        mean, own = feature_map.coef_prior(n_outputs)
+        if not hasattr(feature_map, "coef_scale"):
+            return [mean, own]
+        in_units = feature_map.coef_scale(np.ones(n_outputs), np.ones(mean.shape[1]))
+        assert_array_equal(np.isnan(in_units), ~np.isnan(own))
+        assert feature_map.coef_groups(n_outputs).shape == mean.shape
+        return [mean, np.nan_to_num(own), np.nan_to_num(in_units)]
+
     def mapped(feature_map, X, n_outputs=2 * n):
-        prior = [feature_map.coef_prior(n_outputs)] if hasattr(feature_map, "coef_prior") else []
+        before = prior_of(feature_map, n_outputs)
         H = feature_map.fit_transform(X)
         assert len(feature_map.get_feature_names_out()) == H.shape[-1]
         assert_array_equal(pickle.loads(pickle.dumps(feature_map)).transform(X), H)
-        after = [feature_map.coef_prior(n_outputs)] if prior else []
-        return [H, feature_map.jacobian(X), *sum(prior + after, ())]
+        return [H, feature_map.jacobian(X), *before, *prior_of(feature_map, n_outputs)]
 
     terms = ["acceleration", "gravity", "bias", "input"]
     return {

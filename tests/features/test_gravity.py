@@ -133,8 +133,8 @@ def test_link_named_twice_raises(links):
         ({"axes": ["x"]}, "'axes' parameter"),
         ({"links": "q2"}, "'links' parameter .* Got 'q2'"),
         ({"links": 2}, "'links' parameter .* Got 2"),
-        ({"unknown_scale": -1.0}, "'unknown_scale' parameter .* Got -1.0"),
-        ({"free_scale": np.nan}, "'free_scale' parameter .* Got nan"),
+        ({"unknown_ratio": -1.0}, "'unknown_ratio' parameter .* Got -1.0"),
+        ({"coupling_ratio": np.nan}, "'coupling_ratio' parameter .* Got nan"),
     ],
 )
 @pytest.mark.parametrize("robot", ["iiwa14", None])
@@ -166,30 +166,38 @@ def test_names_say_link_and_lever():
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_prior_knows_which_joints_bear_a_link(fitted):
-    features = LinkGravity("iiwa14", axes="x", links=["q1", "q3", "q7"], unknown_scale=2.0, free_scale=0.5)
+    features = LinkGravity("iiwa14", axes="x", links=["q1", "q3", "q7"], unknown_ratio=2.0, coupling_ratio=0.5)
     if fitted:
         features.fit(rows("iiwa14"))
-    mean, scale = features.coef_prior(14)
+    mean, own = features.coef_prior(14)
     assert_array_equal(mean, np.zeros((14, 3)))
-    expected = np.full((14, 3), 0.5)
-    expected[7:8, 0] = expected[7:10, 1] = expected[7:14, 2] = 2.0
-    assert_array_equal(scale, expected)
+    assert np.isnan(own).all()
+    borne = np.arange(7)[:, np.newaxis] < [1, 3, 7]
+    assert_array_equal(features.coef_groups(14), np.tile(np.where(borne, "gravity", "coupling"), (2, 1)))
+    left_over, size = np.arange(1.0, 15.0), np.array([1.0, 2.0, 4.0])
+    expected = np.tile(np.where(borne, 2.0, 0.5), (2, 1)) * left_over[:, np.newaxis] / size
+    assert_allclose(features.coef_scale(left_over, size), expected)
 
 
 def test_outputs_choose_states():
-    mean, scale = LinkGravity("acrobot", outputs=["dq1/dt", "q2"], free_scale=0.0).coef_prior(2)
+    features = LinkGravity("acrobot", outputs=["dq1/dt", "q2"], unknown_ratio=2.0, coupling_ratio=0.0)
+    mean, _ = features.coef_prior(2)
     assert_array_equal(mean, np.zeros((2, 4)))
-    assert_array_equal(scale, [[1, 1, 1, 1], [0, 0, 0, 0]])
+    assert_array_equal(features.coef_scale([1.0, 10.0], np.ones(4)), [[2, 2, 2, 2], [0, 0, 20, 20]])
 
 
 def test_union_is_inertia_force_gravity_in_two_parts():
-    X, y = rows("iiwa14", 30), np.random.default_rng(1).normal(size=(30, 14))
-    parts = [("inertia", InertiaForce("iiwa14")), ("gravity", LinkGravity("iiwa14", links=range(1, 7)))]
-    union, whole = FeatureUnion(parts), InertiaForceGravity("iiwa14")
-    assert_array_equal(union.fit_transform(X), whole.fit_transform(X))
+    X = rows("iiwa14", 60)
+    inertia, levers = InertiaForce("iiwa14", other_ratio=1.0), LinkGravity("iiwa14", links=range(1, 7))
+    union, whole = FeatureUnion([("if", inertia), ("g", levers)]), InertiaForceGravity("iiwa14", other_ratio=1.0)
+    H = whole.fit_transform(X)
+    assert_array_equal(union.fit_transform(X), H)
+    # `LinkGravity` does not know Δt. What is left of a position counts as Δt times what is left of its velocity.
+    left = np.random.default_rng(1).normal(size=(60, 7))
+    y = H @ whole.coef_prior(14)[0].T + np.hstack([0.03 * left, left])
     of_union, of_whole = (EVGPRegressor(features, n_inducing=5, max_iter=0).fit(X, y) for features in (union, whole))
     assert_array_equal(of_union.coef_prior_mean_, of_whole.coef_prior_mean_)
-    assert_array_equal(of_union.coef_prior_scale_, of_whole.coef_prior_scale_)
+    assert_allclose(of_union.coef_prior_scale_, of_whole.coef_prior_scale_, rtol=1e-12)
 
 
 def test_gravity_inside_ifg_leaves_the_outputs_to_it():

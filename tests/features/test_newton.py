@@ -32,20 +32,18 @@ IFG_MEANS = {
     ],
 }
 GAIN = {"pendulum": 3.0, "cartpole": [3.0], "acrobot": [3.0, 4.0]}
-# Entries that physics knows (k), names without a value (u), and leaves at zero (.).
-IFG_ROLES = {
-    "pendulum": ["kk..", ".kuu"],
-    "cartpole": ["k.k...", ".k.k..", "..k.u.", "...k.u"],
-    "acrobot": ["k.k....", ".k.k...", "..k..uu", "...ku.u"],
+# The groups of weights for velocities: known (k), input (i), gravity (g), coupling (c) and other (.).
+GROUPS = {
+    "pendulum": [".kig"],
+    "cartpole": ["..k.ic", "...kcg"],
+    "acrobot": ["..k.cgg", "...kicg"],
 }
+NAMES = {"k": "known", "i": "input", "g": "gravity", "c": "coupling", ".": "other"}
+PRIOR = {"known_rate": 0.7, "unknown_ratio": 5.0, "coupling_ratio": 0.5, "other_ratio": 0.02}
 
 
 def rows(name, n_rows=5):
     return np.random.default_rng(0).normal(size=(n_rows, len(COLUMNS[name])))
-
-
-def scales(roles, known, unknown, free):
-    return [[{"k": known, "u": unknown, ".": free}[role] for role in row] for row in roles]
 
 
 @pytest.mark.parametrize("name", COLUMNS)
@@ -83,31 +81,56 @@ def test_prior_mean_with_gravity_is_that_of_the_paper(name):
 
 @pytest.mark.parametrize("name", COLUMNS)
 def test_without_guesses_only_eulers_rule_is_known(name):
-    mean, _ = InertiaForceGravity(name).coef_prior(len(IFG_ROLES[name]))
-    euler = scales(IFG_ROLES[name], known=1.0, unknown=0.0, free=0.0)
-    assert_array_equal(mean != 0, np.array(euler) != 0)
-    assert set(mean[mean != 0]) == {1.0, 0.03}
+    n = layout_of(name).n_joints
+    mean, _ = InertiaForceGravity(name).coef_prior(2 * n)
+    assert_array_equal(mean[:, : 2 * n], np.eye(2 * n) + 0.03 * np.eye(2 * n, k=n))
+    assert_array_equal(mean[:, 2 * n :], 0.0)
 
 
 @pytest.mark.parametrize("name", COLUMNS)
-def test_known_unknown_and_free_entries_have_their_own_scales(name):
-    features = InertiaForceGravity(name, known_scale=0.01, unknown_scale=5.0, free_scale=0.5)
-    _, scale = features.coef_prior(len(IFG_ROLES[name]))
-    assert_array_equal(scale, scales(IFG_ROLES[name], 0.01, 5.0, 0.5))
+def test_standard_deviations_are_those_of_their_groups(name):
+    """Of the known weights in 1/s, of all others in units of the data; Δt times those of the velocity for positions."""
+    n, of_velocities = layout_of(name).n_joints, np.array([list(row) for row in GROUPS[name]])
+    features = InertiaForceGravity(name, dt=DT, **PRIOR)
+    groups = np.vectorize(NAMES.get)(np.vstack([of_velocities, of_velocities]))
+    assert_array_equal(features.coef_groups(2 * n), groups)
+    known = of_velocities == "k"
+    _, own = features.coef_prior(2 * n)
+    assert_allclose(own[n:], np.where(known, DT * 0.7, np.nan))
+    rng = np.random.default_rng(0)
+    left_over, size = rng.uniform(1.0, 2.0, 2 * n), rng.uniform(1.0, 2.0, known.shape[1])
+    in_units = features.coef_scale(left_over, size)
+    ratio = np.vectorize({"k": np.nan, "i": 5.0, "g": 5.0, "c": 0.5, ".": 0.02}.get)(of_velocities)
+    assert_allclose(in_units[n:], ratio * left_over[n:, np.newaxis] / size)
+    assert_allclose(own[:n], DT * own[n:])
+    assert_allclose(in_units[:n], DT * in_units[n:])
+    # Without gravity they are the same.
+    inertia = InertiaForce(name, dt=DT, **PRIOR)
+    assert_array_equal(inertia.coef_groups(2 * n), groups[:, : 2 * n + 1])
+    assert_array_equal(inertia.coef_prior(2 * n)[1], own[:, : 2 * n + 1])
+    assert_array_equal(inertia.coef_scale(left_over, size[: 2 * n + 1]), in_units[:, : 2 * n + 1])
 
 
-def test_free_scale_of_zero_pins_the_zeros():
-    mean, scale = InertiaForceGravity("acrobot", free_scale=0.0, gravity_gain=1.0, inverse_inertia=1.0).coef_prior(4)
-    assert_array_equal(scale == 0, mean == 0)
+def test_ratios_of_zero_pin_the_zeros():
+    """For positions, h(x) may then change by what changes their velocities."""
+    guesses = {"gravity_gain": 1.0, "inverse_inertia": 1.0}
+    features = InertiaForceGravity("acrobot", coupling_ratio=0.0, other_ratio=0.0, **guesses)
+    mean, own = features.coef_prior(4)
+    scale = np.where(np.isnan(own), features.coef_scale(np.ones(4), np.ones(7)), own)
+    assert_array_equal(scale[2:] == 0.0, mean[2:] == 0.0)
+    assert_array_equal(scale[:2] == 0.0, mean[2:] == 0.0)
 
 
 @pytest.mark.parametrize("outputs", [["dq2/dt", "q1"], [3, 0], ("dq2/dt", 0), np.array([3, 0])])
 def test_outputs_choose_states_by_name_or_index(outputs):
     guesses = {"inverse_inertia": 2.0, "gravity_gain": 3.0}
-    mean, scale = InertiaForceGravity("acrobot", outputs=outputs, **guesses).coef_prior(2)
-    all_means, all_scales = InertiaForceGravity("acrobot", **guesses).coef_prior(4)
-    assert_array_equal(mean, all_means[[3, 0]])
-    assert_array_equal(scale, all_scales[[3, 0]])
+    some, every = InertiaForceGravity("acrobot", outputs=outputs, **guesses), InertiaForceGravity("acrobot", **guesses)
+    for of_some, of_all in zip(some.coef_prior(2), every.coef_prior(4), strict=True):
+        assert_array_equal(of_some, of_all[[3, 0]])
+    assert_array_equal(some.coef_groups(2), every.coef_groups(4)[[3, 0]])
+    # The velocity of q1 is not predicted. Then its own residuals count, in place of Δt times those of the velocity.
+    left_over, size = np.array([0.03 * 4.0, 2.0, 4.0, 5.0]), np.arange(1.0, 8.0)
+    assert_allclose(some.coef_scale(left_over[[3, 0]], size), every.coef_scale(left_over, size)[[3, 0]])
 
 
 @pytest.mark.parametrize("outputs", [["q3"], [4], [-1], [True], [0.0], [None], ["q1", 7]])
@@ -134,9 +157,10 @@ def test_target_of_another_width_raises(outputs, n_outputs, message):
     [
         ({"dt": 0.0}, r"'dt' parameter .* in the range \(0.0, inf\) or a str among {'column'}. Got 0.0"),
         ({"dt": np.nan}, "'dt' parameter .* Got nan"),
-        ({"known_scale": -1.0}, "'known_scale' parameter .* Got -1.0"),
-        ({"unknown_scale": np.inf}, "'unknown_scale' parameter .* Got inf"),
-        ({"free_scale": -0.1}, "'free_scale' parameter .* Got -0.1"),
+        ({"known_rate": -1.0}, "'known_rate' parameter .* Got -1.0"),
+        ({"unknown_ratio": np.inf}, "'unknown_ratio' parameter .* Got inf"),
+        ({"coupling_ratio": np.nan}, "'coupling_ratio' parameter .* Got nan"),
+        ({"other_ratio": -0.1}, "'other_ratio' parameter .* Got -0.1"),
         ({"inverse_inertia": [1.0, 2.0]}, "inverse_inertia must be a finite number or 1 of them"),
         ({"inverse_inertia": np.nan}, "inverse_inertia must be a finite number"),
         ({"gravity_gain": [1.0, 2.0, 3.0]}, "gravity_gain must be a finite number or 2 of them"),
@@ -147,7 +171,7 @@ def test_invalid_parameter_raises(parameters, message):
         InertiaForceGravity("acrobot", **parameters).coef_prior(4)
 
 
-@pytest.mark.parametrize("parameter", ["dt", "known_scale", "unknown_scale", "free_scale"])
+@pytest.mark.parametrize("parameter", ["dt", *PRIOR])
 def test_parameter_that_is_no_number_raises(parameter):
     with pytest.raises(ValueError, match=f"'{parameter}' parameter .* Got 'much'"):
         InertiaForce("pendulum", **{parameter: "much"}).coef_prior(2)
@@ -162,8 +186,9 @@ def test_invalid_number_of_columns_raises(feature_map):
 
 @pytest.mark.parametrize("feature_map", MAPS)
 def test_only_a_robot_gives_a_prior(feature_map):
-    assert not hasattr(feature_map(), "coef_prior")
-    assert hasattr(feature_map("pendulum"), "coef_prior")
+    for method in ("coef_prior", "coef_scale", "coef_groups"):
+        assert not hasattr(feature_map(), method)
+        assert hasattr(feature_map("pendulum"), method)
 
 
 def test_pandas_output_keeps_the_index_and_names_the_columns():
@@ -206,18 +231,22 @@ def test_without_gravity_nothing_is_added():
 
 @pytest.mark.parametrize("fitted", [False, True])
 def test_prior_of_an_arm_is_eulers_rule_and_gravity_on_the_joints_below_each_link(fitted):
-    features = InertiaForceGravity("iiwa14", gravity_gain=2.0, unknown_scale=3.0, free_scale=0.5)
+    features, inertia = InertiaForceGravity("iiwa14", gravity_gain=2.0, **PRIOR), InertiaForce("iiwa14", **PRIOR)
     if fitted:
         features.fit(arm_rows())
-    mean, scale = features.coef_prior(14)
-    inertia_mean, inertia_scale = InertiaForce("iiwa14", unknown_scale=3.0, free_scale=0.5).coef_prior(14)
-    assert_array_equal(mean[:, :21], inertia_mean)
-    assert_array_equal(scale[:, :21], inertia_scale)
-    borne = np.zeros((14, 12), dtype=bool)
+    mean, own = features.coef_prior(14)
+    groups, in_units = features.coef_groups(14), features.coef_scale(np.ones(14), np.ones(33))
+    for of_all, of_inertia in zip((mean, own), inertia.coef_prior(14), strict=True):
+        assert_array_equal(of_all[:, :21], of_inertia)
+    assert_array_equal(groups[:, :21], inertia.coef_groups(14))
+    assert_array_equal(in_units[:, :21], inertia.coef_scale(np.ones(14), np.ones(21)))
+    borne = np.zeros((7, 12), dtype=bool)
     for column, link in enumerate(np.repeat(range(2, 8), 2)):
-        borne[7 : 7 + link, column] = True
-    assert_array_equal(mean[:, 21:], np.where(borne, -0.06, 0.0))
-    assert_array_equal(scale[:, 21:], np.where(borne, 3.0, 0.5))
+        borne[:link, column] = True
+    assert_array_equal(mean[:, 21:], np.vstack([np.zeros((7, 12)), np.where(borne, -0.06, 0.0)]))
+    assert_array_equal(groups[:, 21:], np.tile(np.where(borne, "gravity", "coupling"), (2, 1)))
+    assert_array_equal(in_units[7:, 21:], np.where(borne, 5.0, 0.5))
+    assert_allclose(in_units[:7], 0.03 * in_units[7:])
 
 
 def test_there_may_be_a_guess_per_lever():
@@ -226,14 +255,14 @@ def test_there_may_be_a_guess_per_lever():
     assert_allclose(mean[7, 21:], -0.03 * gain)
 
 
-def test_levers_can_be_asked_for_and_have_their_own_scales():
-    levers = LinkGravity(axes="x", unknown_scale=5.0, free_scale=0.0)
+def test_levers_can_be_asked_for_and_have_their_own_ratios():
+    levers = LinkGravity(axes="x", unknown_ratio=5.0, coupling_ratio=0.0)
     features = InertiaForceGravity("acrobot", gravity=levers).fit(rows("acrobot"))
     assert features.get_feature_names_out().tolist() == [*COLUMNS["acrobot"], "gravity(q1, u_x)", "gravity(q2, u_x)"]
     assert_allclose(
         features.transform(rows("acrobot"))[:, 5:], 9.81 * np.sin(np.cumsum(rows("acrobot")[:, :2], axis=1))
     )
-    assert_array_equal(features.coef_prior(4)[1][:, 5:], [[0, 0], [0, 0], [5, 5], [0, 5]])
+    assert_array_equal(features.coef_scale(np.ones(4), np.ones(7))[2:, 5:], [[5, 5], [0, 5]])
     assert levers.robot is None  # the user's own is not touched
 
 

@@ -1,0 +1,248 @@
+"""What physics in the model gains: models with and without it, all with the defaults of the library.
+
+    python benchmarks/physics.py errors                       # hours of one core, most of them for iiwa14
+    python benchmarks/physics.py errors --systems pendulum cartpole
+    python benchmarks/physics.py wrong                        # half an hour of one core
+    python benchmarks/physics.py rollouts                     # ten minutes of one core
+    python benchmarks/physics.py errors --quick
+
+All models of a cell learn from the same rows, with `EVGPRegressor`'s defaults: 100 inducing points for each. VGP is the
+model without features, RES-VGP learns the change of state, EVGP-IF and EVGP-IFG have the features `InertiaForce` and
+`InertiaForceGravity`. Noise is a share of each target's standard deviation. Errors are means over test rows of the norm
+of the error of the noise-free target. Coverage and the NLPD are those of noisy targets.
+
+*errors*: the systems of the paper from 4 trajectories and from the paper's number, and robots that the features'
+default prior was not made for (a double pendulum, a UR5 and a Panda) from 4 and 40.
+
+*wrong*: features that are wrong, against the same model without features. "another robot" has the features of the
+acrobot for the cartpole, and the reverse. "gravity upwards" has a guess of gravity with the wrong sign. "noise" adds
+five features that are noise to the model of the change of state.
+
+*rollouts*: errors of positions after 100 steps of the mean, fed back, from 40 states that were not seen, relative to
+the states' scatter: the median over rollouts.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import namedtuple
+from typing import Any
+
+import numpy as np
+import pandas as pd
+from sklearn.base import RegressorMixin
+from sklearn.preprocessing import FunctionTransformer
+
+import harness
+from skevgp import EVGPRegressor, ResidualRegressor, rollout
+from skevgp.datasets import make_dynamics
+from skevgp.features import InertiaForce, InertiaForceGravity
+from skevgp.metrics import containing_ratios, negative_log_predictive_density, prediction_error
+
+SYSTEMS = ("pendulum", "cartpole", "cartpole_damped", "acrobot", "iiwa14")
+UNSEEN = ("double_pendulum", "ur5", "panda")
+MODELS = ("VGP", "RES-VGP", "EVGP-IF", "EVGP-IFG")
+NOISES = (0.01, 0.0)
+FEW, MANY = 4, {**dict.fromkeys(SYSTEMS, 0), **dict.fromkeys(UNSEEN, 40)}  # 0: the paper's number
+TEST_TRAJECTORIES, STEPS = 40, 100
+WRONG = ("another robot", "gravity upwards", "noise")
+# Upwards: (rad/s²) per sine of the angle, which is -19.6 for the pendulum.
+UPWARDS = -20.0
+OTHER = {"acrobot": "cartpole", "cartpole": "acrobot"}
+
+Errors = namedtuple("Errors", "system noise trajectories seed")
+Wrong = namedtuple("Wrong", "map system noise trajectories seed")
+Rollouts = namedtuple("Rollouts", "system noise trajectories seed")
+
+
+def build(model: str, system: str, seed: int) -> RegressorMixin:
+    """Return a model with the defaults of the library."""
+    if model == "RES-VGP":
+        return ResidualRegressor(EVGPRegressor(random_state=seed))
+    features = {"VGP": None, "EVGP-IF": InertiaForce(system), "EVGP-IFG": InertiaForceGravity(system)}[model]
+    return EVGPRegressor(features, random_state=seed)
+
+
+def scores(model: RegressorMixin, cell: Any, quick: bool = False) -> dict[str, Any]:
+    """Fit a model and return its scores on other trajectories."""
+    train = make_dynamics(cell.system, cell.trajectories or None, noise=cell.noise, random_state=cell.seed)
+    test = make_dynamics(cell.system, TEST_TRAJECTORIES, random_state=1000 + cell.seed)
+    if quick:
+        model.set_params(**{name: 3 for name in model.get_params() if name.endswith("max_iter")})
+    seconds, _ = harness.timed(lambda: model.fit(train.data, train.target, groups=train.groups))
+    mean, std = model.predict(test.data, return_std=True)
+    size = cell.noise * train.trajectories[:, 1:].reshape(train.target.shape).std(axis=0)
+    noisy = test.target + size * np.random.RandomState(2000 + cell.seed).standard_normal(mean.shape)
+    ratios = containing_ratios(noisy, mean, std)
+    fitted = getattr(model, "regressor_", model)
+    return {
+        "error": prediction_error(test.target, mean),
+        "error_median": float(np.median(np.linalg.norm(test.target - mean, axis=1))),
+        **{f"cr{k}": float(ratio) for k, ratio in enumerate(ratios, start=1)},
+        "nlpd": negative_log_predictive_density(noisy, mean, std),
+        "rows": len(train.data),
+        "n_iter": fitted.n_iter_,
+        "seconds": round(seconds, 2),
+    }
+
+
+def run_errors(cell: Errors, quick: bool = False) -> list[dict[str, Any]]:
+    return [{"model": name, **scores(build(name, cell.system, cell.seed), cell, quick)} for name in MODELS]
+
+
+def waves(X: np.ndarray) -> np.ndarray:
+    """Return five features that are as good as noise."""
+    return np.sin(1e4 * X @ np.arange(1.0, 1.0 + 5 * X.shape[1]).reshape(5, -1).T)
+
+
+def run_wrong(cell: Wrong, quick: bool = False) -> list[dict[str, Any]]:
+    """Return scores of a model with wrong features, and of one without."""
+    features = {
+        "another robot": InertiaForceGravity(OTHER.get(cell.system, cell.system)),
+        "gravity upwards": InertiaForceGravity(cell.system, gravity_gain=UPWARDS),
+        "noise": FunctionTransformer(waves),
+    }[cell.map]
+    models = {
+        name: EVGPRegressor(chosen, random_state=cell.seed) for name, chosen in (("with", features), ("without", None))
+    }
+    if cell.map == "noise":
+        models = {name: ResidualRegressor(model) for name, model in models.items()}
+    return [{"features": name, **scores(model, cell, quick)} for name, model in models.items()]
+
+
+def run_rollouts(cell: Rollouts, quick: bool = False) -> list[dict[str, Any]]:
+    """Return how far the models' rollouts are from the truth after 100 steps."""
+    train = make_dynamics(
+        cell.system, cell.trajectories or None, noise=cell.noise, input_noise=cell.noise, random_state=cell.seed
+    )
+    test = make_dynamics(cell.system, TEST_TRAJECTORIES, STEPS, random_state=1000 + cell.seed)
+    n_states = train.target.shape[1]
+    scatter = train.trajectories.reshape(-1, n_states).std(axis=0)
+    inputs = test.data[:, n_states:].reshape(TEST_TRAJECTORIES, STEPS, -1)
+    rows = []
+    for name in MODELS:
+        model = build(name, cell.system, cell.seed)
+        if quick:
+            model.set_params(**{each: 3 for each in model.get_params() if each.endswith("max_iter")})
+        harness.timed(lambda model=model: model.fit(train.data, train.target, groups=train.groups))
+        try:
+            with harness.one_thread():
+                ahead = rollout(model, test.trajectories[:, 0], inputs, method="mean").mean
+        except ValueError as problem:
+            if "unstable" not in str(problem):
+                raise
+            ahead = np.full(test.trajectories[:, 1:].shape, np.inf)
+        found = ((ahead[:, -1] - test.trajectories[:, -1]) / scatter)[:, : n_states // 2]
+        errors = np.sqrt(np.mean(found**2, axis=1))
+        rows.append({"model": name, "error": float(np.median(errors)), "error_p90": float(np.quantile(errors, 0.9))})
+    return rows
+
+
+def tables_of_errors(rows: pd.DataFrame) -> harness.Tables:
+    """Return mean errors and coverage of each set, and how often and by how much physics wins."""
+    rows = rows.assign(
+        set=[f"{own.system}, {own.trajectories or 'all'}, {100 * own.noise:g} %" for own in rows.itertuples()]
+    )
+    order = dict.fromkeys(rows.sort_values(["trajectories", "noise"])["set"])
+    wide = rows.pivot_table(index="set", columns="model", values=["error", "cr2", "seconds"], sort=False).loc[
+        list(order)
+    ]
+    error, ratio = wide["error"], wide["error"]["EVGP-IFG"] / wide["error"]["RES-VGP"]
+    systems = np.array([name.split(",")[0] in SYSTEMS for name in wide.index])
+    lines = []
+    for which, chosen in (("the paper's systems", systems), ("robots not seen before", ~systems)):
+        if chosen.any():
+            own = error[chosen]
+            lines.append(
+                {
+                    "": which,
+                    "sets": len(own),
+                    "EVGP-IFG at most RES-VGP": f"{int((ratio[chosen] <= 1.0).sum())} of {len(own)}",
+                    "geometric mean of the ratio": float(np.exp(np.log(ratio[chosen]).mean())),
+                    "EVGP-IFG at most VGP": f"{int((own['EVGP-IFG'] <= own['VGP']).sum())} of {len(own)}",
+                    "least, greatest CR-2": " ".join(
+                        f"{edge:.3f}"
+                        for edge in (wide["cr2"]["EVGP-IFG"][chosen].min(), wide["cr2"]["EVGP-IFG"][chosen].max())
+                    ),
+                    "least number of seeds": int(
+                        rows[rows["set"].isin(own.index)].groupby(["set", "model"]).size().min()
+                    ),
+                }
+            )
+    of_error = error[list(MODELS)].copy()
+    of_error["EVGP-IFG / RES-VGP"] = ratio
+    of_error["CR-2 of EVGP-IFG"] = wide["cr2"]["EVGP-IFG"]
+    of_error["CR-2 of RES-VGP"] = wide["cr2"]["RES-VGP"]
+    of_error["× seconds"] = wide["seconds"]["EVGP-IFG"] / wide["seconds"]["RES-VGP"]
+    return {"does physics win": pd.DataFrame(lines), "error": of_error.reset_index()}
+
+
+def tables_of_wrong(rows: pd.DataFrame) -> harness.Tables:
+    keys = ["map", "system", "noise", "trajectories"]
+    wide = rows.pivot_table(index=keys, columns="features", values=["error", "nlpd", "cr2"], sort=False)
+    out = pd.DataFrame(
+        {
+            "error with": wide["error"]["with"],
+            "without": wide["error"]["without"],
+            "ratio": wide["error"]["with"] / wide["error"]["without"],
+            "NLPD with": wide["nlpd"]["with"],
+            "NLPD without": wide["nlpd"]["without"],
+            "CR-2 with": wide["cr2"]["with"],
+        }
+    )
+    return {"wrong features": out.reset_index()}
+
+
+def tables_of_rollouts(rows: pd.DataFrame) -> harness.Tables:
+    keys = ["system", "noise", "trajectories"]
+    wide = rows.pivot_table(index=keys, columns="model", values="error", sort=False, aggfunc="median")
+    return {"rollouts": wide[list(MODELS)].reset_index()}
+
+
+def cells_of(part: str, options: Any) -> list[Any]:
+    systems = options.systems or ({"errors": (*SYSTEMS, *UNSEEN)}.get(part) or ("pendulum", "cartpole", "acrobot"))
+    if options.quick:
+        systems = systems[:1]
+    sizes = [FEW] if options.quick or part == "wrong" else [FEW, None]
+    cells = [
+        (system, noise, MANY[system] if n is None else n, seed)
+        for n, noise, seed, system in itertools.product(sizes, NOISES, options.seeds, systems)
+    ]
+    if part == "errors":
+        return [Errors(*cell) for cell in sorted(cells, key=lambda cell: cell[0] == "iiwa14" and cell[2] != FEW)]
+    if part == "rollouts":
+        return [Rollouts(*cell) for cell in cells if cell[0] != "acrobot"]
+    return [Wrong(name, *cell) for name in WRONG for cell in cells if name != "another robot" or cell[0] in OTHER]
+
+
+def run(cell: Any) -> list[dict[str, Any]]:
+    return JOBS[type(cell).__name__.lower()](cell)
+
+
+def run_quickly(cell: Any) -> list[dict[str, Any]]:
+    return JOBS[type(cell).__name__.lower()](cell, quick=True)
+
+
+JOBS = {"errors": run_errors, "wrong": run_wrong, "rollouts": run_rollouts}
+TABLES = {"errors": tables_of_errors, "wrong": tables_of_wrong, "rollouts": tables_of_rollouts}
+FILES = {"errors": "physics", "wrong": "physics_wrong", "rollouts": "physics_rollouts"}
+TITLES = {
+    "errors": "What physics in the model gains",
+    "wrong": "Features that are wrong",
+    "rollouts": "Many steps ahead with as many inducing points",
+}
+
+
+def main() -> None:
+    parser = harness.argument_parser(__doc__, quick="one system, few iterations", seeds=4)
+    parser.add_argument("part", choices=list(JOBS))
+    parser.add_argument("--systems", nargs="+", choices=[*SYSTEMS, *UNSEEN], help="default: all")
+    options = harness.parse(parser)
+    output = harness.output_path(options, FILES[options.part])
+    job = run_quickly if options.quick else run
+    n_failures = harness.run_missing(cells_of(options.part, options), job, output, options.jobs)
+    harness.write_page(TITLES[options.part], TABLES[options.part](harness.frame(output)), output, n_failures)
+
+
+if __name__ == "__main__":
+    main()
